@@ -1,0 +1,97 @@
+"""TD-MPC2 updates per second: loss, backward, clipping, Adam, target networks; replay sampling beside it.
+
+    python benchmarks/learner.py                 the sizes of the reference library, and the published one
+
+On CUDA the update is one captured graph, as in training.
+"""
+
+from __future__ import annotations
+
+import argparse
+
+import torch
+from common import publish, rate
+from tensordict import TensorDict
+
+from franka_wm import models
+from franka_wm.data.replay import make_replay
+from franka_wm.envs import resolve_device
+from franka_wm.training.learner import Learner
+
+SIZES = {  # latent, encoder, hidden, batch
+    "128/256, batch 32": (128, 256, 256, 32),
+    "128/256, batch 64": (128, 256, 256, 64),
+    "512/512, batch 64": (512, 256, 512, 64),
+    "512/512, batch 256 (paper)": (512, 256, 512, 256),
+}
+REFERENCE = {"128/256, batch 32": 25.0, "512/512, batch 64": 3.8}
+"""Updates/s that the reference library's TD-MPC2 was measured at, on 2 CPU cores."""
+
+
+def experience(worlds: int, steps: int, device: torch.device) -> TensorDict:
+    """Random transitions of the arm's shapes."""
+
+    def observation() -> dict:
+        return {
+            "state": torch.randn(worlds, steps, 20, device=device),
+            "joint_target": torch.randn(worlds, steps, 7, device=device),
+        }
+
+    flags = torch.zeros(worlds, steps, 1, dtype=torch.bool, device=device)
+    after = observation() | {"reward": -torch.rand(worlds, steps, 1, device=device), "terminated": flags}
+    return TensorDict(
+        observation()
+        | {
+            "action": torch.rand(worlds, steps, 7, device=device) * 2 - 1,
+            "is_init": flags.clone(),
+            "next": after,
+        },
+        batch_size=[worlds, steps],
+    )
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--device", default="auto")
+    parser.add_argument("--seconds", type=float, default=3.0)
+    parser.add_argument("--compile", action="store_true", help="compile the loss, too")
+    parser.add_argument("--out")
+    arguments = parser.parse_args()
+    device = resolve_device(arguments.device)
+    if device.type == "cuda":
+        torch.set_float32_matmul_precision("high")
+    rows = []
+    for name, (latent, encoder, hidden, batch) in SIZES.items():
+        torch.manual_seed(0)
+        model = models.make(
+            "tdmpc2",
+            observation_sizes={"state": 20, "joint_target": 7},
+            action_dim=7,
+            episode_length=50,
+            latent_dim=latent,
+            encoder_dim=encoder,
+            hidden_dim=hidden,
+        ).to(device)
+        learner = Learner(model, compile=arguments.compile)
+        replay = make_replay(capacity=100_000, num_envs=64, window=3, batch_size=batch, device=device)
+        replay.extend(experience(64, 500, device))
+        fixed = replay.sample()
+        alone = rate(lambda: learner.update(fixed), seconds=arguments.seconds, warmup=8)
+        sampled = rate(lambda: learner.update(replay.sample()), seconds=arguments.seconds, warmup=8)
+        rows.append(
+            {
+                "latent/hidden, batch": name,
+                "parameters": f"{sum(p.numel() for p in model.parameters()) / 1e6:.2f} M",
+                "update [1/s]": alone,
+                "sample + update [1/s]": sampled,
+                "reference, 2 CPU cores [1/s]": REFERENCE.get(name, "–"),
+            }
+        )
+        print(rows[-1], flush=True)
+    publish("learner", rows, arguments.out)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,7 @@
+"""A robot arm that plans with a world model it learned, simulated thousands of times over on one GPU.
+
+`franka_wm.envs` is the arm as a TorchRL environment, `franka_wm.models` learns `(z, a) -> z'` from it,
+`franka_wm.planning` plans with what was learned. Importing this package imports none of them.
+"""
+
+__version__ = "0.1.0"

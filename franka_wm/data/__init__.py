@@ -1,0 +1,1 @@
+"""Policies that gather data, and the replay buffer that keeps it."""

@@ -1,0 +1,98 @@
+"""Policies that need no learning, as TensorDict modules that a TorchRL collector can run."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModuleBase
+
+from franka_wm.envs.config import FrankaConfig
+from franka_wm.envs.kinematics import Kinematics
+from franka_wm.errors import UserError
+
+
+class NoopPolicy(TensorDictModuleBase):
+    """Does nothing: action 0. What every agent must beat."""
+
+    in_keys = ["is_init"]  # pyright: ignore[reportAssignmentType]
+    out_keys = ["action"]  # pyright: ignore[reportAssignmentType]
+
+    def __init__(self, action_dim: int = 7):
+        super().__init__()
+        self.action_dim = action_dim
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        is_init = tensordict.get("is_init")
+        return tensordict.set(
+            "action", is_init.new_zeros(*is_init.shape[:-1], self.action_dim, dtype=torch.float32)
+        )
+
+
+class SmoothRandomPolicy(TensorDictModuleBase):
+    """First-order autoregressive random actions in [−1, 1], started anew where an episode starts.
+
+    Args:
+        action_dim: Of the environment.
+        smoothness: Correlation of successive actions, in [0, 1).
+        generator: Source of randomness.
+    """
+
+    in_keys = ["is_init"]  # pyright: ignore[reportAssignmentType]
+    out_keys = ["action"]  # pyright: ignore[reportAssignmentType]
+
+    def __init__(
+        self, action_dim: int = 7, *, smoothness: float = 0.7, generator: torch.Generator | None = None
+    ):
+        super().__init__()
+        if not 0.0 <= smoothness < 1.0:
+            raise UserError(f"smoothness={smoothness}: must be at least 0 and below 1")
+        self.action_dim = action_dim
+        self.smoothness = smoothness
+        self.generator = generator
+        self._present: torch.Tensor | None = None
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        is_init = tensordict.get("is_init")
+        shape = (*is_init.shape[:-1], self.action_dim)
+        noise = torch.randn(shape, device=is_init.device, generator=self.generator)
+        if self._present is None or self._present.shape != noise.shape:
+            self._present = noise
+        else:
+            s = self.smoothness
+            self._present = torch.where(is_init, noise, s * self._present + math.sqrt(1 - s * s) * noise)
+        return tensordict.set("action", self._present.clamp(-1.0, 1.0))
+
+
+class OraclePolicy(TensorDictModuleBase):
+    """Inverse kinematics with the true geometry and the true goal: what the environment allows at best.
+
+    Solves for joint angles that put the tool on the goal, starting from the servo's present targets, and
+    moves the targets there as fast as actions may.
+
+    Args:
+        kinematics: The arm's.
+        config: The environment's: what an action means.
+    """
+
+    in_keys = ["joint_target", "goal"]  # pyright: ignore[reportAssignmentType]
+    out_keys = ["action"]  # pyright: ignore[reportAssignmentType]
+
+    def __init__(self, kinematics: Kinematics, config: FrankaConfig):
+        super().__init__()
+        self.kinematics = kinematics
+        self.config = config
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        target = tensordict.get("joint_target", None)
+        if target is None:
+            raise UserError("the oracle reads joint_target; add it to the environment's observations")
+        goal, c, k = tensordict.get("goal"), self.config, self.kinematics
+        if c.action_mode == "ee_delta":
+            action = (goal - k.forward(target)) / c.ee_scale
+        elif c.action_mode == "joint_position":
+            action = 2 * (k.solve(goal, target) - k.lower) / (k.upper - k.lower) - 1
+        else:
+            action = (k.solve(goal, target) - target) / c.action_scale
+        return tensordict.set("action", action.clamp(-1.0, 1.0))

@@ -1,0 +1,128 @@
+"""A replay buffer on the training device, and a sampler of windows that is exact."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from torchrl.data import LazyTensorStorage, ReplayBuffer
+from torchrl.data.replay_buffers import RoundRobinWriter, Sampler
+
+from franka_wm.errors import UserError
+
+
+class WindowSampler(Sampler):
+    """Windows of consecutive steps of one episode, uniform over all such windows, at a cost of O(batch).
+
+    The storage is (time, worlds), written round-robin along time. A window starts at a uniformly drawn
+    (time, world) and is kept if it neither crosses the writer's position nor contains the start of an episode
+    after its first step: drawing and rejecting is exact and, unlike a list of episodes, free of any pass over
+    the buffer. A fixed number of candidates is drawn, so that nothing waits for the device.
+
+    A window of ``length`` H has H transitions: the observations o₀ … o_{H−1} at its root and, under ``next``,
+    o₁ … o_H. So H + 1 observations, the last one the true end of the episode where there is one.
+
+    Args:
+        writer: The buffer's writer; knows where the oldest step is.
+        length: Transitions per window, H ≥ 1.
+        boundary: Key of the flag that marks the first step of an episode.
+        oversample: Candidates per window kept. With episodes of L steps a candidate is kept with probability
+            (L − H + 1) / L; 4 is enough for L ≥ 2 H and batches of 32.
+    """
+
+    def __init__(
+        self, writer: RoundRobinWriter, *, length: int, boundary: str = "is_init", oversample: int = 4
+    ):
+        if length < 1 or oversample < 1:
+            raise UserError(f"window length={length}, oversample={oversample}: both must be at least 1")
+        self.writer = writer
+        self.length = length
+        self.boundary = boundary
+        self.oversample = oversample
+        self._missing: torch.Tensor | None = None
+
+    def sample(self, storage: Any, batch_size: int) -> tuple[Any, dict]:
+        data = storage._storage
+        capacity, worlds = data.shape[:2]
+        filled = storage._len_along_dim0
+        span = filled - self.length + 1
+        if span < 1:
+            raise UserError(
+                f"the replay buffer holds {filled} steps per world, a window needs {self.length}; collect more first"
+            )
+        device = data.device
+        oldest = self.writer._cursor if filled == capacity else 0
+        count = self.oversample * batch_size + 64
+        draw = torch.randint(span * worlds, (count,), device=device)
+        world = draw % worlds
+        time = (torch.div(draw, worlds, rounding_mode="floor").unsqueeze(1) + oldest
+                + torch.arange(self.length, device=device)) % capacity  # fmt: skip
+        if self.length > 1:
+            starts = data.get(self.boundary)[time[:, 1:], world.unsqueeze(1)]
+            crossing = starts.flatten(1).any(1)
+            # Stable: keeps the order of the draws, so the first batch_size whole windows are a uniform sample.
+            order = torch.sort(crossing, stable=True).indices[:batch_size]
+            self._record_missing(crossing[order])
+            time, world = time[order], world[order]
+        else:
+            time, world = time[:batch_size], world[:batch_size]
+        return (time, world.unsqueeze(1).expand_as(time)), {}
+
+    def _record_missing(self, crossing: torch.Tensor) -> None:
+        if crossing.device.type == "cpu":
+            self._missing = crossing.any()
+            self.check()
+        else:  # asking now would wait for the device: kept for check()
+            self._missing = crossing.any() if self._missing is None else self._missing | crossing.any()
+
+    def check(self) -> None:
+        """Raises if any batch since the last check could not be filled with whole windows; one host sync."""
+        if self._missing is not None and bool(self._missing):
+            raise UserError(
+                f"too few episodes of at least {self.length} steps in the replay buffer; "
+                "shorten the model's horizon, lengthen episodes, or collect more"
+            )
+        self._missing = None
+
+    # What TorchRL asks of a sampler; there is no state beside the buffer's.
+    def _empty(self) -> None: ...
+
+    def dumps(self, path: Any) -> None: ...
+
+    def loads(self, path: Any) -> None: ...
+
+    def state_dict(self) -> dict[str, Any]:
+        return {}
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None: ...
+
+
+def make_replay(
+    *, capacity: int, num_envs: int, window: int, batch_size: int, device: torch.device | str
+) -> ReplayBuffer:
+    """A buffer of (time, worlds) that is extended with the collector's (worlds, time) batches.
+
+    Args:
+        capacity: Transitions in all; rounded down to a whole number of steps per world.
+        num_envs: Worlds.
+        window: Transitions per sampled window, H.
+        batch_size: Windows per sample.
+        device: Where everything lives.
+
+    Returns:
+        A ``ReplayBuffer`` whose samples have batch size (batch_size, window).
+    """
+    steps = capacity // num_envs
+    if steps <= window:
+        raise UserError(
+            f"replay capacity {capacity} is {steps} steps for each of {num_envs} worlds, windows have {window}; "
+            f"use at least {num_envs * (window + 1)}"
+        )
+    writer = RoundRobinWriter()
+    return ReplayBuffer(
+        storage=LazyTensorStorage(steps * num_envs, ndim=2, device=device),
+        sampler=WindowSampler(writer, length=window),
+        writer=writer,
+        batch_size=batch_size,
+        dim_extend=1,
+    )

@@ -1,0 +1,318 @@
+"""What a Franka environment is made of: one frozen, validated dataclass."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, fields
+
+from franka_wm.errors import UserError
+
+OBSERVATIONS = ("pixels", "depth", "segmentation", "goal_pixels", "state", "joint_target")
+"""Observation groups that can be asked for; ``goal`` is always emitted."""
+
+IMAGES = ("pixels", "depth", "segmentation", "goal_pixels")
+CAMERAS = ("front", "wrist")
+ACTION_MODES = {"joint_delta": 7, "joint_position": 7, "ee_delta": 3}
+"""Meaning of an action, and its size."""
+
+HOME = (0.0, -0.4, 0.0, -2.0, 0.0, 1.6, 0.8)
+"""Home pose of the seven arm joints [rad]."""
+
+NUM_JOINTS = 7
+STATE_DIM = 20
+MAX_IMAGE_SIZE = 2048
+
+
+@dataclass(frozen=True, kw_only=True)
+class Randomization:
+    """What each episode of each world draws anew; all off by default. Reproducible from seed × world × episode.
+
+    A factor of ``x`` means a uniform draw from [1 − x, 1 + x]; an offset of ``x`` one from [−x, x].
+
+    Attributes:
+        color: Offset of the red, green and blue of every shape but the ground, which all worlds share.
+        brightness: Factor of the whole picture.
+        camera_position: Offset of the front camera's eye [m] in x, y and z.
+        camera_target: Offset of the point it looks at [m].
+        gains: Factor of the servo's stiffness and damping.
+        armature: Factor of the joints' armature.
+        friction: Largest dry friction of a joint [N·m]; drawn from [0, friction].
+        mass: Factor of every link's mass and inertia.
+        action_noise: Standard deviation of noise added to actions, in every step.
+        action_latency: Largest delay of actions [control steps]; drawn from 0 … action_latency.
+        observation_noise: Standard deviation of noise on observed joint angles [rad] and, times 10, velocities
+            [rad/s], in every step. Tool, goal and rewards stay true.
+    """
+
+    color: float = 0.0
+    brightness: float = 0.0
+    camera_position: float = 0.0
+    camera_target: float = 0.0
+    gains: float = 0.0
+    armature: float = 0.0
+    friction: float = 0.0
+    mass: float = 0.0
+    action_noise: float = 0.0
+    action_latency: int = 0
+    observation_noise: float = 0.0
+
+    def __post_init__(self) -> None:
+        limits = {"color": 1.0, "brightness": 0.99, "gains": 0.9, "armature": 0.9, "mass": 0.9}
+        for f in fields(self):
+            value, limit = getattr(self, f.name), limits.get(f.name, 100.0)
+            if not _is_number(value) or not 0 <= value <= limit:
+                raise UserError(f"randomization.{f.name}={value!r}: must be from 0 to {limit:g}")
+        if not isinstance(self.action_latency, int):
+            raise UserError(
+                f"randomization.action_latency={self.action_latency!r}: must be a whole number of steps"
+            )
+
+    def any(self) -> bool:
+        """Whether anything is drawn at all."""
+        return any(getattr(self, f.name) for f in fields(self))
+
+    @property
+    def dynamics(self) -> bool:
+        """Whether anything of the physical model is drawn."""
+        return bool(self.gains or self.armature or self.friction or self.mass)
+
+    @classmethod
+    def from_mapping(cls, values: Mapping) -> Randomization:
+        """From a mapping; an unknown name is an error that lists the known ones."""
+        known = {f.name for f in fields(cls)}
+        for name in values:
+            if name not in known:
+                raise UserError(f"unknown randomization {name!r}; known: {', '.join(sorted(known))}")
+        return cls(**dict(values))
+
+
+@dataclass(frozen=True, kw_only=True)
+class FrankaConfig:
+    """Everything that defines the simulated arm and its task. Frozen; each field is validated.
+
+    The defaults are those of a plain, stiff, not gravity-compensated servo at 30 Hz, kept because results
+    published with them can be compared. The Hydra presets in ``conf/env`` choose faster and more faithful
+    values and say why.
+
+    Attributes:
+        image_size: Side of the square ``pixels`` observation [px].
+        action_scale: Change of the joint targets per unit of action [rad].
+        fps: Control rate [Hz].
+        substeps: Physics steps per control step.
+        joint_armature: Rotor inertia added to every joint [kg·m²].
+        target_ke: Stiffness of the position servo [N·m/rad].
+        target_kd: Damping of the position servo [N·m·s/rad].
+        pose_noise: Half-width of the uniform noise on the initial joint angles [rad].
+        goal: Reach target in the world frame [m]; the fixed goal, and the one shown before sampling.
+        action_penalty: Weight of the mean squared action in the reward.
+        camera_distance: The eye's x [m].
+        camera_height: The eye's z [m].
+        camera_target_height: The camera looks at (0, 0, this height) [m].
+        camera_fov_degrees: Vertical field of view [degrees].
+        enable_shadows: Cast shadows in ``pixels`` (about half the rendering speed).
+        enable_textures: Use mesh textures where the robot has them.
+        solver: ``"mujoco"``, ``"featherstone"``, or ``"auto"``, which is ``"mujoco"`` on every device.
+        asset_name: Newton's downloadable asset, for ``robot="newton_asset"``.
+        urdf_relative_path: URDF inside that asset.
+        robot: ``"embedded"`` (ships with the package), ``"newton_asset"`` (downloaded), ``"panda_meshes"``
+            or ``"panda_meshes_full"`` (extra ``meshes``), ``"urdf"`` (give ``urdf_path`` to the environment), or
+            one of your own (``docs/robots.md``).
+        action_mode: ``"joint_delta"`` (change of the joint targets, × ``action_scale``), ``"joint_position"``
+            (the targets themselves, −1 and 1 at the joint limits) or ``"ee_delta"`` (tool displacement in the
+            world, × ``ee_scale``, through differential inverse kinematics).
+        ee_scale: Tool displacement per unit of action, for ``"ee_delta"`` [m].
+        task: ``"reach"`` (the goal stands still) or ``"track"`` (it moves on a circle).
+        reward: ``"dense"`` (−tanh distance), ``"sparse"`` (1 where solved, else 0) or ``"normalized"`` (the part
+            of the episode's initial distance that has been closed, at least −1); all minus the action penalty.
+        track_radius, track_period: Of the circle [m] and of one turn [s], for ``task="track"``.
+        cameras: Which of ``("front", "wrist")`` the image observations come from. The first one's keys are
+            ``pixels``, ``depth``, …; another's ``pixels_wrist``, ….
+        show_goal: Draw the goal as a small red ball in every picture.
+        randomization: Ranges that each episode of each world draws from; :class:`Randomization`.
+        finger_opening: Each finger's distance from the closed position [m]; the fingers are held there.
+        observations: Which of ``("pixels", "depth", "segmentation", "goal_pixels", "state", "joint_target")`` are
+            emitted. ``goal`` always is.
+        episode_length: Control steps after which an episode is truncated.
+        goal_sampling: ``"fixed"`` (``goal``) or ``"reachable"`` (the tool position of a random pose, drawn
+            per world and episode).
+        goal_noise: For ``goal_sampling="reachable"``: half-width of the uniform noise around the home pose
+            from which the goal pose is drawn [rad].
+        success_distance: The task is solved where the tool is closer to the goal than this [m].
+        terminate_on_success: End the episode at the first success.
+        gravity_compensation: Cancel gravity's load on the arm, as the real robot's controller does.
+        limit_velocity: Keep the servo from driving a joint faster than the robot's own limit, and its target
+            from running ahead of what the arm can follow.
+        solver_iterations: Constraint solver iterations per physics step (MuJoCo).
+        solver_ls_iterations: Line-search iterations of each of those.
+        auto_reset: ``"native"`` (finished worlds restart inside the step, no host sync) or ``"standard"``
+            (TorchRL resets by mask; slower, needs no support from what drives the environment).
+    """
+
+    image_size: int = 64
+    action_scale: float = 0.25
+    fps: float = 30.0
+    substeps: int = 16
+    joint_armature: float = 0.1
+    target_ke: float | tuple[float, ...] = 800.0
+    target_kd: float | tuple[float, ...] = 40.0
+    pose_noise: float = 0.35
+    goal: tuple[float, float, float] = (0.30, 0.15, 0.55)
+    action_penalty: float = 0.01
+    camera_distance: float = 1.15
+    camera_height: float = 0.65
+    camera_target_height: float = 0.45
+    camera_fov_degrees: float = 60.0
+    enable_shadows: bool = False
+    enable_textures: bool = False
+    solver: str = "auto"
+    asset_name: str = "franka_emika_panda"
+    urdf_relative_path: str = "urdf/fr3_franka_hand.urdf"
+    robot: str = "embedded"
+    action_mode: str = "joint_delta"
+    ee_scale: float = 0.05
+    task: str = "reach"
+    reward: str = "dense"
+    track_radius: float = 0.1
+    track_period: float = 4.0
+    cameras: tuple[str, ...] = ("front",)
+    show_goal: bool = False
+    randomization: Randomization = field(default_factory=lambda: Randomization())
+    finger_opening: float = 0.02
+    observations: tuple[str, ...] = ("pixels", "state")
+    episode_length: int = 50
+    goal_sampling: str = "fixed"
+    goal_noise: float = 0.8
+    success_distance: float = 0.05
+    terminate_on_success: bool = False
+    gravity_compensation: bool = False
+    limit_velocity: bool = False
+    solver_iterations: int = 10
+    solver_ls_iterations: int = 10
+    auto_reset: str = "native"
+
+    def __post_init__(self) -> None:
+        for name in ("goal", "observations", "cameras", "target_ke", "target_kd"):  # Hydra hands lists over
+            value = getattr(self, name)
+            if isinstance(value, Sequence) and not isinstance(value, str):
+                object.__setattr__(self, name, tuple(value))
+            elif name in ("goal", "observations", "cameras"):
+                raise UserError(f"{name}={value!r}: must be a list")
+        if isinstance(self.randomization, Mapping):
+            object.__setattr__(self, "randomization", Randomization.from_mapping(self.randomization))
+        elif not isinstance(self.randomization, Randomization):
+            raise UserError(f"randomization={self.randomization!r}: must be a mapping of ranges")
+        self._check_whole("image_size", 1, MAX_IMAGE_SIZE, "pixels")
+        self._check_whole("substeps", 1, 1000, "physics steps per control step")
+        self._check_whole("episode_length", 1, 1_000_000, "control steps")
+        self._check_whole("solver_iterations", 1, 1000, "iterations")
+        self._check_whole("solver_ls_iterations", 1, 1000, "iterations")
+        for name, low, high, unit in (
+            ("action_scale", 0.0, math.pi, "rad per unit of action"),
+            ("fps", 0.0, 10_000.0, "Hz"),
+            ("ee_scale", 0.0, 1.0, "m per unit of action"),
+            ("track_radius", 0.0, 1.0, "m"),
+            ("track_period", 0.0, 1e6, "s"),
+            ("success_distance", 0.0, 10.0, "m"),
+            ("camera_fov_degrees", 0.0, 180.0, "degrees"),
+        ):
+            self._check_real(name, low, high, unit, open_low=True)
+        if self.camera_fov_degrees >= 180:
+            raise UserError(f"camera_fov_degrees={self.camera_fov_degrees}: must be below 180; try 60")
+        for name, low, high, unit in (
+            ("joint_armature", 0.0, 100.0, "kg·m²"),
+            ("pose_noise", 0.0, math.pi, "rad"),
+            ("goal_noise", 0.0, math.pi, "rad"),
+            ("action_penalty", 0.0, 1e6, "reward per mean squared action"),
+            ("finger_opening", 0.0, 0.04, "m"),
+            ("camera_distance", -100.0, 100.0, "m"),
+            ("camera_height", -100.0, 100.0, "m"),
+            ("camera_target_height", -100.0, 100.0, "m"),
+        ):
+            self._check_real(name, low, high, unit)
+        if self.camera_distance == 0 and self.camera_height == self.camera_target_height:
+            raise UserError(
+                "camera_distance=0 and camera_height=camera_target_height: the eye sits on its target; move one"
+            )
+        for name in ("target_ke", "target_kd"):
+            value = getattr(self, name)
+            gains = value if isinstance(value, tuple) else (value,) * NUM_JOINTS
+            if len(gains) != NUM_JOINTS or not all(_is_number(g) and g >= 0 for g in gains):
+                raise UserError(
+                    f"{name}={getattr(self, name)}: give one gain ≥ 0 for all joints or {NUM_JOINTS} of them"
+                )
+        if len(self.goal) != 3 or not all(_is_number(g) for g in self.goal):
+            raise UserError(f"goal={self.goal}: give three finite numbers (x, y, z) in metres")
+        self._check_choice("solver", ("auto", "mujoco", "featherstone"))
+        from franka_wm.envs.robots.sources import SOURCES  # here: robots need this module
+
+        self._check_choice("robot", tuple(SOURCES))
+        self._check_choice("goal_sampling", ("fixed", "reachable"))
+        self._check_choice("action_mode", tuple(ACTION_MODES))
+        self._check_choice("task", ("reach", "track"))
+        self._check_choice("reward", ("dense", "sparse", "normalized"))
+        self._check_choice("auto_reset", ("native", "standard"))
+        for name in (f.name for f in fields(self) if isinstance(f.default, bool)):
+            if not isinstance(getattr(self, name), bool):
+                raise UserError(f"{name}={getattr(self, name)!r}: must be true or false")
+        for name, known in (("observations", OBSERVATIONS), ("cameras", CAMERAS)):
+            chosen = getattr(self, name)
+            if not chosen or any(c not in known for c in chosen) or len(set(chosen)) != len(chosen):
+                raise UserError(f"{name}={chosen}: choose one or more of {known}, each once")
+        if "goal_pixels" in self.observations and self.task == "track":
+            raise UserError("goal_pixels shows a goal that stands still; leave it out with task=track")
+        if self.randomization.any() and self.solver == "featherstone":
+            raise UserError("randomization needs solver=mujoco")
+        if self.limit_velocity and not all(k > 0 for k in self.gains("target_ke")):
+            raise UserError(
+                "limit_velocity needs target_ke above 0: it limits how far the servo's set point may lead"
+            )
+        if self.solver == "featherstone" and self.substeps % 2:
+            raise UserError(
+                f"substeps={self.substeps} with solver=featherstone: must be even (it swaps two state buffers); "
+                f"try {self.substeps + 1}"
+            )
+
+    @property
+    def action_dim(self) -> int:
+        """Size of an action."""
+        return ACTION_MODES[self.action_mode]
+
+    @property
+    def images(self) -> tuple[str, ...]:
+        """The image observations that were asked for, without cameras' names."""
+        return tuple(o for o in self.observations if o in IMAGES)
+
+    def gains(self, name: str) -> tuple[float, ...]:
+        """``target_ke`` or ``target_kd`` for each of the seven joints."""
+        value = getattr(self, name)
+        return (float(value),) * NUM_JOINTS if isinstance(value, (int, float)) else tuple(value)
+
+    @classmethod
+    def from_mapping(cls, values) -> FrankaConfig:
+        """Builds a config from a mapping (a Hydra node); an unknown name is an error that lists the known ones."""
+        known = {f.name for f in fields(cls)}
+        unknown = sorted(set(values) - known)
+        if unknown:
+            raise UserError(f"unknown environment option {unknown[0]!r}; known: {', '.join(sorted(known))}")
+        return cls(**dict(values))
+
+    def _check_whole(self, name: str, low: int, high: int, unit: str) -> None:
+        value = getattr(self, name)
+        if isinstance(value, bool) or not isinstance(value, int) or not low <= value <= high:
+            raise UserError(f"{name}={value!r}: must be a whole number from {low} to {high} ({unit})")
+
+    def _check_real(self, name: str, low: float, high: float, unit: str, *, open_low: bool = False) -> None:
+        value = getattr(self, name)
+        if not _is_number(value) or value > high or value < low or (open_low and value == low):
+            bounds = f"above {low:g} and at most {high:g}" if open_low else f"from {low:g} to {high:g}"
+            raise UserError(f"{name}={value!r}: must be {bounds} ({unit})")
+
+    def _check_choice(self, name: str, allowed: tuple[str, ...]) -> None:
+        value = getattr(self, name)
+        if value not in allowed:
+            raise UserError(f"{name}={value!r}: must be one of {', '.join(allowed)}")
+
+
+def _is_number(value: object) -> bool:
+    return isinstance(value, (int, float)) and not isinstance(value, bool) and math.isfinite(value)

@@ -1,0 +1,83 @@
+"""The arm for learners that choose among a few moves."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torchrl.data import Categorical, Composite
+from torchrl.envs.transforms import Transform
+
+from franka_wm.envs.config import NUM_JOINTS
+from franka_wm.errors import UserError
+
+
+def discrete_action_table(action_dim: int, magnitude: float = 1.0, include_noop: bool = True) -> torch.Tensor:
+    """Moves along one axis each, and the no-op that lets an agent stay where it arrived.
+
+    Args:
+        action_dim: Number of axes, A.
+        magnitude: Size of a move, in (0, 1]: actions are clipped there.
+        include_noop: Whether the last row is all zeros.
+
+    Returns:
+        (2·A + 1, A) float32, or (2·A, A) without the no-op. Row 2·i is +magnitude on axis i, row 2·i + 1 is
+        −magnitude, and the **last** row is the no-op: the indices of moves do not depend on it.
+    """
+    if isinstance(action_dim, bool) or not isinstance(action_dim, int) or action_dim < 1:
+        raise UserError(f"action_dim={action_dim!r}: must be a whole number of at least 1")
+    if not (math.isfinite(magnitude) and 0.0 < magnitude <= 1.0):
+        raise UserError(f"magnitude={magnitude}: must be above 0 and at most 1, where actions are clipped")
+    moves = torch.eye(action_dim).repeat_interleave(2, 0)
+    moves[1::2] *= -1.0
+    table = magnitude * moves
+    return torch.cat([table, torch.zeros(1, action_dim)]) if include_noop else table
+
+
+class DiscreteActions(Transform):
+    """A TorchRL transform that replaces continuous actions by the rows of :func:`discrete_action_table`.
+
+    The action becomes a :class:`~torchrl.data.Categorical` of int64 whose shape is the **batch size alone**,
+    (N,), without a trailing 1: that is what TorchRL's own modules emit for a categorical action (the argmax of
+    ``QValueActor``, a sample of ``torch.distributions.Categorical``). The environment sees the row, (N, A).
+
+    One gather on the device: no host sync. An index out of range is an error (on CUDA a device-side assert).
+
+    Args:
+        action_dim: Number of axes, A.
+        magnitude, include_noop: As in :func:`discrete_action_table`.
+
+    Attributes:
+        table: (moves, A) float32, a buffer that follows the environment's device.
+
+    Example::
+
+        env = TransformedFrankaEnv(FrankaEnv(num_envs=64), DiscreteActions())
+        env.action_spec.n  # 15
+    """
+
+    table: torch.Tensor
+
+    def __init__(self, action_dim: int = NUM_JOINTS, magnitude: float = 1.0, include_noop: bool = True):
+        super().__init__(in_keys_inv=["action"], out_keys_inv=["action"])
+        self.register_buffer("table", discrete_action_table(action_dim, magnitude, include_noop))
+
+    @property
+    def num_actions(self) -> int:
+        """Rows of the table."""
+        return self.table.shape[0]
+
+    def _inv_apply_transform(self, action: torch.Tensor) -> torch.Tensor:
+        return torch.nn.functional.embedding(action, self.table)
+
+    def transform_input_spec(self, input_spec: Composite) -> Composite:
+        continuous = input_spec["full_action_spec", "action"]
+        if continuous.shape[-1:] != self.table.shape[1:]:
+            raise UserError(
+                f"DiscreteActions(action_dim={self.table.shape[1]}): the environment's actions have shape "
+                f"{tuple(continuous.shape)}; use action_dim={continuous.shape[-1] if continuous.shape else 1}"
+            )
+        input_spec["full_action_spec", "action"] = Categorical(
+            self.num_actions, shape=continuous.shape[:-1], device=continuous.device, dtype=torch.int64
+        )
+        return input_spec

@@ -1,0 +1,467 @@
+# pyright: reportArgumentType=false, reportAttributeAccessIssue=false, reportOptionalMemberAccess=false
+# pyright: reportCallIssue=false, reportReturnType=false, reportIndexIssue=false
+# (Warp's and TorchRL's annotations know neither vectors nor shapes as tuples.)
+"""``FrankaEnv``: N Franka arms as one TorchRL environment."""
+
+from __future__ import annotations
+
+import logging
+import time
+from pathlib import Path
+
+import torch
+import warp as wp
+from tensordict import TensorDict, TensorDictBase
+from torchrl.data import Binary, Bounded, Composite, Unbounded
+from torchrl.envs import EnvBase, TransformedEnv
+
+from franka_wm.envs.camera import Camera, as_torch, camera_framing
+from franka_wm.envs.config import STATE_DIM, FrankaConfig
+from franka_wm.envs.kinematics import Kinematics
+from franka_wm.envs.robots import load_robot
+from franka_wm.envs.simulation import STATISTICS, Simulation
+from franka_wm.envs.tasks import Task, goal_distance, reach_reward
+from franka_wm.errors import UserError
+
+log = logging.getLogger(__name__)
+
+
+def resolve_device(device: torch.device | str | None) -> torch.device:
+    """``None`` or ``"auto"``: the first GPU, or the CPU where there is none; otherwise the device, checked.
+
+    Raises:
+        UserError: If CUDA is asked for where there is none, or the device is of another kind.
+    """
+    if device is None or device == "auto":
+        device = "cuda" if torch.cuda.is_available() else "cpu"
+    try:
+        device = torch.device(device)
+    except RuntimeError as error:
+        raise UserError(f"device={device!r}: must be auto, cpu, cuda or cuda:K") from error
+    if device.type == "cuda":
+        index = 0 if device.index is None else device.index
+        count = torch.cuda.device_count() if torch.cuda.is_available() else 0
+        if index >= count:
+            raise UserError(
+                f"device={device}: this machine has {count} usable CUDA devices; use device=cpu or auto"
+            )
+        return torch.device("cuda", index)
+    if device.type != "cpu":
+        raise UserError(f"device={device}: Newton runs on cpu and cuda")
+    return torch.device("cpu")
+
+
+def _mark_first(
+    env: EnvBase, step: TensorDictBase, following: TensorDictBase
+) -> tuple[TensorDictBase, TensorDictBase]:
+    """Marks the first observation of every new episode.
+
+    TorchRL writes ``is_init`` once for each of ``done``, ``terminated``, ``truncated``, and the last one wins:
+    an episode that follows a success would not be marked.
+    """
+    if env.__dict__.get("_torchrl_native_autoreset", False):
+        following.set("is_init", step.get(("next", "done")).clone())
+    return step, following
+
+
+class FrankaEnv(EnvBase):
+    """N simulated Franka arms that reach, as a TorchRL environment; everything stays on ``device``.
+
+    The leading dimension is always N, also for N = 1:
+
+    ==================  ======================  ==================================================================
+    key                 shape, dtype            meaning
+    ==================  ======================  ==================================================================
+    ``pixels``          (N, H, W, 3) uint8      the camera; present when asked for
+    ``state``           (N, 20) float32         joints 7 [rad], velocities 7 [rad/s], tool 3 [m], tool − goal 3 [m]
+    ``joint_target``    (N, 7) float32          the servo's commanded angles [rad]; present when asked for
+    ``goal``            (N, 3) float32          reach target in the world [m]
+    ``success``         (N, 1) bool             tool within ``success_distance`` of the goal
+    ``is_init``         (N, 1) bool             first observation of an episode
+    ``action``          (N, 7) float32          in [−1, 1]: change of the joint targets, × ``action_scale``
+    ``reward``          (N, 1) float32          −tanh(distance) − penalty · mean(action²)
+    ``done``, …         (N, 1) bool             ``terminated`` by success (if asked), ``truncated`` by time
+    ==================  ======================  ==================================================================
+
+    **Auto-reset.** With ``auto_reset="native"`` a finished world starts its next episode inside the step: no
+    host sync, nothing stepped or rendered twice. What TorchRL's collectors see is exact: ``("next", …)`` holds
+    the *true last observation* of a finished episode, and the following step's root the first of the next one.
+    Plain :meth:`step` does the same; :meth:`step_and_maybe_reset` is the call that hands over the new episode's
+    first observation. Under transforms use :class:`TransformedFrankaEnv`.
+
+    **A world that is no longer finite** is put back to its last finite observation, truncated, reset and
+    counted (``statistics()["nonfinite"]``); no NaN is emitted.
+
+    **Randomness** depends on seed × world × episode alone: world k sees the same episodes whatever N is.
+
+    Args:
+        config: The arm and its task; :class:`FrankaConfig` lists every field.
+        num_envs: Number of worlds, N ≥ 1.
+        device: ``None`` or ``"auto"`` (GPU where there is one), ``"cpu"``, ``"cuda"``, ``"cuda:K"``.
+        seed: Of all randomness.
+        urdf_path: A robot of your own.
+        task: A task of your own (:class:`~franka_wm.envs.tasks.Task`); the config's if not given.
+
+    Raises:
+        UserError: One line, for anything that cannot be built.
+
+    Example::
+
+        env = FrankaEnv(FrankaConfig(observations=("state",)), num_envs=1024)
+        rollout = env.rollout(100, policy, break_when_any_done=False)
+    """
+
+    def __init__(
+        self,
+        config: FrankaConfig | None = None,
+        *,
+        num_envs: int = 1,
+        device: torch.device | str | None = None,
+        seed: int = 0,
+        urdf_path: str | Path | None = None,
+        task: Task | None = None,
+    ):
+        config = FrankaConfig() if config is None else config
+        if isinstance(num_envs, bool) or not isinstance(num_envs, int) or num_envs < 1:
+            raise UserError(f"num_envs={num_envs!r}: must be a whole number of at least 1")
+        device = resolve_device(device)
+        super().__init__(device=device, batch_size=torch.Size([num_envs]))
+        self.config = config
+        self.num_envs = num_envs
+        if task is None:
+            check_robot(config, urdf_path)
+        started = time.perf_counter()
+        log.info("building %d worlds on %s", num_envs, device)
+        self.simulation = Simulation(config, num_envs, str(device), seed=seed, urdf_path=urdf_path, task=task)
+        self.kinematics = self.simulation.kinematics
+        log.info(
+            "built in %.1f s; the first reset and step compile what is not cached yet",
+            time.perf_counter() - started,
+        )
+        self._torchrl_native_autoreset = config.auto_reset == "native"
+        self._make_specs()
+        self._renderers: dict[tuple[int, int], Camera] = {}
+
+    def _make_specs(self) -> None:
+        n, device, size = self.num_envs, self.device, self.config.image_size
+        entries: dict = {}
+        for key in self.simulation.images:
+            if key.startswith("depth"):
+                entries[key] = Unbounded(shape=(n, size, size, 1), device=device)
+            else:
+                channels = 1 if key.startswith("segmentation") else 3
+                entries[key] = Bounded(
+                    0, 255, shape=(n, size, size, channels), dtype=torch.uint8, device=device
+                )
+        if "state" in self.config.observations:
+            entries["state"] = Unbounded(shape=(n, STATE_DIM), device=device)
+        if "joint_target" in self.config.observations:
+            entries["joint_target"] = Bounded(
+                self.kinematics.lower.expand(n, -1), self.kinematics.upper.expand(n, -1), device=device
+            )
+        entries["goal"] = Unbounded(shape=(n, 3), device=device)
+        entries["success"] = Binary(shape=(n, 1), dtype=torch.bool, device=device)
+        entries["is_init"] = Binary(shape=(n, 1), dtype=torch.bool, device=device)
+        self._observed = [key for key in entries if key not in ("success", "is_init")]
+        self.observation_spec = Composite(**entries, shape=(n,), device=device)
+        self.action_spec = Bounded(-1.0, 1.0, shape=(n, self.config.action_dim), device=device)
+        self.reward_spec = Unbounded(shape=(n, 1), device=device)
+        flag = Binary(shape=(n, 1), dtype=torch.bool, device=device)
+        self.done_spec = Composite(
+            done=flag, terminated=flag.clone(), truncated=flag.clone(), shape=(n,), device=device
+        )
+
+    # -- TorchRL ------------------------------------------------------------------------------------------
+
+    def _reset(
+        self, tensordict: TensorDictBase | None = None, *, seed: int | None = None, **_
+    ) -> TensorDictBase:
+        sim = self.simulation
+        if seed is not None:
+            self._set_seed(seed)
+        mask = None if tensordict is None else tensordict.get("_reset", None)
+        sim.reset(mask)
+        out = self._present()
+        out["is_init"] = sim._reset_mask[: self.num_envs].clone().unsqueeze(-1)
+        out["success"] = torch.zeros_like(sim.success)
+        for key in ("done", "terminated", "truncated"):
+            out[key] = torch.zeros_like(sim.done)
+        return TensorDict(out, batch_size=self.batch_size, device=self.device)
+
+    def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
+        sim = self.simulation
+        action = tensordict.get("action")
+        if action.shape != sim.action.shape:
+            raise UserError(
+                f"action has shape {tuple(action.shape)}; it must be {tuple(sim.action.shape)}: (worlds, joints)"
+            )
+        sim.action.copy_(action)
+        sim.step()
+        out = {
+            key: (sim.next_images[key] if key in sim.images else getattr(sim, f"next_{key}")).clone()
+            for key in self._observed
+        }
+        for key in ("success", "reward", "done", "terminated", "truncated"):
+            out[key] = getattr(sim, key).clone()
+        out["is_init"] = torch.zeros_like(sim.done)
+        return TensorDict(out, batch_size=self.batch_size, device=self.device)
+
+    def step_and_maybe_reset(self, tensordict: TensorDictBase) -> tuple[TensorDictBase, TensorDictBase]:
+        return _mark_first(self, *super().step_and_maybe_reset(tensordict))
+
+    def _native_autoreset_set_invalid_next_observation(self, tensordict: TensorDictBase) -> dict:
+        """TorchRL's hook for environments that reset themselves; returns what the next step starts from.
+
+        TorchRL would take that from ``next`` and blank ``next`` out. Here ``next`` keeps the true last
+        observation and the new episode's first comes from the simulation.
+        """
+        sim = self.simulation
+        out = self._present()
+        out["success"] = sim.success & ~sim.done
+        return out
+
+    def _present(self) -> dict[str, torch.Tensor]:
+        sim = self.simulation
+        return {
+            key: (sim.images[key] if key in sim.images else getattr(sim, key)).clone()
+            for key in self._observed
+        }
+
+    def get_state(self) -> TensorDict:
+        """Everything that the futures of the worlds depend on, batch size (N,): a checkpoint of the simulation.
+
+        Index it, save it, or branch from it: ``state[3].expand(N)`` is world 3, N times.
+        """
+        return TensorDict(self.simulation.get_state(), batch_size=self.batch_size, device=self.device)
+
+    def set_state(self, state: TensorDictBase) -> TensorDict:
+        """Puts all worlds where :meth:`get_state` found them and returns what they observe, as a reset does.
+
+        The same actions then lead to the same states, bit for bit on the CPU. Later resets draw by a world's own
+        number: branches are alike until then.
+
+        Raises:
+            UserError: The state is of another config or number of worlds; nothing is changed then.
+        """
+        sim = self.simulation
+        if state.batch_size != self.batch_size:
+            raise UserError(
+                f"set_state: {tuple(state.batch_size)} worlds for {self.num_envs}; index or expand the state first"
+            )
+        sim.set_state(dict(state.items()))
+        out = self._present()
+        out["is_init"] = sim.step_count == 0
+        out["success"] = torch.zeros_like(sim.success)
+        for key in ("done", "terminated", "truncated"):
+            out[key] = torch.zeros_like(sim.done)
+        return TensorDict(out, batch_size=self.batch_size, device=self.device)
+
+    def _set_seed(self, seed: int | None) -> None:
+        self.simulation.set_seed(0 if seed is None else int(seed))
+
+    # -- the arm ------------------------------------------------------------------------------------------
+
+    @property
+    def model(self):
+        """The Newton model of all worlds."""
+        return self.simulation.model
+
+    @property
+    def state(self):
+        """The Newton state of all worlds; what the next step changes."""
+        return self.simulation.newton_state
+
+    @property
+    def action_dim(self) -> int:
+        return self.config.action_dim
+
+    @property
+    def state_dim(self) -> int:
+        return STATE_DIM
+
+    @property
+    def goal(self) -> torch.Tensor:
+        """(N, 3) [m]."""
+        return self.simulation.goal.clone()
+
+    @property
+    def camera_framing(self) -> tuple[tuple[float, float, float], tuple[float, float, float]]:
+        """(eye, target) in world metres, shared by every renderer."""
+        return camera_framing(self.config)
+
+    def joint_positions(self) -> torch.Tensor:
+        """(N, 7) [rad]."""
+        return self.simulation.state[:, :7].clone()
+
+    def joint_targets(self) -> torch.Tensor:
+        """The servo's commanded angles, (N, 7) [rad]."""
+        return self.simulation.joint_target.clone()
+
+    def tool_position(self) -> torch.Tensor:
+        """The hand's centre point, (N, 3) [m]."""
+        return self.simulation.state[:, 14:17].clone()
+
+    def body_positions(self) -> torch.Tensor:
+        """Origins of the moving links, (N, bodies, 3) [m]; fixed links are merged into what carries them."""
+        return wp.to_torch(self.simulation.warp.body_q)[..., :3].clone()
+
+    def state_observation(self) -> torch.Tensor:
+        """(N, 20), as under the key ``state``."""
+        return self.simulation.state.clone()
+
+    def goal_distance(self) -> torch.Tensor:
+        """Tool to goal, (N,) [m]."""
+        return goal_distance(self.simulation.state)
+
+    def reward(self, action: torch.Tensor) -> torch.Tensor:
+        """Reward of having applied ``action`` (N, 7) and being in the present state, (N, 1)."""
+        c, sim = self.config, self.simulation
+        return reach_reward(
+            sim.true_state,
+            action,
+            kind=c.reward,
+            action_penalty=c.action_penalty,
+            success_distance=c.success_distance,
+            initial_distance=sim.initial_distance.unsqueeze(-1),
+        )
+
+    def is_finite(self) -> torch.Tensor:
+        """(N,) bool: health of each world's present state."""
+        return torch.isfinite(self.simulation.state).all(-1)
+
+    def observe(self) -> torch.Tensor:
+        """The camera's picture now, (N, 3, H, W) float32 in [0, 1] at ``image_size``."""
+        return self.render(self.config.image_size).permute(0, 3, 1, 2).float().div_(255.0)
+
+    def render(self, size: int | None = None, samples: int = 1, num_views: int | None = None) -> torch.Tensor:
+        """The camera's picture now, (views, size, size, 3) uint8, for people and videos.
+
+        Args:
+            size: Side [px]; ``image_size`` if not given.
+            samples: Anti-aliasing: ``samples``² rays per pixel.
+            num_views: The first so many worlds; all if not given.
+        """
+        size = self.config.image_size if size is None else size
+        views = self.num_envs if num_views is None else min(num_views, self.num_envs)
+        if size < 1 or samples < 1 or views < 1:
+            raise UserError(
+                f"render(size={size}, samples={samples}, num_views={num_views}): all must be at least 1"
+            )
+        key = (size, samples)
+        camera = self._renderers.get(key)
+        if camera is None or camera.num_views != views:
+            camera = Camera(self.model, self.config, size=size, num_views=views, samples=samples)
+            self._renderers[key] = camera
+        sim = self.simulation
+        device = wp.get_device(sim.device)
+        stream = wp.stream_from_torch(torch.cuda.current_stream(self.device)) if device.is_cuda else None
+        with wp.ScopedStream(stream) if stream is not None else wp.ScopedDevice(device):
+            self.model.bvh_refit_shapes(sim.newton_state)
+            camera.render(sim.newton_state, sim.warp)
+        return as_torch("pixels", camera.images["pixels"]).clone(memory_format=torch.contiguous_format)
+
+    def high_quality_renderer(self, **options):
+        """A :class:`~franka_wm.envs.render.HighQualityRenderer` on this model, aimed by the same framing."""
+        from franka_wm.envs.render import high_quality_renderer
+
+        return high_quality_renderer(self, **options)
+
+    def rollout_actions(self, actions: torch.Tensor, *, seed: int | None = None) -> TensorDict:
+        """Plays a sequence of actions from a fresh (seeded) reset.
+
+        Args:
+            actions: (N, T, 7).
+            seed: Of the reset.
+
+        Returns:
+            ``state`` (N, T + 1, 20), ``joint_q`` (N, T + 1, 7), ``tool`` (N, T + 1, 3), ``reward`` (N, T, 1),
+            ``done`` (N, T, 1), and ``video`` (N, T + 1, H, W, 3) uint8 if the environment observes pixels.
+            Batch size (N,). An episode that ends within T steps goes on in its next one.
+        """
+        if actions.dim() != 3 or actions.shape[0] != self.num_envs or actions.shape[2] != self.action_dim:
+            raise UserError(
+                f"actions has shape {tuple(actions.shape)}; it must be ({self.num_envs}, T, {self.action_dim})"
+            )
+        self.reset(seed=seed)
+        sim = self.simulation
+        states, videos, rewards, dones = [sim.state.clone()], [], [], []
+        if "pixels" in sim.images:
+            videos.append(sim.images["pixels"].clone())
+        for t in range(actions.shape[1]):
+            step = self._step(TensorDict({"action": actions[:, t]}, batch_size=self.batch_size))
+            rewards.append(step["reward"])
+            dones.append(step["done"])
+            states.append(sim.next_state.clone())
+            if "pixels" in sim.images:
+                videos.append(sim.next_images["pixels"].clone())
+        state = torch.stack(states, 1)
+        out = {
+            "state": state,
+            "joint_q": state[..., :7],
+            "tool": state[..., 14:17],
+            "reward": torch.stack(rewards, 1),
+            "done": torch.stack(dones, 1),
+        }
+        if videos:
+            out["video"] = torch.stack(videos, 1)
+        return TensorDict(out, batch_size=self.batch_size)
+
+    def statistics(self, *, clear: bool = True) -> dict[str, float]:
+        """Means over the episodes that ended since the last call; one host sync.
+
+        Returns:
+            ``episodes`` (count), ``return``, ``length``, ``success`` (at the end), ``success_once`` (means;
+            absent when no episode ended) and ``nonfinite`` (count of broken worlds).
+        """
+        sums = self.simulation.statistics.sum(0).tolist()
+        if clear:
+            self.simulation.statistics.zero_()
+        totals = dict(zip(STATISTICS, sums, strict=True))
+        out = {"episodes": totals["episodes"], "nonfinite": totals["nonfinite"]}
+        if totals["episodes"]:
+            out |= {key: totals[key] / totals["episodes"] for key in STATISTICS[1:-1]}
+        return out
+
+
+def check_robot(config: FrankaConfig, urdf_path: str | Path | None = None) -> None:
+    """Raises ``UserError`` if the robot cannot be loaded or the fixed goal is out of its reach."""
+    robot = load_robot(config, urdf_path)
+    if config.goal_sampling == "fixed" and not Kinematics(robot).reachable(config.goal):
+        raise UserError(
+            f"goal={config.goal} m: out of the arm's reach; it reaches about 0.85 m from (0, 0, 0.333)"
+        )
+
+
+class TransformedFrankaEnv(TransformedEnv):
+    """A ``TransformedEnv`` that keeps what :class:`FrankaEnv` promises at the end of episodes.
+
+    TorchRL calls the auto-reset hook on the outermost environment; a plain ``TransformedEnv`` would overwrite
+    the true last observation with NaN and start the next episode from a wrong one. This one runs the new
+    episode's first observation through the transforms instead.
+    """
+
+    def step_and_maybe_reset(self, tensordict: TensorDictBase) -> tuple[TensorDictBase, TensorDictBase]:
+        return _mark_first(self.base_env, *super().step_and_maybe_reset(tensordict))
+
+    def _native_autoreset_set_invalid_next_observation(self, tensordict: TensorDictBase) -> dict:
+        base = self.base_env
+        if not isinstance(base, FrankaEnv):
+            return super()._native_autoreset_set_invalid_next_observation(tensordict)
+        next_tensordict = tensordict.get("next")
+        done = next_tensordict.get("done")
+        fresh = TensorDict(
+            base._native_autoreset_set_invalid_next_observation(tensordict),
+            batch_size=base.batch_size,
+            device=base.device,
+        )
+        fresh["is_init"] = done.clone()
+        for key in ("done", "terminated", "truncated"):
+            fresh[key] = torch.zeros_like(done)
+        reset = self.transform._reset(TensorDict({"_reset": done.clone()}, batch_size=base.batch_size), fresh)
+        mask = done.squeeze(-1)
+        out = {}
+        for key in self._observation_keys_step_mdp:
+            new, old = reset.get(key, None), next_tensordict.get(key, None)
+            if new is not None and old is not None:
+                out[key] = torch.where(mask.view(-1, *[1] * (old.dim() - 1)), new, old)
+        return out

@@ -1,0 +1,266 @@
+"""``FrankaEnv`` as a Gymnasium vector environment, for LeRobot's evaluation and other NumPy code.
+
+    envs = gymnasium.make_vec("franka_wm.envs.gym:FrankaWM/Reach-v0", num_envs=16)
+
+Gymnasium speaks NumPy, so **each step copies its observations to the host and waits for the device**. This is
+the one place in the package that does; train on :class:`~franka_wm.envs.FrankaEnv` itself.
+
+Importing this module registers the names: the part before the colon above is Gymnasium's own way to say what
+to import first. Nothing is simulated before an environment is made.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import gymnasium
+import numpy as np
+import torch
+from gymnasium import spaces
+from gymnasium.vector import AutoresetMode
+from gymnasium.vector.utils import batch_space
+from tensordict import TensorDictBase
+
+from franka_wm.envs.config import NUM_JOINTS, FrankaConfig
+from franka_wm.envs.franka import FrankaEnv
+from franka_wm.errors import UserError
+
+CAMERA = "front"
+
+REACH_V0: dict[str, Any] = {
+    "observations": ("pixels", "state"),
+    "goal_sampling": "reachable",
+    "gravity_compensation": True,
+    "limit_velocity": True,
+    "action_scale": 0.085,
+    "substeps": 4,
+    "episode_length": 50,
+}
+"""What ``FrankaWM/Reach-v0`` is. Published numbers refer to it: change it under another version."""
+
+
+class FrankaVectorEnv(gymnasium.vector.VectorEnv):
+    """N arms behind Gymnasium's vector interface, with the keys that LeRobot reads.
+
+    Observations, a dictionary of NumPy arrays:
+
+    =======================  ============================  ======================================
+    key                      shape, dtype                  meaning
+    =======================  ============================  ======================================
+    ``pixels``/``front``     (N, H, W, 3) uint8            the camera; absent without ``pixels``
+    ``agent_pos``            (N, 7) float32                joint angles [rad]
+    ``environment_state``    (N, 3) float32                the goal [m]
+    =======================  ============================  ======================================
+
+    Actions are (N, 7) float32 in [−1, 1], rewards (N,) float32, terminations and truncations (N,) bool.
+
+    **Autoreset is same-step**: where an episode ended, the observation returned is already the first of the
+    next one. The last of the finished one is in ``info["final_obs"]`` (an object array, ``None`` elsewhere),
+    its success in ``info["final_info"]["is_success"]``; the masks are under ``_final_obs`` and
+    ``_final_info``. All four are absent where no episode ended. ``info["is_success"]`` (N,) belongs to the
+    observation returned, so it is false where an episode has just begun.
+
+    Args:
+        num_envs: Number of worlds, N.
+        env: A ready environment to view instead; it must observe ``state``. Then give nothing else.
+        device: Where it simulates; the GPU where there is one.
+        seed: Until the first ``reset(seed=…)``.
+        render_mode: ``"rgb_array"`` for :meth:`render`, or ``None``.
+        **config: Fields of :class:`~franka_wm.envs.FrankaConfig`.
+
+    Raises:
+        UserError: If an option cannot be used.
+    """
+
+    metadata: dict[str, Any] = {
+        "render_modes": ["rgb_array"],
+        "render_fps": 30,
+        "autoreset_mode": AutoresetMode.SAME_STEP,
+    }
+    task = "reach"
+    task_description = "move the gripper to the goal"
+
+    def __init__(
+        self,
+        num_envs: int = 1,
+        *,
+        env: FrankaEnv | None = None,
+        device: torch.device | str | None = None,
+        seed: int = 0,
+        render_mode: str | None = None,
+        **config: Any,
+    ):
+        if render_mode not in (None, "rgb_array"):
+            raise UserError(f"render_mode={render_mode!r}: must be rgb_array or None")
+        if env is None:
+            observations = tuple(config.pop("observations", ("pixels", "state")))
+            fields_given = FrankaConfig.from_mapping({"observations": observations, **config})
+            env = FrankaEnv(fields_given, num_envs=num_envs, device=device, seed=seed)
+        elif config:
+            raise UserError(f"{next(iter(config))}: env=… is already built; give its options to FrankaEnv")
+        if "state" not in env.config.observations:
+            raise UserError(
+                f"observations={env.config.observations}: agent_pos is read from 'state'; add it to observations"
+            )
+        self.env = env
+        self.num_envs = env.num_envs
+        self.render_mode = render_mode
+        self.metadata = {**type(self).metadata, "render_fps": round(env.config.fps)}
+        self._max_episode_steps = env.config.episode_length
+        entries: dict[str, spaces.Space] = {}
+        if "pixels" in env.config.observations:
+            side = env.config.image_size
+            entries["pixels"] = spaces.Dict({CAMERA: spaces.Box(0, 255, (side, side, 3), np.uint8)})
+        # Joints may overshoot their limits a little, so the box is open.
+        entries["agent_pos"] = spaces.Box(-np.inf, np.inf, (NUM_JOINTS,), np.float32)
+        entries["environment_state"] = spaces.Box(-np.inf, np.inf, (3,), np.float32)
+        self.single_observation_space = spaces.Dict(entries)
+        self.single_action_space = spaces.Box(-1.0, 1.0, (NUM_JOINTS,), np.float32)
+        self.observation_space = batch_space(self.single_observation_space, self.num_envs)
+        self.action_space = batch_space(self.single_action_space, self.num_envs)
+        self._present: TensorDictBase | None = None
+
+    def reset(
+        self, *, seed: int | Sequence[int] | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[dict[str, Any], dict[str, Any]]:
+        """Starts new episodes.
+
+        Args:
+            seed: Of all worlds: world k draws from (seed, k). A list (s, s + 1, …, s + N − 1), which is what
+                Gymnasium makes of a number s, is taken as s; worlds have no seeds of their own.
+            options: ``reset_mask`` (N,) bool resets those worlds only. Other keys are ignored.
+        """
+        seed = self._one_seed(seed)
+        super().reset(seed=seed)
+        mask = None if options is None else options.get("reset_mask")
+        if mask is None:
+            self._present = self.env.reset(seed=seed)
+        else:
+            if self._present is None:
+                raise UserError("reset_mask: reset all worlds once before resetting some")
+            if seed is not None:
+                raise UserError("reset_mask with a seed: seeding restarts all worlds; give one of the two")
+            mask = np.asarray(mask)
+            if mask.shape != (self.num_envs,) or mask.dtype != np.bool_:
+                raise UserError(f"reset_mask: must be a bool array of shape ({self.num_envs},)")
+            where = torch.from_numpy(mask).to(self.env.device).unsqueeze(-1)
+            # TorchRL keeps the other worlds' entries from what it is given.
+            self._present = self.env.reset(self._present.copy().set("_reset", where))
+        assert self._present is not None
+        observations, success = self._to_numpy(self._present)
+        return observations, {"is_success": success}
+
+    def step(
+        self, actions: np.ndarray
+    ) -> tuple[dict[str, Any], np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
+        """One control step of all worlds.
+
+        Args:
+            actions: (N, 7), clipped to [−1, 1].
+
+        Returns:
+            Observations, rewards, terminations, truncations, info.
+        """
+        if self._present is None:
+            raise UserError("step before reset: call reset() first")
+        actions = np.asarray(actions, dtype=np.float32)
+        if actions.shape != (self.num_envs, NUM_JOINTS):
+            raise UserError(f"actions has shape {actions.shape}; it must be ({self.num_envs}, {NUM_JOINTS})")
+        self._present.set("action", torch.from_numpy(actions).to(self.env.device))
+        stepped, self._present = self.env.step_and_maybe_reset(self._present)
+        after = stepped.get("next")
+        observations, success = self._to_numpy(self._present)
+        info: dict[str, Any] = {"is_success": success}
+        done = _host(after.get("done"))
+        if done.any():
+            last, last_success = self._to_numpy(after)
+            final = np.full(self.num_envs, None, dtype=object)
+            for k in np.flatnonzero(done):
+                final[k] = _row(last, k)
+            info["final_obs"], info["_final_obs"] = final, done
+            info["final_info"] = {"is_success": last_success & done, "_is_success": done}
+            info["_final_info"] = done
+        return (
+            observations,
+            _host(after.get("reward")),
+            _host(after.get("terminated")),
+            _host(after.get("truncated")),
+            info,
+        )
+
+    def render(self) -> tuple[np.ndarray, ...] | None:
+        """N frames, (256, 256, 3) uint8; ``None`` without ``render_mode="rgb_array"``."""
+        if self.render_mode is None:
+            return None
+        return tuple(self.env.render(256, samples=2).cpu().numpy())
+
+    def call(self, name: str, *args: Any, **kwargs: Any) -> tuple[Any, ...]:
+        """``name`` of each world, as ``SyncVectorEnv.call`` has it; called if it can be.
+
+        Raises:
+            AttributeError: If there is none.
+        """
+        value = getattr(self, name)
+        if name == "render":
+            return value() or (None,) * self.num_envs
+        return (value(*args, **kwargs) if callable(value) else value,) * self.num_envs
+
+    def get_attr(self, name: str) -> tuple[Any, ...]:
+        """``name`` of each world."""
+        return (getattr(self, name),) * self.num_envs
+
+    def close_extras(self, **kwargs: Any) -> None:
+        self._present = None
+        if not self.env.is_closed:
+            self.env.close()
+
+    def _one_seed(self, seed: int | Sequence[int] | None) -> int | None:
+        if seed is None or isinstance(seed, (int, np.integer)):
+            return None if seed is None else int(seed)
+        seeds = [int(s) for s in seed]
+        if seeds != list(range(seeds[0], seeds[0] + self.num_envs)) if seeds else True:
+            raise UserError(
+                f"seed={seeds}: worlds share one seed; give a number s, or the list s, s + 1, … of {self.num_envs}"
+            )
+        return seeds[0]
+
+    def _to_numpy(self, tensordict: TensorDictBase) -> tuple[dict[str, Any], np.ndarray]:
+        """Observations and success; the copy to the host."""
+        out: dict[str, Any] = {}
+        if "pixels" in self.env.config.observations:
+            out["pixels"] = {CAMERA: tensordict.get("pixels").contiguous().cpu().numpy()}
+        out["agent_pos"] = tensordict.get("state")[:, :NUM_JOINTS].contiguous().cpu().numpy()
+        out["environment_state"] = tensordict.get("goal").contiguous().cpu().numpy()
+        return out, _host(tensordict.get("success"))
+
+
+def _host(column: torch.Tensor) -> np.ndarray:
+    """(N, 1) on the device → (N,) on the host."""
+    return column.squeeze(-1).cpu().numpy()
+
+
+def _row(tree: dict[str, Any], index: int) -> dict[str, Any]:
+    """One world's part of a batched observation."""
+    return {
+        key: _row(value, index) if isinstance(value, dict) else value[index].copy()
+        for key, value in tree.items()
+    }
+
+
+def register() -> None:
+    """Tells Gymnasium about ``FrankaWM/Reach-v0``; once is enough, again does nothing.
+
+    ``gymnasium.make_vec`` then takes every field of :class:`~franka_wm.envs.FrankaConfig`, ``device`` and
+    ``render_mode`` as options. There is no single environment for ``gymnasium.make``: ask for one world.
+    """
+    if "FrankaWM/Reach-v0" not in gymnasium.registry:
+        gymnasium.register(
+            "FrankaWM/Reach-v0",
+            vector_entry_point=f"{__name__}:FrankaVectorEnv",
+            kwargs=dict(REACH_V0),
+            disable_env_checker=True,
+        )
+
+
+register()

@@ -1,0 +1,100 @@
+# pyright: reportOptionalMemberAccess=false, reportOptionalSubscript=false, reportAttributeAccessIssue=false
+# pyright: reportArgumentType=false
+# (Warp's annotations do not say what a built model always has.)
+"""What each episode of each world draws anew: looks, servo, joints, links, delay."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+import warp as wp
+from newton import ModelFlags
+
+from franka_wm.envs import kernels
+from franka_wm.envs.camera import camera_framing
+
+if TYPE_CHECKING:
+    from franka_wm.envs.simulation import Simulation
+
+
+class Randomizer:
+    """Draws for the masked worlds at every reset, inside the captured graph.
+
+    The drawn values live in the Newton model's own arrays, which hold one row for each world; MuJoCo's copy of
+    the physical ones is refreshed only in steps in which some world is reset.
+
+    Args:
+        sim: The simulation; its config says what is drawn.
+    """
+
+    def __init__(self, sim: Simulation):
+        self.sim = sim
+        self.ranges = sim.config.randomization
+        model, n = sim.model, sim.num_envs
+        self._drawn: list[wp.array] = []
+        if self.ranges.color:
+            worlds = model.shape_world.numpy()
+            first = int(np.argmax(worlds == 0))
+            self._shapes = int((worlds == 0).sum())
+            colors = model.shape_color[first : first + n * self._shapes].reshape((n, self._shapes))
+            self._colors, self._plain_colors = colors, wp.clone(colors)
+        else:
+            self._shapes = 0
+            self._colors = self._plain_colors = wp.zeros((n, 1), dtype=wp.vec3f, device=sim.device)
+        if self.ranges.dynamics:
+
+            def per_world(array: wp.array) -> wp.array:
+                return array.reshape((n, array.shape[0] // n))
+
+            self._physical = [
+                per_world(a)
+                for a in (
+                    model.joint_target_ke, model.joint_target_kd, model.joint_armature, model.joint_friction,
+                    model.body_mass, model.body_inertia,
+                )
+            ]  # fmt: skip
+            ke, kd, armature, _, mass, inertia = (wp.clone(a) for a in self._physical)
+            self._plain = [ke, kd, armature, mass, inertia]
+            self._any = wp.zeros(1, dtype=int, device=sim.device)
+
+    def arrays(self) -> list[wp.array]:
+        """What is drawn, each (N, …), beside what the simulation lists itself."""
+        return ([self._colors] if self.ranges.color else []) + (
+            self._physical if self.ranges.dynamics else []
+        )
+
+    def launch(self, mask: wp.array) -> None:
+        """Draws for the masked worlds."""
+        sim, r, w = self.sim, self.ranges, self.sim.warp
+        if r.color or r.brightness or r.camera_position or r.camera_target or r.action_latency:
+            eye, at = (wp.vec3f(*point) for point in camera_framing(sim.config))
+            wp.launch(
+                kernels.draw_looks,
+                sim.num_envs,
+                [
+                    mask, w.seed, w.episode, r.color, r.brightness, eye, at, r.camera_position, r.camera_target,
+                    r.action_latency, self._shapes, self._plain_colors, self._colors, w.brightness, w.poses, w.delay,
+                ],
+                device=sim.device,
+            )  # fmt: skip
+        if r.dynamics:
+            wp.launch(
+                kernels.draw_dynamics,
+                sim.num_envs,
+                [
+                    mask, w.seed, w.episode, r.gains, r.armature, r.friction, r.mass, *self._plain, *self._physical
+                ],
+                device=sim.device,
+            )  # fmt: skip
+            self._any.zero_()
+            wp.launch(kernels.any_masked, sim.num_envs, [mask, self._any], device=sim.device)
+            wp.capture_if(self._any, self.apply)
+
+    def apply(self) -> None:
+        """Hands the physical values to MuJoCo."""
+        if self.ranges.dynamics:
+            flags = ModelFlags.JOINT_DOF_PROPERTIES
+            if self.ranges.mass:
+                flags |= ModelFlags.BODY_INERTIAL_PROPERTIES
+            self.sim.solver.notify_model_changed(flags)

@@ -1,0 +1,109 @@
+"""Where robots come from: for each name that ``robot=`` takes, a function that returns a URDF file.
+
+To add a robot, write such a function and give it a line in :data:`SOURCES`; ``docs/robots.md`` shows how.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from importlib.metadata import PackageNotFoundError, distribution
+from importlib.resources import files
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import newton
+
+from franka_wm.envs.robots.meshes import INSTALL
+from franka_wm.errors import UserError
+
+if TYPE_CHECKING:
+    from franka_wm.envs.config import FrankaConfig
+
+PANDA = "cmeel.prefix/share/example-robot-data/robots/panda_description/urdf/panda.urdf"
+"""The Panda inside the package ``example-robot-data``."""
+
+CELL = 0.008
+"""Details of meshes smaller than this are not drawn [m], unless a source says otherwise."""
+
+
+@dataclass(frozen=True)
+class Source:
+    """A robot that can be named.
+
+    Attributes:
+        find: From the config to the URDF file; raises ``UserError`` if it cannot be had.
+        cell: Details of meshes smaller than this are not drawn [m]; 0 draws every triangle.
+    """
+
+    find: Callable[[FrankaConfig], Path]
+    cell: float = CELL
+
+
+def embedded(config: FrankaConfig) -> Path:
+    """The project's own FR3, drawn with primitives."""
+    return Path(str(files("franka_wm.envs.robots") / "fr3.urdf"))
+
+
+def newton_asset(config: FrankaConfig) -> Path:
+    """A file of Newton's asset collection; downloaded once, then cached by Newton."""
+    try:
+        folder = Path(newton.utils.download_asset(config.asset_name))
+    except ImportError as error:
+        raise UserError(f"robot=newton_asset: the download needs GitPython; {INSTALL}") from error
+    except Exception as error:
+        reason = (str(error).strip() or type(error).__name__).splitlines()[0]
+        raise UserError(
+            f"robot=newton_asset: could not download {config.asset_name!r} ({reason}); use robot=embedded or "
+            "robot=panda_meshes, which need no network, or robot=urdf with urdf_path=…"
+        ) from error
+    path = folder / config.urdf_relative_path
+    if not path.is_file():
+        raise UserError(
+            f"urdf_relative_path={config.urdf_relative_path}: no such file in asset {config.asset_name!r} ({folder})"
+        )
+    return path
+
+
+def panda_meshes(config: FrankaConfig) -> Path:
+    """The Panda with Franka's own meshes, from the package ``example-robot-data``."""
+    try:
+        path = Path(str(distribution("example-robot-data").locate_file(PANDA)))
+    except PackageNotFoundError as error:
+        raise UserError(
+            f"robot=panda_meshes needs the package example-robot-data; {INSTALL}, or use robot=embedded"
+        ) from error
+    if not path.is_file():
+        raise UserError(f"robot=panda_meshes: this version of example-robot-data has no {path}; {INSTALL}")
+    return path
+
+
+def urdf(config: FrankaConfig) -> Path:
+    """Whatever ``urdf_path`` names; without it there is nothing to load."""
+    raise UserError("robot=urdf needs urdf_path=…, the URDF to load; or use robot=embedded")
+
+
+SOURCES: dict[str, Source] = {
+    "embedded": Source(embedded),
+    "newton_asset": Source(newton_asset),
+    "panda_meshes": Source(panda_meshes),
+    "panda_meshes_full": Source(panda_meshes, cell=0.0),
+    "urdf": Source(urdf),
+}
+"""The robots that ``robot=`` takes."""
+
+
+def urdf_source(config: FrankaConfig, urdf_path: str | Path | None) -> Path:
+    """The URDF file to load: ``urdf_path`` where given, else what the config names.
+
+    Raises:
+        UserError: If it does not exist or cannot be had; the message names the alternatives.
+    """
+    if urdf_path is None:
+        return SOURCES[config.robot].find(config)
+    path = Path(urdf_path).expanduser()
+    if not path.is_file():
+        raise UserError(
+            f"urdf_path={path}: no such file; give a URDF with seven arm joints, or use robot=embedded"
+        )
+    return path

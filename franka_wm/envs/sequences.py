@@ -1,0 +1,148 @@
+"""Action sequences that move an arm."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING
+
+import torch
+from tensordict import TensorDict
+
+from franka_wm.envs.config import NUM_JOINTS
+from franka_wm.errors import UserError
+
+if TYPE_CHECKING:
+    from franka_wm.envs.franka import FrankaEnv
+
+
+def smooth_actions(
+    num_sequences: int,
+    length: int,
+    action_dim: int,
+    *,
+    smoothness: float = 0.7,
+    device: torch.device | str | None = None,
+    generator: torch.Generator | None = None,
+) -> torch.Tensor:
+    """First-order autoregressive actions in [−1, 1]; white noise would jitter in place.
+
+    a₀ ~ N(0, 1), aₜ = s·aₜ₋₁ + √(1 − s²)·N(0, 1), clipped: every step has the same distribution.
+
+    Args:
+        num_sequences, length, action_dim: Shape of the result.
+        smoothness: s in [0, 1); 0 is white noise.
+        device: Of the result.
+        generator: Source of randomness.
+
+    Returns:
+        (num_sequences, length, action_dim) float32.
+    """
+    if not 0.0 <= smoothness < 1.0:
+        raise UserError(f"smoothness={smoothness}: must be at least 0 and below 1")
+    noise = torch.randn(num_sequences, length, action_dim, device=device, generator=generator)
+    actions = torch.empty_like(noise)
+    present = noise[:, 0]
+    for t in range(length):
+        if t:
+            present = smoothness * present + math.sqrt(1.0 - smoothness**2) * noise[:, t]
+        actions[:, t] = present
+    return actions.clamp_(-1.0, 1.0)
+
+
+def franka_sequences(
+    env: FrankaEnv,
+    n_sequences: int,
+    length: int,
+    seed: int = 0,
+    smoothness: float = 0.7,
+    *,
+    max_attempts: int = 4,
+) -> TensorDict:
+    """Videos of the arm under smooth random actions, each from a fresh reset: data for a world model.
+
+    All worlds of ``env`` play at once, in as many batches as it takes. A sequence in which its world stopped
+    being finite, or whose episode ended before its last frame (``terminate_on_success``), is discarded and
+    another is drawn, so every frame follows from the one before by the action between them. With
+    ``terminate_on_success`` what remains is therefore biased towards failure.
+
+    The result depends on ``seed`` and on the number of worlds. ``env`` is left amid episodes of other seeds:
+    reset it before going on. Its ``statistics()`` are as before.
+
+    Args:
+        env: The arm. Pictures come if it observes ``pixels``.
+        n_sequences: Sequences wanted, n ≥ 1.
+        length: Frames of each, T ≥ 2; at most ``episode_length + 1``.
+        seed: Of actions, poses and goals.
+        smoothness: Of the actions, in [0, 1): see :func:`smooth_actions`.
+        max_attempts: Gives up after so many times the batches that would do if none were discarded.
+
+    Returns:
+        A TensorDict of batch size (n,) on the environment's device:
+
+        - ``video`` (n, T, 3, H, W) uint8. Bytes, because float would take four times the memory of what is
+          mostly memory: ``video.float() / 255`` is in [0, 1]. In memory the channels are last, so that
+          ``video.movedim(2, -1)``, this package's ``pixels``, costs no copy.
+        - ``action`` (n, T − 1, 7) in [−1, 1]: ``action[:, t]`` leads from frame t to frame t + 1.
+        - ``joint_q`` (n, T, 7) [rad] and ``tool`` (n, T, 3) [m].
+
+    Raises:
+        UserError: If a size cannot be had, or too many sequences are discarded; says what to change.
+    """
+    if isinstance(n_sequences, bool) or not isinstance(n_sequences, int) or n_sequences < 1:
+        raise UserError(f"n_sequences={n_sequences!r}: must be a whole number of at least 1")
+    longest = env.config.episode_length + 1
+    if isinstance(length, bool) or not isinstance(length, int) or not 2 <= length <= longest:
+        raise UserError(
+            f"length={length!r}: must be from 2 to {longest} frames, one more than episode_length="
+            f"{env.config.episode_length}; for longer sequences raise episode_length"
+        )
+    if max_attempts < 1:
+        raise UserError(f"max_attempts={max_attempts}: must be at least 1")
+    from franka_wm.envs.simulation import STATISTICS  # late: this module's other function needs no simulator
+
+    # Drawn on the host, so that every device plays the same sequences.
+    generator = torch.Generator().manual_seed(seed)
+    statistics = env.simulation.statistics
+    before, count = statistics.clone(), statistics[:, STATISTICS.index("nonfinite")]
+    kept: dict[str, list[torch.Tensor]] = {"action": [], "joint_q": [], "tool": []}
+    if "pixels" in env.config.observations:
+        kept["video"] = []
+    missing, tried, broken, ended = n_sequences, 0, 0, 0
+    allowed = max_attempts * math.ceil(n_sequences / env.num_envs)
+    for _ in range(allowed):
+        actions = smooth_actions(
+            env.num_envs, length - 1, NUM_JOINTS, smoothness=smoothness, generator=generator
+        ).to(env.device)
+        reset_seed = int(torch.randint(2**31 - 1, (1,), generator=generator))
+        nonfinite = count.clone()
+        rollout = env.rollout_actions(actions, seed=reset_seed)
+        # A broken world is put back and counted by the environment: its frames look finite.
+        bad = (count > nonfinite) | ~torch.isfinite(rollout["state"]).flatten(1).all(1)
+        cut = rollout.get("done")[:, :-1].flatten(1).any(1) & ~bad
+        good = (~(bad | cut)).nonzero().squeeze(-1)[:missing]
+        tried, broken, ended = tried + env.num_envs, broken + int(bad.sum()), ended + int(cut.sum())
+        for key, parts in kept.items():
+            parts.append((actions if key == "action" else rollout[key])[good])
+        missing -= good.numel()
+        if not missing:
+            break
+    statistics.copy_(before)
+    if missing:
+        remedies = []
+        if broken:
+            remedies.append(
+                f"{broken} stopped being finite: lower target_ke or action_scale, "
+                "or raise substeps or solver_iterations"
+            )
+        if ended:
+            remedies.append(
+                f"{ended} ended early: set terminate_on_success=false, or ask for a shorter length"
+            )
+        raise UserError(
+            f"{broken + ended} of {tried} sequences were discarded and {missing} of {n_sequences} are still missing: "
+            + "; ".join(remedies)
+        )
+    out = {key: torch.cat(parts) for key, parts in kept.items()}
+    if "video" in out:
+        out["video"] = out["video"].movedim(-1, 2)
+    return TensorDict(out, batch_size=[n_sequences], device=env.device)

@@ -1,0 +1,58 @@
+"""What is asked of the arm: goal, reward, success. One file for each task.
+
+A task launches Warp kernels, so that it is part of the captured step; :class:`Task` says when. The pure tensor
+functions of a task say the same in torch, for users and for the tests. To add one: a file here with a subclass,
+and a line in :func:`make_task`; ``docs/tasks.md`` walks through an example.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import warp as wp
+
+from franka_wm.envs.config import FrankaConfig
+
+if TYPE_CHECKING:
+    from franka_wm.envs.simulation import Simulation
+
+
+class Task:
+    """Goal, reward and success of all worlds. Override what differs; each method only launches kernels.
+
+    Args:
+        config: The environment's.
+    """
+
+    def __init__(self, config: FrankaConfig):
+        self.config = config
+
+    def reset(self, sim: Simulation, mask: wp.array) -> None:
+        """Writes ``sim.warp.task_goal`` (N, 3), and ``sim.warp.goal_q`` (N, 7) if known, where ``mask`` (N,)."""
+        raise NotImplementedError(f"{type(self).__name__} gives no goal")
+
+    def begin(self, sim: Simulation, mask: wp.array) -> None:
+        """Called after a reset, when ``sim.warp.true_state`` (N, 20) is the first one of the masked worlds."""
+
+    def advance(self, sim: Simulation) -> None:
+        """Called in every step after the physics and before the observation: moves a goal that moves."""
+
+    def judge(self, sim: Simulation) -> None:
+        """Writes ``sim.warp.reward`` and ``sim.warp.success`` (N, 1) from ``next_true_state`` (N, 20) and ``action``.
+
+        ``next_true_state`` is ``next_state`` without observation noise."""
+        raise NotImplementedError(f"{type(self).__name__} gives no reward")
+
+
+def make_task(config: FrankaConfig) -> Task:
+    """The task that ``config.task`` names."""
+    from franka_wm.envs.tasks.reach import Reach
+    from franka_wm.envs.tasks.track import Track
+
+    return {"reach": Reach, "track": Track}[config.task](config)
+
+
+from franka_wm.envs.tasks.reach import Reach, goal_distance, reach_reward  # noqa: E402  (needs Task)
+from franka_wm.envs.tasks.track import Track  # noqa: E402
+
+__all__ = ["Reach", "Task", "Track", "goal_distance", "make_task", "reach_reward"]

@@ -1,0 +1,108 @@
+"""Reach: bring the tool to a goal that stands still."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import torch
+import warp as wp
+
+from franka_wm.envs import kernels
+from franka_wm.envs.config import HOME, FrankaConfig
+from franka_wm.envs.tasks import Task
+
+if TYPE_CHECKING:
+    from franka_wm.envs.simulation import Simulation
+
+REWARDS = {"dense": 0, "sparse": 1, "normalized": 2}
+
+
+def goal_distance(state: torch.Tensor) -> torch.Tensor:
+    """Distance from tool to goal [m]: (..., 20) → (...,)."""
+    return state[..., 17:20].norm(dim=-1)
+
+
+def reach_reward(
+    state: torch.Tensor,
+    action: torch.Tensor,
+    *,
+    kind: str = "dense",
+    action_penalty: float = 0.01,
+    success_distance: float = 0.05,
+    initial_distance: torch.Tensor | None = None,
+) -> torch.Tensor:
+    """Reward of being in ``state`` after ``action``: (..., 20), (..., A) → (..., 1).
+
+    ``dense``: −tanh(distance), bounded, so that a categorical value head needs no tuning. ``sparse``: 1 within
+    ``success_distance``, else 0. ``normalized``: the part of ``initial_distance`` (..., 1) [m] that has been
+    closed, at least −1. All minus action_penalty · mean(action²), of the action as it is applied: clipped.
+    """
+    distance = goal_distance(state).unsqueeze(-1)
+    effort = action.clamp(-1.0, 1.0).square().mean(-1, keepdim=True)
+    if kind == "sparse":
+        value = (distance < success_distance).float()
+    elif kind == "normalized":
+        if initial_distance is None:
+            raise ValueError("kind='normalized' needs initial_distance")
+        value = (1.0 - distance / initial_distance.clamp_min(success_distance)).clamp_min(-1.0)
+    else:
+        value = -torch.tanh(distance)
+    return value - action_penalty * effort
+
+
+class Reach(Task):
+    """Bring the tool to the goal and keep it there.
+
+    **Goal**: ``config.goal``, or with ``goal_sampling="reachable"`` the tool position of a pose drawn
+    uniformly within ``goal_noise`` of home, above 0.10 m and at least 0.25 m from the base's axis, new in
+    every world and episode. **Reward**: :func:`reach_reward`. **Success**: tool within ``success_distance``.
+    """
+
+    def __init__(self, config: FrankaConfig):
+        super().__init__(config)
+        self._fixed: tuple[wp.array, wp.array] | None = None
+
+    def reset(self, sim: Simulation, mask: wp.array) -> None:
+        self.choose(sim, mask, sim.warp.task_goal)
+
+    def choose(self, sim: Simulation, mask: wp.array, goal: wp.array) -> None:
+        """Writes the masked worlds' goals into ``goal`` (N, 3) and poses that reach them into ``goal_q``."""
+        w, n = sim.warp, sim.num_envs
+        if self.config.goal_sampling == "fixed":
+            if self._fixed is None:
+                point = torch.tensor(self.config.goal, dtype=torch.float32)
+                pose = sim.kinematics.solve(
+                    point.to(sim.device), torch.tensor(HOME, device=sim.device), iterations=60
+                )
+                self._fixed = (
+                    wp.array(self.config.goal, dtype=float, device=sim.device),
+                    wp.from_torch(pose),
+                )
+            wp.launch(kernels.fixed_goal, n, [mask, *self._fixed, w.goal_q, goal], device=sim.device)
+            return
+        wp.launch(
+            kernels.reachable_goal,
+            n,
+            [
+                mask, w.seed, w.episode, w.home, self.config.goal_noise, w.lower, w.upper,
+                w.parent_frames, w.child_frames, w.axes, w.tool_frame, w.goal_q, goal,
+            ],
+            device=sim.device,
+        )  # fmt: skip
+
+    def begin(self, sim: Simulation, mask: wp.array) -> None:
+        if self.config.reward == "normalized":
+            inputs = [mask, sim.warp.true_state, sim.warp.initial_distance]
+            wp.launch(kernels.note_initial_distance, sim.num_envs, inputs, device=sim.device)
+
+    def judge(self, sim: Simulation) -> None:
+        w, c = sim.warp, self.config
+        wp.launch(
+            kernels.judge_reach,
+            sim.num_envs,
+            [
+                w.next_true_state, w.action, REWARDS[c.reward], c.action_penalty, c.success_distance,
+                w.initial_distance, w.reward, w.success,
+            ],
+            device=sim.device,
+        )  # fmt: skip

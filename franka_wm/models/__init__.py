@@ -1,0 +1,37 @@
+"""Families of latent world models, by name.
+
+Every family is a `torch.nn.Module` with `encode(observation) -> z`, `next(z, action) -> z'` and
+`loss(batch) -> TensorDict`, and, where it has them, `reward(z, action)`, `value(z)` and `policy(z)`.
+To add one, write one file here and one line in `_FAMILIES`. A family is imported when it is made.
+"""
+
+from importlib import import_module
+from typing import Any
+
+# name -> (module, class, what it is in one line)
+_FAMILIES: dict[str, tuple[str, str, str]] = {
+    "tdmpc2": (
+        "franka_wm.models.tdmpc2",
+        "TDMPC2",
+        "TD-MPC2: latent dynamics, reward, value and policy, no decoder",
+    ),
+}
+
+
+def available() -> dict[str, str]:
+    """The families that `make` knows: name -> one line of description."""
+    return {name: line for name, (_, _, line) in _FAMILIES.items()}
+
+
+def make(name: str, **overrides: Any) -> Any:
+    """Build the model family `name`; `overrides` go to its constructor.
+
+    The sizes known only at run time (for example `observation_sizes`, `action_dim`) are overrides too.
+
+    Raises:
+        ValueError: no family has this name; the message lists those that exist.
+    """
+    if name not in _FAMILIES:
+        raise ValueError(f"unknown model {name!r}; available: {', '.join(sorted(_FAMILIES))}")
+    module, cls, _ = _FAMILIES[name]
+    return getattr(import_module(module), cls)(**overrides)

@@ -1,0 +1,339 @@
+"""Building blocks of TD-MPC2-like models (Hansen, Su & Wang, ICLR 2024, arXiv:2310.16828).
+
+Everything here is device-side tensor code with static shapes and no host synchronisation, so that a whole
+update can be compiled or captured as a CUDA graph. Leading dimensions are free everywhere.
+"""
+
+import math
+from collections.abc import Sequence
+from itertools import pairwise
+from typing import Literal
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+WEIGHT_STD = 0.02  # truncated-normal initialisation of every linear weight, as published
+
+
+def symlog(x: Tensor) -> Tensor:
+    """sign(x) · log(1 + |x|): compresses large magnitudes and is the identity near zero."""
+    return torch.sign(x) * torch.log1p(x.abs())
+
+
+def symexp(x: Tensor) -> Tensor:
+    """Inverse of `symlog`."""
+    return torch.sign(x) * torch.expm1(x.abs())
+
+
+def initialize(module: nn.Module) -> None:
+    """Truncated normal (std 0.02) weights and zero biases for every `nn.Linear` inside `module`."""
+    for layer in module.modules():
+        if isinstance(layer, nn.Linear):
+            nn.init.trunc_normal_(layer.weight, std=WEIGHT_STD)
+            if layer.bias is not None:
+                nn.init.zeros_(layer.bias)
+
+
+class SimNorm(nn.Module):
+    """Simplicial normalisation: softmax within consecutive groups of `group_size` features.
+
+    (..., D) -> (..., D), each group non-negative and summing to one. It bounds the latent space, which keeps
+    a consistency loss without decoder from collapsing or exploding (TD-MPC2, section 3.1).
+
+    Raises:
+        ValueError: `group_size` is not positive.
+    """
+
+    def __init__(self, group_size: int = 8) -> None:
+        super().__init__()
+        if group_size < 1:
+            raise ValueError(f"group_size must be at least 1, got {group_size}")
+        self.group_size = group_size
+
+    def forward(self, x: Tensor) -> Tensor:
+        return x.unflatten(-1, (-1, self.group_size)).softmax(-1).flatten(-2)
+
+    def extra_repr(self) -> str:
+        return f"group_size={self.group_size}"
+
+
+class NormedLinear(nn.Module):
+    """Linear, dropout (optional), LayerNorm, activation: (..., in_features) -> (..., out_features).
+
+    Args:
+        activation: Mish when None.
+        dropout: probability, applied before the LayerNorm, in training mode only.
+    """
+
+    def __init__(
+        self,
+        in_features: int,
+        out_features: int,
+        *,
+        activation: nn.Module | None = None,
+        dropout: float = 0.0,
+    ) -> None:
+        super().__init__()
+        self.linear = nn.Linear(in_features, out_features)
+        self.norm = nn.LayerNorm(out_features)
+        self.activation = nn.Mish() if activation is None else activation
+        self.dropout = dropout
+
+    def forward(self, x: Tensor) -> Tensor:
+        x = self.linear(x)
+        if self.dropout:
+            x = F.dropout(x, self.dropout, self.training)
+        return self.activation(self.norm(x))
+
+
+def mlp(
+    in_features: int,
+    hidden: Sequence[int],
+    out_features: int,
+    *,
+    output: nn.Module | None = None,
+    dropout: float = 0.0,
+) -> nn.Sequential:
+    """`NormedLinear` hidden layers and an output layer: (..., in_features) -> (..., out_features).
+
+    Args:
+        hidden: width of each hidden layer.
+        output: activation of the output layer, which is then normalised as well (for example `SimNorm`);
+            a plain linear layer when None.
+        dropout: probability on the first layer only, as published.
+    """
+    layers: list[nn.Module] = []
+    for i, (a, b) in enumerate(pairwise((in_features, *hidden))):
+        layers.append(NormedLinear(a, b, dropout=dropout if i == 0 else 0.0))
+    last = hidden[-1] if hidden else in_features
+    layers.append(
+        nn.Linear(last, out_features)
+        if output is None
+        else NormedLinear(last, out_features, activation=output)
+    )
+    network = nn.Sequential(*layers)
+    initialize(network)
+    return network
+
+
+class TwoHotSymlog(nn.Module):
+    """Scalars as a categorical distribution over `bins` equidistant points of symlog space.
+
+    A value between two points puts its mass on these two, in proportion (two-hot; Hafner et al.,
+    arXiv:2301.04104). Cross-entropy on it makes gradients independent of the scale of rewards.
+    Values outside symexp([low, high]) are clamped; for [-10, 10] that is about ±22025.
+
+    Raises:
+        ValueError: fewer than two bins, or an empty range.
+    """
+
+    support: Tensor
+
+    def __init__(self, bins: int = 101, low: float = -10.0, high: float = 10.0) -> None:
+        super().__init__()
+        if bins < 2:
+            raise ValueError(f"bins must be at least 2, got {bins}")
+        if not low < high:
+            raise ValueError(f"low must be below high, got [{low}, {high}]")
+        self.bins, self.low, self.high = bins, float(low), float(high)
+        self.register_buffer("support", torch.linspace(low, high, bins), persistent=False)
+
+    def encode(self, x: Tensor) -> Tensor:
+        """Scalars (..., 1) -> probabilities (..., bins)."""
+        position = (symlog(x).clamp(self.low, self.high) - self.low) * (
+            (self.bins - 1) / (self.high - self.low)
+        )
+        # A triangle of width one bin is the two-hot code: no scatter, so it fuses and needs no index tensor.
+        index = torch.arange(self.bins, device=x.device, dtype=position.dtype)
+        return (1.0 - (position - index).abs()).clamp_min(0.0)
+
+    def decode(self, logits: Tensor) -> Tensor:
+        """Logits (..., bins) -> expected value (..., 1), the expectation taken in symlog space."""
+        return symexp((logits.softmax(-1) * self.support).sum(-1, keepdim=True))
+
+    def loss(self, logits: Tensor, target: Tensor) -> Tensor:
+        """Soft cross-entropy: logits (..., bins), target scalars (..., 1) -> (..., 1), broadcasting.
+
+        The target is a constant: no gradient passes through it.
+        """
+        probabilities = self.encode(target.detach())
+        return -(probabilities * logits.log_softmax(-1)).sum(-1, keepdim=True)
+
+
+class Ensemble(nn.Module):
+    """Several MLPs of one shape, evaluated together as batched matrix products, with slow target copies.
+
+    (..., in_features) -> (members, ..., out_features). Layers are as in `mlp` with a linear output; that last
+    layer starts at zero, so that all members first predict the same.
+
+    The target copies are buffers: no optimiser and no gradient reaches them; `update_target` moves them.
+
+    Args:
+        members: number of networks.
+        hidden: width of each hidden layer.
+        dropout: probability on the first layer, applied only where `forward` is asked for it.
+
+    Raises:
+        ValueError: `members` is not positive.
+    """
+
+    def __init__(
+        self,
+        *,
+        members: int,
+        in_features: int,
+        hidden: Sequence[int],
+        out_features: int,
+        dropout: float = 0.0,
+    ) -> None:
+        super().__init__()
+        if members < 1:
+            raise ValueError(f"members must be at least 1, got {members}")
+        self.members, self.dropout, self.depth = members, dropout, len(hidden) + 1
+        self.out_features = out_features
+        self._names: list[str] = []
+        for i, (a, b) in enumerate(pairwise((in_features, *hidden, out_features))):
+            weight = torch.zeros(members, a, b)
+            if i < len(hidden):
+                nn.init.trunc_normal_(weight, std=WEIGHT_STD)
+                self._add(f"norm_scale_{i}", torch.ones(members, 1, b))
+                self._add(f"norm_shift_{i}", torch.zeros(members, 1, b))
+            self._add(f"weight_{i}", weight)
+            self._add(f"bias_{i}", torch.zeros(members, 1, b))
+
+    def _add(self, name: str, value: Tensor) -> None:
+        self._names.append(name)
+        self.register_parameter(name, nn.Parameter(value))
+        self.register_buffer(f"target_{name}", value.clone())
+
+    def forward(
+        self,
+        x: Tensor,
+        *,
+        weights: Literal["live", "detached", "target"] = "live",
+        members: Tensor | int | None = None,
+        dropout: bool = False,
+    ) -> Tensor:
+        """Evaluate the ensemble.
+
+        Args:
+            x: (..., in_features), shared by all members.
+            weights: `live` trains them; `detached` uses the same values but lets gradients pass only to `x`,
+                so that a policy loss cannot move its critic; `target` uses the slow copies.
+            members: indices (K,) on the device of `x`, or the first so many; only these are computed. All when
+                None.
+            dropout: whether to drop activations of the first layer.
+
+        Returns:
+            (members or K, ..., out_features).
+        """
+
+        def parameter(name: str) -> Tensor:
+            value: Tensor = getattr(self, f"target_{name}" if weights == "target" else name)
+            if weights != "live":
+                value = value.detach()
+            if members is None:
+                return value
+            return value[:members] if isinstance(members, int) else value.index_select(0, members)
+
+        leading = x.shape[:-1]
+        if isinstance(members, int) and not 1 <= members <= self.members:
+            raise ValueError(f"members must be from 1 to {self.members}, got {members}")
+        count = members if isinstance(members, int) else self.members if members is None else members.shape[0]
+        h = x.reshape(-1, x.shape[-1]).expand(count, -1, -1)
+        for i in range(self.depth):
+            h = torch.baddbmm(parameter(f"bias_{i}"), h, parameter(f"weight_{i}"))
+            if i == self.depth - 1:
+                break
+            if i == 0 and dropout and self.dropout:
+                h = F.dropout(h, self.dropout)
+            h = F.layer_norm(h, h.shape[-1:])
+            h = F.mish(torch.addcmul(parameter(f"norm_shift_{i}"), h, parameter(f"norm_scale_{i}")))
+        return h.reshape(count, *leading, self.out_features)
+
+    @torch.no_grad()
+    def update_target(self, tau: float) -> None:
+        """Move every target copy by the fraction `tau` towards its live value, on the device."""
+        targets = [getattr(self, f"target_{name}") for name in self._names]
+        live = [getattr(self, name).detach() for name in self._names]
+        torch._foreach_lerp_(targets, live, tau)  # pyright: ignore[reportPrivateImportUsage]
+
+
+class GaussianPolicy(nn.Module):
+    """Diagonal Gaussian squashed by tanh: latents (..., latent_dim) -> actions (..., action_dim) in [-1, 1].
+
+    The log standard deviation (before squashing) is bounded smoothly to [`log_std_min`, `log_std_max`].
+    """
+
+    def __init__(
+        self,
+        *,
+        latent_dim: int,
+        hidden: Sequence[int],
+        action_dim: int,
+        log_std_min: float = -10.0,
+        log_std_max: float = 2.0,
+    ) -> None:
+        super().__init__()
+        if not log_std_min < log_std_max:
+            raise ValueError(f"log_std_min must be below log_std_max, got [{log_std_min}, {log_std_max}]")
+        self.network = mlp(latent_dim, hidden, 2 * action_dim)
+        self.log_std_min, self.log_std_max = log_std_min, log_std_max
+
+    def distribution(self, z: Tensor) -> tuple[Tensor, Tensor]:
+        """Mean and log standard deviation before squashing, each (..., action_dim)."""
+        mean, raw = self.network(z).chunk(2, dim=-1)
+        span = self.log_std_max - self.log_std_min
+        return mean, self.log_std_min + 0.5 * span * (torch.tanh(raw) + 1.0)
+
+    def forward(self, z: Tensor, *, deterministic: bool = False) -> Tensor:
+        """Actions (..., action_dim): the squashed mean if `deterministic`, else a reparameterised sample."""
+        mean, log_std = self.distribution(z)
+        return torch.tanh(mean if deterministic else mean + log_std.exp() * torch.randn_like(mean))
+
+    def sample(self, z: Tensor) -> tuple[Tensor, Tensor]:
+        """A reparameterised action (..., action_dim) and its log-density (..., 1) after squashing.
+
+        The negative log-density, averaged, estimates the policy's entropy [nat].
+        """
+        mean, log_std = self.distribution(z)
+        noise = torch.randn_like(mean)
+        raw = mean + log_std.exp() * noise
+        log_prob = -0.5 * (noise.square() + math.log(2.0 * math.pi)) - log_std
+        # log(1 - tanh(u)^2), in the form that stays exact where tanh saturates
+        log_slope = 2.0 * (math.log(2.0) - raw - F.softplus(-2.0 * raw))
+        return torch.tanh(raw), (log_prob - log_slope).sum(-1, keepdim=True)
+
+
+class RunningScale(nn.Module):
+    """Running 5-95 percentile range of values, at least 1, by which a policy loss is divided.
+
+    It lets one entropy coefficient serve rewards of any size (TD-MPC2, section 3.2). `update` works on the
+    device, with static shapes.
+    """
+
+    value: Tensor
+
+    def __init__(self, tau: float = 0.01) -> None:
+        super().__init__()
+        self.tau = tau
+        self.register_buffer("value", torch.ones(()))
+
+    @torch.no_grad()
+    def update(self, x: Tensor) -> None:
+        """Move the scale by `tau` towards the 5-95 percentile range of `x` (any shape)."""
+        ordered = x.detach().flatten().sort().values
+        span = _percentile(ordered, 0.95) - _percentile(ordered, 0.05)
+        self.value.lerp_(span.clamp_min(1.0).to(self.value.dtype), self.tau)
+
+    def forward(self, x: Tensor) -> Tensor:
+        # A copy, so that a later update in place cannot invalidate the graph of this division.
+        return x / self.value.clone()
+
+
+def _percentile(ordered: Tensor, fraction: float) -> Tensor:
+    """Linear-interpolated percentile of a sorted vector (n,); its indices depend on the shape alone."""
+    position = fraction * (ordered.shape[0] - 1)
+    low = math.floor(position)
+    return torch.lerp(ordered[low], ordered[min(low + 1, ordered.shape[0] - 1)], position - low)

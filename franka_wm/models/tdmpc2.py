@@ -1,0 +1,371 @@
+"""TD-MPC2: a latent world model without decoder (Hansen, Su & Wang, ICLR 2024, arXiv:2310.16828)."""
+
+from collections.abc import Mapping
+from typing import Any, Literal
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+from franka_wm.models.parts import Ensemble, GaussianPolicy, RunningScale, SimNorm, TwoHotSymlog, mlp
+
+
+class TDMPC2(nn.Module):
+    """Encoder, dynamics, reward, Q-ensemble and policy over one latent space, trained together.
+
+    z = h(s);  z' = d(z, a);  r = R(z, a);  q = Q(z, a);  a = π(z). The defaults are the published
+    5 M-parameter model for state observations. Latents (..., `latent_dim`) are simplices of `simnorm_dim`
+    features, both from the encoder and from the dynamics. Rewards and values are in the units of the
+    environment's reward.
+
+    `train()` and `eval()` matter to `value`, see there. Dropout acts in `loss` alone, never while planning.
+
+    Deliberate differences from the paper:
+      * Raw physical observations can be standardised at the encoder's input, see
+        `set_observation_statistics`; the default is the identity.
+      * One backward pass serves model and policy, so the policy learns from the critic before this update
+        instead of after it. Their gradients stay apart.
+      * The entropy bonus is the plain entropy of the squashed Gaussian.
+
+    Args:
+        observation_sizes: observation key -> size of its last dimension; encoded in this order.
+        action_dim: size of an action; each component lies in [-1, 1].
+        episode_length: steps of an episode, from which the discount follows if it is not given:
+            clamp((T/5 - 1) / (T/5), 0.95, 0.995).
+        discount: per step, in [0, 1).
+        latent_dim: size of z.
+        simnorm_dim: features per simplex; divides `latent_dim`.
+        encoder_dim: width of the encoder's hidden layers.
+        encoder_layers: layers of the encoder, its output layer included.
+        hidden_dim: width of the two hidden layers of every other network.
+        num_q: members of the Q-ensemble, at least 2.
+        value_members: how many of them `value` averages in evaluation mode, always the first; None: all. The
+            paper averages two drawn at random, at two fifths of the cost of all.
+        dropout: on the first layer of each Q-function.
+        bins, value_low, value_high: two-hot code of rewards and values; the range is in symlog space.
+        log_std_min, log_std_max: bounds of the policy's log standard deviation before squashing.
+        rho: weight of unroll step t is rho^t.
+        consistency_coef, reward_coef, value_coef, entropy_coef: weights of the losses.
+        tau: how far target Q-functions, and the policy loss's scale, move at each update.
+        encoder_lr_scale: learning rate of the encoder relative to the rest.
+
+    Raises:
+        ValueError: a size or coefficient that cannot work, or neither `episode_length` nor `discount`.
+    """
+
+    observation_mean: Tensor
+    observation_std: Tensor
+
+    def __init__(
+        self,
+        *,
+        observation_sizes: Mapping[str, int],
+        action_dim: int,
+        episode_length: int | None = None,
+        discount: float | None = None,
+        latent_dim: int = 512,
+        simnorm_dim: int = 8,
+        encoder_dim: int = 256,
+        encoder_layers: int = 2,
+        hidden_dim: int = 512,
+        num_q: int = 5,
+        value_members: int | None = None,
+        dropout: float = 0.01,
+        bins: int = 101,
+        value_low: float = -10.0,
+        value_high: float = 10.0,
+        log_std_min: float = -10.0,
+        log_std_max: float = 2.0,
+        rho: float = 0.5,
+        consistency_coef: float = 20.0,
+        reward_coef: float = 0.1,
+        value_coef: float = 0.1,
+        entropy_coef: float = 1e-4,
+        tau: float = 0.01,
+        encoder_lr_scale: float = 0.3,
+    ) -> None:
+        super().__init__()
+        sizes = {str(key): int(size) for key, size in observation_sizes.items()}
+        if not sizes or min(sizes.values()) < 1:
+            raise ValueError(f"observation_sizes needs at least one key, each of size 1 or more, got {sizes}")
+        if action_dim < 1:
+            raise ValueError(f"action_dim must be at least 1, got {action_dim}")
+        if simnorm_dim < 1 or latent_dim % simnorm_dim:
+            raise ValueError(f"simnorm_dim must divide latent_dim, got {simnorm_dim} and {latent_dim}")
+        if encoder_layers < 1:
+            raise ValueError(f"encoder_layers must be at least 1, got {encoder_layers}")
+        if num_q < 2:
+            raise ValueError(f"num_q must be at least 2 (targets are the minimum of two), got {num_q}")
+        if not 0.0 <= dropout < 1.0:
+            raise ValueError(f"dropout must be in [0, 1), got {dropout}")
+        if not 0.0 < tau <= 1.0:
+            raise ValueError(f"tau must be in (0, 1], got {tau}")
+        if value_members is not None and not 1 <= value_members <= num_q:
+            raise ValueError(f"value_members must be from 1 to num_q={num_q} or None, got {value_members}")
+        self.value_members = value_members
+        self.observation_sizes, self.action_dim, self.latent_dim, self.num_q = (
+            sizes,
+            action_dim,
+            latent_dim,
+            num_q,
+        )
+        self.discount = _discount(discount, episode_length)
+        self.rho, self.tau, self.encoder_lr_scale = rho, tau, encoder_lr_scale
+        self.consistency_coef, self.reward_coef = consistency_coef, reward_coef
+        self.value_coef, self.entropy_coef = value_coef, entropy_coef
+
+        observation_dim, hidden = sum(sizes.values()), (hidden_dim, hidden_dim)
+        self.encoder = mlp(
+            observation_dim, (encoder_dim,) * (encoder_layers - 1), latent_dim, output=SimNorm(simnorm_dim)
+        )
+        self.dynamics = mlp(latent_dim + action_dim, hidden, latent_dim, output=SimNorm(simnorm_dim))
+        self.reward_head = mlp(latent_dim + action_dim, hidden, bins)
+        nn.init.zeros_(self.reward_head[-1].weight)  # type: ignore[arg-type]  # first prediction: exactly 0
+        self.q_ensemble = Ensemble(
+            members=num_q,
+            in_features=latent_dim + action_dim,
+            hidden=hidden,
+            out_features=bins,
+            dropout=dropout,
+        )
+        self.policy_head = GaussianPolicy(
+            latent_dim=latent_dim,
+            hidden=hidden,
+            action_dim=action_dim,
+            log_std_min=log_std_min,
+            log_std_max=log_std_max,
+        )
+        self.two_hot = TwoHotSymlog(bins, value_low, value_high)
+        self.scale = RunningScale(tau)
+        self.register_buffer("observation_mean", torch.zeros(observation_dim))
+        self.register_buffer("observation_std", torch.ones(observation_dim))
+
+    # ------------------------------------------------------------------ what a planner and a policy use
+
+    @torch.no_grad()
+    def set_observation_statistics(self, mean: Tensor, std: Tensor) -> None:
+        """Standardise observations at the encoder's input from now on: (s - mean) / std.
+
+        An addition to the paper: joint angles [rad], velocities [rad/s] and positions [m] differ in size by
+        orders of magnitude. The statistics are saved with the weights and are never trained. A feature of
+        zero standard deviation is centred only.
+
+        Args:
+            mean, std: (sum of `observation_sizes`), in the order of `observation_sizes`, in the units of the
+                observations.
+
+        Raises:
+            ValueError: a wrong shape, a value that is not finite, or a negative standard deviation.
+        """
+        for name, value in (("mean", mean), ("std", std)):
+            if value.shape != self.observation_mean.shape:
+                expected = tuple(self.observation_mean.shape)
+                raise ValueError(f"{name} must have shape {expected}, got {tuple(value.shape)}")
+            if not bool(torch.isfinite(value).all()):
+                raise ValueError(f"{name} of the observations must be finite")
+        if bool((std < 0).any()):
+            raise ValueError("std of the observations must not be negative")
+        # In place, so that a captured CUDA graph sees the new values.
+        self.observation_mean.copy_(mean)
+        self.observation_std.copy_(torch.where(std > 1e-6, std, torch.ones_like(std)))
+
+    def encode(self, observation: TensorDictBase) -> Tensor:
+        """Observations with keys `observation_sizes`, each (..., size) -> latents (..., latent_dim)."""
+        x = torch.cat([observation.get(key) for key in self.observation_sizes], dim=-1)
+        return self.encoder(self._standardise(x))
+
+    def next(self, z: Tensor, action: Tensor) -> Tensor:
+        """Latents (..., latent_dim) and actions (..., action_dim) -> next latents (..., latent_dim)."""
+        return self.dynamics(torch.cat((z, action), dim=-1))
+
+    def reward(self, z: Tensor, action: Tensor) -> Tensor:
+        """Expected reward (..., 1) of an action (..., action_dim) in z (..., latent_dim)."""
+        return self.two_hot.decode(self.reward_head(torch.cat((z, action), dim=-1)))
+
+    def q(
+        self,
+        z: Tensor,
+        action: Tensor,
+        *,
+        weights: Literal["live", "detached", "target"] = "live",
+        reduce: Literal["mean", "pair_mean", "pair_min"] = "mean",
+        first: int | None = None,
+        dropout: bool = False,
+    ) -> Tensor:
+        """Discounted return (..., 1) of an action (..., action_dim) in z (..., latent_dim), then the policy.
+
+        Args:
+            weights: which parameters to use, see `Ensemble.forward`.
+            first: with `mean`, of the first so many members; of all if None.
+            reduce: `mean` of all members; `pair_mean` or `pair_min` of two members drawn at random on the
+                device, afresh at each call.
+            dropout: whether to drop activations, as while fitting.
+        """
+        members = first if reduce == "mean" else self._random_pair(z.device)
+        x = torch.cat((z, action), dim=-1)
+        values = self.two_hot.decode(self.q_ensemble(x, weights=weights, members=members, dropout=dropout))
+        return values.amin(0) if reduce == "pair_min" else values.mean(0)
+
+    def value(self, z: Tensor, *, deterministic: bool | None = None) -> Tensor:
+        """Value (..., 1) of z (..., latent_dim): Q at the policy's action.
+
+        Args:
+            deterministic: True: mean of `value_members` members at the policy's mode. False, as in the paper: mean
+                of two random members at a sampled action. None: deterministic in evaluation mode only.
+        """
+        if deterministic is None:
+            deterministic = not self.training
+        action = self.policy(z, deterministic=deterministic)
+        if deterministic:
+            return self.q(z, action, reduce="mean", first=self.value_members)
+        return self.q(z, action, reduce="pair_mean")
+
+    def policy(self, z: Tensor, deterministic: bool = False) -> Tensor:
+        """Actions (..., action_dim) in [-1, 1] for z (..., latent_dim): a sample, or the mode."""
+        return self.policy_head(z, deterministic=deterministic)
+
+    def policy_sample(self, z: Tensor) -> tuple[Tensor, Tensor]:
+        """A reparameterised action (..., action_dim) and its log-density (..., 1); its negative mean is the
+        entropy [nat]."""
+        return self.policy_head.sample(z)
+
+    # ------------------------------------------------------------------ training
+
+    def forward(self, batch: TensorDictBase) -> TensorDict:
+        """Same as `loss`, for wrappers that call the module."""
+        return self.loss(batch)
+
+    def loss(self, batch: TensorDictBase) -> TensorDict:
+        """Losses of a batch of windows; call `backward` once on the entry `loss`.
+
+        The policy's parameters then hold the gradient of the policy loss alone, and all others that of the
+        model losses alone. In training mode the running scale of the policy loss is updated as well.
+
+        Args:
+            batch: batch size [B, H]: H contiguous transitions, all of one episode, with the observation keys,
+                `action` (B, H, A), and in `next` the observation keys, `reward` (B, H, 1) and `terminated`
+                (B, H, 1) bool. The observations after steps 0..H-2 are read from the root of the following
+                step; only the last one is read from `next`, and it must be the true one, also where the
+                episode ended. A truncated episode is bootstrapped, a terminated one is not.
+
+        Returns:
+            batch size []: `loss` to differentiate, and detached: `loss_consistency`, `loss_reward`,
+            `loss_value`, `loss_policy`, `q_mean`, `q_target_mean`, `policy_entropy` [nat], `policy_scale`,
+            `latent_norm`, `reward_error` (mean absolute).
+
+        Raises:
+            ValueError: the batch size is not [B, H].
+        """
+        if len(batch.batch_size) != 2:
+            raise ValueError(f"a batch of windows has batch size [B, H], got {list(batch.batch_size)}")
+        # Time leads from here on: (H, B, ...).
+        action, reward, terminated = (
+            batch.get(key).transpose(0, 1) for key in ("action", ("next", "reward"), ("next", "terminated"))
+        )
+        horizon = action.shape[0]
+        weight = self.rho ** torch.arange(horizon + 1, device=action.device, dtype=action.dtype).view(
+            -1, 1, 1
+        )
+
+        encoded = self.encoder(self._standardise(self._window(batch)))  # (H+1, B, D), one call
+        after = encoded[1:].detach()
+        with torch.no_grad():
+            target = self._td_target(after, reward, terminated)
+
+        latents = [encoded[0]]
+        for t in range(horizon):
+            latents.append(self.next(latents[-1], action[t]))
+        predicted = torch.stack(latents)  # (H+1, B, D): unrolled from the first observation
+        before = torch.cat((predicted[:-1], action), dim=-1)
+
+        reward_logits = self.reward_head(before)
+        q_logits = self.q_ensemble(before, dropout=self.training)  # (num_q, H, B, bins)
+        step_weight = weight[:-1]
+        consistency = (step_weight * F.mse_loss(predicted[1:], after, reduction="none")).mean()
+        reward_loss = (step_weight * self.two_hot.loss(reward_logits, reward)).mean()
+        value_loss = (step_weight * self.two_hot.loss(q_logits, target)).mean()
+        policy_loss, entropy = self._policy_loss(predicted.detach(), weight)
+
+        total = (
+            self.consistency_coef * consistency
+            + self.reward_coef * reward_loss
+            + self.value_coef * value_loss
+            + policy_loss
+        )
+        with torch.no_grad():
+            metrics = {
+                "loss_consistency": consistency.detach(),
+                "loss_reward": reward_loss.detach(),
+                "loss_value": value_loss.detach(),
+                "loss_policy": policy_loss.detach(),
+                "q_mean": self.two_hot.decode(q_logits.detach()).mean(),
+                "q_target_mean": target.mean(),
+                "policy_entropy": entropy.detach(),
+                "policy_scale": self.scale.value.clone(),
+                "latent_norm": encoded.detach().norm(dim=-1).mean(),
+                "reward_error": (self.two_hot.decode(reward_logits.detach()) - reward).abs().mean(),
+            }
+        return TensorDict({"loss": total, **metrics}, batch_size=[])
+
+    def parameter_groups(self, lr: float) -> list[dict[str, Any]]:
+        """Parameter groups for Adam; every parameter is in exactly one.
+
+        Besides Adam's own options each group has a `name`, and a `clip`: gradient norms are clipped (at 20,
+        as published) over all groups with the same `clip` together.
+        """
+        encoder, policy = list(self.encoder.parameters()), list(self.policy_head.parameters())
+        apart = {id(parameter) for parameter in (*encoder, *policy)}
+        rest = [parameter for parameter in self.parameters() if id(parameter) not in apart]
+        return [
+            {"name": "encoder", "clip": "model", "params": encoder, "lr": lr * self.encoder_lr_scale},
+            {"name": "model", "clip": "model", "params": rest, "lr": lr},
+            {"name": "policy", "clip": "policy", "params": policy, "lr": lr, "eps": 1e-5},
+        ]
+
+    def after_update(self) -> None:
+        """Move the target Q-functions by `tau`; call once after each optimiser step."""
+        self.q_ensemble.update_target(self.tau)
+
+    # ------------------------------------------------------------------ pieces
+
+    def _standardise(self, x: Tensor) -> Tensor:
+        return (x.to(self.observation_mean.dtype) - self.observation_mean) / self.observation_std
+
+    def _window(self, batch: TensorDictBase) -> Tensor:
+        """The H+1 observations of windows [B, H], time first: (H+1, B, observation_dim)."""
+        last = batch.get("next")[:, -1:]
+        window = [torch.cat((batch.get(key), last.get(key)), dim=1) for key in self.observation_sizes]
+        return torch.cat(window, dim=-1).transpose(0, 1)
+
+    def _random_pair(self, device: torch.device) -> Tensor:
+        # Ranking noise draws without replacement, on the device; torch.randperm may wait for the host.
+        return torch.rand(self.num_q, device=device).topk(2).indices
+
+    def _td_target(self, after: Tensor, reward: Tensor, terminated: Tensor) -> Tensor:
+        """One-step targets (H, B, 1) from encoded next latents (H, B, D): r + γ min of two target Qs."""
+        bootstrap = self.q(after, self.policy(after), weights="target", reduce="pair_min")
+        # A selection rather than a product: 0 · nan would poison the target of a terminal step.
+        return reward + self.discount * torch.where(terminated, torch.zeros_like(bootstrap), bootstrap)
+
+    def _policy_loss(self, z: Tensor, weight: Tensor) -> tuple[Tensor, Tensor]:
+        """Loss and mean entropy of the policy at detached latents z (H+1, B, D)."""
+        action, log_prob = self.policy_sample(z)
+        q = self.q(z, action, weights="detached", reduce="pair_mean", dropout=self.training)
+        if self.training:
+            self.scale.update(q[0])
+        loss = -(weight * (self.scale(q) - self.entropy_coef * log_prob)).mean()
+        return loss, -log_prob.mean()
+
+
+def _discount(discount: float | None, episode_length: int | None) -> float:
+    if discount is not None:
+        if not 0.0 <= discount < 1.0:
+            raise ValueError(f"discount must be in [0, 1), got {discount}")
+        return float(discount)
+    if episode_length is None:
+        raise ValueError("give episode_length, from which the discount follows, or discount itself")
+    if episode_length < 1:
+        raise ValueError(f"episode_length must be at least 1, got {episode_length}")
+    fifth = episode_length / 5.0
+    return min(max((fifth - 1.0) / fifth, 0.95), 0.995)

@@ -1,0 +1,217 @@
+"""Model-predictive path integral control for all environments at once."""
+
+from collections.abc import Callable
+
+import torch
+from tensordict import TensorDict
+from torch import Tensor
+
+Objective = Callable[[Tensor, Tensor], Tensor]
+
+
+class MPPI:
+    """MPPI as in TD-MPC2 (Hansen, Su & Wang, arXiv:2310.16828): elites, policy candidates, warm start.
+
+    Each of E environments has its own Gaussian over plans (H, A). An iteration draws S candidates, keeps the
+    best `num_elites` and refits mean and standard deviation with the weights
+    softmax(`temperature` · (v - max v)).
+
+    Differences from the paper's implementation, each for a reason:
+      * Elite scores are divided by their standard deviation before the softmax (`normalize`). Otherwise the
+        temperature depends on the unit of the reward: with distances in metres all elites weigh the same,
+        with returns of hundreds a single one does.
+      * The action is the first one of the final mean, not of a randomly drawn elite. With `explore`, noise of
+        the final standard deviation is added to it. So without `explore` equal noise gives equal actions.
+      * A score that is not finite counts for nothing, instead of as 0, which would be the best where rewards
+        are negative.
+
+    Plain tensor code: static shapes, no data-dependent control flow, no host synchronisation. It holds no
+    state; `previous` carries the plan from one call to the next. Rollouts hold E · S · (H + 1) · D numbers.
+
+    Args:
+        action_dim: A.
+        horizon: H, steps looked ahead.
+        num_samples: S, candidates per environment and iteration, those of the policy included.
+        num_policy_samples: how many of them are rolled out with `prior`; all are drawn from the Gaussian
+            where `plan` gets no prior.
+        num_elites: how many candidates the Gaussian is refitted to.
+        iterations: rounds of sampling and refitting.
+        min_std, max_std: bounds of the standard deviation, in units of the action; it starts at `max_std`.
+        temperature: the higher, the more the best elites dominate (the paper's convention).
+        low, high: bounds of every action component.
+        normalize: see above; False is the paper's.
+
+    Raises:
+        ValueError: a setting that cannot work.
+    """
+
+    def __init__(
+        self,
+        *,
+        action_dim: int,
+        horizon: int = 3,
+        num_samples: int = 512,
+        num_policy_samples: int = 24,
+        num_elites: int = 64,
+        iterations: int = 6,
+        min_std: float = 0.05,
+        max_std: float = 2.0,
+        temperature: float = 0.5,
+        low: float = -1.0,
+        high: float = 1.0,
+        normalize: bool = True,
+    ) -> None:
+        for name, count in (
+            ("action_dim", action_dim),
+            ("horizon", horizon),
+            ("num_samples", num_samples),
+            ("num_elites", num_elites),
+            ("iterations", iterations),
+        ):
+            if count < 1:
+                raise ValueError(f"{name} must be at least 1, got {count}")
+        if not 0 <= num_policy_samples <= num_samples:
+            raise ValueError(
+                f"num_policy_samples must be in [0, num_samples={num_samples}], got {num_policy_samples}"
+            )
+        if num_elites > num_samples:
+            raise ValueError(f"num_elites must not exceed num_samples={num_samples}, got {num_elites}")
+        if not 0.0 < min_std <= max_std:
+            raise ValueError(f"need 0 < min_std <= max_std, got {min_std} and {max_std}")
+        if not temperature > 0.0:
+            raise ValueError(f"temperature must be positive, got {temperature}")
+        if not low < high:
+            raise ValueError(f"low must be below high, got [{low}, {high}]")
+        self.action_dim, self.horizon, self.iterations = action_dim, horizon, iterations
+        self.num_samples, self.num_policy_samples, self.num_elites = (
+            num_samples,
+            num_policy_samples,
+            num_elites,
+        )
+        self.min_std, self.max_std, self.temperature = min_std, max_std, temperature
+        self.low, self.high, self.normalize = low, high, normalize
+
+    @torch.no_grad()
+    def plan(
+        self,
+        z: Tensor,
+        next: Callable[[Tensor, Tensor], Tensor],
+        objective: Objective,
+        *,
+        prior: Callable[[Tensor], Tensor] | None = None,
+        previous: Tensor | None = None,
+        is_init: Tensor | None = None,
+        explore: bool = False,
+        generator: torch.Generator | None = None,
+    ) -> TensorDict:
+        """Plan for E environments.
+
+        Args:
+            z: current latents (E, D).
+            next: (z (..., D), action (..., A)) -> next latents (..., D).
+            objective: (trajectory (E, S, H+1, D), actions (E, S, H, A)) -> scores (E, S), higher is better.
+            prior: a policy z (..., D) -> actions (..., A), unrolled for `num_policy_samples` candidates.
+            previous: the `plan` of the last call (E, H, A); the search starts there, shifted by one step.
+            is_init: (E, 1) bool; where True, `previous` belongs to another episode and is dropped.
+            explore: add noise of the final standard deviation to the returned action.
+            generator: source of the planner's own noise, on the device of z; `prior` draws its own.
+
+        Returns:
+            TensorDict of batch size [E]: `action` (E, A); `plan`, the final mean, and `std`, both (E, H, A);
+            `value` (E, 1), the weighted score of the last elites; `effective_samples` (E, 1), 1 / Σ w² of
+            their weights, between 1 and `num_elites`.
+
+        Raises:
+            ValueError: `previous` or `is_init` has another shape.
+        """
+        envs, samples, horizon = z.shape[0], self.num_samples, self.horizon
+        drawn = samples if prior is None else samples - self.num_policy_samples
+        mean = self._start(z, previous, is_init)
+        std = torch.full_like(mean, self.max_std)
+        from_prior = None if prior is None or drawn == samples else self._roll_prior(z, next, prior)
+        root = z.unsqueeze(1).expand(envs, samples, *z.shape[1:])
+
+        value = effective = mean.new_zeros(envs, 1)
+        for _ in range(self.iterations):
+            noise = torch.randn(
+                envs, drawn, horizon, self.action_dim, device=z.device, dtype=mean.dtype, generator=generator
+            )
+            actions = (mean.unsqueeze(1) + std.unsqueeze(1) * noise).clamp(self.low, self.high)
+            if from_prior is not None:
+                actions = torch.cat((from_prior, actions), dim=1)
+            latents = [root]
+            for t in range(horizon):
+                latents.append(next(latents[-1], actions[:, :, t]))
+            scores = objective(torch.stack(latents, dim=2), actions)
+
+            elite_scores, weights, index = self._elites(scores)
+            elites = actions.gather(1, index[..., None, None].expand(-1, -1, horizon, self.action_dim))
+            w = weights[..., None, None]
+            # Rounding can carry a mean of actions at a bound just past it.
+            mean = (w * elites).sum(1).clamp(self.low, self.high)
+            variance = (w * (elites - mean.unsqueeze(1)).square()).sum(1)
+            std = variance.sqrt().clamp(self.min_std, self.max_std)
+            value = (weights * elite_scores).sum(1, keepdim=True)
+            effective = weights.square().sum(1, keepdim=True).reciprocal()
+
+        action = mean[:, 0]
+        if explore:
+            noise = torch.randn(action.shape, device=z.device, dtype=action.dtype, generator=generator)
+            action = action + std[:, 0] * noise
+        return TensorDict(
+            {
+                "action": action.clamp(self.low, self.high),
+                "plan": mean,
+                "std": std,
+                "value": value,
+                "effective_samples": effective,
+            },
+            batch_size=[envs],
+        )
+
+    def _start(self, z: Tensor, previous: Tensor | None, is_init: Tensor | None) -> Tensor:
+        """Mean to start from (E, H, A): the previous plan one step on, or the middle of the bounds."""
+        shape = (z.shape[0], self.horizon, self.action_dim)
+        cold = torch.full(shape, 0.5 * (self.low + self.high), device=z.device, dtype=z.dtype)
+        if previous is None:
+            return cold
+        if previous.shape != shape:
+            raise ValueError(f"previous must have shape (E, H, A) = {shape}, got {tuple(previous.shape)}")
+        shifted = torch.cat((previous[:, 1:].to(z.dtype), cold[:, :1]), dim=1)
+        if is_init is None:
+            return shifted
+        if is_init.shape != (z.shape[0], 1):
+            raise ValueError(
+                f"is_init must have shape (E, 1) = {(z.shape[0], 1)}, got {tuple(is_init.shape)}"
+            )
+        return torch.where(is_init.unsqueeze(-1), cold, shifted)
+
+    def _roll_prior(
+        self, z: Tensor, next: Callable[[Tensor, Tensor], Tensor], prior: Callable[[Tensor], Tensor]
+    ) -> Tensor:
+        """Candidates of the policy (E, num_policy_samples, H, A)."""
+        latent = z.unsqueeze(1).expand(z.shape[0], self.num_policy_samples, *z.shape[1:])
+        actions = []
+        for _ in range(self.horizon):
+            # A weight of zero does not remove a nan from a weighted mean, so it must not get in.
+            actions.append(torch.nan_to_num(prior(latent), nan=0.0).clamp(self.low, self.high))
+            latent = next(latent, actions[-1])
+        return torch.stack(actions, dim=2)
+
+    def _elites(self, scores: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Scores (E, S) -> the elites' scores, weights and indices, each (E, num_elites)."""
+        valid = torch.isfinite(scores)
+        largest = torch.finfo(scores.dtype).max
+        worst = torch.where(valid, scores, largest).amin(1, keepdim=True)
+        worst = torch.where(valid.any(1, keepdim=True), worst, torch.zeros_like(worst))
+        # Stand in with the worst valid score, which keeps the statistics finite, but rank below it.
+        order = torch.where(valid, scores, -largest)
+        index = order.topk(self.num_elites, dim=1).indices
+        elite_valid = valid.gather(1, index)
+        elite = torch.where(valid, scores, worst).gather(1, index)
+        gap = elite - elite.amax(1, keepdim=True)  # at most 0, so that exp cannot overflow
+        if self.normalize:
+            gap = gap / (elite.std(1, keepdim=True, correction=0) + 1e-6)
+        # Finite instead of -inf: if no candidate is valid, the weights are uniform, not nan.
+        weights = (self.temperature * gap).masked_fill(~elite_valid, -1e9).softmax(1)
+        return elite, weights, index

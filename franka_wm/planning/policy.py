@@ -1,0 +1,171 @@
+"""Policies that a TorchRL collector can run: a planner over a world model, and a policy network alone.
+
+Both explore when TorchRL's exploration type is RANDOM, as it is inside a collector, unless told otherwise.
+"""
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import torch
+from tensordict import TensorDictBase
+from tensordict.nn import InteractionType, TensorDictModuleBase
+from tensordict.nn.probabilistic import interaction_type
+from torch import Tensor, nn
+
+from franka_wm.planning.mppi import MPPI, Objective
+from franka_wm.planning.objectives import RewardPlusValue
+
+
+def _explores(explore: bool | None) -> bool:
+    return interaction_type() is InteractionType.RANDOM if explore is None else explore
+
+
+class PlannerPolicy(TensorDictModuleBase):
+    """Encode, plan, act; the plan travels as an entry of the TensorDict.
+
+    Reads the observation keys, `is_init` (E, 1) bool, and `plan` (E, H, A) if it is there (absent: cold
+    start). Writes `action` (E, A) and `plan`. The plan is dropped where `is_init` is True. The batch size is
+    [E]. No gradient is recorded.
+
+    Args:
+        planner: MPPI or anything with its `plan`.
+        encode: observation TensorDict of batch size [E] -> latents (E, D).
+        next: (z, action) -> next z, any leading dimensions.
+        objective: see `franka_wm.planning.objectives`.
+        observation_keys: what `encode` reads.
+        prior: a policy z -> action for some of the candidates.
+        explore: whether to add noise to the action; None follows TorchRL's exploration type.
+        model: the module behind the callables, so that collectors find its parameters and move it along. If
+            the policy is to be copied (as collectors do for other processes), pass bound methods and objects,
+            not closures.
+    """
+
+    def __init__(
+        self,
+        planner: MPPI,
+        *,
+        encode: Callable[[TensorDictBase], Tensor],
+        next: Callable[[Tensor, Tensor], Tensor],
+        objective: Objective,
+        observation_keys: Sequence[str],
+        prior: Callable[[Tensor], Tensor] | None = None,
+        explore: bool | None = None,
+        model: nn.Module | None = None,
+    ) -> None:
+        super().__init__()
+        self.in_keys = [*observation_keys, "is_init"]
+        self.out_keys = ["action", "plan"]
+        self.planner, self.explore, self.model = planner, explore, model
+        self.encode, self.next, self.objective, self.prior = encode, next, objective, prior
+
+    @classmethod
+    def for_model(
+        cls,
+        model: Any,
+        planner: MPPI,
+        *,
+        observation_keys: Sequence[str] | None = None,
+        objective: Objective | None = None,
+        explore: bool | None = None,
+    ) -> "PlannerPolicy":
+        """Plan with any model that has `encode` and `next`.
+
+        Args:
+            observation_keys: those of `model.observation_sizes` when None.
+            objective: rewards plus value of the model, with its `discount`, when None.
+            explore: see the class.
+
+        A model with `policy` supplies the prior.
+
+        Raises:
+            ValueError: the model lacks what a default needs.
+        """
+        if observation_keys is None:
+            observation_keys = list(getattr(model, "observation_sizes", ()))
+            if not observation_keys:
+                raise ValueError(f"{type(model).__name__} has no observation_sizes: give observation_keys")
+        if objective is None:
+            lacking = [name for name in ("reward", "value", "discount") if not hasattr(model, name)]
+            if lacking:
+                raise ValueError(f"{type(model).__name__} has no {', '.join(lacking)}: give an objective")
+            objective = RewardPlusValue(model.reward, model.value, model.discount)
+        return cls(
+            planner,
+            encode=model.encode,
+            next=model.next,
+            objective=objective,
+            observation_keys=observation_keys,
+            prior=getattr(model, "policy", None),
+            explore=explore,
+            model=model if isinstance(model, nn.Module) else None,
+        )
+
+    @torch.no_grad()
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Write `action` and `plan`.
+
+        Raises:
+            ValueError: the batch size is not [E], or a plan is carried without `is_init` to clear it.
+        """
+        if len(tensordict.batch_size) != 1:
+            raise ValueError(f"expected batch size [E], got {list(tensordict.batch_size)}")
+        previous, is_init = tensordict.get("plan", None), tensordict.get("is_init", None)
+        if previous is not None and is_init is None:
+            raise ValueError(
+                "a plan is carried but is_init is missing: append torchrl.envs.InitTracker to the env"
+            )
+        result = self.planner.plan(
+            self.encode(tensordict),
+            self.next,
+            self.objective,
+            prior=self.prior,
+            previous=previous,
+            is_init=is_init,
+            explore=_explores(self.explore),
+        )
+        tensordict.set("action", result.get("action"))
+        tensordict.set("plan", result.get("plan"))
+        return tensordict
+
+
+class ModelPolicy(TensorDictModuleBase):
+    """The policy network alone: observations in, `action` (E, A) out. No gradient is recorded.
+
+    Args:
+        encode: observation TensorDict -> latents (..., D).
+        policy: called as `policy(z, deterministic=...)` -> actions (..., A).
+        observation_keys: what `encode` reads.
+        explore: True samples, False takes the mode; None follows TorchRL's exploration type.
+        model: see `PlannerPolicy`.
+    """
+
+    def __init__(
+        self,
+        *,
+        encode: Callable[[TensorDictBase], Tensor],
+        policy: Callable[..., Tensor],
+        observation_keys: Sequence[str],
+        explore: bool | None = None,
+        model: nn.Module | None = None,
+    ) -> None:
+        super().__init__()
+        self.in_keys = list(observation_keys)
+        self.out_keys = ["action"]
+        self.encode, self.policy, self.explore, self.model = encode, policy, explore, model
+
+    @classmethod
+    def for_model(cls, model: Any, *, explore: bool | None = None) -> "ModelPolicy":
+        """The policy of a model with `encode`, `policy` and `observation_sizes`."""
+        return cls(
+            encode=model.encode,
+            policy=model.policy,
+            observation_keys=list(model.observation_sizes),
+            explore=explore,
+            model=model if isinstance(model, nn.Module) else None,
+        )
+
+    @torch.no_grad()
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Write `action`."""
+        z = self.encode(tensordict)
+        return tensordict.set("action", self.policy(z, deterministic=not _explores(self.explore)))

@@ -1,0 +1,62 @@
+"""Several runs in one table: the mean over seeds, and the lowest and highest."""
+
+import json
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from franka_wm.errors import UserError
+
+COLUMNS = (
+    ("final distance [cm]", lambda r: 100 * r["final_distance"]["mean"], 2),
+    ("within 5 cm [%]", lambda r: 100 * r["success"]["0.05"]["mean"], 0),
+    ("within 2.5 cm [%]", lambda r: 100 * r["success"]["0.025"]["mean"], 0),
+    ("within 1 cm [%]", lambda r: 100 * r["success"]["0.01"]["mean"], 0),
+)
+
+
+def read_evaluation(run: str | Path) -> dict[str, Any]:
+    """The ``evaluation.json`` of a run's folder.
+
+    Raises:
+        UserError: There is none, or it is not one.
+    """
+    path = Path(run) / "evaluation.json"
+    try:
+        return json.loads(path.read_text())
+    except FileNotFoundError as error:
+        raise UserError(f"{run}: no evaluation.json; give folders of runs that were finished") from error
+    except (OSError, json.JSONDecodeError) as error:
+        raise UserError(
+            f"{path}: cannot be read ({error}); give folders of runs that were finished"
+        ) from error
+
+
+def seeds_table(evaluations: Sequence[Mapping[str, Any]]) -> str:
+    """Markdown: one row per policy, `mean over runs (lowest – highest)` in every cell."""
+    policies = [p for p in evaluations[0] if all(p in e for e in evaluations)]
+    lines = [
+        "| policy | " + " | ".join(name for name, _, _ in COLUMNS) + " |",
+        "|---|" + "---:|" * len(COLUMNS),
+    ]
+    for policy in policies:
+        cells = []
+        for _, value, digits in COLUMNS:
+            values = [value(e[policy]) for e in evaluations]
+            low, high = min(values), max(values)
+            mean = f"{sum(values) / len(values):.{digits}f}"
+            cells.append(mean if len(values) == 1 else f"{mean} ({low:.{digits}f} – {high:.{digits}f})")
+        lines.append(f"| {policy} | " + " | ".join(cells) + " |")
+    return "\n".join(lines)
+
+
+def summary(arguments: list[str]) -> None:
+    """``franka-wm summary RUN RUN …``: runs of different seeds in one table."""
+    if not arguments or arguments[0].startswith("-"):
+        raise UserError("summary needs folders of runs: franka-wm summary outputs/RUN outputs/RUN …")
+    evaluations = [read_evaluation(run) for run in arguments]
+    first = next(iter(evaluations[0].values()))
+    print(
+        f"{len(evaluations)} runs of {first['episodes']} episodes each: mean over runs (lowest – highest run)\n"
+    )
+    print(seeds_table(evaluations))

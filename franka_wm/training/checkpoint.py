@@ -1,0 +1,594 @@
+"""Checkpoints: one folder, written whole or not at all, read without pickle.
+
+    manifest.json           format version, model name, size and SHA-256 of every other file; written last
+    config.yaml             the resolved configuration
+    counters.json           environment steps, updates, ...
+    model.safetensors       weights and buffers
+    optimizer.json          structure of the optimizers' state; its tensors are in optimizer.safetensors
+    rng.json                likewise: torch (CPU, CUDA), NumPy, Python
+    replay.json             likewise: the filled part of the replay buffer
+    extra.json              likewise: whatever else the caller wants back
+
+**Replacing a checkpoint.** A folder cannot replace a non-empty folder in one system call, so it takes three
+steps: write and sync `NAME.writing`; rename `NAME` to `NAME.old`; rename `NAME.writing` to `NAME`. A kill
+between the renames leaves no `NAME`, but a whole `NAME.old`, and that is what `load_checkpoint(NAME)` then
+reads. `NAME.old` is removed only while a whole `NAME` exists.
+"""
+
+import hashlib
+import json
+import os
+import random
+import shutil
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from omegaconf import DictConfig, OmegaConf
+from omegaconf.errors import OmegaConfBaseException
+from safetensors import SafetensorError
+from safetensors.torch import load_file, save_file
+from tensordict import TensorDict, TensorDictBase
+from torch import Tensor, nn
+from torch.optim import Optimizer
+
+from franka_wm import __version__
+from franka_wm.errors import UserError
+
+FORMAT_VERSION = 1
+
+type Optimizers = Optimizer | Mapping[str, Optimizer]
+
+_MANIFEST = "manifest.json"
+_WRITING = ".writing"
+_OLD = ".old"
+# How an optimizer runs, not what it has learned: kept from the optimizer that is loaded into, so that a
+# checkpoint from a GPU (fused, capturable) goes on on a CPU and the other way round.
+_EXECUTION_FLAGS = ("capturable", "differentiable", "foreach", "fused")
+
+
+# -- saving ----------------------------------------------------------------------------------------------
+
+
+def save_checkpoint(
+    folder: str | Path,
+    *,
+    model: nn.Module,
+    config: Mapping[str, Any] | DictConfig,
+    counters: Mapping[str, int | float],
+    optimizer: Optimizers | None = None,
+    replay: TensorDictBase | None = None,
+    extra: Mapping[str, Any] | None = None,
+) -> Path:
+    """Write a checkpoint; an existing one at the same place is replaced, and is whole until it is.
+
+    The state of the random number generators (torch, NumPy, Python) is always saved along.
+
+    Args:
+        folder: where the checkpoint will be. Missing parents are made.
+        model: on any device; a compiled module is saved as the module it wraps.
+        config: resolved before it is written; a missing or unresolvable value is an error.
+        counters: numbers by name, such as `env_steps` and `updates`.
+        optimizer: one optimizer, or several by name.
+        replay: the filled part of the buffer, tensors only, any batch dimensions.
+        extra: nested dicts, lists and tuples of numbers, strings, None and tensors (a `torch.Generator`'s
+            state, say).
+
+    Returns:
+        The folder, absolute.
+
+    Raises:
+        UserError: the folder cannot be written, or something there is not a checkpoint. Nothing
+            half-written stays behind.
+        TypeError: a value that cannot be stored without pickle.
+    """
+    target = Path(folder).resolve()
+    writing = _sibling(target, _WRITING)
+    with _explained(target):
+        # Renaming would fail only after everything has been written; this is the place to say it.
+        if (target.exists() and not target.is_dir()) or (
+            target.is_dir() and not (target / _MANIFEST).exists() and any(target.iterdir())
+        ):
+            raise UserError(f"{target} exists and is not a checkpoint; choose another folder or remove it.")
+        target.parent.mkdir(parents=True, exist_ok=True)
+        if writing.exists():  # an earlier process was killed while it wrote
+            shutil.rmtree(writing)
+        writing.mkdir()
+        try:
+            _write_contents(writing, _unwrap(model), optimizer, config, counters, replay, extra)
+            _swap_in(writing, target)
+        except Exception:
+            shutil.rmtree(writing, ignore_errors=True)
+            raise
+    return target
+
+
+def _write_contents(
+    folder: Path,
+    model: nn.Module,
+    optimizer: Optimizers | None,
+    config: Mapping[str, Any] | DictConfig,
+    counters: Mapping[str, int | float],
+    replay: TensorDictBase | None,
+    extra: Mapping[str, Any] | None,
+) -> None:
+    _save_tensors(_tensor_state(model), folder / "model.safetensors")
+    if optimizer is not None:
+        state = {
+            name: {"type": type(one).__name__, "state_dict": one.state_dict()}
+            for name, one in _by_name(optimizer).items()
+        }
+        _write_tree(folder, "optimizer", state)
+    _write_tree(folder, "rng", _rng_state())
+    if replay is not None:
+        _write_tree(folder, "replay", {"batch_size": list(replay.batch_size), "entries": _entries(replay)})
+    if extra is not None:
+        _write_tree(folder, "extra", extra)
+    OmegaConf.save(_resolved(config), folder / "config.yaml")
+    _write_json(folder / "counters.json", {name: _plain_number(name, n) for name, n in counters.items()})
+
+    files = sorted(folder.iterdir())
+    for path in files:
+        _sync(path)
+    manifest = {
+        "format_version": FORMAT_VERSION,
+        "franka_wm": __version__,
+        "model": type(model).__name__,
+        "saved_at_ns": time.time_ns(),
+        "files": {p.name: {"bytes": p.stat().st_size, "sha256": _sha256(p)} for p in files},
+    }
+    _write_json(folder / _MANIFEST, manifest)
+    _sync(folder / _MANIFEST)
+    _sync(folder)
+
+
+def _swap_in(writing: Path, target: Path) -> None:
+    """Put the whole folder `writing` at `target`. See the module's docstring for what a kill leaves."""
+    old = _sibling(target, _OLD)
+    if target.exists():
+        if old.exists():
+            shutil.rmtree(old)
+        os.rename(target, old)
+    try:
+        os.rename(writing, target)
+    except OSError:
+        if old.exists() and not target.exists():
+            os.rename(old, target)
+        raise
+    _sync(target.parent)
+    # What matters is in place; a leftover here is removed by the next save.
+    shutil.rmtree(old, ignore_errors=True)
+
+
+# -- loading ---------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Checkpoint:
+    """A checkpoint on disk that has been found whole. Tensors are read when they are asked for.
+
+    Attributes:
+        folder: where it was read from.
+        model_name: class name of the model that was saved.
+        config: the resolved configuration.
+        counters: the numbers that were saved.
+    """
+
+    folder: Path
+    model_name: str
+    config: DictConfig
+    counters: dict[str, int | float]
+    _files: Mapping[str, Mapping[str, Any]]
+
+    def load_model(self, model: nn.Module) -> None:
+        """Copy the saved weights and buffers into `model`, in place, whatever device it is on.
+
+        Raises:
+            UserError: the model is another one. Its weights are then untouched.
+        """
+        model = _unwrap(model)
+        saved = load_file(self.folder / "model.safetensors")
+        here = _tensor_state(model)
+        difference = _first_difference(saved, here)
+        if difference is not None:
+            raise UserError(
+                f"checkpoint {self.folder} holds a {self.model_name} that does not fit this "
+                f"{type(model).__name__}: {difference}; build the model from the checkpoint's config.yaml."
+            )
+        # Entries that are no tensors (TensorDictParams keeps its batch size there) are the model's own.
+        model.load_state_dict({**model.state_dict(), **saved})
+
+    def load_optimizer(self, optimizer: Optimizers) -> None:
+        """Give `optimizer` the saved state; it goes on exactly where the saved one stopped.
+
+        How the optimizer runs (`fused`, `capturable`, `foreach`) stays as it was built. State tensors are
+        new objects afterwards: load before a CUDA graph is captured, not after.
+
+        Args:
+            optimizer: one or several by name, as they were saved.
+
+        Raises:
+            UserError: other optimizers, or for other parameters. None of them is then changed.
+        """
+        saved = self._tree("optimizer")
+        if saved is None:
+            raise UserError(
+                f"checkpoint {self.folder} was saved without an optimizer; start a new run from its weights."
+            )
+        optimizers = _by_name(optimizer)
+        if saved.keys() != optimizers.keys():
+            raise UserError(
+                f"checkpoint {self.folder} holds the optimizers {sorted(saved)}, asked for are "
+                f"{sorted(optimizers)}; resume with the trainer that wrote it."
+            )
+        fitted = {}
+        for name, one in optimizers.items():
+            difference = _optimizer_difference(saved[name], one)
+            if difference is not None:
+                raise UserError(
+                    f"optimizer {name!r} of checkpoint {self.folder} does not fit: {difference}; "
+                    "build model and optimizer from the checkpoint's config.yaml."
+                )
+            fitted[name] = _as_it_runs_here(saved[name]["state_dict"], one)
+        for name, one in optimizers.items():
+            rates = [group["lr"] for group in one.param_groups]
+            one.load_state_dict(fitted[name])
+            for group, rate in zip(one.param_groups, rates, strict=True):
+                if isinstance(rate, Tensor):  # a captured graph reads this very tensor
+                    group["lr"] = rate.copy_(torch.as_tensor(group["lr"]))
+
+    def restore_rng(self) -> None:
+        """Set torch's (CPU and CUDA), NumPy's and Python's global generators to their saved states.
+
+        CUDA states are restored for the devices that are there.
+        """
+        state = self._tree("rng")
+        assert state is not None  # always saved, and the manifest was checked
+        random.setstate(state["python"])
+        np.random.set_state(state["numpy"])
+        torch.set_rng_state(state["torch"])
+        if torch.cuda.is_available():
+            for device, one in enumerate(state["cuda"][: torch.cuda.device_count()]):
+                torch.cuda.set_rng_state(one, device)
+
+    def replay(self, device: torch.device | str | None = None) -> TensorDict | None:
+        """The saved replay, with its batch dimensions, on `device` (the CPU if None); None if none was saved.
+
+        Raises:
+            UserError: its file is damaged.
+        """
+        # By far the largest file, and evaluation never opens it: its checksum waits until here.
+        for name in _tree_files("replay"):
+            _check_sum(self.folder, name, self._files)
+        saved = self._tree("replay")
+        if saved is None:
+            return None
+        return TensorDict(saved["entries"], batch_size=saved["batch_size"], device=device or "cpu")
+
+    def extra(self) -> dict[str, Any] | None:
+        """What was saved as `extra`, tensors on the CPU; None if nothing was."""
+        return self._tree("extra")
+
+    def _tree(self, name: str) -> Any:
+        return _read_tree(self.folder, name) if f"{name}.json" in self._files else None
+
+
+def load_checkpoint(folder: str | Path) -> Checkpoint:
+    """Open a checkpoint folder and check that it is whole.
+
+    If saving was killed between its two renames, the previous checkpoint is opened.
+
+    Raises:
+        UserError: no checkpoint, a damaged or truncated one, or one from a newer version of this package.
+    """
+    path = _find(Path(folder).resolve())
+    if path is None:
+        raise UserError(
+            f"no checkpoint at {folder}: a checkpoint is a folder with a {_MANIFEST}; "
+            "give the folder that a training run wrote."
+        )
+    try:
+        manifest = json.loads((path / _MANIFEST).read_bytes())
+        version, model_name, files = manifest["format_version"], manifest["model"], manifest["files"]
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise UserError(
+            f"checkpoint {path} is damaged: {_MANIFEST} cannot be read ({type(error).__name__}); "
+            "use another checkpoint."
+        ) from error
+    if version != FORMAT_VERSION:
+        raise UserError(
+            f"checkpoint {path} has format version {version}, this franka_wm {__version__} reads "
+            f"{FORMAT_VERSION}; use the franka_wm that wrote it ({manifest.get('franka_wm', 'unknown')})."
+        )
+    for name in files:
+        _check_size(path, name, files)
+    for name in files:
+        if name not in _tree_files("replay"):
+            _check_sum(path, name, files)
+    config = OmegaConf.load(path / "config.yaml")
+    assert isinstance(config, DictConfig)
+    counters = json.loads((path / "counters.json").read_bytes())
+    return Checkpoint(path, model_name, config, counters, files)
+
+
+def latest_checkpoint(folder: str | Path) -> Path:
+    """The checkpoint that was written last in a run's folder, or `folder` itself if it is one.
+
+    Looks at `folder`, at the folders in it, and at those in its `checkpoints/`.
+
+    Raises:
+        UserError: there is none.
+    """
+    run = Path(folder).resolve()
+    if _find(run) is not None:
+        return run
+    places = [run, run / "checkpoints"]
+    inside = [entry for place in places if place.is_dir() for entry in place.iterdir() if entry.is_dir()]
+    # A NAME.old that lost its NAME to a kill stands for NAME.
+    names = {p.with_name(p.name.removesuffix(_OLD)) for p in inside if not p.name.endswith(_WRITING)}
+    found = [(_saved_at(whole), name) for name in names if (whole := _find(name)) is not None]
+    if not found:
+        raise UserError(
+            f"no checkpoint in {folder}: expected a checkpoint (a folder with a {_MANIFEST}) or a run's "
+            "folder that holds one; give a folder that a training run wrote."
+        )
+    return max(found)[1]
+
+
+# -- comparing -------------------------------------------------------------------------------------------
+
+
+def _first_difference(saved: Mapping[str, Tensor], here: Mapping[str, Tensor]) -> str | None:
+    """In words, the first entry (in the model's order) that is not the same in shape and dtype."""
+    for name, tensor in here.items():
+        if name not in saved:
+            return f"{name} is missing in the checkpoint"
+        for what in ("shape", "dtype"):
+            there, wanted = getattr(saved[name], what), getattr(tensor, what)
+            if there != wanted:
+                there, wanted = (tuple(v) if what == "shape" else v for v in (there, wanted))
+                return f"{name} has {what} {there} in the checkpoint and {wanted} in the model"
+    unknown = next((name for name in saved if name not in here), None)
+    return None if unknown is None else f"{unknown} is in the checkpoint but not in the model"
+
+
+def _optimizer_difference(saved: Mapping[str, Any], optimizer: Optimizer) -> str | None:
+    """In words, why the saved state is for another optimizer, or None. torch checks only the counts."""
+    if saved["type"] != type(optimizer).__name__:
+        return f"it is {saved['type']}, here is {type(optimizer).__name__}"
+    groups = saved["state_dict"]["param_groups"]
+    if [len(g["params"]) for g in groups] != [len(g["params"]) for g in optimizer.param_groups]:
+        return "its groups hold other numbers of parameters"
+    for group, group_here in zip(groups, optimizer.param_groups, strict=True):
+        for index, parameter in zip(group["params"], group_here["params"], strict=True):
+            for name, value in saved["state_dict"]["state"].get(index, {}).items():
+                if isinstance(value, Tensor) and value.ndim > 0 and value.shape != parameter.shape:
+                    return (
+                        f"{name} of parameter {index} has shape {tuple(value.shape)}, "
+                        f"the parameter {tuple(parameter.shape)}"
+                    )
+    return None
+
+
+def _as_it_runs_here(state: Mapping[str, Any], optimizer: Optimizer) -> dict[str, Any]:
+    """The saved state with the execution flags, and the kind of learning rate, that `optimizer` has."""
+    groups = []
+    for saved, here in zip(state["param_groups"], optimizer.param_groups, strict=True):
+        group = {**saved, **{flag: here[flag] for flag in _EXECUTION_FLAGS if flag in here}}
+        if isinstance(group["lr"], Tensor) and not isinstance(here["lr"], Tensor):
+            group["lr"] = group["lr"].item()
+        groups.append(group)
+    return {"state": state["state"], "param_groups": groups}
+
+
+# -- nested values as JSON + safetensors -------------------------------------------------------------------
+
+
+def _write_tree(folder: Path, name: str, tree: Any) -> None:
+    """Nested values into `name.json`, the tensors among them into `name.safetensors`."""
+    tensors: dict[str, Tensor] = {}
+    structure = _encode(tree, name, tensors)
+    _write_json(folder / f"{name}.json", structure)
+    _save_tensors(tensors, folder / f"{name}.safetensors")
+
+
+def _read_tree(folder: Path, name: str) -> Any:
+    structure = json.loads((folder / f"{name}.json").read_bytes())
+    return _decode(structure, load_file(folder / f"{name}.safetensors"))
+
+
+def _tree_files(name: str) -> tuple[str, str]:
+    return f"{name}.json", f"{name}.safetensors"
+
+
+def _encode(value: Any, where: str, tensors: dict[str, Tensor]) -> Any:
+    """JSON for `value`. What JSON has not (tensors, tuples, dicts with int keys) becomes a tagged list."""
+    if value is None or isinstance(value, str | bool | int | float):
+        return value
+    if isinstance(value, Tensor):
+        tensors[where] = value
+        return ["tensor", where]
+    if isinstance(value, Mapping):
+        items = [[_key(k, where), _encode(v, f"{where}/{k}", tensors)] for k, v in value.items()]
+        return ["dict", items]
+    if isinstance(value, tuple | list):
+        kind = "tuple" if isinstance(value, tuple) else "list"
+        return [kind, [_encode(v, f"{where}/{i}", tensors) for i, v in enumerate(value)]]
+    if isinstance(value, np.ndarray | np.generic):
+        return _encode(value.tolist(), where, tensors)
+    raise TypeError(
+        f"{where} is a {type(value).__name__}, which a checkpoint cannot hold: use numbers, strings, None, "
+        "tensors, and dicts, lists and tuples of these"
+    )
+
+
+def _decode(value: Any, tensors: Mapping[str, Tensor]) -> Any:
+    if not isinstance(value, list):
+        return value
+    kind, content = value
+    if kind == "tensor":
+        return tensors[content]
+    if kind == "dict":
+        return {k: _decode(v, tensors) for k, v in content}
+    items = [_decode(v, tensors) for v in content]
+    return tuple(items) if kind == "tuple" else items
+
+
+def _key(key: Any, where: str) -> str | int:
+    if isinstance(key, str | int):
+        return key
+    raise TypeError(f"{where} has the key {key!r}; a checkpoint holds dicts with str and int keys only")
+
+
+def _save_tensors(tensors: Mapping[str, Tensor], path: Path) -> None:
+    """Like safetensors' `save_file`, which refuses tensors that share memory: such are written twice."""
+    storages: set[int] = set()
+    separate = {}
+    for name, tensor in tensors.items():
+        tensor = tensor.detach().cpu().contiguous()
+        pointer = tensor.untyped_storage().data_ptr()
+        if pointer in storages:
+            tensor = tensor.clone()
+        storages.add(pointer)
+        separate[name] = tensor
+    save_file(separate, path)
+
+
+# -- parts of the state ------------------------------------------------------------------------------------
+
+
+def _unwrap(model: nn.Module) -> nn.Module:
+    """The module inside `torch.compile`'s wrapper, whose names carry a prefix otherwise."""
+    inner = getattr(model, "_orig_mod", model)
+    assert isinstance(inner, nn.Module)
+    return inner
+
+
+def _tensor_state(model: nn.Module) -> dict[str, Tensor]:
+    return {name: value for name, value in model.state_dict().items() if isinstance(value, Tensor)}
+
+
+def _by_name(optimizer: Optimizers) -> dict[str, Optimizer]:
+    return {"optimizer": optimizer} if isinstance(optimizer, Optimizer) else dict(optimizer)
+
+
+def _rng_state() -> dict[str, Any]:
+    return {
+        "torch": torch.get_rng_state(),
+        # Asking for it would start CUDA in a process that has not used it.
+        "cuda": torch.cuda.get_rng_state_all() if torch.cuda.is_initialized() else [],
+        "numpy": np.random.get_state(legacy=True),
+        "python": random.getstate(),
+    }
+
+
+def _entries(data: TensorDictBase) -> dict[str, Any]:
+    """A TensorDict as nested dicts of tensors."""
+    return {
+        str(key): _entries(value) if isinstance(value, TensorDictBase) else value
+        for key, value in data.items()
+    }
+
+
+def _resolved(config: Mapping[str, Any] | DictConfig) -> DictConfig:
+    try:
+        node = config if isinstance(config, DictConfig) else OmegaConf.create(dict(config))
+        plain = OmegaConf.to_container(node, resolve=True, throw_on_missing=True)
+        resolved = OmegaConf.create(_without_paths(plain))
+        assert isinstance(resolved, DictConfig)
+        return resolved
+    except OmegaConfBaseException as error:
+        raise UserError(f"the configuration cannot be resolved: {error}") from error
+
+
+def _without_paths(value: Any) -> Any:
+    """YAML would need a tag that names a Python class for a path."""
+    if isinstance(value, dict):
+        return {k: _without_paths(v) for k, v in value.items()}
+    if isinstance(value, list):
+        return [_without_paths(v) for v in value]
+    return str(value) if isinstance(value, Path) else value
+
+
+def _plain_number(name: str, value: int | float) -> int | float:
+    if isinstance(value, int | float) and not isinstance(value, bool):
+        return value
+    raise TypeError(f"counter {name} is a {type(value).__name__}; counters are int or float")
+
+
+# -- files -------------------------------------------------------------------------------------------------
+
+
+def _sibling(folder: Path, suffix: str) -> Path:
+    return folder.with_name(folder.name + suffix)
+
+
+def _find(folder: Path) -> Path | None:
+    """`folder` if it is a checkpoint, else its predecessor that a killed save has moved aside, else None."""
+    candidates: Sequence[Path] = (folder, _sibling(folder, _OLD))
+    return next((path for path in candidates if (path / _MANIFEST).is_file()), None)
+
+
+def _saved_at(folder: Path) -> int:
+    """Time of saving [ns]; a damaged manifest counts as the oldest."""
+    try:
+        return int(json.loads((folder / _MANIFEST).read_bytes())["saved_at_ns"])
+    except (OSError, ValueError, KeyError, TypeError):
+        return -1
+
+
+def _write_json(path: Path, value: Any) -> None:
+    # No newline at the end: so every truncation, even by one byte, leaves invalid JSON.
+    path.write_text(json.dumps(value, indent=1), encoding="utf-8")
+
+
+def _sync(path: Path) -> None:
+    """Make sure that a file's content, or a folder's list of names, has reached the disk."""
+    descriptor = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
+
+
+def _sha256(path: Path) -> str:
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def _check_size(folder: Path, name: str, files: Mapping[str, Mapping[str, Any]]) -> None:
+    expected = files[name]["bytes"]
+    path = folder / name
+    if not path.is_file():
+        raise UserError(f"checkpoint {folder} is damaged: {name} is missing; use another checkpoint.")
+    actual = path.stat().st_size
+    if actual != expected:
+        raise UserError(
+            f"checkpoint {folder} is damaged: {name} has {actual} bytes, {expected} were written; "
+            "copy it again or use another checkpoint."
+        )
+
+
+def _check_sum(folder: Path, name: str, files: Mapping[str, Mapping[str, Any]]) -> None:
+    if name in files and _sha256(folder / name) != files[name]["sha256"]:
+        raise UserError(
+            f"checkpoint {folder} is damaged: {name} has the right size but other content than was written; "
+            "copy it again or use another checkpoint."
+        )
+
+
+@contextmanager
+def _explained(target: Path) -> Iterator[None]:
+    """Turn what the file system refuses into one line for the user."""
+    try:
+        yield
+    except (OSError, SafetensorError) as error:
+        raise UserError(
+            f"cannot write checkpoint {target}: {error}; choose a folder that you may write to, "
+            "on a disk with room."
+        ) from error

@@ -1,0 +1,253 @@
+"""What surrounds a run: scale by device, one-line errors, folders, loggers, the last line."""
+
+from __future__ import annotations
+
+import functools
+import logging
+import sys
+import tempfile
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from omegaconf import DictConfig, OmegaConf
+
+from franka_wm.errors import FrankaError
+from franka_wm.training.progress import announced, say
+
+INTERRUPTED = 130
+"""Exit status after Ctrl-C, as shells expect."""
+
+
+# -- the command line ---------------------------------------------------------------------------------------
+
+
+def run_command(main: Callable[[], Any]) -> None:
+    """Runs a Hydra main: chooses the scale by device, and turns bad input into one line and exit status 1."""
+    import warp as wp
+
+    wp.config.log_level = wp.LOG_WARNING  # its list of compiled modules drowns what a run has to say
+    arguments = sys.argv[1:]
+    asks_hydra = any(a.startswith("-") and a not in ("-m", "--multirun") for a in arguments)
+    if not asks_hydra:
+        sys.argv[1:] = arguments = with_scale(arguments)
+        problem = check_command(arguments)
+        if problem is not None:
+            fail(problem)
+    main()
+
+
+def one_line_errors(main: Callable[[DictConfig], Any]) -> Callable[[DictConfig], Any]:
+    """Inside Hydra's own wrapper, which would print a traceback for what is the user's to mend."""
+
+    @functools.wraps(main)
+    def wrapped(cfg: DictConfig) -> Any:
+        try:
+            return main(cfg)
+        except FrankaError as error:
+            fail(str(error))
+        except KeyboardInterrupt:
+            print(
+                "stopped; what was saved is in the run's folder: python train.py resume=FOLDER",
+                file=sys.stderr,
+            )
+            sys.exit(INTERRUPTED)
+
+    return wrapped
+
+
+def fail(message: str) -> None:
+    """Says what is wrong and exits with status 1."""
+    print(f"error: {message}", file=sys.stderr, flush=True)
+    sys.exit(1)
+
+
+def with_scale(arguments: list[str]) -> list[str]:
+    """Adds ``scale=gpu`` or ``scale=laptop`` where none, or ``scale=auto``, is given."""
+    given = next((a for a in arguments if a.startswith("scale=")), None)
+    if given not in (None, "scale=auto"):
+        return arguments
+    import torch
+
+    device = next((a.split("=", 1)[1] for a in arguments if a.startswith("device=")), "auto")
+    on_gpu = device.startswith("cuda") or (device == "auto" and torch.cuda.is_available())
+    scale = "gpu" if on_gpu else "laptop"
+    if not any(a.startswith("resume=") for a in arguments):
+        say(f"scale={scale}, by the device; choose with scale=laptop, gpu or smoke")
+    return [a for a in arguments if a != given] + [f"scale={scale}"]
+
+
+def check_command(arguments: list[str]) -> str | None:
+    """What is wrong with the overrides or the folder they write to, in one line; ``None`` if nothing is."""
+    from hydra import compose, initialize_config_dir
+    from hydra.core.global_hydra import GlobalHydra
+    from hydra.errors import HydraException
+    from omegaconf.errors import OmegaConfBaseException
+
+    from franka_wm.training import build
+
+    if any(a in ("-m", "--multirun") for a in arguments):
+        return None  # sweeps are resolved by Hydra itself
+    folder = str(Path(sys.argv[0]).resolve().parent / "conf")
+    try:
+        with initialize_config_dir(folder, version_base="1.3"):
+            cfg = compose("config", overrides=arguments)
+        if cfg.resume is None:
+            build.check(cfg)
+        else:
+            _, cfg = resumed(cfg, arguments)
+            build.check(cfg)
+    except FrankaError as error:
+        return str(error)
+    except (HydraException, OmegaConfBaseException) as error:
+        lines = [
+            line.strip() for line in str(error).splitlines() if line.strip() and "object_type" not in line
+        ]
+        lines = [
+            line for line in lines if not line.startswith(("full_key:", "Config search path", "Set the env"))
+        ]
+        return "; ".join(lines) + "; python train.py --help lists every option"
+    finally:
+        GlobalHydra.instance().clear()
+    chosen = next((a.split("=", 1)[1] for a in arguments if a.startswith("hydra.run.dir=")), "outputs")
+    return unwritable(Path(chosen))
+
+
+def unwritable(folder: Path) -> str | None:
+    """Why ``folder`` cannot be made or written, in one line; ``None`` if it can. Leaves nothing behind."""
+    place = folder.absolute()
+    while not place.exists():
+        place = place.parent
+    if not place.is_dir():
+        return f"hydra.run.dir={folder}: {place} is not a folder; choose another place for the results"
+    try:
+        tempfile.TemporaryDirectory(
+            dir=place
+        ).cleanup()  # asking for permission is not enough: root has it everywhere
+    except OSError:
+        return f"hydra.run.dir={folder}: {place} is not writable; choose another place for the results"
+    return None
+
+
+# -- a run --------------------------------------------------------------------------------------------------
+
+
+@dataclass
+class Run:
+    """One run's configuration, folder, loggers, and the checkpoint that it goes on from."""
+
+    cfg: DictConfig
+    folder: Path
+    checkpoint: Any = None
+    loggers: list[Any] = field(default_factory=list)
+
+    def build_environments(self) -> tuple[Any, Any]:
+        """The training worlds and the evaluation worlds, compiled and ready."""
+        from franka_wm.training import build
+
+        with announced(
+            f"building {self.cfg.collector.num_envs} training and {self.cfg.evaluation.episodes} evaluation worlds; "
+            "on a machine's first start this compiles kernels for a minute or two"
+        ):
+            judge = build.make_evaluation_env(self.cfg)
+            env = build.make_env(self.cfg)
+            for one in (env, judge):
+                one.step(one.rand_action(one.reset()))
+                one.statistics()
+                one.set_seed(self.cfg.seed)
+        return env, judge
+
+    def learner_options(self) -> dict[str, Any]:
+        trainer = self.cfg.trainer
+        return {name: trainer[name] for name in ("lr", "grad_clip", "capture", "compile")}
+
+    def evaluation_during_training(
+        self, env: Any, policies: Mapping[str, Any]
+    ) -> Callable[[], dict[str, float]]:
+        """A function that plays the policies of ``evaluation.during`` and returns numbers to log."""
+        from franka_wm.evaluation.closed_loop import EVALUATION_SEED, play_episodes
+
+        names = list(self.cfg.evaluation.during)
+
+        def evaluate() -> dict[str, float]:
+            numbers = {}
+            for name in names:
+                episodes = play_episodes(env, policies[name], seed=self.cfg.seed + EVALUATION_SEED)
+                distance = episodes.get("final_distance")
+                numbers[f"eval/{name}/final_distance"] = float(distance.mean())
+                numbers[f"eval/{name}/success"] = float(
+                    (distance < env.config.success_distance).float().mean()
+                )
+                numbers[f"eval/{name}/return"] = float(episodes.get("return").mean())
+            return numbers
+
+        return evaluate
+
+
+def start(cfg: DictConfig) -> Run:
+    """Checks the configuration, takes over a checkpoint's where the run goes on from one, opens the loggers.
+
+    Raises:
+        UserError: One line, before anything is built or written.
+    """
+    import torch
+    from hydra.core.hydra_config import HydraConfig
+
+    from franka_wm.envs import resolve_device
+    from franka_wm.training import build
+
+    folder = Path(HydraConfig.get().runtime.output_dir)
+    checkpoint = None
+    if cfg.resume is not None:
+        checkpoint, cfg = resumed(cfg, list(HydraConfig.get().overrides.task))
+    build.check(cfg)
+    device = resolve_device(cfg.device)
+    logging.getLogger("torchrl").setLevel(logging.WARNING)
+    torch.manual_seed(cfg.seed)
+    if device.type == "cuda":
+        torch.set_float32_matmul_precision("high")
+    OmegaConf.save(cfg, folder / "config.yaml", resolve=True)
+    say(f"device {device}   seed {cfg.seed}   results in {folder}")
+    return Run(cfg=cfg, folder=folder, checkpoint=checkpoint, loggers=make_loggers(cfg, folder))
+
+
+def resumed(cfg: DictConfig, overrides: list[str]) -> tuple[Any, DictConfig]:
+    """The checkpoint, and its configuration with the values (not the groups) given on the command line.
+
+    Raises:
+        UserError: The command line asks for another group than the checkpoint was made with.
+    """
+    from franka_wm.training.checkpoint import latest_checkpoint, load_checkpoint
+
+    checkpoint = load_checkpoint(latest_checkpoint(str(cfg.resume)))
+    saved = checkpoint.config
+    changes = []
+    for override in overrides:
+        name = override.split("=", 1)[0].lstrip("+~")
+        if name in ("resume", "scale"):
+            continue
+        if "." not in name and name not in ("seed", "device"):
+            raise FrankaError(
+                f"{override}: a run that resumes keeps its {name}; leave it out, or change single values ({name}.key=…)"
+            )
+        changes.append(override.lstrip("+"))
+    merged = OmegaConf.merge(saved, OmegaConf.from_dotlist(changes))
+    assert isinstance(merged, DictConfig)
+    merged.resume = str(cfg.resume)
+    return checkpoint, merged
+
+
+def make_loggers(cfg: DictConfig, folder: Path) -> list[Any]:
+    """TorchRL's loggers that ``cfg.logger.names`` lists, writing into ``folder``."""
+    from torchrl.record.loggers import get_logger
+
+    return [get_logger(n, logger_name=str(folder), experiment_name=n) for n in cfg.logger.names]
+
+
+def finish(run: Run, *, interrupted: bool) -> None:
+    """The last line; exits with 130 after Ctrl-C."""
+    if interrupted:
+        say(f"stopped; go on with: python train.py resume={run.folder}")
+        sys.exit(INTERRUPTED)
+    say(f"results: {run.folder}")

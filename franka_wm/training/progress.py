@@ -1,0 +1,93 @@
+"""What a run says on the terminal while it works."""
+
+from __future__ import annotations
+
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import TextIO
+
+
+def say(text: str, stream: TextIO | None = None) -> None:
+    """One line, at once."""
+    print(text, file=sys.stdout if stream is None else stream, flush=True)
+
+
+def duration(seconds: float) -> str:
+    """``75`` → ``1:15``; ``4000`` → ``1:06:40``."""
+    whole = max(0, round(seconds))
+    hours, rest = divmod(whole, 3600)
+    minutes, rest = divmod(rest, 60)
+    return f"{hours}:{minutes:02d}:{rest:02d}" if hours else f"{minutes}:{rest:02d}"
+
+
+def count(number: float) -> str:
+    """``12345`` → ``12.3k``."""
+    for size, suffix in ((1e9, "G"), (1e6, "M"), (1e3, "k")):
+        if abs(number) >= size:
+            return f"{number / size:.1f}{suffix}"
+    return f"{number:.0f}"
+
+
+@contextmanager
+def announced(what: str, *, every: float = 10.0) -> Iterator[None]:
+    """Says what starts, that it is still going on every so many seconds, and how long it took.
+
+    A thread does the talking, since compiling a kernel does not return to Python.
+    """
+    say(f"{what} …")
+    started = time.perf_counter()
+    finished = threading.Event()
+
+    def talk() -> None:
+        while not finished.wait(every):
+            say(f"  still at it, {duration(time.perf_counter() - started)}")
+
+    thread = threading.Thread(target=talk, daemon=True)
+    thread.start()
+    try:
+        yield
+    finally:
+        finished.set()
+        thread.join()
+    say(f"  done in {time.perf_counter() - started:.1f} s")
+
+
+class Progress:
+    """Prints a line at most every ``every`` seconds: done, rates, time left, and what the caller adds.
+
+    Args:
+        total: Updates in all.
+        done: Updates already made (a resumed run).
+        env_steps: Environment steps already made.
+        every: Seconds between lines.
+    """
+
+    def __init__(self, total: int, *, done: int = 0, env_steps: int = 0, every: float = 10.0):
+        self.total, self.every = total, every
+        self._started = self._last = time.perf_counter()
+        self._first = self._previous = (done, env_steps)
+
+    def due(self) -> bool:
+        """Whether it is time for a line."""
+        return time.perf_counter() - self._last >= self.every
+
+    def line(self, updates: int, env_steps: int, extra: str = "") -> dict[str, float]:
+        """Prints a line; returns the rates since the last one."""
+        now = time.perf_counter()
+        span = max(now - self._last, 1e-9)
+        rates = {
+            "updates_per_s": (updates - self._previous[0]) / span,
+            "env_steps_per_s": (env_steps - self._previous[1]) / span,
+        }
+        done = updates - self._first[0]
+        left = (now - self._started) * (self.total - updates) / done if done else float("nan")
+        say(
+            f"updates {count(updates)}/{count(self.total)} ({rates['updates_per_s']:.0f}/s)   "
+            f"env steps {count(env_steps)} ({count(rates['env_steps_per_s'])}/s)   {extra}   "
+            f"{'left ' + duration(left) if done else ''}"
+        )
+        self._last, self._previous = now, (updates, env_steps)
+        return rates

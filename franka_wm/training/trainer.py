@@ -1,0 +1,241 @@
+"""The loop: gather, update, evaluate, save."""
+
+from __future__ import annotations
+
+import signal
+import time
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import torch
+from omegaconf import DictConfig
+from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModuleBase
+from torchrl.collectors import Collector
+from torchrl.data import ReplayBuffer
+
+from franka_wm.envs import FrankaEnv
+from franka_wm.training.checkpoint import Checkpoint, save_checkpoint
+from franka_wm.training.learner import Learner
+from franka_wm.training.progress import Progress, say
+
+
+class ActingPolicy(TensorDictModuleBase):
+    """One of several policies, exchangeable while a collector runs it."""
+
+    def __init__(self, policies: Mapping[str, TensorDictModuleBase], name: str):
+        super().__init__()
+        self.policies = dict(policies)  # a plain dict: the collector must not copy their models
+        self.out_keys = ["action"]
+        self.use(name)
+
+    def use(self, name: str) -> None:
+        self.name = name
+        self.in_keys = list(self.policies[name].in_keys)  # pyright: ignore[reportAttributeAccessIssue]
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        return self.policies[self.name](tensordict)
+
+
+@contextmanager
+def interruptible() -> Iterator[Any]:
+    """Yields a function that tells whether Ctrl-C was pressed; a second Ctrl-C stops at once."""
+    pressed = False
+
+    def note(signum: int, frame: Any) -> None:
+        nonlocal pressed
+        if pressed:
+            raise KeyboardInterrupt
+        pressed = True
+        say("\ninterrupted: finishing this step and saving; press Ctrl-C again to stop at once")
+
+    try:
+        before = signal.signal(signal.SIGINT, note)
+    except ValueError:  # not in the main thread: the one who started us handles Ctrl-C
+        yield lambda: False
+        return
+    try:
+        yield lambda: pressed
+    finally:
+        signal.signal(signal.SIGINT, before)
+
+
+class Trainer:
+    """Gathers experience and learns from it, in turns.
+
+    Args:
+        env: The training worlds.
+        learner: Updates the model.
+        replay: Receives (worlds, time) batches, gives windows.
+        policies: By name; ``random`` gathers the first steps, ``actor`` the rest.
+        actor: Which of them acts.
+        cfg: The whole configuration; saved with every checkpoint.
+        folder: Of the run.
+        loggers: TorchRL loggers.
+        evaluate: Called now and then with nothing, returns numbers to log.
+    """
+
+    def __init__(
+        self,
+        *,
+        env: FrankaEnv,
+        learner: Learner,
+        replay: ReplayBuffer,
+        policies: Mapping[str, TensorDictModuleBase],
+        actor: str,
+        cfg: DictConfig,
+        folder: Path,
+        loggers: list[Any],
+        evaluate: Any,
+    ):
+        self.env, self.learner, self.replay, self.cfg, self.folder = env, learner, replay, cfg, folder
+        self.model = learner.model
+        self.actor = actor
+        self.loggers = loggers
+        self.evaluate = evaluate
+        self.env_steps = 0
+        self.seconds = 0.0
+        self.rows: list[dict[str, float]] = []
+        self.interrupted = False
+        self._keys = list(self.model.observation_sizes)
+        self._acting = ActingPolicy(policies, "random")
+        self._collector: Collector | None = None
+        self._experience: Iterator[TensorDictBase] | None = None
+
+    # -- the loop -----------------------------------------------------------------------------------------
+
+    def fit(self) -> None:
+        """Trains until ``cfg.trainer.updates``, or until Ctrl-C; writes checkpoints into ``folder``."""
+        trainer = self.cfg.trainer
+        total = trainer.updates
+        started = time.perf_counter() - self.seconds
+        progress = Progress(
+            total, done=self.learner.updates, env_steps=self.env_steps, every=trainer.log_every
+        )
+        evaluated = saved = time.perf_counter()
+        with interruptible() as stop:
+            if len(self.replay) == 0:
+                self.seed()
+            self._acting.use(self.actor)
+            while self.learner.updates < total and not stop():
+                self.gather()
+                for _ in range(min(trainer.updates_per_batch, total - self.learner.updates)):
+                    self.learner.update(self.replay.sample())
+                self.seconds = time.perf_counter() - started
+                now = time.perf_counter()
+                last = self.learner.updates >= total
+                if progress.due() or last:
+                    self.log(progress)
+                if now - evaluated >= self.cfg.evaluation.every and not last:
+                    evaluated = self.record(self.evaluate(), say_it=True)
+                    started += evaluated - now  # seconds count training, not evaluation
+                if now - saved >= trainer.checkpoint_every and not last:
+                    self.save()
+                    saved = time.perf_counter()
+            self.interrupted = stop()
+            self.save()
+        if self._collector is not None:
+            self._collector.shutdown()
+
+    def seed(self) -> None:
+        """Fills the replay with smooth random motion and lets the model see its scale."""
+        collector = self.cfg.collector
+        batches = -(-collector.seed_steps // collector.steps_per_batch)
+        for _ in range(batches):
+            self.gather()
+        if self.cfg.trainer.standardize and not self.learner.updates:  # trained weights know their scale
+            data = self.replay[:]  # (worlds, time): TorchRL gives back what it was extended with
+            seen = torch.cat([data.get(key).flatten(0, 1) for key in self._keys], -1)
+            self.model.set_observation_statistics(seen.mean(0), seen.std(0).clamp_min(1e-3))
+
+    def gather(self) -> None:
+        """One batch of the collector into the replay."""
+        if self._experience is None:
+            collector = self.cfg.collector
+            self._collector = Collector(
+                self.env,
+                self._acting,
+                frames_per_batch=collector.steps_per_batch * self.env.num_envs,
+                total_frames=-1,
+                track_traj_ids=False,
+                no_cuda_sync=True,
+                trust_policy=True,
+            )
+            self._experience = iter(self._collector)
+        batch = next(self._experience)
+        self.env_steps += batch.numel()
+        keys = [*self._keys, "action", "is_init"]
+        after = [("next", key) for key in (*self._keys, "reward", "terminated")]
+        self.replay.extend(batch.select(*keys, *after))
+
+    # -- what is kept and said ------------------------------------------------------------------------------
+
+    def log(self, progress: Progress) -> None:
+        """Reads what the device has summed up, tells the terminal and the loggers."""
+        self.replay.sampler.check()  # type: ignore[union-attr]
+        episodes = self.env.statistics()
+        row = {f"train/{name}": value for name, value in episodes.items()}
+        row |= self.learner.metrics()
+        text = ""
+        if episodes["episodes"]:
+            text = f"return {episodes['return']:.2f}   success {100 * episodes['success']:.0f} %"
+        if episodes["nonfinite"]:
+            text += f"   {episodes['nonfinite']:.0f} worlds broke and were reset"
+        row |= progress.line(self.learner.updates, self.env_steps, text)
+        self.record(row)
+
+    def record(self, numbers: Mapping[str, float], *, say_it: bool = False) -> float:
+        """Adds a row to the history and the loggers; returns the time."""
+        row = dict(numbers)
+        row |= {"env_steps": self.env_steps, "updates": self.learner.updates, "time_s": self.seconds}
+        self.rows.append(row)
+        for logger in self.loggers:
+            for name, value in numbers.items():
+                logger.log_scalar(name, value, step=self.learner.updates)
+        if say_it:
+            say("  " + "   ".join(f"{name} {value:.3f}" for name, value in numbers.items()))
+        return time.perf_counter()
+
+    def save(self) -> Path:
+        """Writes ``checkpoints/latest``."""
+        replay = None
+        if self.cfg.trainer.checkpoint_replay and len(self.replay):
+            replay = self._oldest_first()
+        return save_checkpoint(
+            self.folder / "checkpoints" / "latest",
+            model=self.model,
+            optimizer=self.learner.optimizer,
+            config=self.cfg,
+            counters={"env_steps": self.env_steps, "updates": self.learner.updates, "seconds": self.seconds},
+            replay=replay,
+            extra={"rows": self.rows},
+        )
+
+    def restore(self, checkpoint: Checkpoint) -> None:
+        """Continues from a checkpoint: weights, optimiser, counters, history, experience, random numbers.
+
+        The worlds themselves start new episodes.
+        """
+        checkpoint.load_model(self.model)
+        checkpoint.load_optimizer(self.learner.optimizer)
+        self.learner.updates = int(checkpoint.counters["updates"])
+        self.env_steps = int(checkpoint.counters["env_steps"])
+        self.seconds = float(checkpoint.counters["seconds"])
+        self.rows = list((checkpoint.extra() or {}).get("rows", []))
+        experience = checkpoint.replay(self.env.device)
+        if experience is not None:
+            self.replay.extend(experience)
+        checkpoint.restore_rng()
+        # Otherwise the worlds would repeat the episodes that the first run has already seen.
+        self.env.set_seed(self.cfg.seed + self.env_steps)
+
+    def _oldest_first(self) -> TensorDictBase:
+        """The filled part of the replay, (worlds, time), in the order in which it was gathered."""
+        data = self.replay[:]
+        cursor = self.replay.writer._cursor  # type: ignore[union-attr]
+        full = self.replay.storage._len_along_dim0 == self.replay.storage._storage.shape[0]  # type: ignore[union-attr]
+        if full and cursor:
+            return torch.cat([data[:, cursor:], data[:, :cursor]], 1)  # pyright: ignore[reportReturnType]
+        return data

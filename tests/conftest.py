@@ -1,0 +1,65 @@
+"""What the tests share: small environments, configurations as train.py composes them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+import warp as wp
+from hydra import compose, initialize_config_dir
+from hydra.core.global_hydra import GlobalHydra
+from omegaconf import DictConfig
+
+from franka_wm.envs import FrankaConfig, FrankaEnv
+
+ROOT = Path(__file__).resolve().parents[1]
+
+wp.config.log_level = wp.LOG_WARNING
+
+SMALL = {"substeps": 2, "gravity_compensation": True, "observations": ("state", "joint_target")}
+
+
+@pytest.fixture(scope="session")
+def root() -> Path:
+    """The repository."""
+    return ROOT
+
+
+@pytest.fixture(scope="session")
+def small_env() -> Callable[..., FrankaEnv]:
+    """Makes a cheap environment on the CPU: two substeps, no pictures unless asked for."""
+
+    def make(num_envs: int = 3, *, seed: int = 0, **changes: Any) -> FrankaEnv:
+        config = FrankaConfig(**(SMALL | changes))
+        return FrankaEnv(config, num_envs=num_envs, device="cpu", seed=seed)
+
+    return make
+
+
+@pytest.fixture(scope="session")
+def composed() -> Callable[..., DictConfig]:
+    """The configuration that ``python train.py …`` would run with."""
+
+    def make(*overrides: str) -> DictConfig:
+        GlobalHydra.instance().clear()
+        with initialize_config_dir(str(ROOT / "conf"), version_base="1.3"):
+            return compose("config", overrides=list(overrides))
+
+    return make
+
+
+@pytest.fixture(scope="session")
+def random_actions() -> Callable[..., torch.Tensor]:
+    """Uniform actions (N, T, 7) whose first worlds do not depend on N."""
+
+    def make(num_envs: int, steps: int, seed: int = 0) -> torch.Tensor:
+        worlds = [
+            torch.rand(steps, 7, generator=torch.Generator().manual_seed(1000 * seed + k))
+            for k in range(num_envs)
+        ]
+        return 2 * torch.stack(worlds) - 1
+
+    return make

@@ -1,0 +1,74 @@
+"""Policies that need no learning do what they say."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from tensordict import TensorDict
+
+from franka_wm.data.policies import NoopPolicy, OraclePolicy, SmoothRandomPolicy
+from franka_wm.envs import FrankaEnv
+from franka_wm.errors import UserError
+from franka_wm.training import build
+
+
+@pytest.fixture(scope="module")
+def env(composed) -> FrankaEnv:
+    """The reach preset, as train.py builds it."""
+    return build.make_env(composed("env=reach", "device=cpu"), num_envs=16)
+
+
+def first(num_envs: int, is_init: bool = False) -> TensorDict:
+    return TensorDict({"is_init": torch.full((num_envs, 1), is_init)}, batch_size=[num_envs])
+
+
+def test_noop() -> None:
+    action = NoopPolicy()(first(4))["action"]
+    assert action.shape == (4, 7) and action.dtype == torch.float32 and not action.any()
+
+
+def test_smooth_random_is_smooth_bounded_and_starts_anew() -> None:
+    policy = SmoothRandomPolicy(smoothness=0.8, generator=torch.Generator().manual_seed(0))
+    actions = torch.stack([policy(first(300))["action"] for _ in range(30)], 1)
+    assert actions.abs().max() == 1.0
+
+    def correlation(a: torch.Tensor, b: torch.Tensor) -> float:
+        return torch.corrcoef(torch.stack([a.flatten(), b.flatten()]))[0, 1].item()
+
+    assert correlation(actions[:, :-1], actions[:, 1:]) == pytest.approx(0.8, abs=0.06)
+    assert abs(correlation(actions[:, :-10], actions[:, 10:])) < 0.2
+    spread = actions.transpose(0, 1).flatten(1).std(1)
+    torch.testing.assert_close(spread, spread.mean().expand(30), rtol=0.1, atol=0)
+    # A new episode forgets; the other worlds do not.
+    mixed = first(300)
+    mixed["is_init"][:150] = True
+    following = policy(mixed)["action"]
+    assert abs(correlation(actions[:150, -1], following[:150])) < 0.1
+    assert correlation(actions[150:, -1], following[150:]) == pytest.approx(0.8, abs=0.08)
+
+
+def test_smooth_random_takes_another_number_of_worlds() -> None:
+    policy = SmoothRandomPolicy()
+    assert policy(first(4))["action"].shape == (4, 7)
+    assert policy(first(9))["action"].shape == (9, 7)
+
+
+def test_impossible_smoothness() -> None:
+    with pytest.raises(UserError):
+        SmoothRandomPolicy(smoothness=1.0)
+
+
+def test_oracle_reaches_every_goal(env: FrankaEnv) -> None:
+    oracle = OraclePolicy(env.kinematics, env.config)
+    observation = env.reset(seed=0)
+    start = env.goal_distance()
+    for _ in range(30):
+        observation = env.step(oracle(observation))["next"]
+    assert start.mean() > 0.1
+    assert observation["state"][:, 17:].norm(dim=-1).max() < 0.01
+    assert observation["success"].all()
+
+
+def test_oracle_needs_the_targets() -> None:
+    with pytest.raises(UserError, match="joint_target"):
+        OraclePolicy(None, 0.25)(TensorDict({"goal": torch.zeros(1, 3)}, batch_size=[1]))  # type: ignore[arg-type]

@@ -1,0 +1,153 @@
+"""Windows: contiguous, of one episode, uniform over all there are; also when the buffer wraps around."""
+
+from __future__ import annotations
+
+from collections import Counter
+from unittest import mock
+
+import pytest
+import torch
+from scipy.stats import chisquare
+from tensordict import TensorDict
+from torchrl.data import ReplayBuffer
+
+from franka_wm.data.replay import WindowSampler, make_replay
+from franka_wm.errors import UserError
+
+WORLDS = 3
+
+
+def experience(steps: int, *, start: int = 0, lengths: tuple[int, ...] = (5, 3, 7)) -> TensorDict:
+    """(WORLDS, steps) whose numbers say where they come from; world k has episodes of ``lengths[k]`` steps."""
+    time = torch.arange(start, start + steps).expand(len(lengths), steps)
+    length = torch.tensor(lengths).unsqueeze(1)
+    data = {
+        "time": time,
+        "world": torch.arange(len(lengths)).unsqueeze(1).expand_as(time),
+        "episode": time // length,
+        "is_init": time % length == 0,
+        "state": torch.stack([time, time * 10], -1).float(),
+        "next": TensorDict(
+            {"state": torch.stack([time + 1, time * 10 + 1], -1).float(), "done": (time + 1) % length == 0},
+            batch_size=time.shape,
+        ),
+    }
+    data["is_init"] = data["is_init"].unsqueeze(-1)
+    return TensorDict(data, batch_size=time.shape)
+
+
+def buffer(steps: int, window: int, batch_size: int = 64) -> ReplayBuffer:
+    return make_replay(
+        capacity=steps * WORLDS, num_envs=WORLDS, window=window, batch_size=batch_size, device="cpu"
+    )
+
+
+def whole_windows(first: int, last: int, window: int) -> set[tuple[int, int]]:
+    """(world, first step) of every window of one episode within steps [first, last)."""
+    data = experience(last)
+    return {
+        (world, t)
+        for world in range(WORLDS)
+        for t in range(first, last - window + 1)
+        if data["episode"][world, t] == data["episode"][world, t + window - 1]
+    }
+
+
+@pytest.mark.parametrize("window", [1, 3])
+@pytest.mark.parametrize(("total", "chunk"), [(21, 7), (40, 8), (63, 9), (67, 5)])
+def test_windows(window: int, total: int, chunk: int) -> None:
+    """A buffer of 40 steps: half full, full, wrapped once, wrapped in the middle of a chunk."""
+    torch.manual_seed(0)
+    replay = buffer(40, window, 400)
+    gathered = 0
+    while gathered < total:
+        steps = min(chunk, total - gathered)
+        replay.extend(experience(steps, start=gathered))
+        gathered += steps
+    expected = whole_windows(max(0, total - 40), total, window)
+    counts: Counter[tuple[int, int]] = Counter()
+    for _ in range(60):
+        sample = replay.sample()
+        assert sample.batch_size == (400, window)
+        assert (sample["time"] == sample["time"][:, :1] + torch.arange(window)).all()
+        assert (sample["world"] == sample["world"][:, :1]).all()
+        assert (sample["episode"] == sample["episode"][:, :1]).all()
+        assert (sample["state"][..., 1] == 10 * sample["time"]).all()
+        assert (sample["next", "state"][..., 0] == sample["time"] + 1).all()
+        counts.update(zip(sample["world"][:, 0].tolist(), sample["time"][:, 0].tolist(), strict=True))
+    # All of them, nothing else; the last transition of every episode among them; equally often.
+    assert set(counts) == expected
+    assert chisquare([counts[w] for w in sorted(expected)]).pvalue > 1e-3
+
+
+def test_every_last_transition_can_be_sampled() -> None:
+    torch.manual_seed(0)
+    replay = buffer(40, 3, 500)
+    replay.extend(experience(35))
+    seen = set()
+    for _ in range(20):
+        sample = replay.sample()
+        ends = sample["next", "done"][:, -1]
+        seen |= set(zip(sample["world"][ends, -1].tolist(), sample["time"][ends, -1].tolist(), strict=True))
+        assert not sample["next", "done"][:, :-1].any()
+    data = experience(35)
+    assert seen == {(w, t) for w, t in data["next", "done"].nonzero().tolist()}
+
+
+def test_cost_does_not_depend_on_capacity() -> None:
+    """The same number of candidates, and nothing read but the flags of those."""
+    drawn = []
+    for steps in (20, 2000):
+        replay = buffer(steps, 3, 32)
+        replay.extend(experience(steps))
+        with mock.patch.object(torch, "randint", wraps=torch.randint) as randint:
+            replay.sample()
+        assert randint.call_count == 1
+        drawn.append(randint.call_args.args[1])
+    assert drawn[0] == drawn[1] and drawn[0][0] <= 4 * 32 + 64
+
+
+def test_a_batch_size_of_ones_own() -> None:
+    replay = buffer(40, 3)
+    replay.extend(experience(30))
+    assert replay.sample(7).batch_size == (7, 3)
+
+
+def test_too_few_windows() -> None:
+    replay = buffer(40, 6)
+    replay.extend(experience(5))
+    with pytest.raises(UserError, match="collect more"):
+        replay.sample()
+    replay = buffer(40, 6)
+    replay.extend(experience(30, lengths=(5, 3, 5)))
+    with pytest.raises(UserError, match="too few episodes"):
+        replay.sample()
+
+
+@pytest.mark.parametrize(("capacity", "num_envs"), [(3, 3), (11, 3), (0, 3), (2, 3)])
+def test_capacity_too_small(capacity: int, num_envs: int) -> None:
+    with pytest.raises(UserError, match="at least 12"):
+        make_replay(capacity=capacity, num_envs=num_envs, window=3, batch_size=4, device="cpu")
+
+
+def test_smallest_capacity() -> None:
+    replay = make_replay(capacity=12, num_envs=3, window=3, batch_size=4, device="cpu")
+    replay.extend(experience(4, lengths=(4, 4, 4)))
+    assert replay.sample()["time"].amin() == 0
+
+
+@pytest.mark.parametrize("options", [{"length": 0}, {"length": 2, "oversample": 0}])
+def test_impossible_sampler(options: dict[str, int]) -> None:
+    with pytest.raises(UserError):
+        WindowSampler(buffer(10, 2).writer, **options)
+
+
+def test_round_trip() -> None:
+    replay = buffer(40, 3)
+    data = experience(12)
+    replay.extend(data[:, :7])
+    replay.extend(data[:, 7:])
+    stored = replay[:]  # TorchRL gives it back as it was given: (worlds, time)
+    assert stored.batch_size == (WORLDS, 12)
+    assert (stored == data).all()
+    assert len(replay) == 12 * WORLDS

@@ -1,0 +1,153 @@
+"""Pictures: of the arm, of the right world, where the geometry says."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from tensordict import TensorDict
+
+from franka_wm.envs import FrankaConfig, FrankaEnv
+from franka_wm.envs.camera import look_at, project
+from franka_wm.errors import UserError
+
+PIXELS = {"observations": ("pixels", "state", "joint_target"), "image_size": 48}
+
+
+@pytest.fixture(scope="module")
+def env(small_env) -> FrankaEnv:
+    return small_env(3, **PIXELS)
+
+
+def difference(a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:
+    """Largest difference of the colours, 0 … 255."""
+    return (a.int() - b.int()).abs().amax(-1)
+
+
+def test_the_arm_is_seen(env: FrankaEnv) -> None:
+    """Sky above, ground below, light shells and dark joints in between."""
+    picture = env.reset(seed=0)["pixels"]
+    assert picture.dtype == torch.uint8 and picture.shape == (3, 48, 48, 3)
+    colours = picture.float().mean(-1)
+    assert colours.flatten(1).std(1).min() > 20
+    centre = colours[:, 10:40, 14:34].flatten(1)
+    assert (centre.amax(1) > 200).all() and (centre.amin(1) < 80).all()
+    sky, ground = picture[:, 0, 0].float(), picture[:, -1, 0].float()
+    assert (sky[:, 2] > sky[:, 0] + 20).all() and (ground.mean(-1) < sky.mean(-1) - 40).all()
+
+
+def test_views_differ_between_worlds_and_follow_the_arm(env: FrankaEnv) -> None:
+    first = env.reset(seed=0)
+    for a, b in ((0, 1), (1, 2), (0, 2)):
+        assert (difference(first["pixels"][a], first["pixels"][b]) > 20).float().mean() > 0.02
+    action = torch.zeros(3, 7)
+    action[1] = 1.0
+    after = env.step(first.clone().set("action", action))["next"]
+    changed = (difference(after["pixels"], first["pixels"]) > 20).float().mean((1, 2))
+    assert changed[1] > 0.03 > changed[[0, 2]].max()
+
+
+def test_worlds_are_pictured_as_if_alone(env: FrankaEnv, small_env) -> None:
+    alone = small_env(1, **PIXELS)
+    assert torch.equal(alone.reset(seed=4)["pixels"][0], env.reset(seed=4)["pixels"][0])
+    action = 0.7 * torch.ones(3, 7)
+    ours = env.step(TensorDict({"action": action}, batch_size=[3]))["next", "pixels"]
+    theirs = alone.step(TensorDict({"action": action[:1]}, batch_size=[1]))["next", "pixels"]
+    assert torch.equal(ours[0], theirs[0])
+
+
+def test_masked_reset_pictures_only_what_was_reset(env: FrankaEnv) -> None:
+    step = env.rand_step(env.reset(seed=2))["next"]
+    mask = torch.tensor([[True], [False], [False]])
+    fresh = env.reset(step.clone().set("_reset", mask))
+    assert torch.equal(fresh["pixels"][1:], step["pixels"][1:])
+    assert (difference(fresh["pixels"][0], step["pixels"][0]) > 20).any()
+
+
+def test_render(env: FrankaEnv) -> None:
+    observed = env.reset(seed=0)["pixels"]
+    assert torch.equal(env.render(), observed)
+    picture = env.observe()
+    assert picture.shape == (3, 3, 48, 48) and picture.dtype == torch.float32
+    torch.testing.assert_close(picture, observed.permute(0, 3, 1, 2) / 255.0)
+    plain = env.render(96)
+    smooth = env.render(96, samples=3)
+    assert plain.shape == smooth.shape == (3, 96, 96, 3) and plain.dtype == torch.uint8
+    assert torch.equal(env.render(96, num_views=2), plain[:2])
+    moved = difference(plain, smooth).float()
+    assert 0.01 < (moved > 8).float().mean() < 0.15  # edges only
+    assert moved.mean() < 6
+
+
+def test_render_without_pixels_among_the_observations(small_env) -> None:
+    env = small_env(2)
+    state = env.reset(seed=0)["state"]
+    pictures = env.render(40)
+    assert pictures.shape == (2, 40, 40, 3) and pictures.float().std() > 20
+    assert torch.equal(env.state_observation(), state)
+    assert (difference(pictures[0], pictures[1]) > 20).any()
+
+
+@pytest.mark.parametrize("options", [{"size": 0}, {"samples": 0}, {"num_views": 0}, {"size": -3}])
+def test_impossible_render(env: FrankaEnv, options: dict[str, int]) -> None:
+    with pytest.raises(UserError):
+        env.render(**options)
+
+
+@pytest.mark.parametrize("size", [1, 7, 33])
+def test_any_image_size(small_env, size: int) -> None:
+    picture = small_env(1, observations=("pixels",), image_size=size).reset()["pixels"]
+    assert picture.shape == (1, size, size, 3)
+    assert size == 1 or picture.float().std() > 5
+
+
+def test_shadows_darken_the_ground(small_env) -> None:
+    plain, shadowed = (
+        small_env(1, **PIXELS, enable_shadows=on).reset(seed=0)["pixels"].float() for on in (False, True)
+    )
+    assert (shadowed <= plain + 1).float().mean() > 0.98
+    assert ((plain - shadowed).amax(-1) > 10).float().mean() > 0.01
+
+
+def test_projection_of_known_points() -> None:
+    config, size = FrankaConfig(), 200
+    eye, centre = (1.15, 0.0, 0.65), (0.0, 0.0, 0.45)
+    points = torch.tensor([centre, (0.0, 0.1, 0.45), (0.0, -0.1, 0.45), (0.0, 0.0, 0.55)])
+    seen = project(points, config, size)
+    torch.testing.assert_close(seen[0], torch.tensor([100.0, 100.0]), atol=1e-3, rtol=0)
+    # A point beside the centre, as far away as it: a right triangle.
+    focal = 100 / math.tan(math.radians(30))
+    shift = focal * 0.1 / np.linalg.norm(np.subtract(eye, centre))
+    torch.testing.assert_close(seen[1], torch.tensor([100 + shift, 100.0]).float(), atol=1e-2, rtol=0)
+    torch.testing.assert_close(seen[2], torch.tensor([100 - shift, 100.0]).float(), atol=1e-2, rtol=0)
+    assert seen[3, 1] < 95 and abs(seen[3, 0] - 100) < 1e-3
+    # The top of the picture is 30° above the middle.
+    down = math.atan2(0.2, 1.15)
+    top = torch.tensor(
+        [[eye[0] - math.cos(down - math.radians(30)), 0.0, 0.65 - math.sin(down - math.radians(30))]]
+    )
+    torch.testing.assert_close(project(top, config, size), torch.tensor([[100.0, 0.0]]), atol=1e-2, rtol=0)
+
+
+def test_projection_hits_the_fingers(small_env) -> None:
+    """Only the fingers' opening differs between two pictures; the tool point lies between their tips."""
+    closed, opened = (small_env(3, finger_opening=o, goal_sampling="reachable") for o in (0.0, 0.04))
+    for one in (closed, opened):
+        one.reset(seed=5)
+    marks = project(closed.tool_position(), closed.config, 256)
+    changed = difference(closed.render(256), opened.render(256)) > 25
+    for k in range(3):
+        rows, columns = changed[k].nonzero(as_tuple=True)
+        assert rows.numel() > 20
+        distance = torch.hypot(columns + 0.5 - marks[k, 0], rows + 0.5 - marks[k, 1])
+        assert distance.mean() < 16 and distance.min() < 14, (k, distance.mean(), distance.min())
+
+
+def test_framing(env: FrankaEnv) -> None:
+    assert env.camera_framing == ((1.15, 0.0, 0.65), (0.0, 0.0, 0.45))
+    with pytest.raises(UserError):
+        look_at((1, 1, 1), (1, 1, 1))
+    straight_down = np.array(look_at((0, 0, 2), (0, 0, 0)))
+    assert np.isfinite(straight_down).all()

@@ -1,0 +1,172 @@
+"""What can be asked for, and one line for what cannot."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from omegaconf import OmegaConf
+
+from franka_wm.envs import FrankaConfig, FrankaEnv, resolve_device
+from franka_wm.errors import UserError
+
+STATE = {"observations": ("state",)}
+
+
+def one_line(error: UserError) -> str:
+    text = str(error)
+    assert text and "\n" not in text and len(text) < 300
+    return text
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("substeps", -1),
+        ("substeps", 0),
+        ("substeps", 2.5),
+        ("substeps", True),
+        ("image_size", 0),
+        ("image_size", -64),
+        ("image_size", 100_000),
+        ("action_scale", 0.0),
+        ("action_scale", float("nan")),
+        ("fps", 0),
+        ("fps", "fast"),
+        ("joint_armature", -0.1),
+        ("target_ke", -1.0),
+        ("target_ke", (1.0, 2.0)),
+        ("target_kd", float("inf")),
+        ("target_kd", "stiff"),
+        ("target_ke", None),
+        ("pose_noise", -0.1),
+        ("goal", (0.3, 0.1)),
+        ("goal", (0.3, 0.1, float("nan"))),
+        ("goal", ("a", "b", "c")),
+        ("goal", None),
+        ("goal", 0.3),
+        ("action_penalty", -1),
+        ("camera_fov_degrees", 180),
+        ("camera_distance", None),
+        ("enable_shadows", "yes"),
+        ("solver", "bullet"),
+        ("robot", "ur5"),
+        ("finger_opening", 0.5),
+        ("observations", ()),
+        ("observations", ("state", "state")),
+        ("observations", ("touch",)),
+        ("observations", "state"),
+        ("observations", None),
+        ("episode_length", 0),
+        ("goal_sampling", "sometimes"),
+        ("goal_noise", -1.0),
+        ("success_distance", 0.0),
+        ("terminate_on_success", 1),
+        ("solver_iterations", 0),
+        ("auto_reset", "maybe"),
+    ],
+)
+def test_impossible_value(name: str, value: Any) -> None:
+    with pytest.raises(UserError) as caught:
+        FrankaConfig(**{name: value})
+    assert name in one_line(caught.value)
+
+
+def test_impossible_combinations() -> None:
+    with pytest.raises(UserError):
+        FrankaConfig(camera_distance=0.0, camera_height=0.5, camera_target_height=0.5)
+    with pytest.raises(UserError):
+        FrankaConfig(solver="featherstone", substeps=3)
+
+
+def test_config_is_frozen_and_takes_names_only() -> None:
+    with pytest.raises(dataclasses.FrozenInstanceError):
+        FrankaConfig().substeps = 3  # type: ignore[misc]
+    with pytest.raises(TypeError):
+        FrankaConfig(64)  # type: ignore[misc]
+
+
+def test_unknown_field_lists_the_known() -> None:
+    with pytest.raises(UserError) as caught:
+        FrankaConfig.from_mapping({"substep": 4})
+    text = str(caught.value)
+    assert "'substep'" in text and "substeps" in text and "\n" not in text
+
+
+def test_sequences_from_hydra_become_tuples() -> None:
+    config = FrankaConfig.from_mapping(OmegaConf.create({"goal": [0.3, 0.1, 0.5], "target_ke": [1.0] * 7}))
+    assert config.goal == (0.3, 0.1, 0.5) and config.gains("target_ke") == (1.0,) * 7
+    assert hash(config) == hash(FrankaConfig(goal=(0.3, 0.1, 0.5), target_ke=(1.0,) * 7))
+
+
+def test_the_yaml_lists_every_field_with_its_default(root: Path) -> None:
+    values = OmegaConf.to_container(OmegaConf.load(root / "conf/env/franka.yaml"))
+    assert isinstance(values, dict)
+    assert values.pop("kind") == "franka" and values.pop("urdf_path") is None
+    defaults = dataclasses.asdict(FrankaConfig())
+    assert list(values) == list(defaults)
+    assert FrankaConfig.from_mapping(values) == FrankaConfig()
+
+
+def test_defaults_are_the_documented_ones() -> None:
+    documented = {
+        "image_size": 64,
+        "action_scale": 0.25,
+        "fps": 30,
+        "substeps": 16,
+        "joint_armature": 0.1,
+        "target_ke": 800,
+        "target_kd": 40,
+        "pose_noise": 0.35,
+        "goal": (0.30, 0.15, 0.55),
+        "action_penalty": 0.01,
+        "camera_distance": 1.15,
+        "camera_height": 0.65,
+        "camera_target_height": 0.45,
+        "camera_fov_degrees": 60,
+        "enable_shadows": False,
+        "enable_textures": False,
+        "solver": "auto",
+        "asset_name": "franka_emika_panda",
+        "urdf_relative_path": "urdf/fr3_franka_hand.urdf",
+    }
+    config = FrankaConfig()
+    assert {name: getattr(config, name) for name in documented} == documented
+
+
+@pytest.mark.parametrize("num_envs", [0, -3, 1.5, True, "8"])
+def test_impossible_number_of_worlds(num_envs: Any) -> None:
+    with pytest.raises(UserError) as caught:
+        FrankaEnv(FrankaConfig(**STATE), num_envs=num_envs, device="cpu")
+    assert "num_envs" in one_line(caught.value)
+
+
+def test_goal_out_of_reach() -> None:
+    with pytest.raises(UserError) as caught:
+        FrankaEnv(FrankaConfig(goal=(3.0, 0.0, 0.0), **STATE), device="cpu")
+    assert "reach" in one_line(caught.value)
+
+
+@pytest.mark.parametrize("device", ["tpu", "meta", "mps"])
+def test_impossible_device(device: str) -> None:
+    with pytest.raises(UserError) as caught:
+        resolve_device(device)
+    assert "device=" in one_line(caught.value)
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="needs a machine without CUDA")
+@pytest.mark.parametrize("device", ["cuda", "cuda:1"])
+def test_cuda_where_there_is_none(device: str) -> None:
+    with pytest.raises(UserError) as caught:
+        FrankaEnv(FrankaConfig(**STATE), device=device)
+    assert "device=cpu" in one_line(caught.value)
+    assert resolve_device(None) == resolve_device("auto") == torch.device("cpu")
+
+
+def test_robot_that_needs_a_path() -> None:
+    with pytest.raises(UserError) as caught:
+        FrankaEnv(FrankaConfig(robot="urdf", **STATE), device="cpu")
+    assert "urdf_path" in one_line(caught.value)

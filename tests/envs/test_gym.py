@@ -1,0 +1,155 @@
+"""The Gymnasium view: its spaces, and what it says where an episode ends."""
+
+import gymnasium
+import numpy as np
+import pytest
+import torch
+from gymnasium.vector import AutoresetMode
+
+from franka_wm.envs import FrankaConfig, FrankaEnv
+from franka_wm.envs.gym import REACH_V0, FrankaVectorEnv, register
+from franka_wm.errors import UserError
+
+SMALL = {"image_size": 32, "substeps": 4, "gravity_compensation": True, "device": "cpu"}
+STATE = {**SMALL, "observations": ("state",)}
+
+
+@pytest.fixture
+def actions() -> np.ndarray:
+    return np.random.default_rng(0).uniform(-1, 1, (8, 3, 7)).astype(np.float32)
+
+
+def test_made_by_name_and_inside_its_spaces() -> None:
+    envs = gymnasium.make_vec("franka_wm.envs.gym:FrankaWM/Reach-v0", num_envs=2, image_size=32, device="cpu")
+    assert envs.num_envs == 2
+    assert envs.metadata["autoreset_mode"] is AutoresetMode.SAME_STEP
+    config = envs.unwrapped.env.config
+    assert {key: getattr(config, key) for key in REACH_V0} == REACH_V0
+    observation, info = envs.reset(seed=0)
+    assert envs.observation_space.contains(observation)
+    assert observation["pixels"]["front"].shape == (2, 32, 32, 3)
+    assert set(info) == {"is_success"}
+    envs.action_space.seed(0)
+    actions = envs.action_space.sample()
+    assert actions.shape == (2, 7)
+    observation, reward, terminated, truncated, info = envs.step(actions)
+    assert envs.observation_space.contains(observation)
+    assert envs.single_observation_space.contains({
+        "pixels": {"front": observation["pixels"]["front"][0]},
+        "agent_pos": observation["agent_pos"][0],
+        "environment_state": observation["environment_state"][0],
+    })  # fmt: skip
+    assert reward.shape == terminated.shape == truncated.shape == info["is_success"].shape == (2,)
+    assert terminated.dtype == truncated.dtype == info["is_success"].dtype == np.bool_
+    envs.close()
+    envs.close()
+
+
+def test_registering_again_changes_nothing() -> None:
+    spec = gymnasium.spec("FrankaWM/Reach-v0")
+    register()
+    assert gymnasium.spec("FrankaWM/Reach-v0") is spec
+
+
+@pytest.mark.parametrize("auto_reset", ["native", "standard"])
+def test_it_is_the_same_simulation_across_episode_ends(auto_reset: str, actions: np.ndarray) -> None:
+    """Numbers are the environment's own; at an end, the last and the first observation are where they belong."""
+    options = {**SMALL, "episode_length": 3, "auto_reset": auto_reset}
+    view = FrankaVectorEnv(3, **options)
+    config = FrankaConfig(**{k: v for k, v in options.items() if k != "device"})
+    env = FrankaEnv(config, num_envs=3, device="cpu")
+    observation, _ = view.reset(seed=5)
+    present = env.reset(seed=5)
+    for t, action in enumerate(actions):
+        assert np.array_equal(observation["agent_pos"], present["state"][:, :7].numpy())
+        assert np.array_equal(observation["pixels"]["front"], present["pixels"].numpy())
+        stepped, present = env.step_and_maybe_reset(present.set("action", torch.from_numpy(action)))
+        observation, reward, terminated, truncated, info = view.step(action)
+        after = stepped["next"]
+        assert np.array_equal(reward, after["reward"].squeeze(-1).numpy())
+        assert not terminated.any()
+        ended = (t + 1) % 3 == 0
+        assert truncated.tolist() == [ended] * 3
+        assert ("final_obs" in info) == ("final_info" in info) == ended
+        if ended:
+            assert info["_final_obs"].tolist() == info["_final_info"].tolist() == [True] * 3
+            for k in range(3):
+                last = info["final_obs"][k]
+                assert view.single_observation_space.contains(last)
+                assert np.array_equal(last["agent_pos"], after["state"][k, :7].numpy())
+                assert np.array_equal(last["pixels"]["front"], after["pixels"][k].numpy())
+                assert not np.array_equal(last["agent_pos"], observation["agent_pos"][k])
+
+
+def test_success_is_told_of_the_finished_episode() -> None:
+    view = FrankaVectorEnv(2, **STATE, success_distance=10.0, terminate_on_success=True)
+    view.reset(seed=0)
+    _, _, terminated, truncated, info = view.step(np.zeros((2, 7), np.float32))
+    assert terminated.all()
+    assert not truncated.any()
+    assert info["final_info"]["is_success"].tolist() == [True, True]
+    assert not info["is_success"].any(), "the new episode has not succeeded"
+
+
+def test_seeds_decide_and_lists_of_them_are_gymnasiums() -> None:
+    view = FrankaVectorEnv(3, **STATE, goal_sampling="reachable")
+    first = view.reset(seed=4)[0]
+    assert np.array_equal(view.reset(seed=[4, 5, 6])[0]["agent_pos"], first["agent_pos"])
+    assert np.array_equal(view.reset(seed=4)[0]["environment_state"], first["environment_state"])
+    assert not np.array_equal(view.reset(seed=7)[0]["agent_pos"], first["agent_pos"])
+    assert not np.array_equal(view.reset()[0]["agent_pos"], first["agent_pos"])
+    for wrong in ([4, 4, 4], [4], []):
+        with pytest.raises(UserError, match="share one seed"):
+            view.reset(seed=wrong)
+
+
+def test_some_worlds_can_be_reset(actions: np.ndarray) -> None:
+    view = FrankaVectorEnv(3, **STATE)
+    view.reset(seed=0)
+    before = view.step(actions[0])[0]["agent_pos"]
+    after = view.reset(options={"reset_mask": np.array([False, True, False])})[0]["agent_pos"]
+    assert np.array_equal(before[[0, 2]], after[[0, 2]])
+    assert not np.array_equal(before[1], after[1])
+    # The masked world's clock started again, the others' did not.
+    assert view.env.simulation.step_count.squeeze(-1).tolist() == [1, 0, 1]
+
+
+def test_results_are_not_overwritten_by_the_next_step(actions: np.ndarray) -> None:
+    view = FrankaVectorEnv(3, **SMALL)
+    view.reset(seed=0)
+    observation, reward, *_ = view.step(actions[0])
+    kept = observation["agent_pos"].copy(), observation["pixels"]["front"].copy(), reward.copy()
+    view.step(actions[1])
+    assert np.array_equal(observation["agent_pos"], kept[0])
+    assert np.array_equal(observation["pixels"]["front"], kept[1])
+    assert np.array_equal(reward, kept[2])
+
+
+def test_lerobot_reads_it() -> None:
+    utils = pytest.importorskip("lerobot.envs.utils")
+    view = FrankaVectorEnv(2, **SMALL, render_mode="rgb_array")
+    observation = utils.preprocess_observation(
+        view.reset(seed=[0, 1], options={"lerobot_new_rollout": True})[0]
+    )
+    assert observation["observation.images.front"].shape == (2, 3, 32, 32)
+    assert observation["observation.state"].shape == (2, 7)
+    assert observation["observation.environment_state"].shape == (2, 3)
+    assert view.call("_max_episode_steps")[0] == 50
+    assert view.call("task_description") == ("move the gripper to the goal",) * 2
+    frames = view.call("render")
+    assert len(frames) == 2
+    assert frames[0].shape == (256, 256, 3)
+    assert frames[0].std() > 5
+
+
+def test_wrong_use_is_one_line() -> None:
+    with pytest.raises(UserError, match="agent_pos"):
+        FrankaVectorEnv(1, **{**SMALL, "observations": ("pixels",)})
+    with pytest.raises(UserError, match="unknown environment option"):
+        FrankaVectorEnv(1, gravity=0)
+    view = FrankaVectorEnv(2, **STATE)
+    with pytest.raises(UserError, match="reset"):
+        view.step(np.zeros((2, 7), np.float32))
+    view.reset()
+    with pytest.raises(UserError, match=r"\(2, 7\)"):
+        view.step(np.zeros((3, 7), np.float32))

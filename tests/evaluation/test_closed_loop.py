@@ -1,0 +1,120 @@
+"""Closed-loop evaluation: true ends of whole episodes, on episodes that training never saw."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from tensordict import TensorDict
+
+from franka_wm.data.policies import NoopPolicy, OraclePolicy, SmoothRandomPolicy
+from franka_wm.envs import FrankaEnv
+from franka_wm.errors import UserError
+from franka_wm.evaluation.closed_loop import (
+    EVALUATION_SEED,
+    evaluate_policies,
+    play_episodes,
+    summarize,
+)
+
+LENGTH = 6
+
+
+@pytest.fixture(scope="module")
+def env(small_env) -> FrankaEnv:
+    return small_env(5, episode_length=LENGTH, goal_sampling="reachable")
+
+
+def test_the_true_end_of_each_episode(env: FrankaEnv) -> None:
+    """Of episodes that reset themselves: played by hand, the last state before the reset."""
+    episodes = play_episodes(env, NoopPolicy(), seed=3)
+    observation = env.reset(seed=3)
+    total = torch.zeros(5)
+    for _ in range(LENGTH):
+        observation = env.step(observation.set("action", torch.zeros(5, 7)))["next"]
+        total += observation["reward"].squeeze(-1)
+    assert torch.equal(episodes["final_distance"], observation["state"][:, 17:].norm(dim=-1))
+    torch.testing.assert_close(episodes["return"], total)
+    assert (episodes["length"] == LENGTH).all()
+    # Not the distance in the episode that began then.
+    assert (episodes["final_distance"] - env.goal_distance()).abs().min() > 1e-4
+
+
+def test_doing_nothing_ends_where_it_began(env: FrankaEnv) -> None:
+    episodes = play_episodes(env, NoopPolicy(), seed=3)
+    env.reset(seed=3)
+    torch.testing.assert_close(episodes["final_distance"], env.goal_distance(), atol=0.005, rtol=0)
+
+
+def test_only_the_first_episode_counts(small_env) -> None:
+    """With ends at success, worlds end at different times and go on into episodes that are not counted."""
+    env = small_env(6, episode_length=12, success_distance=0.25, terminate_on_success=True)
+    policy = SmoothRandomPolicy(generator=torch.Generator().manual_seed(0))
+    episodes = play_episodes(env, policy, seed=0)
+    policy = SmoothRandomPolicy(generator=torch.Generator().manual_seed(0))
+    observation = env.reset(seed=0)
+    ends: dict[int, tuple[float, int]] = {}
+    for t in range(12):
+        step, observation = env.step_and_maybe_reset(policy(observation))
+        after = step["next"]
+        for k in after["done"].squeeze(-1).nonzero().flatten().tolist():
+            ends.setdefault(k, (after["state"][k, 17:].norm().item(), t + 1))
+    assert len({length for _, length in ends.values()}) > 1
+    for k, (distance, length) in ends.items():
+        assert episodes["final_distance"][k].item() == pytest.approx(distance)
+        assert episodes["length"][k] == length
+    assert torch.equal(episodes["success_once"], (episodes["final_distance"] < 0.25).float())
+
+
+def test_repeats_are_exact_and_seeds_matter(env: FrankaEnv) -> None:
+    first, second, other = (play_episodes(env, NoopPolicy(), seed=s)["final_distance"] for s in (1, 1, 2))
+    assert torch.equal(first, second) and not torch.isclose(first, other).any()
+
+
+def test_episodes_differ_from_those_of_training(env: FrankaEnv) -> None:
+    evaluated = play_episodes(env, NoopPolicy(), seed=EVALUATION_SEED)["final_distance"]
+    env.reset(seed=0)
+    for _ in range(20):
+        assert not torch.isclose(evaluated.unsqueeze(0), env.goal_distance().unsqueeze(1), atol=1e-5).any()
+        env.reset()
+
+
+def test_video_is_called_before_every_step(env: FrankaEnv) -> None:
+    """One picture for each step's beginning: none shows the next episode."""
+    seen: list[torch.Tensor] = []
+    play_episodes(env, NoopPolicy(), seed=3, video=lambda: seen.append(env.goal))
+    assert len(seen) == LENGTH
+    assert all(torch.equal(goal, seen[0]) for goal in seen)
+
+
+def test_summary() -> None:
+    distance = torch.tensor([0.005, 0.02, 0.04, 0.2])
+    episodes = TensorDict({"final_distance": distance, "return": -distance}, batch_size=[4])
+    summary = summarize(episodes)
+    assert set(summary) == {"final_distance", "success", "return", "episodes"}
+    assert summary["episodes"] == 4
+    assert summary["final_distance"]["mean"] == pytest.approx(distance.mean().item())
+    assert summary["return"]["mean"] == pytest.approx(-distance.mean().item())
+    rates = {name: interval["mean"] for name, interval in summary["success"].items()}
+    assert rates == {"0.05": 0.75, "0.025": 0.5, "0.01": 0.25}
+    for interval in (summary["final_distance"], summary["return"], *summary["success"].values()):
+        assert set(interval) == {"mean", "low", "high"}
+        assert interval["low"] < interval["mean"] < interval["high"]
+
+
+def test_policies_play_the_same_episodes(env: FrankaEnv) -> None:
+    told = []
+    oracle = OraclePolicy(env.kinematics, env.config)
+    results = evaluate_policies(
+        env,
+        {"a": NoopPolicy(), "oracle": oracle, "b": NoopPolicy()},
+        seed=0,
+        report=lambda name, r: told.append(name),
+    )
+    assert told == ["a", "oracle", "b"]
+    assert results["a"] == results["b"]
+    assert results["oracle"]["final_distance"]["mean"] < 0.5 * results["a"]["final_distance"]["mean"]
+
+
+def test_one_episode_has_no_interval(small_env) -> None:
+    with pytest.raises(UserError, match="at least 2"):
+        evaluate_policies(small_env(1), {"noop": NoopPolicy()}, seed=0)

@@ -1,0 +1,177 @@
+import pytest
+import torch
+from torch.nn import functional as F
+
+from franka_wm.models import available, make
+from franka_wm.models.parts import (
+    Ensemble,
+    GaussianPolicy,
+    NormedLinear,
+    RunningScale,
+    SimNorm,
+    TwoHotSymlog,
+    mlp,
+    symexp,
+    symlog,
+)
+
+
+@pytest.fixture(autouse=True)
+def _seed():
+    torch.manual_seed(0)
+
+
+def test_the_registry_names_what_exists():
+    assert "tdmpc2" in available()
+    with pytest.raises(ValueError, match="tdmpc2"):
+        make("nonesuch")
+
+
+def test_simnorm_gives_simplices_within_each_group():
+    groups = SimNorm(4)(5 * torch.randn(3, 2, 12)).unflatten(-1, (3, 4))
+    assert (groups >= 0).all()
+    torch.testing.assert_close(groups.sum(-1), torch.ones(3, 2, 3))
+
+
+def test_mlp_starts_as_published_and_drops_only_in_its_first_layer():
+    network = mlp(10, (200, 200), 7, dropout=0.3)
+    linears = [m for m in network.modules() if isinstance(m, torch.nn.Linear)]
+    assert all((layer.bias == 0).all() for layer in linears)
+    assert linears[1].weight.std().item() == pytest.approx(0.02, rel=0.1)
+    assert [layer.dropout for layer in network if isinstance(layer, NormedLinear)] == [0.3, 0.0]
+    x = torch.randn(4, 10)
+    assert not torch.equal(network(x), network(x))
+    network.eval()
+    assert torch.equal(network(x), network(x))
+
+
+def test_two_hot_round_trip_over_the_whole_range():
+    code = TwoHotSymlog()
+    x = torch.tensor([-2.0e4, -123.4, -1.0, -0.05, 0.0, 0.3, 1.0, 7.7, 60.0, 2.0e4]).unsqueeze(-1)
+    p = code.encode(x)
+    torch.testing.assert_close(p.sum(-1), torch.ones(10))
+    assert ((p > 1e-6).sum(-1) <= 2).all()
+    torch.testing.assert_close(code.decode((p + 1e-30).log()), x, rtol=1e-3, atol=1e-4)
+    torch.testing.assert_close(symexp(symlog(x)), x, rtol=1e-4, atol=1e-5)
+
+
+def test_two_hot_clamps_what_is_out_of_range():
+    code = TwoHotSymlog(bins=11, low=-1.0, high=1.0)
+    p = code.encode(torch.tensor([[-1e6], [1e6]]))
+    assert p[0, 0] == 1 and p[1, -1] == 1
+
+
+def test_two_hot_gradient_is_softmax_minus_target():
+    code = TwoHotSymlog()
+    logits, target = torch.randn(6, 101, requires_grad=True), 3 * torch.randn(6, 1)
+    code.loss(logits, target).sum().backward()
+    torch.testing.assert_close(logits.grad, logits.detach().softmax(-1) - code.encode(target))
+
+
+def test_two_hot_fits_by_gradient_descent():
+    code, target = TwoHotSymlog(), torch.tensor([[-40.0], [0.2], [3.0]])
+    logits = torch.zeros(3, 101, requires_grad=True)
+    optimiser = torch.optim.Adam([logits], lr=0.3)
+    for _ in range(200):
+        optimiser.zero_grad()
+        code.loss(logits, target).mean().backward()
+        optimiser.step()
+    torch.testing.assert_close(code.decode(logits), target, rtol=0.05, atol=0.02)
+
+
+def _ensemble(dropout: float = 0.0) -> Ensemble:
+    ensemble = Ensemble(members=4, in_features=6, hidden=(16, 12), out_features=5, dropout=dropout)
+    with torch.no_grad():
+        for parameter in ensemble.parameters():
+            parameter.add_(0.3 * torch.randn_like(parameter))
+    return ensemble
+
+
+def test_the_ensemble_equals_a_loop_over_its_members():
+    ensemble, x = _ensemble(), torch.randn(3, 7, 6)
+    p = dict(ensemble.named_parameters())
+    expected = []
+    for k in range(4):
+        h = x
+        for i, width in enumerate((16, 12)):
+            h = F.linear(h, p[f"weight_{i}"][k].T, p[f"bias_{i}"][k, 0])
+            h = F.mish(F.layer_norm(h, (width,), p[f"norm_scale_{i}"][k, 0], p[f"norm_shift_{i}"][k, 0]))
+        expected.append(F.linear(h, p["weight_2"][k].T, p["bias_2"][k, 0]))
+    torch.testing.assert_close(ensemble(x), torch.stack(expected))
+    chosen = torch.tensor([3, 1])
+    torch.testing.assert_close(ensemble(x, members=chosen), torch.stack(expected)[chosen])
+
+
+def test_a_fresh_ensemble_has_distinct_members_and_predicts_zero():
+    ensemble = Ensemble(members=3, in_features=6, hidden=(16, 16), out_features=5)
+    assert (ensemble(torch.randn(8, 6)) == 0).all()
+    first = ensemble.get_parameter("weight_0")
+    assert not torch.equal(first[0], first[1])
+
+
+@pytest.mark.parametrize("weights", ["detached", "target"])
+@pytest.mark.parametrize("members", [None, torch.tensor([0, 2])])
+def test_detached_and_target_weights_pass_gradients_to_the_input_alone(weights, members):
+    ensemble, x = _ensemble(), torch.randn(3, 6, requires_grad=True)
+    ensemble.update_target(1.0)
+    torch.testing.assert_close(ensemble(x, weights=weights), ensemble(x))
+    ensemble(x, weights=weights, members=members).sum().backward()
+    assert x.grad is not None and x.grad.abs().sum() > 0
+    assert all(parameter.grad is None for parameter in ensemble.parameters())
+
+
+def test_the_target_moves_by_tau_exactly_and_is_not_trained():
+    ensemble = _ensemble()
+    before = {name: buffer.clone() for name, buffer in ensemble.named_buffers()}
+    live = {name: parameter.detach().clone() for name, parameter in ensemble.named_parameters()}
+    ensemble.update_target(0.25)
+    for name, value in live.items():
+        old = before[f"target_{name}"]
+        torch.testing.assert_close(ensemble.get_buffer(f"target_{name}"), old + 0.25 * (value - old))
+        assert torch.equal(ensemble.get_parameter(name), value)
+
+
+def test_the_ensemble_drops_only_when_asked():
+    ensemble, x = _ensemble(dropout=0.5), torch.randn(9, 6)
+    assert torch.equal(ensemble(x), ensemble(x))
+    assert not torch.equal(ensemble(x, dropout=True), ensemble(x, dropout=True))
+
+
+def test_log_prob_of_the_squashed_gaussian_is_a_density():
+    torch.manual_seed(0)
+    policy = GaussianPolicy(latent_dim=3, hidden=(8,), action_dim=2)
+    z = torch.randn(5, 3)
+    mean, log_std = policy.distribution(z)
+    normal = torch.distributions.Normal(mean, log_std.exp())
+    reference = torch.distributions.TransformedDistribution(
+        normal, torch.distributions.transforms.TanhTransform(cache_size=1)
+    )
+    torch.manual_seed(1)
+    action, log_prob = policy.sample(z)
+    torch.testing.assert_close(
+        log_prob, reference.log_prob(action).sum(-1, keepdim=True), rtol=1e-3, atol=1e-3
+    )
+
+
+def test_policy_is_bounded_and_finite_even_when_saturated():
+    policy = GaussianPolicy(latent_dim=3, hidden=(8,), action_dim=2)
+    with torch.no_grad():
+        policy.network[-1].bias.fill_(40.0)  # type: ignore[union-attr]
+    z = torch.randn(6, 3, requires_grad=True)
+    action, log_prob = policy.sample(z)
+    log_prob.sum().backward()
+    assert (action.abs() <= 1).all() and torch.isfinite(log_prob).all()
+    assert torch.isfinite(policy.network[-1].bias.grad).all()  # type: ignore[union-attr,arg-type]
+    assert (policy.distribution(z)[1] <= 2.0).all()
+    assert torch.equal(policy(z, deterministic=True), policy(z, deterministic=True))
+    assert policy.distribution(z)[1].max().item() == pytest.approx(2.0)
+
+
+def test_running_scale_follows_the_percentile_range():
+    scale, x = RunningScale(tau=0.5), 100 * torch.randn(3, 40)
+    expected = torch.quantile(x, 0.95) - torch.quantile(x, 0.05)
+    scale.update(x)
+    torch.testing.assert_close(scale.value, 0.5 + 0.5 * expected)
+    small = RunningScale(tau=1.0)
+    small.update(0.01 * x / 100)
+    assert small.value == 1.0

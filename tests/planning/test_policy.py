@@ -1,0 +1,229 @@
+# pyright: reportArgumentType=false, reportCallIssue=false, reportAttributeAccessIssue=false
+import copy
+
+import pytest
+import torch
+from tensordict import TensorDict
+from torch import nn
+from torchrl.collectors import Collector
+from torchrl.data import Bounded, Composite, Unbounded
+from torchrl.envs import EnvBase, InitTracker, TransformedEnv
+from torchrl.envs.utils import ExplorationType, check_env_specs, set_exploration_type
+
+from franka_wm.models import make
+from franka_wm.planning import MPPI, GoalDistance, ModelPolicy, PlannerPolicy
+
+HORIZON, GOAL = 3, 2.0
+
+
+@pytest.fixture(autouse=True)
+def _seed():
+    torch.manual_seed(0)
+
+
+class Points(EnvBase):
+    """N points that move by their action; point n's episode lasts 3 + n steps."""
+
+    def __init__(self, n: int = 3) -> None:
+        super().__init__(device="cpu", batch_size=[n])
+        self.observation_spec = Composite(state=Unbounded((n, 2)), shape=(n,))
+        self.action_spec = Bounded(-1.0, 1.0, (n, 2))
+        self.reward_spec = Unbounded((n, 1))
+        flag = Unbounded((n, 1), dtype=torch.bool)
+        self.full_done_spec = Composite(
+            done=flag.clone(), terminated=flag.clone(), truncated=flag.clone(), shape=(n,)
+        )
+        self.lengths = 3 + torch.arange(n).unsqueeze(-1)
+        self.steps = torch.zeros(n, 1, dtype=torch.int64)
+        self.state = torch.zeros(n, 2)
+
+    def _reset(self, tensordict=None):
+        chosen = None if tensordict is None else tensordict.get("_reset", None)
+        where = torch.ones_like(self.steps, dtype=torch.bool) if chosen is None else chosen.view(-1, 1)
+        self.steps = torch.where(where, 0, self.steps)
+        self.state = torch.where(where, torch.rand_like(self.state), self.state)
+        no = torch.zeros_like(where)
+        return TensorDict(
+            {"state": self.state, "done": no, "terminated": no.clone(), "truncated": no.clone()},
+            self.batch_size,
+        )
+
+    def _step(self, tensordict):
+        self.state, self.steps = self.state + tensordict["action"], self.steps + 1
+        truncated = self.steps >= self.lengths
+        reward = -(self.state - GOAL).norm(dim=-1, keepdim=True)
+        return TensorDict(
+            {
+                "state": self.state,
+                "reward": reward,
+                "done": truncated,
+                "truncated": truncated.clone(),
+                "terminated": torch.zeros_like(truncated),
+            },
+            self.batch_size,
+        )
+
+    def _set_seed(self, seed):
+        torch.manual_seed(0 if seed is None else seed)
+
+
+class Exact(nn.Module):
+    """The points' own law as a world model."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.observation_sizes = {"state": 2}
+        self.gain = nn.Parameter(torch.ones(()))
+
+    def encode(self, observation):
+        return observation.get("state")
+
+    def next(self, z, action):
+        return z + self.gain * action
+
+
+class Recording(MPPI):
+    """MPPI that keeps what it was asked to start from."""
+
+    def __init__(self, **settings) -> None:
+        super().__init__(**settings)
+        self.calls = []
+
+    def plan(self, z, next, objective, **options):
+        result = super().plan(z, next, objective, **options)
+        self.calls.append((options["previous"], options["is_init"], result["plan"]))
+        return result
+
+
+def mppi(cls=MPPI):
+    return cls(
+        action_dim=2, horizon=HORIZON, num_samples=64, num_elites=8, num_policy_samples=4, iterations=3
+    )
+
+
+def policy(planner, **options) -> PlannerPolicy:
+    return PlannerPolicy.for_model(
+        Exact(), planner, objective=GoalDistance(torch.full((2,), GOAL)), **options
+    )
+
+
+def observation(n: int = 3) -> TensorDict:
+    return TensorDict({"state": torch.randn(n, 2), "is_init": torch.ones(n, 1, dtype=torch.bool)}, [n])
+
+
+def test_the_toy_environment_is_sound():
+    check_env_specs(Points())
+
+
+def test_a_collector_carries_the_plan_and_clears_it_where_an_episode_begins():
+    planner = mppi(Recording)
+    collector = Collector(
+        TransformedEnv(Points(), InitTracker()), policy(planner), frames_per_batch=3 * 12, total_frames=3 * 24
+    )
+    batches = [batch.clone() for batch in collector]
+    collector.shutdown()
+    data = torch.cat(batches, dim=1)
+    assert data.batch_size == (3, 24) and data["plan"].shape == (3, 24, HORIZON, 2)
+    # where an episode begins: at the start, and after every truncation, each point at its own time
+    begins = torch.cat((torch.ones(3, 1, 1, dtype=torch.bool), data["next", "done"][:, :-1]), dim=1)
+    assert torch.equal(data["is_init"], begins)
+    assert begins.sum(1).flatten().tolist() == [8, 6, 5]
+    # the calls of the rollout itself; collectors may call the policy before, to learn its outputs
+    calls = planner.calls[-24:]
+    for t in range(1, 24):
+        previous, is_init, _ = calls[t]
+        assert previous is not None
+        assert torch.equal(is_init, begins[:, t])
+        inside = ~is_init.squeeze(-1)  # where an episode begins the collector may leave anything
+        assert torch.equal(previous[inside], data["plan"][inside, t - 1])  # carried, across batches too
+        assert previous[inside].abs().min() > 0
+
+
+def test_what_is_carried_matters_only_within_an_episode():
+    decided = policy(mppi(), explore=False)
+    start = observation()
+    misleading = torch.full((3, HORIZON, 2), -1.0)
+
+    def act(td):
+        torch.manual_seed(0)
+        return decided(td)["plan"]
+
+    cold = act(start.clone())
+    assert torch.equal(act(start.clone().set("plan", misleading)), cold)
+    inside = start.clone().set("is_init", torch.tensor([[True], [False], [True]])).set("plan", misleading)
+    changed = (act(inside) != cold).flatten(1).any(1)
+    assert changed.tolist() == [False, True, False]
+
+
+def test_closed_loop_reaches_the_goal():
+    env = TransformedEnv(Points(6), InitTracker())
+    with set_exploration_type(ExplorationType.DETERMINISTIC):
+        rollout = env.rollout(3, policy(MPPI(action_dim=2, horizon=HORIZON, num_samples=256, num_elites=16)))
+    assert (rollout["next", "state"][:, -1] - GOAL).norm(dim=-1).max() < 0.4
+
+
+def test_exploration_follows_torchrl_unless_told():
+    def spread(explore, kind):
+        torch.manual_seed(0)
+        acting = policy(mppi(), explore=explore)
+        with set_exploration_type(kind):
+            td = acting(observation())
+        return (td["action"] - td["plan"][:, 0]).abs().max()
+
+    assert spread(None, ExplorationType.RANDOM) > 0
+    assert spread(None, ExplorationType.DETERMINISTIC) == 0
+    assert spread(True, ExplorationType.DETERMINISTIC) > 0
+    assert spread(False, ExplorationType.RANDOM) == 0
+
+
+def test_mistakes_are_named():
+    acting = policy(mppi())
+    with pytest.raises(ValueError, match="is_init"):
+        acting(observation().exclude("is_init").set("plan", torch.zeros(3, HORIZON, 2)))
+    with pytest.raises(ValueError, match="batch size"):
+        acting(observation()[0])
+    with pytest.raises(ValueError, match="objective"):
+        PlannerPolicy.for_model(Exact(), mppi())
+
+
+def test_a_copy_of_the_policy_uses_its_own_model():
+    """Collectors copy policies; a copy whose callables still point at the original would never be updated."""
+    original = policy(mppi())
+    duplicate = copy.deepcopy(original)
+    assert {id(p) for p in duplicate.parameters()}.isdisjoint({id(p) for p in original.parameters()})
+    with torch.no_grad():
+        duplicate.model.gain.zero_()  # type: ignore[union-attr,operator]
+    z, action = torch.zeros(1, 2), torch.ones(1, 2)
+    assert duplicate.next(z, action).sum() == 0 and original.next(z, action).sum() == 2
+
+
+def tdmpc2():
+    return make(
+        "tdmpc2",
+        observation_sizes={"state": 2},
+        action_dim=2,
+        discount=0.9,
+        latent_dim=16,
+        encoder_dim=16,
+        hidden_dim=16,
+    )
+
+
+def test_a_learned_model_plans_and_acts_inside_a_collector():
+    model = tdmpc2().eval()
+    acting = PlannerPolicy.for_model(model, mppi())
+    assert acting.in_keys == ["state", "is_init"] and acting.out_keys == ["action", "plan"]
+    env = TransformedEnv(Points(), InitTracker())
+    for behaviour in (acting, ModelPolicy.for_model(model)):
+        collector = Collector(env, behaviour, frames_per_batch=12, total_frames=12)
+        (data,) = [batch.clone() for batch in collector]
+        assert data["action"].abs().max() <= 1 and not data["action"].requires_grad
+
+
+def test_the_model_policy_samples_or_takes_the_mode():
+    model, td = tdmpc2(), observation()
+    quiet, noisy = ModelPolicy.for_model(model, explore=False), ModelPolicy.for_model(model, explore=True)
+    assert torch.equal(quiet(td.clone())["action"], quiet(td.clone())["action"])
+    assert not torch.equal(noisy(td.clone())["action"], noisy(td.clone())["action"])
+    mode = model.policy(model.encode(td), deterministic=True)
+    assert torch.equal(quiet(td.clone())["action"], mode)

@@ -1,0 +1,43 @@
+"""The table over seeds."""
+
+import json
+
+import pytest
+
+from franka_wm.errors import UserError
+from franka_wm.report.seeds import read_evaluation, seeds_table, summary
+
+
+def evaluation(distance: float, success: float) -> dict:
+    interval = {"mean": success, "low": 0.0, "high": 1.0}
+    return {
+        "planner": {
+            "final_distance": {"mean": distance, "low": 0.0, "high": 1.0},
+            "success": {key: interval for key in ("0.05", "0.025", "0.01")},
+            "return": {"mean": -1.0, "low": -2.0, "high": 0.0},
+            "episodes": 64,
+        }
+    }
+
+
+def test_mean_and_range_over_runs():
+    table = seeds_table([evaluation(0.01, 1.0), evaluation(0.03, 0.5)])
+    assert "| planner | 2.00 (1.00 – 3.00) | 75 (50 – 100) |" in table
+
+
+def test_summary_reads_folders(tmp_path, capsys):
+    for k, distance in enumerate((0.01, 0.02)):
+        (tmp_path / str(k)).mkdir()
+        (tmp_path / str(k) / "evaluation.json").write_text(json.dumps(evaluation(distance, 1.0)))
+    summary([str(tmp_path / "0"), str(tmp_path / "1")])
+    assert "2 runs of 64 episodes" in (out := capsys.readouterr().out) and "1.50" in out
+
+
+def test_a_run_without_evaluation_is_refused(tmp_path):
+    with pytest.raises(UserError, match="no evaluation"):
+        read_evaluation(tmp_path)
+    (tmp_path / "evaluation.json").write_text("{")
+    with pytest.raises(UserError, match="cannot be read"):
+        read_evaluation(tmp_path)
+    with pytest.raises(UserError, match="needs folders"):
+        summary([])

@@ -1,0 +1,121 @@
+"""``franka-wm``: what it prints, how it fails, and what it does not import."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+import franka_wm
+from franka_wm import cli
+
+
+def test_listing_imports_neither_simulator_nor_torch() -> None:
+    code = (
+        "import sys; from franka_wm import cli; assert cli.main(['list']) == 0;"
+        "print([m for m in ('torch', 'newton', 'warp', 'torchrl', 'hydra', 'numpy') if m in sys.modules])"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.splitlines()[-1] == "[]"
+
+
+def test_list_names_everything_with_one_line(capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.main(["list"]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    entries = [line.split(maxsplit=1) for line in lines if line.startswith("  ")]
+    names = {entry[0] for entry in entries}
+    conf = Path(franka_wm.__file__).parents[1] / "conf"
+    assert names >= {file.stem for group in ("env", "planner") for file in (conf / group).glob("*.yaml")}
+    assert names >= {"embedded", "reach", "tdmpc2"}
+    assert all(len(entry) == 2 for entry in entries), "an entry has no description"
+
+
+def test_robots_are_those_that_the_config_accepts() -> None:
+    from franka_wm.envs import FrankaConfig
+
+    with pytest.raises(ValueError, match="must be one of") as error:
+        FrankaConfig(robot="?")
+    accepted = str(error.value).split("must be one of ")[1].split(", ")
+    assert sorted(cli.ROBOTS) == sorted(accepted)
+
+
+def test_tasks_are_those_that_the_config_accepts() -> None:
+    from franka_wm.envs import FrankaConfig
+
+    with pytest.raises(ValueError, match="must be one of") as error:
+        FrankaConfig(task="?")
+    accepted = str(error.value).split("must be one of ")[1].split(", ")
+    assert sorted(cli.tasks()) == sorted(accepted)
+    assert all(cli.tasks().values())
+
+
+def test_unknown_verb_is_one_line_and_status_2(capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.main(["fly"]) == 2
+    captured = capsys.readouterr()
+    assert captured.out == ""
+    assert captured.err.startswith("error: no verb 'fly'")
+    assert captured.err.count("\n") == 1
+
+
+@pytest.mark.parametrize("arguments", [["bench", "nothing"], ["list", "x"]])
+def test_bad_arguments_are_one_line(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.main(arguments) == 1
+    assert capsys.readouterr().err.count("\n") == 1
+
+
+def test_version_and_help(capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.main(["--version"]) == 0
+    assert capsys.readouterr().out == f"franka-wm {franka_wm.__version__}\n"
+    assert cli.main(["--help"]) == 0
+    out = capsys.readouterr().out
+    assert all(f"franka-wm {verb}" in out for verb in cli.VERBS)
+
+
+def test_a_verb_is_one_line_in_the_table(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "a_verb.py").write_text(
+        "from franka_wm.errors import UserError\n"
+        "def run(arguments):\n"
+        "    if arguments: raise UserError('bad:\\n  ' + arguments[0])\n"
+        "    return 7\n"
+    )
+    monkeypatch.syspath_prepend(str(tmp_path))
+    monkeypatch.setitem(cli.VERBS, "try", ("a_verb:run", "", "a verb"))
+    assert cli.main(["try"]) == 7
+    assert cli.main(["try", "x"]) == 1
+    assert capsys.readouterr().err == "error: bad: x\n"
+
+
+def test_bench_runs_the_script_with_its_arguments_and_status(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "benchmarks").mkdir()
+    (tmp_path / "pyproject.toml").touch()
+    (tmp_path / "benchmarks" / "common.py").write_text("FACTOR = 2\n")
+    (tmp_path / "benchmarks" / "tiny.py").write_text(
+        "import sys\nfrom common import FACTOR\nprint(FACTOR, sys.argv[1:])\nsys.exit(3)\n"
+    )
+    monkeypatch.setattr(cli, "CHECKOUT", tmp_path)
+    assert cli.main(["bench", "tiny", "--worlds", "4"]) == 3
+    assert "2 ['--worlds', '4']" in capfd.readouterr().out
+    assert cli.main(["bench", "common"]) == 1, "common is no benchmark"
+
+
+def test_outside_a_checkout_bench_says_so_and_list_still_lists(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(cli, "CHECKOUT", tmp_path)
+    assert cli.main(["bench", "env"]) == 1
+    error = capsys.readouterr().err
+    assert error.count("\n") == 1
+    assert "checkout" in error
+    assert cli.main(["list"]) == 0
+    assert "tdmpc2" in capsys.readouterr().out
+
+
+def test_list_into_a_closed_pipe_leaves_no_traceback() -> None:
+    command = f"{sys.executable} -m franka_wm.cli list | true"
+    done = subprocess.run(["bash", "-c", command], capture_output=True, text=True, check=False)
+    assert "Traceback" not in done.stderr
+    assert "BrokenPipe" not in done.stderr

@@ -1,0 +1,305 @@
+"""``python train.py``: one run from nothing to its report, going on, Ctrl-C, and one line for what cannot be."""
+
+from __future__ import annotations
+
+import json
+import os
+import runpy
+import shutil
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import av
+import pytest
+from hydra.core.global_hydra import GlobalHydra
+from omegaconf import OmegaConf
+
+from franka_wm.errors import FrankaError
+from franka_wm.training.checkpoint import latest_checkpoint, load_checkpoint
+from franka_wm.training.entry import check_command, with_scale
+
+TRAIN = Path(__file__).resolve().parents[1] / "train.py"
+LENGTH = 20
+SMOKE = ["scale=smoke", "device=cpu", f"env.episode_length={LENGTH}", "env.substeps=2"]
+
+
+def train(*arguments: str, cwd: Path) -> subprocess.CompletedProcess[str]:
+    """In a process of its own, in a folder of its own."""
+    command = [sys.executable, str(TRAIN), *arguments]
+    return subprocess.run(command, cwd=cwd, capture_output=True, text=True, timeout=240, check=False)
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory) -> tuple[Path, subprocess.CompletedProcess[str]]:
+    """The smoke run: its folder and what it said."""
+    place = tmp_path_factory.mktemp("smoke")
+    done = train(*SMOKE, f"hydra.run.dir={place}/run", cwd=place)
+    assert done.returncode == 0, done.stdout + done.stderr
+    return place / "run", done
+
+
+# -- a run -----------------------------------------------------------------------------------------------
+
+
+def test_what_it_says(run) -> None:
+    folder, done = run
+    lines = done.stdout.strip().splitlines()
+    assert lines[-1] == f"results: {folder}"
+    assert any(line.startswith("updates 30/30") for line in lines)
+    assert "compiles kernels" in done.stdout
+    assert "Traceback" not in done.stderr
+
+
+def test_evaluation_json(run) -> None:
+    results = json.loads((run[0] / "evaluation.json").read_text())
+    assert set(results) == {"planner", "policy", "noop", "random", "oracle"}
+    for name, result in results.items():
+        assert set(result) == {"final_distance", "success", "return", "episodes"}, name
+        assert result["episodes"] == 4
+        assert set(result["success"]) == {"0.05", "0.025", "0.01"}
+        for interval in (result["final_distance"], result["return"], *result["success"].values()):
+            assert set(interval) == {"mean", "low", "high"}
+            assert interval["low"] <= interval["mean"] <= interval["high"]
+        assert -LENGTH * 1.01 <= result["return"]["mean"] <= 0
+    assert results["oracle"]["final_distance"]["mean"] < 0.05 < results["noop"]["final_distance"]["mean"]
+
+
+def test_what_it_leaves(run) -> None:
+    folder = run[0]
+    for name in ("evaluation.md", "curves.png", "last_frame.png", "csv", "tensorboard"):
+        assert (folder / name).exists(), name
+    assert (folder / "curves.png").read_bytes().startswith(b"\x89PNG")
+    cfg = OmegaConf.load(folder / "config.yaml")
+    assert cfg.scale == "smoke" and cfg.env.episode_length == LENGTH and cfg.model.latent_dim == 32
+    assert "${" not in (folder / "config.yaml").read_text()
+    losses = list(folder.glob("csv/**/loss.csv"))
+    assert losses and losses[0].read_text().strip()
+
+
+def test_video(run) -> None:
+    """As many frames as an episode has steps, and the arm moves in it."""
+    with av.open(str(run[0] / "video.mp4")) as film:
+        frames = [frame.to_ndarray(format="rgb24").astype(int) for frame in film.decode(video=0)]
+    assert len(frames) == LENGTH
+    assert all(frame.std() > 10 for frame in frames)
+    assert (abs(frames[0] - frames[-1]).max(-1) > 40).mean() > 0.005
+
+
+def test_checkpoint(run) -> None:
+    checkpoint = load_checkpoint(latest_checkpoint(run[0]))
+    assert checkpoint.counters["updates"] == 30
+    assert checkpoint.counters["env_steps"] == 8 * (10 + 15)
+
+
+def test_going_on(run, tmp_path: Path) -> None:
+    done = train(f"resume={run[0]}", "trainer.updates=50", f"hydra.run.dir={tmp_path}/more", cwd=tmp_path)
+    assert done.returncode == 0, done.stdout + done.stderr
+    before, after = (load_checkpoint(latest_checkpoint(f)) for f in (run[0], tmp_path / "more"))
+    assert after.counters["updates"] == 50
+    assert after.counters["env_steps"] == before.counters["env_steps"] + 8 * 10  # no second seed phase
+    assert after.counters["seconds"] > before.counters["seconds"]
+    history = after.extra()["rows"]
+    assert history[: len(before.extra()["rows"])] == before.extra()["rows"]
+    assert before.replay().numel() == 8 * 25 and after.replay().numel() == 8 * 35
+    assert (tmp_path / "more" / "evaluation.json").exists()
+    assert after.config.model == before.config.model  # of the checkpoint, not of the scale of this machine
+
+
+def test_ctrl_c(tmp_path: Path) -> None:
+    """Exit status 130, and a whole checkpoint to go on from."""
+    command = [sys.executable, "-u", str(TRAIN), *SMOKE, "trainer.updates=1000000", "trainer.log_every=0.2"]
+    process = subprocess.Popen(
+        [*command, f"hydra.run.dir={tmp_path}/run"],
+        cwd=tmp_path,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+    )
+    assert process.stdout is not None
+    said = []
+    try:
+        for line in process.stdout:
+            said.append(line)
+            if line.startswith("updates"):
+                process.send_signal(signal.SIGINT)
+                break
+        said.append(process.communicate(timeout=60)[0])
+    finally:
+        process.kill()
+    text = "".join(said)
+    assert process.returncode == 130, text
+    assert "Traceback" not in text and f"resume={tmp_path}/run" in text
+    checkpoint = load_checkpoint(latest_checkpoint(tmp_path / "run"))
+    assert 0 < checkpoint.counters["updates"] < 1_000_000
+    assert checkpoint.replay() is not None
+    assert not (tmp_path / "run" / "evaluation.json").exists()
+
+
+# -- bad input -------------------------------------------------------------------------------------------
+
+
+def assert_one_line(text: str) -> None:
+    lines = text.strip().splitlines()
+    assert len(lines) == 1 and lines[0].startswith("error: "), text
+
+
+@pytest.fixture
+def refuse(tmp_path: Path, monkeypatch, capfd):
+    """Runs train.py in this process; returns the one line with which it refuses."""
+
+    def refuse(*arguments: str, folder: Path = tmp_path / "run") -> str:
+        monkeypatch.chdir(tmp_path)
+        monkeypatch.setattr(sys, "argv", [str(TRAIN), "scale=smoke", *arguments, f"hydra.run.dir={folder}"])
+        GlobalHydra.instance().clear()
+        capfd.readouterr()
+        with pytest.raises(SystemExit) as caught:
+            runpy.run_path(str(TRAIN), run_name="__main__")
+        assert caught.value.code == 1
+        text = capfd.readouterr().err
+        text = "\n".join(line for line in text.splitlines() if not line.startswith("Warp CUDA warning"))
+        assert_one_line(text)
+        return text
+
+    return refuse
+
+
+@pytest.mark.parametrize(
+    ("override", "named"),
+    [
+        ("collector.num_env=3", "num_env"),
+        ("env=fly", "fly"),
+        ("model=crystal_ball", "crystal_ball"),
+        ("env.substep=3", "substep"),
+        ("+env.substep=3", "substep"),
+        ("env.substeps=-1", "substeps"),
+        ("env.goal=null", "goal"),
+        ("env.image_size=0", "image_size"),
+        ("collector.num_envs=0", "num_envs"),
+        ("device=tpu", "tpu"),
+        ("seed=abc", "seed"),
+        ("env.substeps=", "substeps"),
+        ("nonsense", "nonsense"),
+    ],
+)
+def test_bad_values(override: str, named: str, refuse) -> None:
+    assert named in refuse(override)
+
+
+@pytest.mark.parametrize(
+    ("overrides", "named"),
+    [
+        (["env=reach_fixed", "env.goal=[3,0,0]"], "goal"),
+        (["replay.capacity=6"], "capacity"),
+        (["trainer.lr=-1"], "lr"),
+        (["collector.smoothness=1.5"], "smoothness"),
+        (["evaluation.during=[nobody]"], "nobody"),
+        (["logger.names=[carrier_pigeon]"], "carrier_pigeon"),
+        (["planner.num_elites=0"], "num_elites"),
+        (["model.latent_dim=-8"], "latent_dim"),
+    ],
+)
+def test_bad_values_that_only_a_part_knows(overrides: list[str], named: str, refuse) -> None:
+    assert named in refuse("collector.num_envs=2", "evaluation.episodes=2", *overrides)
+
+
+@pytest.mark.parametrize(
+    "override",
+    [
+        "collector.num_env=3",
+        "env=fly",
+        "env.substeps=-1",
+        "collector.num_envs=0",
+        "device=tpu",
+        "resume=nowhere",
+        "env.goal_sampling=fixed env.goal=[3,0,0]",
+        "trainer.lr=-1",
+        "logger.names=[carrier_pigeon]",
+    ],
+)
+def test_a_refusal_leaves_nothing_behind(override: str, refuse, tmp_path: Path) -> None:
+    """No folder that looks like the results of a run."""
+    refuse("collector.num_envs=2", "evaluation.episodes=2", *override.split())
+    assert sorted(tmp_path.rglob("*")) == []
+
+
+def test_cuda_where_there_is_none(refuse) -> None:
+    import torch
+
+    if torch.cuda.is_available():
+        pytest.skip("this machine has CUDA")
+    assert "device=cpu" in refuse("device=cuda")
+
+
+def test_a_folder_that_cannot_be(refuse, tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("in the way")
+    assert "not a folder" in refuse(folder=tmp_path / "file" / "run")
+    assert (tmp_path / "file").read_text() == "in the way"
+
+
+@pytest.mark.skipif(os.geteuid() == 0, reason="root may write everywhere")
+def test_a_folder_that_is_read_only(refuse, tmp_path: Path) -> None:
+    (tmp_path / "locked").mkdir(mode=0o500)
+    assert "not writable" in refuse(folder=tmp_path / "locked" / "run")
+
+
+def test_going_on_from_nothing(refuse, tmp_path: Path) -> None:
+    assert "nowhere" in refuse(f"resume={tmp_path}/nowhere")
+    (tmp_path / "empty").mkdir()
+    assert "empty" in refuse(f"resume={tmp_path}/empty")
+
+
+def test_going_on_from_a_truncated_checkpoint(run, refuse, tmp_path: Path) -> None:
+    broken = tmp_path / "broken"
+    shutil.copytree(latest_checkpoint(run[0]), broken)
+    weights = broken / "model.safetensors"
+    weights.write_bytes(weights.read_bytes()[:-100])
+    assert "model.safetensors" in refuse(f"resume={broken}")
+
+
+def test_going_on_with_another_model(run, refuse) -> None:
+    refuse(f"resume={run[0]}", "model=tdmpc2")  # a group
+    refuse(f"resume={run[0]}", "model.latent_dim=64")  # a size that the weights do not have
+
+
+def test_going_on_with_an_unknown_option(run, refuse) -> None:
+    assert "updatez" in refuse(f"resume={run[0]}", "trainer.updatez=3")
+
+
+def test_in_a_process_of_its_own(tmp_path: Path) -> None:
+    done = train("env.substeps=-1", cwd=tmp_path)
+    assert done.returncode == 1
+    assert_one_line(done.stderr)
+    assert "substeps" in done.stderr
+
+
+def test_help_explains_the_groups(tmp_path: Path) -> None:
+    done = train("--help", cwd=tmp_path)
+    assert done.returncode == 0
+    for word in ("env:", "model:", "planner:", "scale:", "reach_fixed_pixels", "resume", "num_samples"):
+        assert word in done.stdout, word
+
+
+# -- the command line, without a run ---------------------------------------------------------------------
+
+
+def test_scale_is_chosen_by_the_device(capsys) -> None:
+    assert with_scale(["scale=smoke", "seed=1"]) == ["scale=smoke", "seed=1"]
+    assert capsys.readouterr().out == ""
+    assert with_scale(["device=cpu"]) == ["device=cpu", "scale=laptop"]
+    assert "scale=laptop" in capsys.readouterr().out
+    assert with_scale(["device=cuda", "scale=auto"]) == ["device=cuda", "scale=gpu"]
+
+
+def test_check_command(monkeypatch, tmp_path: Path) -> None:
+    monkeypatch.setattr(sys, "argv", [str(TRAIN)])
+    monkeypatch.chdir(tmp_path)
+    assert check_command(["env=reach", "scale=smoke", "hydra.run.dir=somewhere"]) is None
+    problem = check_command(["env=fly"])
+    assert problem is not None and "reach_fixed" in problem and "\n" not in problem
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_errors_are_one_line() -> None:
+    assert str(FrankaError("first\n  second")) == "first second"

@@ -1,0 +1,59 @@
+"""The package as a whole: what importing it costs, and what its files promise."""
+
+import re
+import subprocess
+import sys
+import tomllib
+from pathlib import Path
+
+import franka_wm
+from franka_wm.errors import FrankaError, UserError
+
+ROOT = Path(__file__).parents[1]
+
+
+def test_import_is_light() -> None:
+    heavy = ["torch", "tensordict", "torchrl", "warp", "newton", "lerobot", "matplotlib", "numpy", "hydra"]
+    code = f"import sys, franka_wm, franka_wm.errors; print([m for m in {heavy} if m in sys.modules])"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=ROOT)
+    assert done.stdout.strip() == "[]"
+
+
+def test_report_does_not_load_what_it_may_not_need() -> None:
+    heavy = ["matplotlib", "av", "PIL", "rich"]
+    modules = ", ".join(f"franka_wm.report.{m}" for m in ("curves", "style", "table"))
+    code = f"import sys, {modules}; print([m for m in {heavy} if m in sys.modules])"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=ROOT)
+    assert done.stdout.strip() == "[]"
+
+
+def test_version_is_the_one_in_pyproject() -> None:
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    assert project["version"] == franka_wm.__version__
+
+
+def test_lock_holds_hashes_and_no_addresses() -> None:
+    lock = (ROOT / "requirements.lock").read_text()
+    assert "://" not in lock
+    assert "--index-url" not in lock
+    packages = re.findall(r"^[A-Za-z0-9][^ ]*==", lock, flags=re.MULTILINE)
+    entries = re.split(r"^(?=[A-Za-z0-9])", lock, flags=re.MULTILINE)[1:]
+    assert len(packages) == len(entries) > 50
+    assert all("--hash=sha256:" in entry for entry in entries)
+
+
+def test_lock_covers_every_direct_dependency() -> None:
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    wanted = [*project["dependencies"], *project["optional-dependencies"]["dev"], "setuptools"]
+    names = {re.split(r"[\[<>=~! ]", w)[0].lower() for w in wanted}
+    locked = {
+        n.lower() for n in re.findall(r"^([A-Za-z0-9._-]+)==", (ROOT / "requirements.lock").read_text(), re.M)
+    }
+    assert names <= locked
+
+
+def test_user_error_is_one_line_and_a_value_error() -> None:
+    error = UserError("num_envs is 0;\n   at least 1 is needed")
+    assert str(error) == "num_envs is 0; at least 1 is needed"
+    assert isinstance(error, ValueError)
+    assert isinstance(error, FrankaError)

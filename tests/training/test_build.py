@@ -1,0 +1,111 @@
+"""From configuration to parts: every preset builds, what cannot be is refused before anything is built."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from franka_wm.envs import FrankaConfig
+from franka_wm.errors import UserError
+from franka_wm.training import build
+
+ROOT = Path(__file__).resolve().parents[2]
+
+
+def options(group: str) -> list[str]:
+    return sorted(path.stem for path in (ROOT / "conf" / group).glob("*.yaml"))
+
+
+def test_every_group_is_there() -> None:
+    groups = {path.name for path in (ROOT / "conf").iterdir() if path.is_dir()}
+    wanted = "env model planner collector replay trainer logger evaluation scale dataset"
+    assert set(wanted.split()) <= groups
+    assert {"reach", "reach_fixed", "reach_pixels", "reach_fixed_pixels"} <= set(options("env"))
+    assert {"laptop", "gpu", "smoke"} <= set(options("scale"))
+
+
+@pytest.mark.parametrize("name", options("env"))
+def test_every_environment_preset(name: str, composed) -> None:
+    cfg = composed(f"env={name}")
+    build.check(cfg)
+    values = build.plain(cfg.env)
+    assert values.pop("kind") == "franka"
+    values.pop("urdf_path")
+    config = FrankaConfig.from_mapping(values)
+    assert ("pixels" in config.observations) == (name.endswith("pixels") or name == "franka")
+    if "fixed" in name:
+        assert config.goal_sampling == "fixed" and config.episode_length == 20
+    elif name != "franka":
+        assert config.goal_sampling == "reachable"
+
+
+@pytest.mark.parametrize("name", options("scale"))
+def test_every_scale(name: str, composed) -> None:
+    cfg = composed(f"scale={name}")
+    build.check(cfg)
+    assert cfg.scale == name
+    build.make_planner(cfg, 7)
+
+
+@pytest.mark.parametrize(
+    "group", ["collector", "replay", "trainer", "logger", "evaluation", "model", "planner"]
+)
+def test_every_other_option(group: str, composed) -> None:
+    assert options(group)
+    for name in options(group):
+        build.check(composed(f"{group}={name}"))
+
+
+def test_the_default_is_to_reach_sampled_goals(composed) -> None:
+    cfg = composed()
+    assert cfg.env.goal_sampling == "reachable" and cfg.env.gravity_compensation is True
+    assert cfg.evaluation.episodes >= 64 and cfg.trainer.checkpoint_replay is True
+
+
+def test_environments_of_a_run(composed) -> None:
+    cfg = composed(
+        "env=reach_pixels", "device=cpu", "env.image_size=8", "env.substeps=1", "collector.num_envs=2"
+    )
+    env = build.make_env(cfg)
+    assert env.num_envs == 2 and set(env.config.observations) == {"pixels", "state", "joint_target"}
+    judge = build.make_evaluation_env(cfg, num_envs=3)
+    assert judge.num_envs == 3 and set(judge.config.observations) == {"state", "joint_target"}
+
+
+@pytest.mark.parametrize(
+    ("override", "named"),
+    [
+        ("env.substeps=-1", "substeps"),
+        ("env.image_size=0", "image_size"),
+        ("env.observations=[pixels]", "observations"),
+        ("env.observations=[depth]", "observations"),
+        ("env.goal=null", "goal"),
+        ("env.target_ke=stiff", "target_ke"),
+        ("env.episode_length=2", "episode_length"),
+        ("collector.num_envs=0", "num_envs"),
+        ("collector.num_envs=2.5", "num_envs"),
+        ("collector.acts=oracle", "acts"),
+        ("collector.steps_per_batch=0", "steps_per_batch"),
+        ("collector.seed_steps=0", "seed_steps"),
+        ("replay.window=0", "window"),
+        ("replay.batch_size=-1", "batch_size"),
+        ("trainer.updates=-1", "updates"),
+        ("trainer.updates_per_batch=0", "updates_per_batch"),
+        ("evaluation.episodes=1", "episodes"),
+        ("evaluation.video_size=97", "video_size"),
+        ("device=tpu", "tpu"),
+    ],
+)
+def test_refused_before_anything_is_built(override: str, named: str, composed) -> None:
+    cfg = composed(override)
+    with pytest.raises(UserError) as caught:
+        build.check(cfg)
+    assert named in str(caught.value) and "\n" not in str(caught.value)
+
+
+def test_planner_and_model_that_do_not_exist(composed, small_env) -> None:
+    with pytest.raises(UserError, match="planner"):
+        build.make_planner(composed("planner.name=crystal_ball"), 7)
+    with pytest.raises(UserError, match="model"):
+        build.make_model(composed("model.name=oracle_bone"), small_env(1))

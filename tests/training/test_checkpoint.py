@@ -1,0 +1,525 @@
+"""Checkpoints: exact after a round trip, whole after a kill at any step, and clear about what is wrong."""
+
+import json
+import os
+import random
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from omegaconf import OmegaConf
+from tensordict import TensorDict, TensorDictParams
+from torch import Tensor, nn
+
+from franka_wm.errors import UserError
+from franka_wm.training.checkpoint import latest_checkpoint, load_checkpoint, save_checkpoint
+
+
+class Small(nn.Module):
+    """Weights, a buffer, a tied weight, an integer buffer, and a TensorDict of parameters."""
+
+    def __init__(self, hidden: int = 16) -> None:
+        super().__init__()
+        self.first = nn.Linear(20, hidden)
+        self.norm = nn.BatchNorm1d(hidden)
+        self.second = nn.Linear(hidden, hidden)
+        self.tied = nn.Linear(hidden, hidden, bias=False)
+        self.tied.weight = self.second.weight
+        heads = TensorDict(
+            {"q": {"weight": torch.randn(5, hidden)}, "bias": torch.zeros(5, 1)}, batch_size=[5]
+        )
+        self.heads = TensorDictParams(heads)
+
+    def forward(self, x: Tensor) -> Tensor:
+        """(B, 20) -> (B, 5)"""
+        h = self.tied(self.second(torch.relu(self.norm(self.first(x)))))
+        return h @ self.heads["q", "weight"].T + self.heads["bias"].T
+
+
+class Other(nn.Module):
+    def __init__(self) -> None:
+        super().__init__()
+        self.encoder = nn.Linear(3, 3)
+
+
+def train(model: nn.Module, optimizer: torch.optim.Optimizer, steps: int) -> None:
+    """A few updates whose data comes from the global generator, so that RNG state matters too."""
+    device = next(model.parameters()).device
+    for _ in range(steps):
+        optimizer.zero_grad()
+        model(torch.randn(8, 20).to(device)).square().mean().backward()
+        optimizer.step()
+
+
+def save(folder: Path, model: nn.Module | None = None, *, step: int = 0, **others) -> Path:
+    return save_checkpoint(
+        folder,
+        model=Small() if model is None else model,
+        config={"env": {"name": "reach"}, "seed": 3},
+        counters={"env_steps": step},
+        **others,
+    )
+
+
+def some_replay() -> TensorDict:
+    return TensorDict(
+        {
+            "state": torch.randn(6, 4, 20),
+            "pixels": torch.randint(0, 256, (6, 4, 8, 8, 3), dtype=torch.uint8),
+            "half": torch.randn(6, 4, 2).bfloat16(),
+            "next": {"done": torch.rand(6, 4, 1) > 0.5, "stats": {"length": torch.arange(24).view(6, 4, 1)}},
+        },
+        batch_size=[6, 4],
+    )
+
+
+# -- round trips -----------------------------------------------------------------------------------------
+
+
+def test_weights_buffers_and_config_come_back(tmp_path: Path) -> None:
+    model = Small()
+    train(model, torch.optim.SGD(model.parameters(), lr=0.1), 3)
+    config = OmegaConf.create({"lr": 1e-3, "half": "${lr}", "steps": [1, 2], "path": tmp_path, "none": None})
+    counters = {"env_steps": 12_345_678_901, "updates": 7, "time_s": 0.1 + 0.2}
+    path = save_checkpoint(tmp_path / "a", model=model, config=config, counters=counters)
+    assert path == (tmp_path / "a").resolve()
+
+    checkpoint = load_checkpoint(tmp_path / "a")
+    assert checkpoint.counters == counters
+    assert checkpoint.model_name == "Small"
+    expected = {"lr": 1e-3, "half": 1e-3, "steps": [1, 2], "path": str(tmp_path), "none": None}
+    assert OmegaConf.to_container(checkpoint.config, resolve=False) == expected
+    restored = Small()
+    weight = restored.first.weight
+    checkpoint.load_model(restored)
+    assert restored.first.weight is weight  # in place: an optimizer or a captured graph keeps its tensors
+    assert restored.tied.weight is restored.second.weight
+    assert int(restored.norm.num_batches_tracked) == 3
+    x = torch.randn(4, 20)
+    assert torch.equal(restored.eval()(x), model.eval()(x))
+
+
+def test_a_compiled_model_is_saved_as_itself(tmp_path: Path) -> None:
+    model = Small()
+    save(tmp_path / "a", torch.compile(model))  # type: ignore[arg-type]
+    restored = Small()
+    load_checkpoint(tmp_path / "a").load_model(restored)
+    assert torch.equal(restored.first.weight, model.first.weight)
+
+
+ADAMS: dict[str, Callable[[list[nn.Parameter]], torch.optim.Optimizer]] = {
+    "adam": lambda p: torch.optim.Adam(p, lr=3e-3, betas=(0.8, 0.99)),
+    "adamw amsgrad": lambda p: torch.optim.AdamW(p, lr=3e-3, weight_decay=0.1, amsgrad=True),
+    "adam fused": lambda p: torch.optim.Adam(p, lr=3e-3, fused=True),
+    "adam tensor lr": lambda p: torch.optim.Adam(p, lr=torch.tensor(3e-3), foreach=False),
+    "adamw groups": lambda p: torch.optim.AdamW([{"params": p[:2], "lr": 1e-4}, {"params": p[2:]}]),
+    "sgd momentum": lambda p: torch.optim.SGD(p, lr=1e-2, momentum=0.9),
+}
+
+
+@pytest.mark.parametrize("kind", ADAMS)
+def test_training_goes_on_bit_for_bit(tmp_path: Path, kind: str) -> None:
+    model = Small()
+    optimizer = ADAMS[kind](list(model.parameters()))
+    train(model, optimizer, 4)
+    optimizer.param_groups[0]["lr"] = optimizer.param_groups[0]["lr"] * 0.5  # as a schedule does
+    save(tmp_path / "a", model, optimizer=optimizer)
+    train(model, optimizer, 5)
+
+    torch.manual_seed(99)
+    resumed = Small()
+    resumed_optimizer = ADAMS[kind](list(resumed.parameters()))
+    checkpoint = load_checkpoint(tmp_path / "a")
+    checkpoint.load_model(resumed)
+    checkpoint.load_optimizer(resumed_optimizer)
+    checkpoint.restore_rng()
+    train(resumed, resumed_optimizer, 5)
+    for (name, a), b in zip(model.state_dict().items(), resumed.state_dict().values(), strict=True):
+        if isinstance(a, Tensor):
+            assert torch.equal(a, b), name
+    state, again = optimizer.state_dict(), resumed_optimizer.state_dict()
+    assert state["state"].keys() == again["state"].keys()
+    for index, entries in state["state"].items():
+        for name, value in entries.items():
+            other = again["state"][index][name]
+            assert type(value) is type(other)
+            if isinstance(value, Tensor):
+                assert torch.equal(value, other)
+                assert value.dtype == other.dtype
+    assert [g["lr"] for g in state["param_groups"]] == [g["lr"] for g in again["param_groups"]]
+
+
+def test_execution_flags_are_the_ones_of_the_new_optimizer(tmp_path: Path) -> None:
+    model = Small()
+    fused = torch.optim.Adam(model.parameters(), lr=1e-3, fused=True)
+    train(model, fused, 2)
+    save(tmp_path / "a", model, optimizer=fused)
+    plain = torch.optim.Adam(model.parameters(), lr=torch.tensor(5.0), foreach=False)
+    rate = plain.param_groups[0]["lr"]
+    load_checkpoint(tmp_path / "a").load_optimizer(plain)
+    group = plain.param_groups[0]
+    assert (group["fused"], group["foreach"]) == (None, False)
+    assert group["lr"] is rate  # a captured graph reads this tensor
+    assert float(rate) == pytest.approx(1e-3)
+    train(model, plain, 1)
+
+
+def test_several_optimizers_by_name(tmp_path: Path) -> None:
+    model = Small()
+    parts = {"model": list(model.first.parameters()), "policy": [model.second.weight]}
+    optimizers = {name: torch.optim.Adam(p, lr=1e-3) for name, p in parts.items()}
+    for optimizer in optimizers.values():
+        train(model, optimizer, 2)
+    save(tmp_path / "a", model, optimizer=optimizers)
+    again = {name: torch.optim.Adam(p, lr=1.0) for name, p in parts.items()}
+    load_checkpoint(tmp_path / "a").load_optimizer(again)
+    for name, optimizer in optimizers.items():
+        moment = next(iter(optimizer.state.values()))["exp_avg"]
+        assert torch.equal(next(iter(again[name].state.values()))["exp_avg"], moment)
+    with pytest.raises(UserError, match=r"holds the optimizers \['model', 'policy'\], asked for are"):
+        load_checkpoint(tmp_path / "a").load_optimizer(again["model"])
+
+
+def test_all_generators_go_on_where_they_were(tmp_path: Path) -> None:
+    def draw() -> list[float]:
+        return [random.random(), float(np.random.normal()), float(torch.randn(())), random.gauss(0, 1)]
+
+    np.random.normal()  # leaves a cached second value, which is part of the state
+    save(tmp_path / "a")
+    first = draw()
+    assert draw() != first
+    load_checkpoint(tmp_path / "a").restore_rng()
+    assert draw() == first
+
+
+def test_replay_comes_back_entry_by_entry(tmp_path: Path) -> None:
+    replay = some_replay()
+    # What a half-filled buffer hands over: a view of a larger storage.
+    save(tmp_path / "a", replay=replay[:3])
+    restored = load_checkpoint(tmp_path / "a").replay()
+    assert restored is not None
+    assert restored.batch_size == (3, 4)
+    assert set(restored.keys(True, True)) == set(replay.keys(True, True))
+    for key, value in replay[:3].items(True, True):
+        assert restored[key].dtype == value.dtype
+        assert torch.equal(restored[key], value)
+    size = (tmp_path / "a" / "replay.safetensors").stat().st_size
+    assert size < 1.2 * replay[:3].bytes() + 2000  # not the whole storage
+
+
+def test_what_was_not_saved_is_none(tmp_path: Path) -> None:
+    save(tmp_path / "a")
+    checkpoint = load_checkpoint(tmp_path / "a")
+    assert checkpoint.replay() is None
+    assert checkpoint.extra() is None
+    with pytest.raises(UserError, match="without an optimizer"):
+        checkpoint.load_optimizer(torch.optim.Adam(Small().parameters()))
+
+
+def test_extra_keeps_types(tmp_path: Path) -> None:
+    generator = torch.Generator().manual_seed(4)
+    extra = {
+        "generator": generator.get_state(),
+        "t": (1, [2.5, None, True]),
+        "ids": {3: "a", "x/y": float("inf")},
+    }
+    save(tmp_path / "a", extra=extra)
+    restored = load_checkpoint(tmp_path / "a").extra()
+    assert restored is not None
+    assert torch.equal(restored.pop("generator"), extra["generator"])
+    assert restored == {k: v for k, v in extra.items() if k != "generator"}
+    assert isinstance(restored["t"], tuple)
+
+
+def test_what_needs_pickle_is_refused_and_leaves_nothing(tmp_path: Path) -> None:
+    with pytest.raises(TypeError, match="extra/thing is a object"):
+        save(tmp_path / "a", extra={"thing": object()})
+    with pytest.raises(TypeError, match="counter env_steps is a Tensor"):
+        save_checkpoint(
+            tmp_path / "a",
+            model=Small(),
+            config={},
+            counters={"env_steps": torch.tensor(1)},  # type: ignore[dict-item]
+        )
+    with pytest.raises(UserError, match="configuration cannot be resolved"):
+        save_checkpoint(tmp_path / "a", model=Small(), config={"a": "${missing}"}, counters={})
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_no_pickle_is_written_or_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def forbidden(*_args, **_kwargs):
+        raise AssertionError("pickle")
+
+    for name in ("load", "save"):
+        monkeypatch.setattr(torch, name, forbidden)
+    monkeypatch.setattr("pickle.dumps", forbidden)
+    monkeypatch.setattr("pickle.loads", forbidden)
+    model = Small()
+    optimizer = torch.optim.Adam(model.parameters())
+    train(model, optimizer, 1)
+    save(tmp_path / "a", model, optimizer=optimizer, replay=some_replay(), extra={"x": torch.ones(2)})
+    checkpoint = load_checkpoint(tmp_path / "a")
+    checkpoint.load_model(model)
+    checkpoint.load_optimizer(optimizer)
+    checkpoint.restore_rng()
+    checkpoint.replay()
+    kinds = {p.suffix for p in (tmp_path / "a").iterdir()}
+    assert kinds == {".json", ".safetensors", ".yaml"}
+
+
+# -- whole or not at all -----------------------------------------------------------------------------------
+
+
+class Killed(BaseException):
+    """Not an Exception: no handler in the code under test may run, as after SIGKILL."""
+
+
+def die_at(monkeypatch: pytest.MonkeyPatch, step: int) -> list[str]:
+    """From the given call on, every call that changes the disk kills. Returns the names of those before."""
+    calls: list[str] = []
+
+    def wrap(name: str, real: Callable) -> Callable:
+        def call(*args, **kwargs):
+            if len(calls) >= step:
+                raise Killed
+            calls.append(name)
+            return real(*args, **kwargs)
+
+        return call
+
+    monkeypatch.setattr(os, "rename", wrap("rename", os.rename))
+    monkeypatch.setattr(os, "fsync", wrap("fsync", os.fsync))
+    monkeypatch.setattr(shutil, "rmtree", wrap("rmtree", shutil.rmtree))
+    return calls
+
+
+def test_a_kill_at_any_step_leaves_the_old_or_the_new_checkpoint(tmp_path: Path) -> None:
+    models = {1: Small(), 2: Small(), 3: Small()}
+    finished, seen = False, []
+    step = 0
+    while not finished:
+        folder = tmp_path / str(step) / "checkpoint"
+        save(folder, models[1], step=1)
+        with pytest.MonkeyPatch.context() as patch:
+            calls = die_at(patch, step)
+            try:
+                save(folder, models[2], step=2)
+                finished = True
+            except Killed:
+                pass
+        for place in (folder, latest_checkpoint(folder), latest_checkpoint(folder.parent)):
+            checkpoint = load_checkpoint(place)
+            restored = Small()
+            checkpoint.load_model(restored)
+            which = checkpoint.counters["env_steps"]
+            assert which in (1, 2)
+            assert torch.equal(restored.first.weight, models[int(which)].first.weight)
+        seen.append(which)
+        # The next save recovers from whatever was left, and tidies up.
+        save(folder, models[3], step=3)
+        assert load_checkpoint(folder).counters == {"env_steps": 3}
+        assert [p.name for p in folder.parent.iterdir()] == ["checkpoint"]
+        step += 1
+    assert {"rename", "fsync", "rmtree"} == set(calls)
+    assert seen[0] == 1
+    assert seen[-1] == 2
+    assert sorted(seen) == seen  # once the new one is there, it stays
+
+
+def test_a_kill_during_the_first_save_leaves_no_checkpoint(tmp_path: Path, monkeypatch) -> None:
+    with monkeypatch.context() as patch:
+        die_at(patch, 3)
+        with pytest.raises(Killed):
+            save(tmp_path / "a")
+    with pytest.raises(UserError, match="no checkpoint"):
+        load_checkpoint(tmp_path / "a")
+    with pytest.raises(UserError, match="no checkpoint in"):
+        latest_checkpoint(tmp_path)
+    save(tmp_path / "a", step=5)
+    assert [p.name for p in tmp_path.iterdir()] == ["a"]
+
+
+@pytest.mark.parametrize("failing", ["first rename", "second rename", "fsync"])
+def test_a_failure_keeps_the_old_checkpoint_and_leaves_nothing_else(
+    tmp_path: Path, monkeypatch, failing
+) -> None:
+    save(tmp_path / "a", step=1)
+    rename, renames = os.rename, []
+
+    def failing_rename(source, target):
+        renames.append(source)
+        if len(renames) == {"first rename": 1, "second rename": 2}.get(failing):
+            raise OSError(5, "Input/output error")
+        rename(source, target)
+
+    def failing_fsync(_descriptor):
+        raise OSError(28, "No space left on device")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(os, "rename", failing_rename)
+        if failing == "fsync":
+            patch.setattr(os, "fsync", failing_fsync)
+        with pytest.raises(UserError, match=r"cannot write checkpoint .*(Input/output|No space)"):
+            save(tmp_path / "a", step=2)
+    assert [p.name for p in tmp_path.iterdir()] == ["a"]
+    assert load_checkpoint(tmp_path / "a").counters == {"env_steps": 1}
+
+
+# -- clear about what is wrong -----------------------------------------------------------------------------
+
+
+def everything(folder: Path) -> Path:
+    model = Small()
+    optimizer = torch.optim.Adam(model.parameters())
+    train(model, optimizer, 1)
+    return save(folder, model, optimizer=optimizer, replay=some_replay(), extra={"x": torch.ones(2)})
+
+
+def read_all(folder: Path) -> None:
+    load_checkpoint(folder).replay()
+
+
+def test_damage_to_any_file_is_named(tmp_path: Path) -> None:
+    folder = everything(tmp_path / "a")
+    names = sorted(p.name for p in folder.iterdir())
+    assert len(names) == 12
+    for name in names:
+        path = folder / name
+        whole = path.read_bytes()
+        for kept in (len(whole) - 1, len(whole) // 2, 0):
+            path.write_bytes(whole[:kept])
+            with pytest.raises(UserError, match=name) as caught:
+                read_all(folder)
+            assert "\n" not in str(caught.value)
+            if name != "manifest.json":
+                assert f"has {kept} bytes, {len(whole)} were written" in str(caught.value)
+        if name != "manifest.json":
+            middle = len(whole) // 2
+            path.write_bytes(whole[:middle] + bytes([whole[middle] ^ 1]) + whole[middle + 1 :])
+            with pytest.raises(UserError, match=f"{name} has the right size but other content"):
+                read_all(folder)
+        path.unlink()
+        missing = "no checkpoint" if name == "manifest.json" else f"{name} is missing"
+        with pytest.raises(UserError, match=missing):
+            read_all(folder)
+        path.write_bytes(whole)
+    read_all(folder)
+
+
+def test_a_newer_format_is_not_guessed_at(tmp_path: Path) -> None:
+    manifest = save(tmp_path / "a") / "manifest.json"
+    content = json.loads(manifest.read_text()) | {"format_version": 2}
+    manifest.write_text(json.dumps(content))
+    with pytest.raises(UserError, match=r"format version 2.*reads 1"):
+        load_checkpoint(tmp_path / "a")
+
+
+@pytest.mark.parametrize(
+    ("other", "says"),
+    [
+        (
+            lambda: Small(hidden=8),
+            r"first\.weight has shape \(16, 20\) in the checkpoint and \(8, 20\) in the model",
+        ),
+        (lambda: Small().double(), r"first\.weight has dtype torch.float32 .* torch.float64"),
+        (Other, r"holds a Small that does not fit this Other: encoder\.weight is missing"),
+        (lambda: Small().first, r"this Linear: weight is missing in the checkpoint"),
+    ],
+)
+def test_another_model_is_refused_and_not_touched(
+    tmp_path: Path, other: Callable[[], nn.Module], says: str
+) -> None:
+    save(tmp_path / "a")
+    model = other()
+    before = [p.clone() for p in model.parameters()]
+    with pytest.raises(UserError, match=says):
+        load_checkpoint(tmp_path / "a").load_model(model)
+    assert all(torch.equal(a, b) for a, b in zip(before, model.parameters(), strict=True))
+
+
+def test_a_checkpoint_with_more_than_the_model_is_refused(tmp_path: Path) -> None:
+    model = Small()
+    model.add_module("decoder", nn.Linear(2, 2))
+    save(tmp_path / "a", model)
+    with pytest.raises(UserError, match=r"decoder\.\w+ is in the checkpoint but not in the model"):
+        load_checkpoint(tmp_path / "a").load_model(Small())
+
+
+def test_another_optimizer_is_refused(tmp_path: Path) -> None:
+    model = Small()
+    optimizer = torch.optim.Adam(model.parameters())
+    train(model, optimizer, 1)
+    checkpoint = load_checkpoint(save(tmp_path / "a", model, optimizer=optimizer))
+    with pytest.raises(UserError, match="it is Adam, here is AdamW"):
+        checkpoint.load_optimizer(torch.optim.AdamW(model.parameters()))
+    with pytest.raises(UserError, match="other numbers of parameters"):
+        checkpoint.load_optimizer(torch.optim.Adam(model.first.parameters()))
+    with pytest.raises(
+        UserError, match=r"exp_avg of parameter 0 has shape \(16, 20\), the parameter \(8, 20\)"
+    ):
+        checkpoint.load_optimizer(torch.optim.Adam(Small(hidden=8).parameters()))
+
+
+def test_places_that_cannot_be_written(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("mine")
+    with pytest.raises(UserError, match="cannot write checkpoint"):
+        save(tmp_path / "file" / "a")
+    with pytest.raises(UserError, match="exists and is not a checkpoint"):
+        save(tmp_path / "file")
+    (tmp_path / "thesis").mkdir()
+    (tmp_path / "thesis" / "chapter.txt").write_text("mine")
+    with pytest.raises(UserError, match="exists and is not a checkpoint"):
+        save(tmp_path / "thesis")
+    assert (tmp_path / "thesis" / "chapter.txt").read_text() == "mine"
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["file", "thesis"]
+
+
+@pytest.mark.skipif(os.geteuid() == 0, reason="root may write everywhere")
+def test_a_folder_without_permission(tmp_path: Path) -> None:
+    tmp_path.chmod(0o500)
+    with pytest.raises(UserError, match="Permission denied"):
+        save(tmp_path / "a")
+
+
+def test_latest_is_the_one_written_last(tmp_path: Path) -> None:
+    save(tmp_path / "run" / "checkpoints" / "z_first", step=1)
+    last = save(tmp_path / "run" / "checkpoints" / "a_last", step=2)
+    (tmp_path / "run" / "videos").mkdir()
+    (tmp_path / "run" / "log.csv").write_text("")
+    assert latest_checkpoint(tmp_path / "run") == last
+    assert latest_checkpoint(last) == last
+    best = save(tmp_path / "run" / "best", step=3)
+    assert latest_checkpoint(tmp_path / "run") == best
+    for nothing in (tmp_path / "run" / "videos", tmp_path / "not there"):
+        with pytest.raises(UserError, match="no checkpoint in"):
+            latest_checkpoint(nothing)
+
+
+@pytest.mark.gpu
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
+def test_a_captured_optimizer_goes_on_on_the_gpu_and_on_the_cpu(tmp_path: Path) -> None:
+    def build(device: str, **flags) -> tuple[Small, torch.optim.Adam]:
+        model = Small().to(device)
+        return model, torch.optim.Adam(model.parameters(), lr=1e-3, **flags)
+
+    model, optimizer = build("cuda", capturable=True, fused=True)
+    train(model, optimizer, 3)
+    save(tmp_path / "a", model, optimizer=optimizer)
+    draws = torch.randn(4, device="cuda")
+    train(model, optimizer, 3)
+    checkpoint = load_checkpoint(tmp_path / "a")
+    resumed, again = build("cuda", capturable=True, fused=True)
+    checkpoint.load_model(resumed)
+    checkpoint.load_optimizer(again)
+    checkpoint.restore_rng()
+    assert torch.equal(torch.randn(4, device="cuda"), draws)
+    train(resumed, again, 3)
+    assert torch.equal(resumed.first.weight, model.first.weight)
+    assert all(state["step"].is_cuda for state in again.state.values())
+    on_cpu, cpu_optimizer = build("cpu")
+    checkpoint.load_model(on_cpu)
+    checkpoint.load_optimizer(cpu_optimizer)
+    train(on_cpu, cpu_optimizer, 1)

@@ -1,0 +1,135 @@
+"""One update: weights move, gradients are clipped, metrics are means."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+import torch
+from tensordict import TensorDict
+from torch import nn
+
+from franka_wm.errors import UserError
+from franka_wm.training import build
+from franka_wm.training.learner import Learner
+
+
+class Line(nn.Module):
+    """y = w x + b with two clip groups; the loss is known by hand."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.w, self.b, self.frozen = (nn.Parameter(torch.full((1,), v)) for v in (1.0, 2.0, 3.0))
+        self.frozen.requires_grad_(False)
+        self.after = 0
+
+    def parameter_groups(self, lr: float) -> list[dict[str, Any]]:
+        return [
+            {"params": [self.w], "lr": lr, "clip": "slope"},
+            {"params": [self.b], "lr": 0.1 * lr, "clip": "offset"},
+        ]
+
+    def loss(self, batch: TensorDict) -> TensorDict:
+        error = (self.w * batch["x"] + self.b + 0 * self.frozen).square().mean()
+        return TensorDict({"loss": error, "x_mean": batch["x"].mean()})
+
+    def after_update(self) -> None:
+        self.after += 1
+
+
+def batch(value: float) -> TensorDict:
+    return TensorDict({"x": torch.full((4, 2), value)}, batch_size=[4, 2])
+
+
+def test_metrics_are_means_since_the_last_call() -> None:
+    model = Line()
+    learner = Learner(model, lr=1e-9)
+    assert learner.metrics() == {}
+    for value in (1.0, 2.0, 6.0):
+        learner.update(batch(value))
+    metrics = learner.metrics()
+    assert metrics["x_mean"] == pytest.approx(3.0)
+    assert metrics["loss"] == pytest.approx((9 + 16 + 64) / 3, rel=1e-5)
+    # d/dw = 2 (x + 2) x, d/db = 2 (x + 2): norms before clipping, one for each group.
+    assert metrics["grad_norm_slope"] == pytest.approx((6 + 16 + 96) / 3, rel=1e-5)
+    assert metrics["grad_norm_offset"] == pytest.approx((6 + 8 + 16) / 3, rel=1e-5)
+    assert learner.metrics() == {}
+    learner.update(batch(5.0))
+    assert learner.metrics()["x_mean"] == pytest.approx(5.0)
+    assert learner.updates == model.after == 4
+
+
+def test_gradients_are_clipped_in_each_group() -> None:
+    model = Line()
+    learner = Learner(model, lr=1e-9, grad_clip=10.0)
+    learner.update(batch(6.0))  # gradients 96 and 16
+    assert model.w.grad is not None and model.b.grad is not None
+    assert model.w.grad.item() == pytest.approx(10.0, rel=1e-4)
+    assert model.b.grad.item() == pytest.approx(10.0, rel=1e-4)
+    learner.update(batch(0.5))  # gradients 2.5 and 5: as they are, and not on top of the last ones
+    assert model.w.grad.item() == pytest.approx(2.5, rel=1e-4)
+    assert model.b.grad.item() == pytest.approx(5.0, rel=1e-4)
+
+
+def test_learning_rates_are_the_group_s() -> None:
+    model = Line()
+    Learner(model, lr=0.01).update(batch(1.0))
+    assert model.w.item() == pytest.approx(1 - 0.01, abs=1e-5)  # Adam's first step is the learning rate
+    assert model.b.item() == pytest.approx(2 - 0.001, abs=1e-5)
+    assert model.frozen.item() == 3.0
+
+
+def test_it_learns() -> None:
+    model = Line()
+    learner = Learner(model, lr=0.05)
+    for _ in range(200):
+        learner.update(batch(1.0))
+    learner.metrics()
+    learner.update(batch(1.0))
+    assert learner.metrics()["loss"] < 1e-3
+
+
+@pytest.mark.parametrize("options", [{"lr": 0.0}, {"lr": -1.0}, {"grad_clip": 0.0}, {"lr": float("nan")}])
+def test_impossible_options(options: dict[str, float]) -> None:
+    with pytest.raises(UserError):
+        Learner(Line(), **options)
+
+
+def test_capture_without_cuda() -> None:
+    with pytest.raises(UserError, match="cuda"):
+        Learner(Line(), capture=True)
+
+
+def test_every_part_of_the_world_model_moves(composed, small_env) -> None:
+    cfg = composed("scale=smoke", "device=cpu")
+    torch.manual_seed(0)
+    model = build.make_model(cfg, small_env(2))
+    learner = Learner(model, lr=1e-3)
+    before = {name: p.detach().clone() for name, p in model.named_parameters()}
+    data = TensorDict(
+        {
+            "state": torch.randn(16, 3, 20),
+            "joint_target": torch.randn(16, 3, 7),
+            "action": torch.rand(16, 3, 7) * 2 - 1,
+            "next": TensorDict(
+                {
+                    "state": torch.randn(16, 3, 20),
+                    "joint_target": torch.randn(16, 3, 7),
+                    "reward": -torch.rand(16, 3, 1),
+                    "terminated": torch.zeros(16, 3, 1, dtype=torch.bool),
+                },
+                batch_size=[16, 3],
+            ),
+        },
+        batch_size=[16, 3],
+    )
+    for _ in range(3):
+        learner.update(data)
+    metrics = learner.metrics()
+    assert all(torch.tensor(value).isfinite() for value in metrics.values())
+    still = [
+        name
+        for name, p in model.named_parameters()
+        if p.requires_grad and torch.equal(p.detach(), before[name])
+    ]
+    assert not still

@@ -1,0 +1,173 @@
+"""The loop in this process: it gathers, learns, logs, saves, and goes on where it stopped."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+import torch
+from omegaconf import DictConfig
+from tensordict import TensorDict
+
+from franka_wm.envs import FrankaEnv
+from franka_wm.training import build
+from franka_wm.training.checkpoint import latest_checkpoint, load_checkpoint
+from franka_wm.training.learner import Learner
+from franka_wm.training.trainer import Trainer
+
+N, CAPACITY = 4, 50
+
+Make = Callable[..., Trainer]
+
+
+@pytest.fixture(scope="module")
+def cfg(composed) -> DictConfig:
+    return composed(
+        "scale=smoke",
+        "device=cpu",
+        "env.substeps=1",
+        "env.episode_length=7",
+        f"collector.num_envs={N}",
+        f"replay.capacity={CAPACITY * N}",
+        "trainer.updates=20",
+        "logger=none",
+    )
+
+
+@pytest.fixture(scope="module")
+def env(cfg: DictConfig) -> FrankaEnv:
+    return build.make_env(cfg)
+
+
+@pytest.fixture
+def make(cfg: DictConfig, env: FrankaEnv, tmp_path: Path) -> Make:
+    def make(folder: str = "run", evaluate=dict, **changes) -> Trainer:
+        mine = cfg.copy()
+        for key, value in changes.items():
+            mine.trainer[key] = value
+        torch.manual_seed(0)
+        env.set_seed(0)
+        model = build.make_model(mine, env)
+        planner = build.make_planner(mine, env.action_dim)
+        return Trainer(
+            env=env,
+            learner=Learner(model),
+            replay=build.make_replay_buffer(mine, env.device),
+            policies=build.make_policies(model, planner, env),
+            actor="policy",
+            cfg=mine,
+            folder=tmp_path / folder,
+            loggers=[],
+            evaluate=evaluate,
+        )
+
+    return make
+
+
+def in_order(trainer: Trainer) -> TensorDict:
+    """(worlds, time), the oldest first, by the writer's position alone."""
+    data = trainer.replay[:]
+    cursor = trainer.replay.writer._cursor
+    return torch.cat([data[:, cursor:], data[:, :cursor]], 1) if data.shape[1] == CAPACITY else data
+
+
+def test_a_run(make: Make) -> None:
+    trainer = make()
+    before = {k: v.clone() for k, v in trainer.model.state_dict().items()}
+    trainer.fit()
+    assert trainer.learner.updates == 20 and not trainer.interrupted
+    # 10 seed steps, then two batches of 5, in 4 worlds.
+    assert trainer.env_steps == (10 + 10) * N == len(trainer.replay)
+    after = trainer.model.state_dict()
+    assert any(not torch.equal(before[k], after[k]) for k in before)
+    row = trainer.rows[-1]
+    assert row["updates"] == 20 and row["env_steps"] == trainer.env_steps
+    assert {"loss", "train/episodes", "updates_per_s", "time_s"} <= set(row)
+    checkpoint = load_checkpoint(latest_checkpoint(trainer.folder))
+    assert checkpoint.counters["updates"] == 20 and checkpoint.counters["env_steps"] == trainer.env_steps
+
+
+def test_observations_are_standardized_by_the_seed_data(make: Make) -> None:
+    trainer = make()
+    given = []
+    trainer.model.set_observation_statistics = lambda mean, std: given.append((mean, std))
+    trainer.seed()
+    data = trainer.replay[:]
+    seen = torch.cat([data[key] for key in trainer.model.observation_sizes], -1).flatten(0, 1)
+    torch.testing.assert_close(given[0][0], seen.mean(0))
+    torch.testing.assert_close(given[0][1], seen.std(0).clamp_min(1e-3))
+
+
+def test_experience_is_whole(make: Make) -> None:
+    """The last transition of every episode is there, its next observation the true one."""
+    trainer = make()
+    trainer.fit()
+    data = in_order(trainer)
+    assert data.shape == (N, 20)
+    starts = data["is_init"].squeeze(-1)
+    assert (starts == (torch.arange(20) % 7 == 0)).all()
+    follows = data["next", "state"][:, :-1] == data["state"][:, 1:]
+    assert torch.equal(follows.all(-1), ~starts[:, 1:])
+    assert torch.isfinite(data["next", "state"]).all() and (data["next", "state"] != 0).any(-1).all()
+
+
+@pytest.mark.parametrize("updates", [20, 110])
+def test_going_on(make: Make, updates: int) -> None:
+    """Also with a buffer that has wrapped around: all of it, in order, as windows of the same worlds."""
+    first = make("first", updates=updates)
+    first.fit()
+    if updates == 110:
+        assert first.env_steps > CAPACITY * N
+    second = make("second", updates=updates + 10)
+    second.restore(load_checkpoint(latest_checkpoint(first.folder)))
+    assert second.learner.updates == updates and second.env_steps == first.env_steps
+    assert second.rows == first.rows and second.seconds == pytest.approx(first.seconds)
+    for key, value in first.model.state_dict().items():
+        assert torch.equal(value, second.model.state_dict()[key]), key
+
+    kept, restored = in_order(first), in_order(second)
+    assert restored.shape == kept.shape
+    assert (restored == kept).all()
+    sample = second.replay.sample(200)
+    assert (sample["next", "state"][:, :-1] == sample["state"][:, 1:]).all()
+
+    second.fit()
+    assert second.learner.updates == updates + 10
+    assert second.env_steps == first.env_steps + 5 * N  # no second seed phase
+    assert second.rows[: len(first.rows)] == first.rows and len(second.rows) > len(first.rows)
+    newest = in_order(second)
+    assert newest["is_init"][:, -5].all()  # the worlds began new episodes
+
+
+def test_going_on_without_the_experience_keeps_the_scale_of_observations(make: Make) -> None:
+    first = make("first", checkpoint_replay=False)
+    first.fit()
+    second = make("second", updates=25, checkpoint_replay=False)
+    second.restore(load_checkpoint(latest_checkpoint(first.folder)))
+    assert len(second.replay) == 0
+    calls = []
+    second.model.set_observation_statistics = lambda mean, std: calls.append(mean)
+    second.fit()
+    assert second.learner.updates == 25
+    assert not calls, "weights learned with one scale would see another"
+
+
+def test_evaluation_while_training(make: Make, cfg: DictConfig) -> None:
+    trainer = make(evaluate=lambda: {"eval/policy/success": 0.5})
+    trainer.cfg.evaluation.every = 0.0
+    trainer.fit()
+    rows = [row for row in trainer.rows if "eval/policy/success" in row]
+    assert len(rows) == 1  # after the first batch; the last one is left to the end of the run
+    assert rows[0]["updates"] == 10
+
+
+def test_policies_take_turns(make: Make) -> None:
+    """Smooth random motion first, then the actor."""
+    trainer = make(updates=10)
+    used = []
+    forward = trainer._acting.forward
+    trainer._acting.forward = lambda td: (used.append(trainer._acting.name), forward(td))[1]  # type: ignore[method-assign]
+    trainer.fit()
+    acted = used[-15:]
+    assert acted == ["random"] * 10 + ["policy"] * 5

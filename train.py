@@ -1,0 +1,53 @@
+"""Learn a world model of a simulated Franka arm, plan with it, evaluate it.
+
+python train.py                          at the scale of this machine
+python train.py env=reach_fixed seed=3   Hydra overrides
+python train.py --help                   everything that can be changed
+"""
+
+from __future__ import annotations
+
+import hydra
+from omegaconf import DictConfig
+
+from franka_wm.training.entry import one_line_errors, run_command
+
+
+@hydra.main(version_base="1.3", config_path="conf", config_name="config")
+@one_line_errors
+def main(cfg: DictConfig) -> None:
+    """One run: build, train, evaluate, report."""
+    from franka_wm.evaluation.report import evaluate_and_report
+    from franka_wm.training import build
+    from franka_wm.training.entry import finish, start
+    from franka_wm.training.learner import Learner
+    from franka_wm.training.trainer import Trainer
+
+    run = start(cfg)
+    env, judge = run.build_environments()
+    model = build.make_model(run.cfg, env)
+    planner = build.make_planner(run.cfg, env.action_dim)
+    policies = build.make_policies(
+        model, planner, env, seed=run.cfg.seed, smoothness=run.cfg.collector.smoothness
+    )
+    trainer = Trainer(
+        env=env,
+        learner=Learner(model, **run.learner_options()),
+        replay=build.make_replay_buffer(run.cfg, env.device),
+        policies=policies,
+        actor=build.ACTORS[run.cfg.collector.acts],
+        cfg=run.cfg,
+        folder=run.folder,
+        loggers=run.loggers,
+        evaluate=run.evaluation_during_training(judge, policies),
+    )
+    if run.checkpoint is not None:
+        trainer.restore(run.checkpoint)
+    trainer.fit()
+    if not trainer.interrupted:
+        evaluate_and_report(run.cfg, run.folder, judge, policies, rows=trainer.rows)
+    finish(run, interrupted=trainer.interrupted)
+
+
+if __name__ == "__main__":
+    run_command(main)
