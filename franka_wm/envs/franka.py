@@ -249,6 +249,33 @@ class FrankaEnv(EnvBase):
                 f"set_state: {tuple(state.batch_size)} worlds for {self.num_envs}; index or expand the state first"
             )
         sim.set_state(dict(state.items()))
+        return self._observed_anew()
+
+    def set_goal(self, goal: torch.Tensor) -> TensorDict:
+        """Moves the goals to ``goal`` and returns what the worlds observe now, as a reset does.
+
+        Each world keeps its goal until its next episode draws another. With ``task="track"`` the circle is
+        moved so that the goal passes there now. Nothing else changes; with ``reward="normalized"`` the episode's
+        initial distance stays what it was. A goal out of reach is allowed: the arm gets as near as it can.
+
+        Args:
+            goal: (N, 3), or (3,) for all worlds [m], in the world's frame.
+
+        Raises:
+            UserError: Another shape, or a number that is not finite; nothing is changed then.
+        """
+        goal = torch.as_tensor(goal, dtype=torch.float32, device=self.device)
+        if goal.shape not in ((3,), (self.num_envs, 3)) or not bool(goal.isfinite().all()):
+            raise UserError(
+                f"set_goal: got shape {tuple(goal.shape)}; it must be ({self.num_envs}, 3) or (3,), "
+                "finite, in metres"
+            )
+        self.simulation.set_goal(goal.expand(self.num_envs, 3))
+        return self._observed_anew()
+
+    def _observed_anew(self) -> TensorDict:
+        """What the worlds observe after something was set by hand."""
+        sim = self.simulation
         out = self._present()
         out["is_init"] = sim.step_count == 0
         out["success"] = torch.zeros_like(sim.success)

@@ -176,12 +176,28 @@ class Simulation:
             tensor.copy_(state[name])
         self._seed.copy_(state["seed"][:1])
         self.randomizer.apply()
+        self._observe_anew()
+        if self._cameras or self._goal_camera is not None:
+            self.show_all()
+
+    def set_goal(self, goal: torch.Tensor) -> None:
+        """Moves every world's goal to ``goal`` (N, 3) [m], until its next reset; no host sync.
+
+        A goal that moves goes on from there: its circle is moved along.
+        """
+        self._goal_center += goal - self._task_goal
+        self._task_goal.copy_(goal)
+        self.goal_q.copy_(self.kinematics.solve(goal, self.goal_q, iterations=24))
+        self._observe_anew()
+        if self._goal_camera is not None or (self._cameras and self.config.show_goal):
+            self.show_all()
+
+    def _observe_anew(self) -> None:
+        """The present observation after the arrays behind it were written by hand; resets no world."""
         self._reset_mask.zero_()
         if self._reset_graph is None:
             self._reset_graph = self._capture(self._launch_reset_and_observe)
         self._replay(self._reset_graph)
-        if self._cameras or self._goal_camera is not None:
-            self.show_all()
 
     def show_all(self) -> None:
         """Renders the present of all worlds anew."""
