@@ -3,8 +3,33 @@
 Nothing here knows a model family: models enter as callables.
 """
 
+from franka_wm.planning.cem import CEM
+from franka_wm.planning.gradient import GradientPlanner
+from franka_wm.planning.icem import ICEM
 from franka_wm.planning.mppi import MPPI
-from franka_wm.planning.objectives import GoalDistance, RewardPlusValue
+from franka_wm.planning.objectives import (
+    ActionPenalty,
+    GoalDistance,
+    GoalImage,
+    RewardPlusValue,
+    Smoothness,
+    Sum,
+)
 from franka_wm.planning.policy import ModelPolicy, PlannerPolicy
+from franka_wm.planning.sampling import Planner
 
-__all__ = ["MPPI", "GoalDistance", "ModelPolicy", "PlannerPolicy", "RewardPlusValue"]
+__all__ = [
+    "CEM",
+    "ICEM",
+    "MPPI",
+    "ActionPenalty",
+    "GoalDistance",
+    "GoalImage",
+    "GradientPlanner",
+    "ModelPolicy",
+    "Planner",
+    "PlannerPolicy",
+    "RewardPlusValue",
+    "Smoothness",
+    "Sum",
+]

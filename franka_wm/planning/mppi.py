@@ -6,7 +6,20 @@ import torch
 from tensordict import TensorDict
 from torch import Tensor
 
-Objective = Callable[[Tensor, Tensor], Tensor]
+from franka_wm.planning.objectives import Objective
+from franka_wm.planning.sampling import (
+    best,
+    explored,
+    gaussian_candidates,
+    require_bounds,
+    require_counts,
+    roll_prior,
+    rollout,
+    take,
+    warm_start,
+)
+
+__all__ = ["MPPI", "Objective"]
 
 
 class MPPI:
@@ -61,15 +74,13 @@ class MPPI:
         high: float = 1.0,
         normalize: bool = True,
     ) -> None:
-        for name, count in (
-            ("action_dim", action_dim),
-            ("horizon", horizon),
-            ("num_samples", num_samples),
-            ("num_elites", num_elites),
-            ("iterations", iterations),
-        ):
-            if count < 1:
-                raise ValueError(f"{name} must be at least 1, got {count}")
+        require_counts(
+            action_dim=action_dim,
+            horizon=horizon,
+            num_samples=num_samples,
+            num_elites=num_elites,
+            iterations=iterations,
+        )
         if not 0 <= num_policy_samples <= num_samples:
             raise ValueError(
                 f"num_policy_samples must be in [0, num_samples={num_samples}], got {num_policy_samples}"
@@ -80,8 +91,7 @@ class MPPI:
             raise ValueError(f"need 0 < min_std <= max_std, got {min_std} and {max_std}")
         if not temperature > 0.0:
             raise ValueError(f"temperature must be positive, got {temperature}")
-        if not low < high:
-            raise ValueError(f"low must be below high, got [{low}, {high}]")
+        require_bounds(low, high)
         self.action_dim, self.horizon, self.iterations = action_dim, horizon, iterations
         self.num_samples, self.num_policy_samples, self.num_elites = (
             num_samples,
@@ -124,28 +134,33 @@ class MPPI:
         Raises:
             ValueError: `previous` or `is_init` has another shape.
         """
-        envs, samples, horizon = z.shape[0], self.num_samples, self.horizon
-        drawn = samples if prior is None else samples - self.num_policy_samples
-        mean = self._start(z, previous, is_init)
+        drawn = self.num_samples if prior is None else self.num_samples - self.num_policy_samples
+        bounds = {"low": self.low, "high": self.high}
+        mean = warm_start(
+            z,
+            previous,
+            is_init,
+            horizon=self.horizon,
+            action_dim=self.action_dim,
+            low=self.low,
+            high=self.high,
+        )
         std = torch.full_like(mean, self.max_std)
-        from_prior = None if prior is None or drawn == samples else self._roll_prior(z, next, prior)
-        root = z.unsqueeze(1).expand(envs, samples, *z.shape[1:])
-
-        value = effective = mean.new_zeros(envs, 1)
-        for _ in range(self.iterations):
-            noise = torch.randn(
-                envs, drawn, horizon, self.action_dim, device=z.device, dtype=mean.dtype, generator=generator
+        from_prior = None
+        if prior is not None and self.num_policy_samples:
+            from_prior = roll_prior(
+                z, next, prior, samples=self.num_policy_samples, horizon=self.horizon, **bounds
             )
-            actions = (mean.unsqueeze(1) + std.unsqueeze(1) * noise).clamp(self.low, self.high)
+
+        value = effective = mean.new_zeros(z.shape[0], 1)
+        for _ in range(self.iterations):
+            actions = gaussian_candidates(mean, std, drawn, generator=generator, **bounds)
             if from_prior is not None:
                 actions = torch.cat((from_prior, actions), dim=1)
-            latents = [root]
-            for t in range(horizon):
-                latents.append(next(latents[-1], actions[:, :, t]))
-            scores = objective(torch.stack(latents, dim=2), actions)
+            scores = objective(rollout(z, actions, next), actions)
 
             elite_scores, weights, index = self._elites(scores)
-            elites = actions.gather(1, index[..., None, None].expand(-1, -1, horizon, self.action_dim))
+            elites = take(actions, index)
             w = weights[..., None, None]
             # Rounding can carry a mean of actions at a bound just past it.
             mean = (w * elites).sum(1).clamp(self.low, self.high)
@@ -154,64 +169,23 @@ class MPPI:
             value = (weights * elite_scores).sum(1, keepdim=True)
             effective = weights.square().sum(1, keepdim=True).reciprocal()
 
-        action = mean[:, 0]
-        if explore:
-            noise = torch.randn(action.shape, device=z.device, dtype=action.dtype, generator=generator)
-            action = action + std[:, 0] * noise
         return TensorDict(
             {
-                "action": action.clamp(self.low, self.high),
+                "action": explored(mean[:, 0], std[:, 0], explore, generator=generator, **bounds),
                 "plan": mean,
                 "std": std,
                 "value": value,
                 "effective_samples": effective,
             },
-            batch_size=[envs],
+            batch_size=[z.shape[0]],
         )
-
-    def _start(self, z: Tensor, previous: Tensor | None, is_init: Tensor | None) -> Tensor:
-        """Mean to start from (E, H, A): the previous plan one step on, or the middle of the bounds."""
-        shape = (z.shape[0], self.horizon, self.action_dim)
-        cold = torch.full(shape, 0.5 * (self.low + self.high), device=z.device, dtype=z.dtype)
-        if previous is None:
-            return cold
-        if previous.shape != shape:
-            raise ValueError(f"previous must have shape (E, H, A) = {shape}, got {tuple(previous.shape)}")
-        shifted = torch.cat((previous[:, 1:].to(z.dtype), cold[:, :1]), dim=1)
-        if is_init is None:
-            return shifted
-        if is_init.shape != (z.shape[0], 1):
-            raise ValueError(
-                f"is_init must have shape (E, 1) = {(z.shape[0], 1)}, got {tuple(is_init.shape)}"
-            )
-        return torch.where(is_init.unsqueeze(-1), cold, shifted)
-
-    def _roll_prior(
-        self, z: Tensor, next: Callable[[Tensor, Tensor], Tensor], prior: Callable[[Tensor], Tensor]
-    ) -> Tensor:
-        """Candidates of the policy (E, num_policy_samples, H, A)."""
-        latent = z.unsqueeze(1).expand(z.shape[0], self.num_policy_samples, *z.shape[1:])
-        actions = []
-        for _ in range(self.horizon):
-            # A weight of zero does not remove a nan from a weighted mean, so it must not get in.
-            actions.append(torch.nan_to_num(prior(latent), nan=0.0).clamp(self.low, self.high))
-            latent = next(latent, actions[-1])
-        return torch.stack(actions, dim=2)
 
     def _elites(self, scores: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Scores (E, S) -> the elites' scores, weights and indices, each (E, num_elites)."""
-        valid = torch.isfinite(scores)
-        largest = torch.finfo(scores.dtype).max
-        worst = torch.where(valid, scores, largest).amin(1, keepdim=True)
-        worst = torch.where(valid.any(1, keepdim=True), worst, torch.zeros_like(worst))
-        # Stand in with the worst valid score, which keeps the statistics finite, but rank below it.
-        order = torch.where(valid, scores, -largest)
-        index = order.topk(self.num_elites, dim=1).indices
-        elite_valid = valid.gather(1, index)
-        elite = torch.where(valid, scores, worst).gather(1, index)
+        index, elite, valid = best(scores, self.num_elites)
         gap = elite - elite.amax(1, keepdim=True)  # at most 0, so that exp cannot overflow
         if self.normalize:
             gap = gap / (elite.std(1, keepdim=True, correction=0) + 1e-6)
         # Finite instead of -inf: if no candidate is valid, the weights are uniform, not nan.
-        weights = (self.temperature * gap).masked_fill(~elite_valid, -1e9).softmax(1)
+        weights = (self.temperature * gap).masked_fill(~valid, -1e9).softmax(1)
         return elite, weights, index

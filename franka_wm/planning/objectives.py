@@ -2,11 +2,34 @@
 
 E environments, S candidates, H steps. The trajectory starts at the current latent. They are classes rather
 than closures so that a policy that holds one can be copied and sent to another process.
+
+An objective that depends on the present observation (a goal picture, the last action) has
+`bind(tensordict) -> Objective`, which is called at every decision; `bind` below does so for any objective.
+Its `in_keys` name the entries that it cannot do without.
 """
 
-from collections.abc import Callable
+import math
+from collections.abc import Callable, Sequence
+from typing import Any, Literal, get_args
 
+import torch
+from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
+from torch.nn import functional as F
+
+Objective = Callable[[Tensor, Tensor], Tensor]
+
+Metric = Literal["l2", "l1", "cosine"]
+"""`l2`: squared Euclidean, Σ (x - g)². `l1`: Σ |x - g|. `cosine`: 1 - cos(x, g), between 0 and 2."""
+
+
+def bind(objective: Any, tensordict: TensorDictBase) -> Objective:
+    """The objective for the present decision: `objective.bind(tensordict)` where there is such a method.
+
+    Args:
+        tensordict: what the policy was given, of batch size [E].
+    """
+    return objective.bind(tensordict) if hasattr(objective, "bind") else objective
 
 
 class RewardPlusValue:
@@ -41,24 +64,196 @@ class RewardPlusValue:
 
 
 class GoalDistance:
-    """Minus the squared Euclidean distance to a goal latent, summed over the rollout or at its end only.
+    """Minus the distance to a goal, summed over the rollout or at its end only.
 
     The current latent, which no action can change, is left out. Summing rewards arriving early and staying.
 
     Args:
-        goal_latent: (D,) for all environments, or (E, D), one each.
+        goal_latent: (D,) for all environments, or (E, D), one each; in the space that `embed` maps to.
         summed: over the H predicted latents; else the last one alone.
+        metric: see `Metric`.
+        embed: latents (..., Z) -> (..., D), what the distance is measured on; None: the latents themselves.
 
     Raises:
-        ValueError: `goal_latent` has another number of dimensions.
+        ValueError: `goal_latent` has another number of dimensions, or there is no such metric.
     """
 
-    def __init__(self, goal_latent: Tensor, summed: bool = True) -> None:
+    def __init__(
+        self,
+        goal_latent: Tensor,
+        summed: bool = True,
+        *,
+        metric: Metric = "l2",
+        embed: Callable[[Tensor], Tensor] | None = None,
+    ) -> None:
         if goal_latent.dim() not in (1, 2):
             raise ValueError(f"goal_latent must be (D,) or (E, D), got {tuple(goal_latent.shape)}")
-        self.goal_latent, self.summed = goal_latent, summed
+        _require_metric(metric)
+        self.goal_latent, self.summed, self.metric, self.embed = goal_latent, summed, metric, embed
 
     def __call__(self, trajectory: Tensor, actions: Tensor) -> Tensor:
         goal = self.goal_latent if self.goal_latent.dim() == 1 else self.goal_latent[:, None, None]
         reached = trajectory[:, :, 1:] if self.summed else trajectory[:, :, -1:]
-        return -(reached - goal).square().sum(dim=(-2, -1))
+        if self.embed is not None:
+            reached = self.embed(reached)
+        if reached.shape[-1] != goal.shape[-1]:
+            raise ValueError(
+                f"the goal has {goal.shape[-1]} features and the latents it is compared with "
+                f"{reached.shape[-1]}: give `embed`, which maps latents to the goal's space"
+            )
+        if self.metric == "l2":
+            return -(reached - goal).square().sum(dim=(-2, -1))
+        if self.metric == "l1":
+            return -(reached - goal).abs().sum(dim=(-2, -1))
+        return (F.cosine_similarity(reached, goal, dim=-1) - 1.0).sum(-1)
+
+
+class GoalImage:
+    """Minus the distance to what the goal's picture looks like to the model.
+
+    The picture is encoded once per decision, by `bind`; planning then is `GoalDistance`.
+
+    Args:
+        encode_goal: observation of a goal, a TensorDict of batch size [E] whose entry `pixels` holds the
+            goal's picture -> (E, D). It holds nothing else: other entries of the present observation
+            (joint angles) are not those of the goal.
+        embed: latents (..., Z) -> (..., D), the space of `encode_goal`; None: the latents themselves.
+        pixels: the key that the model's encoder reads.
+        goal: the key of the goal's picture in the observation, (E, H, W, C) uint8.
+        metric, summed: see `GoalDistance`.
+
+    Raises:
+        ValueError: there is no such metric.
+    """
+
+    def __init__(
+        self,
+        encode_goal: Callable[[TensorDictBase], Tensor],
+        embed: Callable[[Tensor], Tensor] | None = None,
+        pixels: str = "pixels",
+        goal: str = "goal_pixels",
+        metric: Metric = "l2",
+        summed: bool = True,
+    ) -> None:
+        _require_metric(metric)
+        self.encode_goal, self.embed, self.pixels, self.goal = encode_goal, embed, pixels, goal
+        self.metric: Metric = metric
+        self.summed = summed
+        self.in_keys = [goal]
+
+    def bind(self, tensordict: TensorDictBase) -> GoalDistance:
+        """The objective of the present decision.
+
+        Raises:
+            ValueError: the observation has no picture of the goal.
+        """
+        picture = tensordict.get(self.goal, None)
+        if picture is None:
+            raise ValueError(
+                f"the observation has no {self.goal!r}, the picture of the goal to plan towards: "
+                "add it to env.observations"
+            )
+        observation = TensorDict({self.pixels: picture}, batch_size=tensordict.batch_size)
+        return GoalDistance(self.encode_goal(observation), self.summed, metric=self.metric, embed=self.embed)
+
+    def __call__(self, trajectory: Tensor, actions: Tensor) -> Tensor:
+        raise ValueError("a GoalImage has no goal yet: plan with its bind(tensordict)")
+
+
+class Sum:
+    """Weighted sum of objectives: Σ weight · score. `bind` binds every term.
+
+    Args:
+        terms: pairs (weight, objective).
+
+    Raises:
+        ValueError: no terms, or a weight that is not finite.
+    """
+
+    def __init__(self, terms: Sequence[tuple[float, Objective]]) -> None:
+        if not terms:
+            raise ValueError("a Sum needs at least one (weight, objective)")
+        for weight, objective in terms:
+            if not math.isfinite(weight):
+                raise ValueError(
+                    f"the weight of {type(objective).__name__} in a Sum must be finite, got {weight}"
+                )
+        self.terms = [(float(weight), objective) for weight, objective in terms]
+        self.in_keys = [key for _, objective in terms for key in getattr(objective, "in_keys", ())]
+
+    def bind(self, tensordict: TensorDictBase) -> "Sum":
+        """The same sum of bound terms."""
+        return Sum([(weight, bind(objective, tensordict)) for weight, objective in self.terms])
+
+    def __call__(self, trajectory: Tensor, actions: Tensor) -> Tensor:
+        (weight, objective), *rest = self.terms
+        score = weight * objective(trajectory, actions)
+        for weight, objective in rest:
+            score = score + weight * objective(trajectory, actions)
+        return score
+
+
+class ActionPenalty:
+    """Minus `weight` times the squared size of the actions, Σ_t |a_t|².
+
+    Raises:
+        ValueError: a negative weight.
+    """
+
+    def __init__(self, weight: float) -> None:
+        self.weight = _penalty("ActionPenalty", weight)
+
+    def __call__(self, trajectory: Tensor, actions: Tensor) -> Tensor:
+        return -self.weight * actions.square().sum(dim=(-2, -1))
+
+
+class Smoothness:
+    """Minus `weight` times the squared changes of the action, Σ_{t>0} |a_t - a_{t-1}|².
+
+    Bound to an observation, it also counts the change from the last executed action to the first planned
+    one: otherwise replanning at every step leaves what is executed as rough as before.
+
+    Raises:
+        ValueError: a negative weight.
+    """
+
+    def __init__(self, weight: float) -> None:
+        self.weight = _penalty("Smoothness", weight)
+        self._last: Tensor | None = None  # (E, A)
+        self._acted: Tensor | None = None  # (E, 1)
+
+    def bind(self, tensordict: TensorDictBase) -> "Smoothness":
+        """The objective of the present decision.
+
+        Args:
+            tensordict: may hold `action` (E, A), the last executed action (TorchRL's environments carry it
+                to the next step; after a reset there is none), and `is_init` (E, 1) bool: where True, the
+                action belongs to another episode and does not count.
+        """
+        bound = Smoothness(self.weight)
+        last = tensordict.get("action", None)
+        if last is not None:
+            is_init = tensordict.get("is_init", None)
+            acted = torch.ones_like(last[..., :1]) if is_init is None else (~is_init).to(last.dtype)
+            # What lies in a fresh buffer may not be finite, and 0 · nan is nan.
+            bound._last = torch.where(acted > 0, last, torch.zeros_like(last))
+            bound._acted = acted
+        return bound
+
+    def __call__(self, trajectory: Tensor, actions: Tensor) -> Tensor:
+        change = actions.diff(dim=2).square().sum(dim=(-2, -1))
+        if self._last is not None and self._acted is not None:
+            first = (actions[:, :, 0] - self._last.unsqueeze(1)).square().sum(-1)
+            change = change + self._acted * first
+        return -self.weight * change
+
+
+def _require_metric(metric: str) -> None:
+    if metric not in get_args(Metric):
+        raise ValueError(f"metric={metric!r}: must be one of {', '.join(get_args(Metric))}")
+
+
+def _penalty(name: str, weight: float) -> float:
+    if not (math.isfinite(weight) and weight >= 0.0):
+        raise ValueError(f"the weight of {name} must be finite and not negative, got {weight}")
+    return float(weight)

@@ -1,0 +1,212 @@
+"""What the planners share: the start of a search, rollouts of candidates, and which candidates are the best.
+
+E environments, S candidates, H steps, A action components, D the size of a latent.
+"""
+
+from collections.abc import Callable
+from typing import NamedTuple, Protocol
+
+import torch
+from tensordict import TensorDict
+from torch import Tensor
+
+from franka_wm.planning.objectives import Objective
+
+Next = Callable[[Tensor, Tensor], Tensor]
+"""(z (..., D), action (..., A)) -> next latents (..., D)."""
+
+Prior = Callable[[Tensor], Tensor]
+"""A policy: z (..., D) -> actions (..., A)."""
+
+
+class Planner(Protocol):
+    """What a policy asks of a planner; see `franka_wm.planning.MPPI.plan` for the shapes."""
+
+    def plan(
+        self,
+        z: Tensor,
+        next: Next,
+        objective: Objective,
+        *,
+        prior: Prior | None = None,
+        previous: Tensor | None = None,
+        is_init: Tensor | None = None,
+        explore: bool = False,
+        generator: torch.Generator | None = None,
+    ) -> TensorDict: ...
+
+
+# ---------------------------------------------------------------------- settings
+
+
+def require_counts(**counts: int) -> None:
+    """Raises ValueError naming the first of `counts` that is below 1."""
+    for name, count in counts.items():
+        if count < 1:
+            raise ValueError(f"{name} must be at least 1, got {count}")
+
+
+def require_fraction(**fractions: float) -> None:
+    """Raises ValueError naming the first of `fractions` outside [0, 1)."""
+    for name, value in fractions.items():
+        if not 0.0 <= value < 1.0:
+            raise ValueError(f"{name} must be in [0, 1), got {value}")
+
+
+def require_bounds(low: float, high: float) -> None:
+    """Raises ValueError unless `low` < `high`."""
+    if not low < high:
+        raise ValueError(f"low must be below high, got [{low}, {high}]")
+
+
+# ---------------------------------------------------------------------- the start of a search
+
+
+def warm_start(
+    z: Tensor,
+    previous: Tensor | None,
+    is_init: Tensor | None,
+    *,
+    horizon: int,
+    action_dim: int,
+    low: float,
+    high: float,
+    repeat_last: bool = False,
+) -> Tensor:
+    """Plan to start from (E, H, A): the previous one, one step on, or the middle of the bounds.
+
+    Args:
+        z: current latents (E, ...): how many environments, where, and in which precision.
+        previous: plan of the last call (E, H, A), or None.
+        is_init: (E, 1) bool; where True, `previous` belongs to another episode and is dropped.
+        repeat_last: fill the step that comes into sight with the last action; else with the middle.
+
+    Raises:
+        ValueError: `previous` or `is_init` has another shape.
+    """
+    shape = (z.shape[0], horizon, action_dim)
+    cold = torch.full(shape, 0.5 * (low + high), device=z.device, dtype=z.dtype)
+    if previous is None:
+        return cold
+    if previous.shape != shape:
+        raise ValueError(f"previous must have shape (E, H, A) = {shape}, got {tuple(previous.shape)}")
+    previous = previous.to(z.dtype)
+    shifted = torch.cat((previous[:, 1:], previous[:, -1:] if repeat_last else cold[:, :1]), dim=1)
+    if is_init is None:
+        return shifted
+    require_is_init(is_init, z.shape[0])
+    return torch.where(is_init.unsqueeze(-1), cold, shifted)
+
+
+def require_is_init(is_init: Tensor, envs: int) -> None:
+    """Raises ValueError unless `is_init` is (E, 1)."""
+    if is_init.shape != (envs, 1):
+        raise ValueError(f"is_init must have shape (E, 1) = {(envs, 1)}, got {tuple(is_init.shape)}")
+
+
+# ---------------------------------------------------------------------- candidates
+
+
+def rollout(z: Tensor, actions: Tensor, next: Next) -> Tensor:
+    """Latents (E, ...) and candidates (E, S, H, A) -> trajectories (E, S, H+1, ...) that start at `z`."""
+    latents = [z.unsqueeze(1).expand(z.shape[0], actions.shape[1], *z.shape[1:])]
+    for t in range(actions.shape[2]):
+        latents.append(next(latents[-1], actions[:, :, t]))
+    return torch.stack(latents, dim=2)
+
+
+def roll_prior(
+    z: Tensor, next: Next, prior: Prior, *, samples: int, horizon: int, low: float, high: float
+) -> Tensor:
+    """Candidates of a policy (E, samples, H, A), each unrolled from `z`."""
+    latent = z.unsqueeze(1).expand(z.shape[0], samples, *z.shape[1:])
+    actions = []
+    for _ in range(horizon):
+        # A weight of zero does not remove a nan from a weighted mean, so it must not get in.
+        actions.append(torch.nan_to_num(prior(latent), nan=0.0).clamp(low, high))
+        latent = next(latent, actions[-1])
+    return torch.stack(actions, dim=2)
+
+
+def gaussian_candidates(
+    mean: Tensor, std: Tensor, samples: int, *, low: float, high: float, generator: torch.Generator | None
+) -> Tensor:
+    """Draws of independent Gaussians: mean and std (E, H, A) -> (E, samples, H, A), clamped."""
+    envs, horizon, action_dim = mean.shape
+    noise = torch.randn(
+        envs, samples, horizon, action_dim, device=mean.device, dtype=mean.dtype, generator=generator
+    )
+    return (mean.unsqueeze(1) + std.unsqueeze(1) * noise).clamp(low, high)
+
+
+def explored(
+    action: Tensor,
+    std: Tensor | float,
+    explore: bool,
+    *,
+    low: float,
+    high: float,
+    generator: torch.Generator | None,
+) -> Tensor:
+    """The action (E, A) within its bounds, with Gaussian noise of `std` if `explore`."""
+    if explore:
+        noise = torch.randn(action.shape, device=action.device, dtype=action.dtype, generator=generator)
+        action = action + std * noise
+    return action.clamp(low, high)
+
+
+# ---------------------------------------------------------------------- the best candidates
+
+
+class Elites(NamedTuple):
+    """The best candidates of each environment, best first."""
+
+    index: Tensor
+    """(E, K): which candidates they are."""
+    scores: Tensor
+    """(E, K), always finite: the worst valid score (0 if none is valid) stands in for one that is not."""
+    valid: Tensor
+    """(E, K) bool: whether the score was finite."""
+
+    def mean_score(self) -> Tensor:
+        """Mean of the valid scores (E, 1); where none is valid, 0."""
+        weight = self.valid.to(self.scores.dtype)
+        return (weight * self.scores).sum(1, keepdim=True) / weight.sum(1, keepdim=True).clamp(min=1.0)
+
+
+def best(scores: Tensor, count: int) -> Elites:
+    """The `count` best of scores (E, S); those that are not finite come last, whatever they are."""
+    valid = torch.isfinite(scores)
+    largest = torch.finfo(scores.dtype).max
+    worst = torch.where(valid, scores, largest).amin(1, keepdim=True)
+    worst = torch.where(valid.any(1, keepdim=True), worst, torch.zeros_like(worst))
+    # Stand in with the worst valid score, which keeps the statistics finite, but rank below it.
+    order = torch.where(valid, scores, -largest)
+    index = order.topk(count, dim=1).indices
+    return Elites(index, torch.where(valid, scores, worst).gather(1, index), valid.gather(1, index))
+
+
+def take(actions: Tensor, index: Tensor) -> Tensor:
+    """Candidates (E, S, H, A) at `index` (E, K) -> (E, K, H, A)."""
+    return actions.gather(1, index[..., None, None].expand(-1, -1, *actions.shape[2:]))
+
+
+def refit(
+    elites: Tensor, valid: Tensor, mean: Tensor, std: Tensor, *, momentum: float
+) -> tuple[Tensor, Tensor]:
+    """Gaussian of the elites, each weighing the same, smoothed with the one before.
+
+    new = `momentum` · old + (1 - `momentum`) · fitted, for mean and standard deviation. Where no elite is
+    valid, the old Gaussian stays.
+
+    Args:
+        elites: (E, K, H, A).
+        valid: (E, K) bool; the others weigh nothing.
+        mean, std: the Gaussian they were drawn from, (E, H, A).
+    """
+    count = valid.sum(1).view(-1, 1, 1)
+    weight = (valid.to(elites.dtype) / valid.sum(1, keepdim=True).clamp(min=1))[..., None, None]
+    fitted = (weight * elites).sum(1)
+    deviation = (weight * (elites - fitted.unsqueeze(1)).square()).sum(1).sqrt()
+    keep = momentum + (1.0 - momentum) * (count == 0).to(elites.dtype)
+    return keep * mean + (1.0 - keep) * fitted, keep * std + (1.0 - keep) * deviation
