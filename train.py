@@ -17,6 +17,7 @@ from franka_wm.training.entry import one_line_errors, run_command
 @one_line_errors
 def main(cfg: DictConfig) -> None:
     """One run: build, train, evaluate, report."""
+    from franka_wm.envs import resolve_device
     from franka_wm.evaluation.report import evaluate_and_report
     from franka_wm.training import build
     from franka_wm.training.entry import finish, start
@@ -25,26 +26,25 @@ def main(cfg: DictConfig) -> None:
 
     run = start(cfg)
     env, judge = run.build_environments()
-    model = build.make_model(run.cfg, env)
-    planner = build.make_planner(run.cfg, env.action_dim)
-    policies = build.make_policies(
-        model, planner, env, seed=run.cfg.seed, smoothness=run.cfg.collector.smoothness
-    )
+    replay, spaces = run.build_experience(env)
+    model = build.make_model(run.cfg, spaces, resolve_device(run.cfg.device))
+    policies = build.make_agent_policies(run.cfg, model, judge, spaces)
     trainer = Trainer(
         env=env,
         learner=Learner(model, **run.learner_options()),
-        replay=build.make_replay_buffer(run.cfg, env.device),
+        replay=replay,
         policies=policies,
         actor=build.ACTORS[run.cfg.collector.acts],
         cfg=run.cfg,
         folder=run.folder,
         loggers=run.loggers,
         evaluate=run.evaluation_during_training(judge, policies),
+        spaces=spaces,
     )
     if run.checkpoint is not None:
         trainer.restore(run.checkpoint)
     trainer.fit()
-    if not trainer.interrupted:
+    if not trainer.interrupted and policies:
         evaluate_and_report(run.cfg, run.folder, judge, policies, rows=trainer.rows)
     finish(run, interrupted=trainer.interrupted)
 

@@ -96,3 +96,48 @@ class OraclePolicy(TensorDictModuleBase):
         else:
             action = (k.solve(goal, target) - target) / c.action_scale
         return tensordict.set("action", action.clamp(-1.0, 1.0))
+
+
+class DiscretePolicy(TensorDictModuleBase):
+    """A policy for continuous actions, played with numbered moves: the row of the table nearest to its action.
+
+    Args:
+        policy: Writes ``action`` (N, A).
+        table: The moves, (M, A).
+    """
+
+    def __init__(self, policy: TensorDictModuleBase, table: torch.Tensor):
+        super().__init__()
+        self.policy = policy
+        self.table = table
+        self.in_keys = list(policy.in_keys)  # pyright: ignore[reportAttributeAccessIssue]
+        self.out_keys = ["action"]
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        action = self.policy(tensordict).get("action")
+        distance = (action.unsqueeze(-2) - self.table).square().sum(-1)
+        return tensordict.set("action", distance.argmin(-1))
+
+
+class RandomMovesPolicy(TensorDictModuleBase):
+    """A move drawn uniformly, in every step: int64 (N,).
+
+    Args:
+        num_actions: How many moves there are.
+        generator: Source of randomness.
+    """
+
+    in_keys = ["is_init"]  # pyright: ignore[reportAssignmentType]
+    out_keys = ["action"]  # pyright: ignore[reportAssignmentType]
+
+    def __init__(self, num_actions: int, *, generator: torch.Generator | None = None):
+        super().__init__()
+        self.num_actions = num_actions
+        self.generator = generator
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        is_init = tensordict.get("is_init")
+        action = torch.randint(
+            self.num_actions, is_init.shape[:-1], device=is_init.device, generator=self.generator
+        )
+        return tensordict.set("action", action)

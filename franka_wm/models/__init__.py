@@ -23,6 +23,18 @@ def available() -> dict[str, str]:
     return {name: line for name, (_, _, line) in _FAMILIES.items()}
 
 
+def family(name: str) -> type:
+    """The class of the family `name`.
+
+    Raises:
+        ValueError: no family has this name; the message lists those that exist.
+    """
+    if name not in _FAMILIES:
+        raise ValueError(f"unknown model {name!r}; available: {', '.join(sorted(_FAMILIES))}")
+    module, cls, _ = _FAMILIES[name]
+    return getattr(import_module(module), cls)
+
+
 def make(name: str, **overrides: Any) -> Any:
     """Build the model family `name`; `overrides` go to its constructor.
 
@@ -31,7 +43,20 @@ def make(name: str, **overrides: Any) -> Any:
     Raises:
         ValueError: no family has this name; the message lists those that exist.
     """
-    if name not in _FAMILIES:
-        raise ValueError(f"unknown model {name!r}; available: {', '.join(sorted(_FAMILIES))}")
-    module, cls, _ = _FAMILIES[name]
-    return getattr(import_module(module), cls)(**overrides)
+    return family(name)(**overrides)
+
+
+def load(folder: str, *, device: str = "cpu") -> Any:
+    """A trained model from a checkpoint alone, in evaluation mode: no environment is built.
+
+    Args:
+        folder: a run's folder, a checkpoint in it, or `hf:user/name` on the Hugging Face Hub.
+        device: where the weights go.
+
+    Raises:
+        UserError: no checkpoint there, or a damaged one.
+    """
+    # Checkpoints belong to the room above; this is the door that users know, opened when it is used.
+    from franka_wm.training.load import load_model
+
+    return load_model(folder, device=device)

@@ -20,6 +20,11 @@ def _explores(explore: bool | None) -> bool:
     return interaction_type() is InteractionType.RANDOM if explore is None else explore
 
 
+def _keys(model: Any) -> list[str]:
+    keys = getattr(model, "observation_keys", None)
+    return list(getattr(model, "observation_sizes", ()) if keys is None else keys)
+
+
 class PlannerPolicy(TensorDictModuleBase):
     """Encode, plan, act; the plan travels as an entry of the TensorDict.
 
@@ -27,12 +32,19 @@ class PlannerPolicy(TensorDictModuleBase):
     start). Writes `action` (E, A) and `plan`. The plan is dropped where `is_init` is True. The batch size is
     [E]. No gradient is recorded.
 
+    A model with memory (`observe`) predicts from a history that its latents hold. Then the last latent and
+    the action taken in it travel along, too, as `context` (E, Z) and `context_action` (E, A).
+
+    An objective that depends on the observation (a goal picture) has `bind(tensordict)`, which is called at
+    every decision.
+
     Args:
         planner: MPPI or anything with its `plan`.
         encode: observation TensorDict of batch size [E] -> latents (E, D).
         next: (z, action) -> next z, any leading dimensions.
         objective: see `franka_wm.planning.objectives`.
         observation_keys: what `encode` reads.
+        observe: (observation, latent before, action, is_init) -> latents (E, Z), of a model with memory.
         prior: a policy z -> action for some of the candidates.
         explore: whether to add noise to the action; None follows TorchRL's exploration type.
         model: the module behind the callables, so that collectors find its parameters and move it along. If
@@ -48,15 +60,18 @@ class PlannerPolicy(TensorDictModuleBase):
         next: Callable[[Tensor, Tensor], Tensor],
         objective: Objective,
         observation_keys: Sequence[str],
+        observe: Callable[[TensorDictBase, Tensor, Tensor, Tensor], Tensor] | None = None,
         prior: Callable[[Tensor], Tensor] | None = None,
         explore: bool | None = None,
         model: nn.Module | None = None,
     ) -> None:
         super().__init__()
-        self.in_keys = [*observation_keys, "is_init"]
-        self.out_keys = ["action", "plan"]
+        self.in_keys = [*observation_keys, *getattr(objective, "in_keys", ()), "is_init"]
+        context = [] if observe is None else ["context", "context_action"]
+        self.out_keys = ["action", "plan", *context]
         self.planner, self.explore, self.model = planner, explore, model
         self.encode, self.next, self.objective, self.prior = encode, next, objective, prior
+        self.observe = observe
 
     @classmethod
     def for_model(
@@ -71,7 +86,7 @@ class PlannerPolicy(TensorDictModuleBase):
         """Plan with any model that has `encode` and `next`.
 
         Args:
-            observation_keys: those of `model.observation_sizes` when None.
+            observation_keys: the model's own, `observation_keys` or `observation_sizes`, when None.
             objective: rewards plus value of the model, with its `discount`, when None.
             explore: see the class.
 
@@ -81,7 +96,7 @@ class PlannerPolicy(TensorDictModuleBase):
             ValueError: the model lacks what a default needs.
         """
         if observation_keys is None:
-            observation_keys = list(getattr(model, "observation_sizes", ()))
+            observation_keys = _keys(model)
             if not observation_keys:
                 raise ValueError(f"{type(model).__name__} has no observation_sizes: give observation_keys")
         if objective is None:
@@ -95,6 +110,7 @@ class PlannerPolicy(TensorDictModuleBase):
             next=model.next,
             objective=objective,
             observation_keys=observation_keys,
+            observe=getattr(model, "observe", None),
             prior=getattr(model, "policy", None),
             explore=explore,
             model=model if isinstance(model, nn.Module) else None,
@@ -114,10 +130,12 @@ class PlannerPolicy(TensorDictModuleBase):
             raise ValueError(
                 "a plan is carried but is_init is missing: append torchrl.envs.InitTracker to the env"
             )
+        z = self._latent(tensordict, is_init)
+        bind = getattr(self.objective, "bind", None)
         result = self.planner.plan(
-            self.encode(tensordict),
+            z,
             self.next,
-            self.objective,
+            self.objective if bind is None else bind(tensordict),
             prior=self.prior,
             previous=previous,
             is_init=is_init,
@@ -125,7 +143,20 @@ class PlannerPolicy(TensorDictModuleBase):
         )
         tensordict.set("action", result.get("action"))
         tensordict.set("plan", result.get("plan"))
+        if self.observe is not None:
+            tensordict.set("context", z).set("context_action", result.get("action"))
         return tensordict
+
+    def _latent(self, tensordict: TensorDictBase, is_init: Tensor | None) -> Tensor:
+        before = None if self.observe is None else tensordict.get("context", None)
+        if before is None:
+            return self.encode(tensordict)
+        if is_init is None:
+            raise ValueError(
+                "a context is carried but is_init is missing: append torchrl.envs.InitTracker to the env"
+            )
+        assert self.observe is not None
+        return self.observe(tensordict, before, tensordict.get("context_action"), is_init)
 
 
 class ModelPolicy(TensorDictModuleBase):
@@ -159,7 +190,7 @@ class ModelPolicy(TensorDictModuleBase):
         return cls(
             encode=model.encode,
             policy=model.policy,
-            observation_keys=list(model.observation_sizes),
+            observation_keys=_keys(model),
             explore=explore,
             model=model if isinstance(model, nn.Module) else None,
         )

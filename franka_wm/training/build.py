@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any
 
 import torch
@@ -10,13 +10,24 @@ from omegaconf import DictConfig, OmegaConf
 from torchrl.data import ReplayBuffer
 
 from franka_wm import models, planning
-from franka_wm.data.policies import NoopPolicy, OraclePolicy, SmoothRandomPolicy
+from franka_wm.data.policies import (
+    DiscretePolicy,
+    NoopPolicy,
+    OraclePolicy,
+    RandomMovesPolicy,
+    SmoothRandomPolicy,
+)
 from franka_wm.data.replay import make_replay
-from franka_wm.envs import FrankaConfig, FrankaEnv, resolve_device
-from franka_wm.envs.config import IMAGES, NUM_JOINTS, STATE_DIM
-from franka_wm.envs.franka import check_robot
+from franka_wm.envs import FrankaConfig, FrankaEnv, TransformedFrankaEnv, resolve_device
+from franka_wm.envs.discretize import DiscreteActions
 from franka_wm.errors import UserError
 from franka_wm.planning import ModelPolicy, PlannerPolicy
+from franka_wm.training.spaces import Spaces
+
+ACTORS = {"policy": "policy", "planner": "planner", "smooth": "random", "noop": "noop", "ik": "oracle"}
+"""What ``collector.acts`` may be, and the policy that it names."""
+
+POLICIES = ("planner", "policy", "noop", "random", "oracle")
 
 
 def plain(node: Any) -> dict[str, Any]:
@@ -24,96 +35,254 @@ def plain(node: Any) -> dict[str, Any]:
     return dict(OmegaConf.to_container(node, resolve=True)) if isinstance(node, DictConfig) else dict(node)  # type: ignore[arg-type]
 
 
-def make_env(
-    cfg: DictConfig, *, num_envs: int | None = None, seed: int | None = None, **changes: Any
-) -> FrankaEnv:
-    """The environment that ``cfg.env`` describes; ``changes`` override fields of its config."""
-    values = plain(cfg.env)
-    kind, urdf_path = values.pop("kind"), values.pop("urdf_path")
-    if kind != "franka":
-        raise UserError(f"env.kind={kind!r}: must be franka")
-    return FrankaEnv(
-        FrankaConfig.from_mapping(values | changes),
-        num_envs=cfg.collector.num_envs if num_envs is None else num_envs,
-        device=cfg.device,
-        seed=cfg.seed if seed is None else seed,
-        urdf_path=urdf_path,
-    )
+# -- environments -------------------------------------------------------------------------------------------
 
 
-def make_evaluation_env(cfg: DictConfig, *, num_envs: int | None = None) -> FrankaEnv:
-    """The same task for evaluation: with what the oracle reads; without pictures unless the model sees."""
-    sees = "pixels" in observation_keys(cfg)
-    observations = [o for o in ("pixels",) if sees] + ["state", "joint_target"]
-    return make_env(
-        cfg, num_envs=cfg.evaluation.episodes if num_envs is None else num_envs, observations=observations
-    )
+def is_arm(cfg: DictConfig) -> bool:
+    """Whether the environment is the arm, not one of another library."""
+    return cfg.env.kind == "franka"
 
 
-def observation_keys(cfg: DictConfig) -> list[str]:
-    """What the model reads: everything but pictures that the environment emits."""
-    keys = [key for key in cfg.env.observations if key not in IMAGES]
-    if "state" not in keys:
-        raise UserError(f"env.observations={list(cfg.env.observations)}: model={cfg.model.name} needs state")
-    return keys
+def make_env(cfg: DictConfig, *, num_envs: int | None = None, seed: int | None = None, **changes: Any) -> Any:
+    """The environment that ``cfg.env`` describes; ``changes`` override fields of its config.
 
+    For a model that chooses among moves, the arm's actions are numbers of moves.
+    """
+    values = plain(cfg.env) | changes
+    worlds = int(cfg.collector.num_envs if num_envs is None else num_envs)
+    start = int(cfg.seed if seed is None else seed)
+    if not is_arm(cfg):
+        from franka_wm.envs.external import ExternalEnv, external_config
 
-def make_model(cfg: DictConfig, env: FrankaEnv) -> Any:
-    """The world model that ``cfg.model`` names, on the environment's device."""
-    sizes = {key: env.observation_spec[key].shape[-1] for key in observation_keys(cfg)}
-    return _make_model(cfg, sizes, env.action_dim, env.config.episode_length).to(env.device)
-
-
-def _make_model(cfg: DictConfig, sizes: dict[str, int], action_dim: int, episode_length: int) -> Any:
-    values = plain(cfg.model)
-    name = values.pop("name")
-    for key, value in values.items():
-        if key.endswith(("_dim", "_layers", "num_q", "bins")) and (not isinstance(value, int) or value < 1):
-            raise UserError(f"model.{key}={value!r}: must be a whole number of at least 1")
-    try:
-        return models.make(
-            name, observation_sizes=sizes, action_dim=action_dim, episode_length=episode_length, **values
+        return ExternalEnv(
+            external_config(values), num_envs=worlds, device=resolve_device(cfg.device), seed=start
         )
+    del values["kind"]
+    urdf_path = values.pop("urdf_path")
+    config = FrankaConfig.from_mapping(values)
+    env = FrankaEnv(config, num_envs=worlds, device=cfg.device, seed=start, urdf_path=urdf_path)
+    return TransformedFrankaEnv(env, DiscreteActions(config.action_dim)) if is_discrete(cfg) else env
+
+
+def make_evaluation_env(cfg: DictConfig, *, num_envs: int | None = None, **changes: Any) -> Any:
+    """The same task for evaluation: with what the oracle reads, and the pictures that the model reads."""
+    num_envs = cfg.evaluation.episodes if num_envs is None else num_envs
+    if is_arm(cfg):
+        read = model_keys(cfg) or []
+        goal = ["goal_pixels"] if plans_to_pictures(cfg) else []
+        pictures = [o for o in cfg.env.observations if o not in ("state", "joint_target")]
+        used = [o for o in pictures if any(key == o or key.startswith(f"{o}_") for key in [*read, *goal])]
+        changes = {"observations": [*used, "state", "joint_target"]} | changes
+    return make_env(cfg, num_envs=num_envs, **changes)
+
+
+# -- models -------------------------------------------------------------------------------------------------
+
+
+NOT_FOR_MODELS = ("name", "observations", "window", "lr")
+"""Entries of ``conf/model`` that are about a family's training, not for its constructor."""
+
+
+def window(cfg: DictConfig) -> int:
+    """Transitions of a training window: ``replay.window``, or what the model asks for."""
+    return cfg.model.window if cfg.replay.window is None else cfg.replay.window
+
+
+def learning_rate(cfg: DictConfig) -> float:
+    """``trainer.lr``, or the model's own."""
+    return cfg.model.lr if cfg.trainer.lr is None else cfg.trainer.lr
+
+
+def model_keys(cfg: DictConfig) -> list[str] | None:
+    """The observations that ``cfg.model`` names; ``None``: every vector that there is."""
+    keys = cfg.model.get("observations")
+    return None if keys is None else list(keys)
+
+
+def is_discrete(cfg: DictConfig) -> bool:
+    """Whether the model chooses among moves."""
+    try:
+        return bool(getattr(models.family(cfg.model.name), "discrete", False))
+    except ValueError as error:
+        raise UserError(f"model.name: {error}") from error
+
+
+def make_model(cfg: DictConfig, surroundings: Any, device: torch.device | str | None = None) -> Any:
+    """The world model that ``cfg.model`` names.
+
+    Args:
+        surroundings: :class:`Spaces`, or an environment.
+        device: The environment's if there is one.
+    """
+    if not isinstance(surroundings, Spaces):
+        device = surroundings.device if device is None else device
+        surroundings = Spaces.of_env(surroundings)
+    values = {key: value for key, value in plain(cfg.model).items() if key not in NOT_FOR_MODELS}
+    name = cfg.model.name
+    spaces = surroundings.only(model_keys(cfg), f"model={name}")
+    for key, value in values.items():
+        counted = key.endswith(("_dim", "_layers", "num_q", "bins"))
+        if counted and (isinstance(value, bool) or not isinstance(value, int) or value < 1):
+            raise UserError(f"model.{key}={value!r}: must be a whole number of at least 1")
+    discrete = is_discrete(cfg)
+    if discrete and not spaces.num_actions:
+        raise UserError(f"model={name} chooses among moves; this environment's actions are continuous")
+    if not discrete and not spaces.action_dim:
+        raise UserError(
+            f"model={name} needs continuous actions, here are {spaces.num_actions} moves; try model=muzero"
+        )
+    actions = {"num_actions": spaces.num_actions} if discrete else {"action_dim": spaces.action_dim}
+    sizes: dict[str, Any] = {"observation_sizes": spaces.observation_sizes}
+    if spaces.image_sizes:
+        sizes["image_sizes"] = spaces.image_sizes
+    try:
+        model = models.make(name, **sizes, **actions, episode_length=spaces.episode_length, **values)
     except (TypeError, ValueError) as error:
         raise UserError(f"model={name}: {error}") from error
+    return model.to(device)
 
 
-def make_planner(cfg: DictConfig, action_dim: int) -> Any:
-    """The planner that ``cfg.planner`` names."""
+# -- planners and policies ----------------------------------------------------------------------------------
+
+PLANNERS: Mapping[str, tuple[str, str]] = {
+    "mppi": ("franka_wm.planning.mppi", "MPPI"),
+    "cem": ("franka_wm.planning.cem", "CEM"),
+    "icem": ("franka_wm.planning.icem", "ICEM"),
+    "gradient": ("franka_wm.planning.gradient", "GradientPlanner"),
+    "mcts": ("franka_wm.planning.mcts", "MCTS"),
+}
+"""Name → module and class. To add a planner: a file, a line here, a file in ``conf/planner``."""
+
+SEARCHES = ("mcts",)
+"""Planners for numbered moves; the others are for continuous actions."""
+
+
+def make_planner(cfg: DictConfig, actions: int) -> Any:
+    """The planner that ``cfg.planner`` names.
+
+    Args:
+        actions: Size of a continuous action, or the number of moves.
+    """
+    from importlib import import_module
+
     values = plain(cfg.planner)
     name = values.pop("name")
-    known = {"mppi": planning.MPPI}
-    if name not in known:
-        raise UserError(f"planner={name!r}: must be one of {', '.join(known)}")
+    if name not in PLANNERS:
+        raise UserError(f"planner={name!r}: must be one of {', '.join(PLANNERS)}")
+    discrete = is_discrete(cfg)
+    if discrete != (name in SEARCHES):
+        fitting = [one for one in PLANNERS if (one in SEARCHES) == discrete]
+        what = "chooses among moves" if discrete else "has continuous actions"
+        raise UserError(f"planner={name}: model={cfg.model.name} {what}; use planner={' or '.join(fitting)}")
+    for key, value in values.items():
+        counts = key in ("horizon", "iterations") or key.startswith("num_")
+        if counts and (isinstance(value, bool) or not isinstance(value, int)):
+            raise UserError(f"planner.{key}={value!r}: must be a whole number")
+    module, kind = PLANNERS[name]
+    size = {"num_actions": actions} if discrete else {"action_dim": actions}
     try:
-        return known[name](action_dim=action_dim, **values)
+        return getattr(import_module(module), kind)(**size, **values)
     except (TypeError, ValueError) as error:
         raise UserError(f"planner={name}: {error}") from error
 
 
+def plans_to_pictures(cfg: DictConfig) -> bool:
+    """Whether the planner's goal is a picture."""
+    return objective_name(cfg) == "goal_image"
+
+
+def objective_name(cfg: DictConfig) -> str | None:
+    """``reward_value``, ``goal_image``, or ``None`` for a family that does not plan by an objective."""
+    name = cfg.objective.name
+    if name != "auto":
+        return name
+    family = models.family(cfg.model.name)
+    if getattr(family, "discrete", False) or not hasattr(family, "next"):
+        return None
+    return "reward_value" if hasattr(family, "value") else "goal_image"
+
+
+def make_objective(cfg: DictConfig, model: Any) -> Any:
+    """What the planner maximises, by ``cfg.objective``."""
+    o = cfg.objective
+    name = objective_name(cfg)
+    if name is None:
+        return None
+    if name == "reward_value":
+        lacking = [part for part in ("reward", "value", "discount") if not hasattr(model, part)]
+        if lacking:
+            raise UserError(
+                f"objective=reward_value: model={cfg.model.name} has no {', '.join(lacking)}; use objective=goal_image"
+            )
+        chosen: Any = planning.RewardPlusValue(model.reward, model.value, model.discount)
+    elif name == "goal_image":
+        if not hasattr(model, "encode_goal"):
+            raise UserError(
+                f"objective=goal_image: model={cfg.model.name} has no encode_goal; use objective=reward_value"
+            )
+        chosen = planning.GoalImage(
+            model.encode_goal, embed=getattr(model, "embed", None), metric=o.metric, summed=o.summed
+        )
+    else:
+        raise UserError(f"objective.name={name!r}: must be auto, reward_value or goal_image")
+    parts: list[tuple[float, Any]] = [(1.0, chosen)]
+    if o.action_penalty:
+        parts.append((1.0, planning.ActionPenalty(o.action_penalty)))
+    if o.smoothness_penalty:
+        parts.append((1.0, planning.Smoothness(o.smoothness_penalty)))
+    return chosen if len(parts) == 1 else planning.Sum(parts)
+
+
 def make_policies(
-    model: Any, planner: Any, env: FrankaEnv, *, seed: int = 0, smoothness: float = 0.7
+    model: Any, planner: Any, env: Any, *, seed: int = 0, smoothness: float = 0.7, objective: Any = None
 ) -> dict[str, Any]:
     """Every policy that can act or be compared, by name.
 
-    ``random`` is smooth random (first-order autoregressive), ``oracle`` inverse kinematics with true geometry.
+    ``planner`` and ``policy`` where the model has what they need; ``noop`` and ``random`` (smooth random:
+    first-order autoregressive); for the arm ``oracle``, inverse kinematics with true geometry.
     """
     generator = torch.Generator(device=env.device).manual_seed(seed)
-    return {
-        "planner": PlannerPolicy.for_model(model, planner),
-        "policy": ModelPolicy.for_model(model),
-        "noop": NoopPolicy(env.action_dim),
-        "random": SmoothRandomPolicy(env.action_dim, smoothness=smoothness, generator=generator),
-        "oracle": OraclePolicy(env.kinematics, env.config),
+    policies: dict[str, Any] = {}
+    discrete = not env.action_spec.dtype.is_floating_point
+    if discrete:
+        policies["planner"] = planning.SearchPolicy.for_model(model, planner)
+    elif hasattr(model, "next"):
+        policies["planner"] = PlannerPolicy.for_model(model, planner, objective=objective)
+    if hasattr(model, "policy"):
+        policies["policy"] = ModelPolicy.for_model(model)
+    arm = isinstance(env, (FrankaEnv, TransformedFrankaEnv))
+    if discrete and not arm:
+        policies["random"] = RandomMovesPolicy(env.action_dim, generator=generator)
+        return policies
+    size = env.config.action_dim if arm else env.action_dim
+    others: dict[str, Any] = {
+        "noop": NoopPolicy(size),
+        "random": SmoothRandomPolicy(size, smoothness=smoothness, generator=generator),
     }
+    if arm:
+        others["oracle"] = OraclePolicy(env.kinematics, env.config)
+    if discrete:
+        moves: Any = env.transform
+        others = {name: DiscretePolicy(policy, moves.table) for name, policy in others.items()}
+    return policies | others
 
 
-ACTORS = {"policy": "policy", "planner": "planner", "smooth": "random", "noop": "noop", "ik": "oracle"}
-"""What ``collector.acts`` may be, and the policy that it names."""
+def make_agent_policies(cfg: DictConfig, model: Any, env: Any, spaces: Spaces) -> dict[str, Any]:
+    """Planner, objective and policies by the configuration; none without an environment to act in."""
+    if env is None:
+        return {}
+    planner = make_planner(cfg, spaces.num_actions or spaces.action_dim) if hasattr(model, "next") else None
+    return make_policies(
+        model,
+        planner,
+        env,
+        seed=cfg.seed,
+        smoothness=cfg.collector.smoothness,
+        objective=make_objective(cfg, model),
+    )
 
 
-POLICIES = ("planner", "policy", "noop", "random", "oracle")
-LOGGERS = ("csv", "tensorboard")
+# -- experience ---------------------------------------------------------------------------------------------
 
 
 def make_replay_buffer(cfg: DictConfig, device: torch.device) -> ReplayBuffer:
@@ -121,82 +290,24 @@ def make_replay_buffer(cfg: DictConfig, device: torch.device) -> ReplayBuffer:
     return make_replay(
         capacity=cfg.replay.capacity,
         num_envs=cfg.collector.num_envs,
-        window=cfg.replay.window,
+        window=window(cfg),
         batch_size=cfg.replay.batch_size,
         device=device,
     )
 
 
-def check(cfg: DictConfig) -> None:
-    """What can be refused before anything is built."""
-    resolve_device(cfg.device)
-    numbers: Mapping[str, tuple[Any, float]] = {
-        "collector.num_envs": (cfg.collector.num_envs, 1),
-        "collector.steps_per_batch": (cfg.collector.steps_per_batch, 1),
-        "collector.seed_steps": (cfg.collector.seed_steps, 1),
-        "replay.capacity": (cfg.replay.capacity, 1),
-        "replay.batch_size": (cfg.replay.batch_size, 1),
-        "replay.window": (cfg.replay.window, 1),
-        "trainer.updates": (cfg.trainer.updates, 0),
-        "trainer.updates_per_batch": (cfg.trainer.updates_per_batch, 1),
-        "evaluation.episodes": (cfg.evaluation.episodes, 2),
-        "evaluation.video_episodes": (cfg.evaluation.video_episodes, 0),
-        "evaluation.video_size": (cfg.evaluation.video_size, 16),
-    }
-    for name, (value, least) in numbers.items():
-        if isinstance(value, bool) or not isinstance(value, int) or value < least:
-            raise UserError(f"{name}={value!r}: must be a whole number of at least {least}")
-    if cfg.evaluation.video_size % 2:
-        raise UserError(
-            f"evaluation.video_size={cfg.evaluation.video_size}: must be even, video codecs want it"
-        )
-    if cfg.collector.acts not in ACTORS:
-        raise UserError(f"collector.acts={cfg.collector.acts!r}: must be one of {', '.join(ACTORS)}")
-    if cfg.env.episode_length < cfg.replay.window:
-        raise UserError(
-            f"env.episode_length={cfg.env.episode_length} is shorter than replay.window={cfg.replay.window}; "
-            "no window would fit into an episode"
-        )
-    for name, value in (("seed", cfg.seed),):
-        if isinstance(value, bool) or not isinstance(value, int):
-            raise UserError(f"{name}={value!r}: must be a whole number")
-    for name, value in (("trainer.lr", cfg.trainer.lr), ("trainer.grad_clip", cfg.trainer.grad_clip)):
-        if isinstance(value, bool) or not isinstance(value, (int, float)) or not value > 0:
-            raise UserError(f"{name}={value!r}: must be above 0")
-    for name, value in (
-        ("trainer.log_every", cfg.trainer.log_every),
-        ("trainer.checkpoint_every", cfg.trainer.checkpoint_every),
-        ("evaluation.every", cfg.evaluation.every),
-    ):
-        if isinstance(value, bool) or not isinstance(value, (int, float)) or not value > 0:
-            raise UserError(f"{name}={value!r}: must be a number of seconds above 0")
-    for name, value in plain(cfg.planner).items():
-        counts = name in ("horizon", "iterations") or name.startswith("num_")
-        if counts and (isinstance(value, bool) or not isinstance(value, int)):
-            raise UserError(f"planner.{name}={value!r}: must be a whole number")
-    if not 0 <= cfg.collector.smoothness < 1:
-        raise UserError(f"collector.smoothness={cfg.collector.smoothness}: must be at least 0 and below 1")
-    if cfg.replay.capacity < (steps := cfg.collector.num_envs * (cfg.replay.window + 1)):
-        raise UserError(
-            f"replay.capacity={cfg.replay.capacity}: must be at least {steps}, one window for every world"
-        )
-    if cfg.replay.capacity < cfg.collector.num_envs * cfg.collector.steps_per_batch:
-        raise UserError(f"replay.capacity={cfg.replay.capacity}: smaller than one batch of the collector")
-    _check_names("evaluation.during", cfg.evaluation.during, POLICIES)
-    _check_names("logger.names", cfg.logger.names, LOGGERS)
-    values = plain(cfg.env)
-    kind, urdf_path = values.pop("kind"), values.pop("urdf_path")
-    if kind != "franka":
-        raise UserError(f"env.kind={kind!r}: must be franka")
-    config = FrankaConfig.from_mapping(values)
-    keys = observation_keys(cfg)
-    check_robot(config, urdf_path)
-    sizes = {"state": STATE_DIM, "joint_target": NUM_JOINTS}
-    _make_model(cfg, {key: sizes[key] for key in keys}, config.action_dim, config.episode_length)
-    make_planner(cfg, config.action_dim)
+def is_offline(cfg: DictConfig) -> bool:
+    """Whether experience comes from recorded data."""
+    return cfg.dataset.kind != "none"
 
 
-def _check_names(option: str, names: Any, known: Sequence[str]) -> None:
-    unknown = [name for name in names if name not in known]
-    if unknown:
-        raise UserError(f"{option}: no {unknown[0]!r}; choose from {', '.join(known)}")
+def open_recorded(cfg: DictConfig, device: torch.device) -> tuple[Any, Any]:
+    """Training and validation windows of the datasets that ``cfg.dataset`` names."""
+    from franka_wm.data.lerobot import open_dataset
+
+    values = plain(cfg.dataset)
+    kind = values.pop("kind")
+    if kind != "lerobot":
+        raise UserError(f"dataset.kind={kind!r}: must be none or lerobot")
+    common = values | {"window": window(cfg), "batch_size": cfg.replay.batch_size, "device": device}
+    return tuple(open_dataset(**common, split=split) for split in ("train", "validation"))  # type: ignore[return-value]

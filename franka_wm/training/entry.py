@@ -85,7 +85,7 @@ def check_command(arguments: list[str]) -> str | None:
     from hydra.errors import HydraException
     from omegaconf.errors import OmegaConfBaseException
 
-    from franka_wm.training import build
+    from franka_wm.training.check import check
 
     if any(a in ("-m", "--multirun") for a in arguments):
         return None  # sweeps are resolved by Hydra itself
@@ -94,10 +94,10 @@ def check_command(arguments: list[str]) -> str | None:
         with initialize_config_dir(folder, version_base="1.3"):
             cfg = compose("config", overrides=arguments)
         if cfg.resume is None:
-            build.check(cfg)
+            check(cfg)
         else:
             _, cfg = resumed(cfg, arguments)
-            build.check(cfg)
+            check(cfg)
     except FrankaError as error:
         return str(error)
     except (HydraException, OmegaConfBaseException) as error:
@@ -143,24 +143,55 @@ class Run:
     loggers: list[Any] = field(default_factory=list)
 
     def build_environments(self) -> tuple[Any, Any]:
-        """The training worlds and the evaluation worlds, compiled and ready."""
+        """The training worlds and the evaluation worlds, compiled and ready; ``None`` where there are none.
+
+        A run on recorded data trains in no world; without an environment (``env=none``) none judges it either.
+        """
         from franka_wm.training import build
 
-        with announced(
-            f"building {self.cfg.collector.num_envs} training and {self.cfg.evaluation.episodes} evaluation worlds; "
-            "on a machine's first start this compiles kernels for a minute or two"
-        ):
+        if self.cfg.env.kind == "none":
+            return None, None
+        gathers = not build.is_offline(self.cfg)
+        worlds = f"{self.cfg.evaluation.episodes} evaluation worlds"
+        if gathers:
+            worlds = f"{self.cfg.collector.num_envs} training and {worlds}"
+        compiling = "on a machine's first start this compiles kernels for a minute or two"
+        with announced(f"building {worlds}" + (f"; {compiling}" if build.is_arm(self.cfg) else "")):
             judge = build.make_evaluation_env(self.cfg)
-            env = build.make_env(self.cfg)
+            env = build.make_env(self.cfg) if gathers else None
             for one in (env, judge):
-                one.step(one.rand_action(one.reset()))
-                one.statistics()
-                one.set_seed(self.cfg.seed)
+                if one is not None:
+                    one.step(one.rand_action(one.reset()))
+                    one.statistics()
+                    one.set_seed(self.cfg.seed)
         return env, judge
+
+    def build_experience(self, env: Any) -> tuple[Any, Any]:
+        """Where batches come from, and what a model must know of it: ``sample()`` and its :class:`Spaces`."""
+        from franka_wm.envs import resolve_device
+        from franka_wm.training import build
+        from franka_wm.training.spaces import Spaces
+
+        if not build.is_offline(self.cfg):
+            return build.make_replay_buffer(self.cfg, env.device), Spaces.of_env(env)
+        windows, _ = build.open_recorded(self.cfg, resolve_device(self.cfg.device))
+        spaces = Spaces(
+            observation_sizes=dict(windows.observation_sizes),
+            image_sizes=dict(windows.image_sizes),
+            action_dim=windows.action_dim,
+            episode_length=windows.episode_length,
+        )
+        return windows, spaces
 
     def learner_options(self) -> dict[str, Any]:
         trainer = self.cfg.trainer
-        return {name: trainer[name] for name in ("lr", "grad_clip", "capture", "compile")}
+        from franka_wm.training.build import learning_rate
+
+        names = ("grad_clip", "capture", "compile", "precision", "schedule", "warmup")
+        return {name: trainer[name] for name in names} | {
+            "lr": learning_rate(self.cfg),
+            "total_updates": trainer.updates,
+        }
 
     def evaluation_during_training(
         self, env: Any, policies: Mapping[str, Any]
@@ -168,17 +199,17 @@ class Run:
         """A function that plays the policies of ``evaluation.during`` and returns numbers to log."""
         from franka_wm.evaluation.closed_loop import EVALUATION_SEED, play_episodes
 
-        names = list(self.cfg.evaluation.during)
+        names = [name for name in self.cfg.evaluation.during if name in policies]
 
         def evaluate() -> dict[str, float]:
             numbers = {}
             for name in names:
                 episodes = play_episodes(env, policies[name], seed=self.cfg.seed + EVALUATION_SEED)
-                distance = episodes.get("final_distance")
-                numbers[f"eval/{name}/final_distance"] = float(distance.mean())
-                numbers[f"eval/{name}/success"] = float(
-                    (distance < env.config.success_distance).float().mean()
-                )
+                distance = episodes.get("final_distance", None)
+                if distance is not None:
+                    reached = distance < env.config.success_distance
+                    numbers[f"eval/{name}/final_distance"] = float(distance.mean())
+                    numbers[f"eval/{name}/success"] = float(reached.float().mean())
                 numbers[f"eval/{name}/return"] = float(episodes.get("return").mean())
             return numbers
 
@@ -195,13 +226,13 @@ def start(cfg: DictConfig) -> Run:
     from hydra.core.hydra_config import HydraConfig
 
     from franka_wm.envs import resolve_device
-    from franka_wm.training import build
+    from franka_wm.training.check import check
 
     folder = Path(HydraConfig.get().runtime.output_dir)
     checkpoint = None
     if cfg.resume is not None:
         checkpoint, cfg = resumed(cfg, list(HydraConfig.get().overrides.task))
-    build.check(cfg)
+    check(cfg)
     device = resolve_device(cfg.device)
     logging.getLogger("torchrl").setLevel(logging.WARNING)
     torch.manual_seed(cfg.seed)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import torch
@@ -9,6 +10,9 @@ from tensordict import TensorDictBase
 from torch import nn
 
 from franka_wm.errors import UserError
+
+PRECISIONS = ("float32", "bfloat16")
+SCHEDULES = ("constant", "cosine")
 
 
 class Learner:
@@ -27,6 +31,10 @@ class Learner:
         grad_clip: Largest gradient norm of each clip group; the norm before clipping is a metric.
         capture: Capture the update as a CUDA graph; ``None``: on CUDA.
         compile: Compile the loss with ``torch.compile`` first; takes a minute at the start.
+        precision: ``float32``, or ``bfloat16``: the loss runs under autocast, weights and optimiser stay float32.
+        schedule: ``constant``, or ``cosine``: down to zero at ``total_updates``.
+        warmup: Updates over which the learning rate rises from zero.
+        total_updates: Of the run; needed by ``cosine``.
     """
 
     EAGER_UPDATES = 4
@@ -40,7 +48,17 @@ class Learner:
         grad_clip: float = 20.0,
         capture: bool | None = None,
         compile: bool = False,
+        precision: str = "float32",
+        schedule: str = "constant",
+        warmup: int = 0,
+        total_updates: int | None = None,
     ):
+        if precision not in PRECISIONS:
+            raise UserError(f"precision={precision!r}: must be one of {', '.join(PRECISIONS)}")
+        if schedule not in SCHEDULES:
+            raise UserError(f"schedule={schedule!r}: must be one of {', '.join(SCHEDULES)}")
+        if schedule == "cosine" and not total_updates:
+            raise UserError("schedule=cosine needs total_updates, at whose end the learning rate is zero")
         if not lr > 0 or not grad_clip > 0:
             raise UserError(f"lr={lr}, grad_clip={grad_clip}: both must be above 0")
         self.model = model
@@ -56,7 +74,15 @@ class Learner:
         self._clip_groups: dict[str, list[nn.Parameter]] = {}
         for group in groups:
             self._clip_groups.setdefault(group.get("clip", "model"), []).extend(group["params"])
-        self.optimizer = torch.optim.Adam(groups, lr=lr, fused=True, capturable=on_cuda)
+        self.schedule, self.warmup, self.total_updates = schedule, warmup, total_updates
+        self._scheduled = schedule != "constant" or warmup > 0
+        if self._scheduled and on_cuda:  # a captured graph must read the present rate, not the first
+            for group in groups:
+                group["lr"] = torch.tensor(float(group.get("lr", lr)), device=self.device)
+        # Without weight decay, the default of every group, AdamW is Adam.
+        self.optimizer = torch.optim.AdamW(groups, lr=lr, weight_decay=0.0, fused=True, capturable=on_cuda)
+        self._rates = [float(group["lr"]) for group in self.optimizer.param_groups]
+        self.precision = precision
         self._loss = torch.compile(model.loss, mode="default") if compile else model.loss
         self.updates = 0
         self._names: list[str] = []
@@ -68,6 +94,8 @@ class Learner:
 
     def update(self, batch: TensorDictBase) -> None:
         """One update from ``batch`` of batch size (B, H); no host sync."""
+        if self._scheduled:
+            self._set_rates()
         if self._graph is None and self.capture and self._seen >= self.EAGER_UPDATES:
             self._record(batch)
         if self._graph is None:
@@ -89,6 +117,23 @@ class Learner:
         self._summed += 1
         self.updates += 1
 
+    def rate(self, update: int) -> float:
+        """The learning rate at an update, relative to the one given."""
+        factor = min(1.0, (update + 1) / self.warmup) if self.warmup else 1.0
+        if self.schedule == "cosine":
+            assert self.total_updates is not None
+            past = max(0, update - self.warmup) / max(1, self.total_updates - self.warmup)
+            factor *= 0.5 * (1.0 + math.cos(math.pi * min(1.0, past)))
+        return factor
+
+    def _set_rates(self) -> None:
+        factor = self.rate(self.updates)
+        for group, rate in zip(self.optimizer.param_groups, self._rates, strict=True):
+            if isinstance(group["lr"], torch.Tensor):
+                group["lr"].fill_(rate * factor)
+            else:
+                group["lr"] = rate * factor
+
     def metrics(self) -> dict[str, float]:
         """Means of losses and gradient norms since the last call; one host sync."""
         if self._sums is None or not self._summed:
@@ -99,7 +144,10 @@ class Learner:
         return dict(zip(self._names, values, strict=True))
 
     def _eager(self, batch: TensorDictBase) -> None:
-        losses = self._loss(batch)
+        low = self.precision == "bfloat16"
+        # No cache of cast weights: it would hold tensors of one captured update into the next.
+        with torch.autocast(self.device.type, torch.bfloat16, enabled=low, cache_enabled=False):
+            losses = self._loss(batch)
         losses.get("loss").backward()
         values = {name: value for name, value in losses.items()}
         for name, parameters in self._clip_groups.items():

@@ -14,12 +14,11 @@ from omegaconf import DictConfig
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torchrl.collectors import Collector
-from torchrl.data import ReplayBuffer
 
-from franka_wm.envs import FrankaEnv
 from franka_wm.training.checkpoint import Checkpoint, save_checkpoint
 from franka_wm.training.learner import Learner
 from franka_wm.training.progress import Progress, say
+from franka_wm.training.spaces import Spaces
 
 
 class ActingPolicy(TensorDictModuleBase):
@@ -80,15 +79,16 @@ class Trainer:
     def __init__(
         self,
         *,
-        env: FrankaEnv,
+        env: Any,
         learner: Learner,
-        replay: ReplayBuffer,
+        replay: Any,
         policies: Mapping[str, TensorDictModuleBase],
         actor: str,
         cfg: DictConfig,
         folder: Path,
         loggers: list[Any],
         evaluate: Any,
+        spaces: Spaces | None = None,
     ):
         self.env, self.learner, self.replay, self.cfg, self.folder = env, learner, replay, cfg, folder
         self.model = learner.model
@@ -99,8 +99,12 @@ class Trainer:
         self.seconds = 0.0
         self.rows: list[dict[str, float]] = []
         self.interrupted = False
-        self._keys = list(self.model.observation_sizes)
-        self._acting = ActingPolicy(policies, "random")
+        self.spaces = Spaces.of_env(env) if spaces is None else spaces
+        self._vectors = list(self.model.observation_sizes)
+        self._keys = list(getattr(self.model, "observation_keys", self._vectors))
+        self._extra = list(getattr(self.model, "replay_keys", ()))
+        # What the acting policy writes for the loss, a random one does not: then the actor fills the replay, too.
+        self._acting = ActingPolicy(policies, actor if self._extra else "random") if policies else None
         self._collector: Collector | None = None
         self._experience: Iterator[TensorDictBase] | None = None
 
@@ -116,11 +120,16 @@ class Trainer:
         )
         evaluated = saved = time.perf_counter()
         with interruptible() as stop:
-            if len(self.replay) == 0:
-                self.seed()
-            self._acting.use(self.actor)
+            if self.env is None:
+                self.standardize(self.replay.statistics())
+            else:
+                assert self._acting is not None
+                if len(self.replay) == 0:
+                    self.seed()
+                self._acting.use(self.actor)
             while self.learner.updates < total and not stop():
-                self.gather()
+                if self.env is not None:
+                    self.gather()
                 for _ in range(min(trainer.updates_per_batch, total - self.learner.updates)):
                     self.learner.update(self.replay.sample())
                 self.seconds = time.perf_counter() - started
@@ -145,10 +154,17 @@ class Trainer:
         batches = -(-collector.seed_steps // collector.steps_per_batch)
         for _ in range(batches):
             self.gather()
-        if self.cfg.trainer.standardize and not self.learner.updates:  # trained weights know their scale
-            data = self.replay[:]  # (worlds, time): TorchRL gives back what it was extended with
-            seen = torch.cat([data.get(key).flatten(0, 1) for key in self._keys], -1)
-            self.model.set_observation_statistics(seen.mean(0), seen.std(0).clamp_min(1e-3))
+        data = self.replay[:]  # (worlds, time): TorchRL gives back what it was extended with
+        seen = {key: data.get(key).flatten(0, 1) for key in self._vectors}
+        self.standardize({key: (x.mean(0), x.std(0)) for key, x in seen.items()})
+
+    def standardize(self, statistics: Mapping[str, tuple[torch.Tensor, torch.Tensor]]) -> None:
+        """Lets the model see mean and deviation of its vector observations."""
+        if not self.cfg.trainer.standardize or self.learner.updates or not self._vectors:
+            return  # trained weights know their scale
+        mean, std = (torch.cat([statistics[key][i] for key in self._vectors]) for i in (0, 1))
+        device = self.learner.device
+        self.model.set_observation_statistics(mean.to(device), std.to(device).clamp_min(1e-3))
 
     def gather(self) -> None:
         """One batch of the collector into the replay."""
@@ -166,7 +182,7 @@ class Trainer:
             self._experience = iter(self._collector)
         batch = next(self._experience)
         self.env_steps += batch.numel()
-        keys = [*self._keys, "action", "is_init"]
+        keys = [*self._keys, "action", "is_init", *self._extra]
         after = [("next", key) for key in (*self._keys, "reward", "terminated")]
         self.replay.extend(batch.select(*keys, *after))
 
@@ -174,15 +190,23 @@ class Trainer:
 
     def log(self, progress: Progress) -> None:
         """Reads what the device has summed up, tells the terminal and the loggers."""
-        self.replay.sampler.check()  # type: ignore[union-attr]
-        episodes = self.env.statistics()
-        row = {f"train/{name}": value for name, value in episodes.items()}
-        row |= self.learner.metrics()
-        text = ""
-        if episodes["episodes"]:
-            text = f"return {episodes['return']:.2f}   success {100 * episodes['success']:.0f} %"
-        if episodes["nonfinite"]:
-            text += f"   {episodes['nonfinite']:.0f} worlds broke and were reset"
+        row, text = {}, ""
+        if self.env is None:
+            self.replay.check()
+        else:
+            self.replay.sampler.check()
+            episodes = self.env.statistics()
+            row = {f"train/{name}": value for name, value in episodes.items()}
+            if episodes["episodes"]:
+                text = f"return {episodes['return']:.2f}"
+                if "success" in episodes:
+                    text += f"   success {100 * episodes['success']:.0f} %"
+            if episodes.get("nonfinite"):
+                text += f"   {episodes['nonfinite']:.0f} worlds broke and were reset"
+        metrics = self.learner.metrics()
+        if not text and "loss" in metrics:
+            text = f"loss {metrics['loss']:.4g}"
+        row |= metrics
         row |= progress.line(self.learner.updates, self.env_steps, text)
         self.record(row)
 
@@ -201,7 +225,7 @@ class Trainer:
     def save(self) -> Path:
         """Writes ``checkpoints/latest``."""
         replay = None
-        if self.cfg.trainer.checkpoint_replay and len(self.replay):
+        if self.env is not None and self.cfg.trainer.checkpoint_replay and len(self.replay):
             replay = self._oldest_first()
         return save_checkpoint(
             self.folder / "checkpoints" / "latest",
@@ -210,7 +234,7 @@ class Trainer:
             config=self.cfg,
             counters={"env_steps": self.env_steps, "updates": self.learner.updates, "seconds": self.seconds},
             replay=replay,
-            extra={"rows": self.rows},
+            extra={"rows": self.rows, "spaces": self.spaces.as_dict()},
         )
 
     def restore(self, checkpoint: Checkpoint) -> None:
@@ -224,10 +248,12 @@ class Trainer:
         self.env_steps = int(checkpoint.counters["env_steps"])
         self.seconds = float(checkpoint.counters["seconds"])
         self.rows = list((checkpoint.extra() or {}).get("rows", []))
-        experience = checkpoint.replay(self.env.device)
+        experience = None if self.env is None else checkpoint.replay(self.env.device)
         if experience is not None:
             self.replay.extend(experience)
         checkpoint.restore_rng()
+        if self.env is None:
+            return
         # Otherwise the worlds would repeat the episodes that the first run has already seen.
         self.env.set_seed(self.cfg.seed + self.env_steps)
 

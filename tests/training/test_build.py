@@ -9,6 +9,7 @@ import pytest
 from franka_wm.envs import FrankaConfig
 from franka_wm.errors import UserError
 from franka_wm.training import build
+from franka_wm.training.check import check
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -25,15 +26,19 @@ def test_every_group_is_there() -> None:
     assert {"laptop", "gpu", "smoke"} <= set(options("scale"))
 
 
-@pytest.mark.parametrize("name", options("env"))
+OTHERS = ("gym", "dm_control", "none")
+"""Environments that are not the arm."""
+
+
+@pytest.mark.parametrize("name", [name for name in options("env") if name not in OTHERS])
 def test_every_environment_preset(name: str, composed) -> None:
     cfg = composed(f"env={name}")
-    build.check(cfg)
+    check(cfg)
     values = build.plain(cfg.env)
     assert values.pop("kind") == "franka"
     values.pop("urdf_path")
     config = FrankaConfig.from_mapping(values)
-    assert ("pixels" in config.observations) == (name.endswith("pixels") or name == "franka")
+    assert ("pixels" in config.observations) == (name.endswith(("pixels", "goal_image")) or name == "franka")
     if "fixed" in name:
         assert config.goal_sampling == "fixed" and config.episode_length == 20
     elif name != "franka":
@@ -43,18 +48,42 @@ def test_every_environment_preset(name: str, composed) -> None:
 @pytest.mark.parametrize("name", options("scale"))
 def test_every_scale(name: str, composed) -> None:
     cfg = composed(f"scale={name}")
-    build.check(cfg)
+    check(cfg)
     assert cfg.scale == name
     build.make_planner(cfg, 7)
 
 
+NEEDS = {  # what else an option goes with
+    "planner": {"mcts": ["model=muzero"], "gumbel": ["model=muzero"]},
+    "model": {
+        "muzero": ["planner=mcts"],
+        "lewm": ["env=reach_goal_image"],
+        "action_world_model": ["env=reach_goal_image"],
+    },
+    "objective": {"goal_image": ["env=reach_goal_image", "model=lewm"]},
+}
+
+
 @pytest.mark.parametrize(
-    "group", ["collector", "replay", "trainer", "logger", "evaluation", "model", "planner"]
+    ("group", "name"),
+    [
+        (group, name)
+        for group in (
+            "collector",
+            "replay",
+            "trainer",
+            "logger",
+            "evaluation",
+            "model",
+            "planner",
+            "objective",
+        )
+        for name in options(group)
+    ],
 )
-def test_every_other_option(group: str, composed) -> None:
-    assert options(group)
-    for name in options(group):
-        build.check(composed(f"{group}={name}"))
+def test_every_other_option(group: str, name: str, composed) -> None:
+    others = NEEDS.get(group, {}).get(name, ["env=reach_pixels"] if group == "model" else [])
+    check(composed(f"{group}={name}", *others))
 
 
 def test_the_default_is_to_reach_sampled_goals(composed) -> None:
@@ -100,7 +129,7 @@ def test_environments_of_a_run(composed) -> None:
 def test_refused_before_anything_is_built(override: str, named: str, composed) -> None:
     cfg = composed(override)
     with pytest.raises(UserError) as caught:
-        build.check(cfg)
+        check(cfg)
     assert named in str(caught.value) and "\n" not in str(caught.value)
 
 

@@ -1,0 +1,177 @@
+"""Other environments than the arm, through TorchRL's own wrappers: Gymnasium and the DeepMind Control Suite.
+
+They run on the CPU, one copy after the other (``SerialEnv``): a way to hold algorithms against published curves,
+not a fast one.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import partial
+from typing import Any
+
+import torch
+from tensordict import TensorDictBase
+from torchrl.envs import EnvBase, SerialEnv, TransformedEnv
+from torchrl.envs.transforms import (
+    ActionScaling,
+    CatTensors,
+    Compose,
+    DoubleToFloat,
+    InitTracker,
+    RewardSum,
+    StepCounter,
+)
+
+from franka_wm.errors import UserError
+
+
+@dataclass(frozen=True, kw_only=True)
+class ExternalConfig:
+    """An environment that is not the arm.
+
+    Attributes:
+        kind: ``gym`` or ``dm_control``.
+        name: Of Gymnasium's environment, or the suite's domain.
+        task: Of the suite's domain; not for Gymnasium.
+        episode_length: Steps after which an episode is truncated, action repeats counted once.
+        frame_skip: Simulator steps for each action; rewards are summed.
+        observations: Key that models read → the wrapper's keys, concatenated in this order. Empty: every vector, in
+            the wrapper's order, as ``state``.
+    """
+
+    kind: str
+    name: str
+    task: str | None = None
+    episode_length: int = 500
+    frame_skip: int = 1
+    observations: Mapping[str, Sequence[str]] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        if self.kind not in ("gym", "dm_control"):
+            raise UserError(f"env.kind={self.kind!r}: must be franka, gym or dm_control")
+        for name in ("episode_length", "frame_skip"):
+            value = getattr(self, name)
+            if isinstance(value, bool) or not isinstance(value, int) or value < 1:
+                raise UserError(f"env.{name}={value!r}: must be a whole number of at least 1")
+
+
+class ExternalEnv(TransformedEnv):
+    """N copies of an environment of another simulator, with the keys that models of this package read.
+
+    ``state`` (N, D) float32 and whatever else ``config.observations`` names; ``action`` in [−1, 1], (N, A), or int64
+    (N,) where actions are discrete; ``reward`` (N, 1); ``is_init``, ``done``, ``terminated``, ``truncated`` (N, 1).
+    Finished copies are reset as TorchRL's collectors do it (standard mode).
+
+    Args:
+        config: Which environment.
+        num_envs: Copies, N.
+        seed: Of all copies.
+        device: Where the TensorDicts live; the simulators stay on the CPU.
+
+    Raises:
+        UserError: The extra is not installed, or there is no such environment or observation.
+    """
+
+    def __init__(
+        self,
+        config: ExternalConfig,
+        *,
+        num_envs: int = 1,
+        seed: int = 0,
+        device: torch.device | str | None = None,
+    ):
+        make = partial(_make_one, config)
+        one = make()
+        groups = _groups(config, one)
+        continuous = one.action_spec.dtype.is_floating_point
+        one.close()
+        transforms = [
+            DoubleToFloat(),
+            *(CatTensors(in_keys=keys, out_key=name, sort=False) for name, keys in groups.items()),
+            # TorchRL's wrapper for Gymnasium leaves actions in the units of the environment.
+            *([ActionScaling(in_keys_inv=["action"])] if continuous else []),
+            StepCounter(max_steps=config.episode_length),
+            RewardSum(),
+            InitTracker(),
+        ]
+        base = SerialEnv(num_envs, make, device=device)
+        super().__init__(base, Compose(*transforms))
+        self.config, self.num_envs = config, num_envs
+        self._totals = torch.zeros(3, device=device)
+        self.set_seed(seed)
+
+    def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
+        out = super()._step(tensordict)
+        done = out.get("done")
+        finished = (out.get("episode_reward"), out.get("step_count").float(), torch.ones_like(done).float())
+        self._totals += torch.stack([torch.where(done, x, 0.0).sum() for x in finished]).to(self._totals)
+        return out
+
+    @property
+    def action_dim(self) -> int:
+        """Size of a continuous action, A; the number of moves where actions are discrete."""
+        spec = self.action_spec
+        return spec.shape[-1] if spec.dtype.is_floating_point else int(spec.n)  # type: ignore[attr-defined]
+
+    def statistics(self, *, clear: bool = True) -> dict[str, float]:
+        """Means over the episodes that ended since the last call: ``return``, ``length``; and ``episodes``."""
+        total, length, count = self._totals.tolist()
+        if clear:
+            self._totals.zero_()
+        count_or_one = max(count, 1.0)
+        return {"return": total / count_or_one, "length": length / count_or_one, "episodes": count}
+
+
+def _make_one(config: ExternalConfig) -> EnvBase:
+    try:
+        if config.kind == "gym":
+            from torchrl.envs import GymEnv
+
+            return GymEnv(config.name, frame_skip=config.frame_skip, categorical_action_encoding=True)
+        from torchrl.envs import DMControlEnv
+
+        return DMControlEnv(config.name, config.task, frame_skip=config.frame_skip)
+    except ImportError as error:
+        extra = config.kind
+        raise UserError(f"env={extra} needs pip install 'franka-wm[{extra}]' ({error})") from error
+    except Exception as error:  # whatever the other library raises for a name that it does not know
+        what = config.name if config.task is None else f"{config.name} {config.task}"
+        reason = (str(error).strip() or type(error).__name__).splitlines()[0]
+        raise UserError(f"env={config.kind}: cannot make {what!r}: {reason}") from error
+
+
+def _groups(config: ExternalConfig, env: EnvBase) -> dict[str, list[str]]:
+    """Key that models read → the wrapper's keys."""
+    vectors = [
+        key
+        for key, spec in env.observation_spec.items()
+        if spec is not None and spec.dtype.is_floating_point and len(spec.shape) <= 1
+    ]
+    if not config.observations:
+        return {"state": [str(key) for key in vectors]}
+    groups: dict[str, list[str]] = {}
+    for name, keys in config.observations.items():
+        groups[name] = [keys] if isinstance(keys, str) else list(keys)
+        for key in groups[name]:
+            if key not in vectors:
+                raise UserError(
+                    f"env.observations: no {key!r}; {config.name} has {', '.join(map(str, vectors))}"
+                )
+    return groups
+
+
+def external_config(values: Mapping[str, Any]) -> ExternalConfig:
+    """From a plain mapping.
+
+    Raises:
+        UserError: A key that does not exist.
+    """
+    known = set(ExternalConfig.__dataclass_fields__)
+    unknown = sorted(set(values) - known)
+    if unknown:
+        raise UserError(f"env.{unknown[0]}: no such field; choose from {', '.join(sorted(known))}")
+    given: dict[str, Any] = dict(values)
+    given["observations"] = dict(given.get("observations") or {})
+    return ExternalConfig(**given)

@@ -1,0 +1,127 @@
+"""What can be refused before anything is built or written: one line each."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from omegaconf import DictConfig
+
+from franka_wm.envs import FrankaConfig, resolve_device
+from franka_wm.envs.franka import check_robot
+from franka_wm.errors import UserError
+from franka_wm.training import build
+from franka_wm.training.learner import PRECISIONS, SCHEDULES
+from franka_wm.training.spaces import Spaces
+
+LOGGERS = ("csv", "tensorboard")
+
+
+def check(cfg: DictConfig) -> None:
+    """What can be refused before anything is built."""
+    resolve_device(cfg.device)
+    window = build.window(cfg)
+    numbers: Mapping[str, tuple[Any, float]] = {
+        "collector.num_envs": (cfg.collector.num_envs, 1),
+        "collector.steps_per_batch": (cfg.collector.steps_per_batch, 1),
+        "collector.seed_steps": (cfg.collector.seed_steps, 1),
+        "replay.capacity": (cfg.replay.capacity, 1),
+        "replay.batch_size": (cfg.replay.batch_size, 1),
+        "replay.window": (window, 1),
+        "trainer.updates": (cfg.trainer.updates, 0),
+        "trainer.updates_per_batch": (cfg.trainer.updates_per_batch, 1),
+        "trainer.warmup": (cfg.trainer.warmup, 0),
+        "evaluation.episodes": (cfg.evaluation.episodes, 2),
+        "evaluation.video_episodes": (cfg.evaluation.video_episodes, 0),
+        "evaluation.video_size": (cfg.evaluation.video_size, 16),
+    }
+    for name, (value, least) in numbers.items():
+        if isinstance(value, bool) or not isinstance(value, int) or value < least:
+            raise UserError(f"{name}={value!r}: must be a whole number of at least {least}")
+    if cfg.evaluation.video_size % 2:
+        raise UserError(
+            f"evaluation.video_size={cfg.evaluation.video_size}: must be even, video codecs want it"
+        )
+    if cfg.collector.acts not in build.ACTORS:
+        raise UserError(f"collector.acts={cfg.collector.acts!r}: must be one of {', '.join(build.ACTORS)}")
+    if cfg.env.kind != "none" and cfg.env.episode_length < window:
+        raise UserError(
+            f"env.episode_length={cfg.env.episode_length} is shorter than replay.window={window}; "
+            "no window would fit into an episode"
+        )
+    for name, value in (("seed", cfg.seed),):
+        if isinstance(value, bool) or not isinstance(value, int):
+            raise UserError(f"{name}={value!r}: must be a whole number")
+    for name, value in (
+        ("trainer.lr", build.learning_rate(cfg)),
+        ("trainer.grad_clip", cfg.trainer.grad_clip),
+    ):
+        if isinstance(value, bool) or not isinstance(value, (int, float)) or not value > 0:
+            raise UserError(f"{name}={value!r}: must be above 0")
+    for name, value in (
+        ("trainer.log_every", cfg.trainer.log_every),
+        ("trainer.checkpoint_every", cfg.trainer.checkpoint_every),
+        ("evaluation.every", cfg.evaluation.every),
+    ):
+        if isinstance(value, bool) or not isinstance(value, (int, float)) or not value > 0:
+            raise UserError(f"{name}={value!r}: must be a number of seconds above 0")
+    if not 0 <= cfg.collector.smoothness < 1:
+        raise UserError(f"collector.smoothness={cfg.collector.smoothness}: must be at least 0 and below 1")
+    if cfg.replay.capacity < (steps := cfg.collector.num_envs * (window + 1)):
+        raise UserError(
+            f"replay.capacity={cfg.replay.capacity}: must be at least {steps}, one window for every world"
+        )
+    if cfg.replay.capacity < cfg.collector.num_envs * cfg.collector.steps_per_batch:
+        raise UserError(f"replay.capacity={cfg.replay.capacity}: smaller than one batch of the collector")
+    _check_names("evaluation.during", cfg.evaluation.during, build.POLICIES)
+    for name, known in (("precision", PRECISIONS), ("schedule", SCHEDULES)):
+        if cfg.trainer[name] not in known:
+            raise UserError(f"trainer.{name}={cfg.trainer[name]!r}: must be one of {', '.join(known)}")
+    _check_names("logger.names", cfg.logger.names, LOGGERS)
+    if build.is_offline(cfg):
+        _check_dataset(cfg)
+    elif cfg.env.kind == "none":
+        raise UserError(
+            "env=none: without an environment there must be data; use dataset=lerobot dataset.root=…"
+        )
+    spaces = _spaces(cfg)
+    if spaces is not None:
+        model = build.make_model(cfg, spaces, "cpu")
+        if build.objective_name(cfg) == "goal_image" and "goal_pixels" not in spaces.image_sizes:
+            raise UserError(
+                f"planning to a goal image needs goal_pixels among env.observations={list(cfg.env.observations)}; "
+                "use env=reach_goal_image or reach_fixed_goal_image"
+            )
+        build.make_objective(cfg, model)
+        if hasattr(model, "next"):
+            build.make_planner(cfg, spaces.num_actions or spaces.action_dim)
+
+
+def _spaces(cfg: DictConfig) -> Spaces | None:
+    """What the model will be built for; ``None`` where only the environment or the dataset itself can tell."""
+    if not build.is_arm(cfg):
+        values = build.plain(cfg.env)
+        if values["kind"] != "none":
+            from franka_wm.envs.external import external_config
+
+            external_config(values)
+        return None
+    values = build.plain(cfg.env)
+    del values["kind"]
+    urdf_path = values.pop("urdf_path")
+    config = FrankaConfig.from_mapping(values)
+    check_robot(config, urdf_path)
+    return None if build.is_offline(cfg) else Spaces.of_config(config, discrete=build.is_discrete(cfg))
+
+
+def _check_dataset(cfg: DictConfig) -> None:
+    if build.is_discrete(cfg):
+        raise UserError(
+            f"dataset={cfg.dataset.kind}: model={cfg.model.name} learns from its own search, not from recordings"
+        )
+
+
+def _check_names(option: str, names: Any, known: Sequence[str]) -> None:
+    unknown = [name for name in names if name not in known]
+    if unknown:
+        raise UserError(f"{option}: no {unknown[0]!r}; choose from {', '.join(known)}")

@@ -1,0 +1,108 @@
+"""A trained agent from a checkpoint alone: its model, and an environment and policies to judge it with."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+from omegaconf import DictConfig
+
+from franka_wm.envs import resolve_device
+from franka_wm.errors import UserError
+from franka_wm.training import build
+from franka_wm.training.checkpoint import Checkpoint, latest_checkpoint, load_checkpoint
+from franka_wm.training.spaces import Spaces
+
+HUB = "hf:"
+
+
+@dataclass
+class Agent:
+    """What a checkpoint holds, ready to act.
+
+    Attributes:
+        folder: Of the checkpoint.
+        cfg: The configuration it was trained with; ``device`` is the one in use now.
+        env: Evaluation worlds.
+        model: In evaluation mode.
+        planner: Of the family; ``None`` where the model has no dynamics.
+        policies: By name, as :func:`franka_wm.training.build.make_policies` makes them.
+        counters: ``updates``, ``env_steps``, ``seconds``.
+    """
+
+    folder: Path
+    cfg: DictConfig
+    env: Any
+    model: Any
+    planner: Any
+    policies: dict[str, Any]
+    counters: dict[str, float]
+
+
+def load_agent(
+    folder: str | Path,
+    *,
+    num_envs: int | None = None,
+    device: torch.device | str = "auto",
+    env_changes: Mapping[str, Any] | None = None,
+    seed: int | None = None,
+) -> Agent:
+    """Rebuilds environment, model, planner and policies from a checkpoint.
+
+    Args:
+        folder: A run's folder, a checkpoint in it, or ``hf:user/name``.
+        num_envs: Evaluation worlds; the configuration's ``evaluation.episodes`` if not given.
+        device: ``auto``, ``cpu``, ``cuda``, ``cuda:K``.
+        env_changes: Fields of the environment's configuration to change.
+        seed: Of the environment and the policies; the run's if not given.
+
+    Raises:
+        UserError: One line: no checkpoint, a damaged one, or one whose environment cannot be built here.
+    """
+    checkpoint = find_checkpoint(folder)
+    cfg = checkpoint.config.copy()
+    cfg.device = str(device)
+    if seed is not None:
+        cfg.seed = seed
+    if cfg.env.kind == "none":
+        raise UserError(
+            f"{folder}: was trained on recorded data without an environment; there is nothing to act in"
+        )
+    model = _model(checkpoint, cfg, resolve_device(cfg.device))
+    env = build.make_evaluation_env(cfg, num_envs=num_envs, **dict(env_changes or {}))
+    spaces = Spaces.of_env(env)
+    policies = build.make_agent_policies(cfg, model, env, spaces)
+    planner = getattr(policies.get("planner"), "planner", None)
+    return Agent(checkpoint.folder, cfg, env, model, planner, policies, dict(checkpoint.counters))
+
+
+def load_model(folder: str | Path, *, device: torch.device | str = "cpu") -> Any:
+    """The model alone, in evaluation mode.
+
+    Args and errors: as for :func:`load_agent`.
+    """
+    checkpoint = find_checkpoint(folder)
+    return _model(checkpoint, checkpoint.config, resolve_device(device))
+
+
+def find_checkpoint(folder: str | Path) -> Checkpoint:
+    """The newest checkpoint of a folder, or of a repository on the Hub."""
+    if str(folder).startswith(HUB):
+        from franka_wm.data.lerobot.hub import download
+
+        folder = download(str(folder).removeprefix(HUB))
+    return load_checkpoint(latest_checkpoint(folder))
+
+
+def _model(checkpoint: Checkpoint, cfg: DictConfig, device: torch.device) -> Any:
+    saved = (checkpoint.extra() or {}).get("spaces")
+    if saved is None:
+        raise UserError(
+            f"{checkpoint.folder}: does not say what sizes its model has; it was written by an older version"
+        )
+    model = build.make_model(cfg, Spaces.from_dict(saved), device)
+    checkpoint.load_model(model)
+    return model.eval()

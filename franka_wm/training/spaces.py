@@ -1,0 +1,119 @@
+"""What a model must know of its surroundings: sizes of observations and actions, length of an episode."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, field, replace
+from typing import Any
+
+import torch
+
+from franka_wm.envs.config import IMAGES, NUM_JOINTS, STATE_DIM, FrankaConfig
+from franka_wm.envs.discretize import discrete_action_table
+from franka_wm.errors import UserError
+
+
+@dataclass(frozen=True)
+class Spaces:
+    """Sizes that a model is built for; saved with every checkpoint, so that a model needs no environment.
+
+    Attributes:
+        observation_sizes: Vector observations: key → size of the last dimension.
+        image_sizes: Pictures, uint8: key → (height, width, channels).
+        action_dim: Size of a continuous action; 0 where actions are numbers of moves.
+        num_actions: How many moves there are; 0 where actions are continuous.
+        episode_length: Steps, at most.
+    """
+
+    observation_sizes: Mapping[str, int] = field(default_factory=dict)
+    image_sizes: Mapping[str, tuple[int, int, int]] = field(default_factory=dict)
+    action_dim: int = 0
+    num_actions: int = 0
+    episode_length: int = 50
+
+    def only(self, keys: Sequence[str] | None, reader: str) -> Spaces:
+        """The same with the observations ``keys`` alone; with every vector if ``None``.
+
+        Raises:
+            UserError: One of them is not there.
+        """
+        if keys is None:
+            if not self.observation_sizes:
+                raise UserError(
+                    f"{reader} reads vectors, here are only {_list(self.image_sizes)}; add state to env.observations, "
+                    "or choose model.observations"
+                )
+            return replace(self, image_sizes={})
+        there = [*self.observation_sizes, *self.image_sizes]
+        for key in keys:
+            if key not in there:
+                raise UserError(
+                    f"{reader} reads {key!r}, here are {_list(there)}; choose an env (or dataset) that has it, "
+                    "or other model.observations"
+                )
+        if not keys:
+            raise UserError(f"{reader}: model.observations is empty; choose from {_list(there)}")
+        vectors = {key: self.observation_sizes[key] for key in keys if key in self.observation_sizes}
+        images = {key: self.image_sizes[key] for key in keys if key in self.image_sizes}
+        return replace(self, observation_sizes=vectors, image_sizes=images)
+
+    def as_dict(self) -> dict[str, Any]:
+        """Plain, for a checkpoint."""
+        values = asdict(self)
+        return values | {"image_sizes": {key: list(size) for key, size in self.image_sizes.items()}}
+
+    @classmethod
+    def from_dict(cls, values: Mapping[str, Any]) -> Spaces:
+        """Inverse of :meth:`as_dict`."""
+        images = {key: (size[0], size[1], size[2]) for key, size in values["image_sizes"].items()}
+        return replace(cls(**values), image_sizes=images)
+
+    @classmethod
+    def of_config(cls, config: FrankaConfig, *, discrete: bool = False) -> Spaces:
+        """Of the arm, before it is built."""
+        pictures = [key for key in config.observations if key in IMAGES]
+        names = {key: image_names(key, config) for key in pictures}
+        channels = {"depth": 1, "segmentation": 1}
+        size = config.image_size
+        images = {name: (size, size, channels.get(key, 3)) for key in pictures for name in names[key]}
+        vectors = {"state": STATE_DIM, "joint_target": NUM_JOINTS}
+        moves = discrete_action_table(config.action_dim).shape[0]
+        return cls(
+            observation_sizes={key: size for key, size in vectors.items() if key in config.observations},
+            image_sizes=images,
+            action_dim=0 if discrete else config.action_dim,
+            num_actions=moves if discrete else 0,
+            episode_length=config.episode_length,
+        )
+
+    @classmethod
+    def of_env(cls, env: Any) -> Spaces:
+        """Of an environment that is there."""
+        vectors, images = {}, {}
+        for key, spec in env.observation_spec.items():
+            shape = spec.shape[1:]
+            if key in ("goal", "success", "is_init", "step_count", "episode_reward"):
+                continue
+            if spec.dtype == torch.uint8 and len(shape) == 3:
+                images[key] = tuple(shape)
+            elif len(shape) == 1 and spec.dtype.is_floating_point:
+                vectors[key] = shape[0]
+        action = env.action_spec
+        discrete = not action.dtype.is_floating_point
+        return cls(
+            observation_sizes=vectors,
+            image_sizes=images,
+            action_dim=0 if discrete else action.shape[-1],
+            num_actions=int(action.n) if discrete else 0,
+            episode_length=env.config.episode_length,
+        )
+
+
+def image_names(key: str, config: FrankaConfig) -> list[str]:
+    """The TensorDict keys of a picture: the plain name for the first camera, with the camera's for others."""
+    others = () if key == "goal_pixels" else config.cameras[1:]
+    return [key, *(f"{key}_{camera}" for camera in others)]
+
+
+def _list(keys: Any) -> str:
+    return ", ".join(sorted(keys)) or "none"
