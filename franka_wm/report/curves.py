@@ -1,27 +1,50 @@
-"""The learning curves of a run: final distance to the goal, success rate, losses."""
+"""Learning curves: final distance to the goal, success rate, return, losses; one run, or several seeds with bands."""
 
 import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import numpy as np
+from numpy.typing import NDArray
+
 from franka_wm.errors import UserError
-from franka_wm.report import style, written_whole
+from franka_wm.report import style
+from franka_wm.report.figure import (
+    check_format,
+    finish_axes,
+    new_figure,
+    save_figure,
+    title_figure,
+)
+from franka_wm.report.style import LIGHT, Theme
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
-_FORMATS = ("pdf", "png", "svg")
-_X_LABELS = {"env_steps": "environment steps", "updates": "updates", "time_s": "time [s]"}
+type Rows = Sequence[Mapping[str, float]]
+
+X_LABELS = {"env_steps": "environment steps", "updates": "updates", "time_s": "time [s]"}
+
+# What a logged quantity is called, and what it is multiplied with to be in that unit.
+QUANTITIES = {
+    "final_distance": ("final distance to the goal [cm]", 100.0),
+    "success": ("successful episodes [%]", 100.0),
+    "return": ("return of an episode", 1.0),
+}
+PANELS = (*QUANTITIES, "losses", "gradients")
+"""What `panel_figure` draws."""
 
 
 def plot_learning_curves(
-    rows: Sequence[Mapping[str, float]],
+    rows: Rows,
     path: str | Path,
     *,
     x: str = "env_steps",
     success_distance: float | None = 0.05,
     title: str | None = None,
+    theme: Theme = LIGHT,
 ) -> Path:
     """Draw the logged rows of a run into one figure: distance, success rate, losses.
 
@@ -35,6 +58,7 @@ def plot_learning_curves(
         x: the key of the horizontal axis; rows without it are not drawn.
         success_distance: marked in the distance panel [m]; None for no mark.
         title: above the panels.
+        theme: colours.
 
     Returns:
         `path`.
@@ -42,82 +66,185 @@ def plot_learning_curves(
     Raises:
         UserError: no row has the key `x`, another file ending, or the file cannot be written.
     """
-    path = Path(path)
-    kind = path.suffix.removeprefix(".").lower()
-    if kind not in _FORMATS:
-        raise UserError(f"cannot draw {path.name}: the file must end in .{', .'.join(_FORMATS)}.")
-    placed = sorted((row for row in rows if x in row), key=lambda row: row[x])
-    if not placed:
-        raise UserError(f"no logged row has {x!r} to draw against; log it, or choose another with x=.")
+    check_format(path)
+    placed = _placed(rows, x)
+    figure, (distance, success, losses) = new_figure(
+        columns=3, width=4.0, height=3.8, theme=theme, sharex=True
+    )
+    _draw_quantity(distance, placed, x, "final_distance", success_distance, theme)
+    _draw_quantity(success, placed, x, "success", None, theme)
+    _draw_values(losses, placed, x, _loss_keys(placed), "losses", theme)
+    title_figure(figure, title, theme=theme)
+    return save_figure(figure, path)
 
-    # Figure itself, not pyplot: no global state, no window, whatever backend the user has set.
-    from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(12, 3.8), layout="constrained")
-    distance, success, losses = figure.subplots(1, 3, sharex=True)
+def panel_figure(
+    rows: Rows,
+    panel: str,
+    *,
+    x: str = "env_steps",
+    success_distance: float | None = 0.05,
+    theme: Theme = LIGHT,
+) -> "Figure | None":
+    """One of `PANELS` of a run as a figure of its own; None where no row holds anything for it.
 
-    if success_distance is not None:
-        label = f"success: {style.centimetres(success_distance)}"
-        distance.axhline(100 * success_distance, color=style.GREY, linestyle=":", linewidth=1, label=label)
-    for key in _keys(placed, "final_distance"):
-        _draw_policy(distance, placed, x, key, scale=100)
-    for key in _keys(placed, "success"):
-        _draw_policy(success, placed, x, key, scale=100)
-    loss_keys = sorted({key for row in placed for key in row if _leaf(key).startswith("loss")})
-    for index, key in enumerate(loss_keys):
-        colour = style.PALETTE[index % len(style.PALETTE)]
-        dashes = ("-", "--", ":")[index // len(style.PALETTE) % 3]
-        xs, ys = _points(placed, x, key, 1)
-        losses.plot(
-            xs, ys, color=colour, linestyle=dashes, linewidth=1.2, label=_leaf(key)[4:].strip("_") or key
+    Raises:
+        UserError: no row has the key `x`.
+    """
+    placed = _placed(rows, x)
+    figure, (axes,) = new_figure(theme=theme)
+    if panel in QUANTITIES:
+        if not _keys(placed, panel):
+            return None
+        mark = success_distance if panel == "final_distance" else None
+        _draw_quantity(axes, placed, x, panel, mark, theme)
+        return figure
+    keys = _loss_keys(placed) if panel == "losses" else _gradient_keys(placed)
+    if not keys:
+        return None
+    names = {"losses": "losses", "gradients": "gradient norm before clipping, latent norm"}
+    _draw_values(axes, placed, x, keys, names[panel], theme)
+    return figure
+
+
+def seed_bands(
+    runs: Sequence[Rows], key: str, *, x: str = "env_steps", points: int = 200
+) -> dict[str, NDArray]:
+    """One logged quantity of several runs on common places of the horizontal axis.
+
+    Runs log at different moments; between two of them a run is taken to change linearly. Only the stretch that
+    all runs cover is given, so that the mean is over the same runs everywhere.
+
+    Args:
+        runs: rows of each run; those without `key` are left out.
+        points: places on the axis.
+
+    Returns:
+        `x`, `mean`, `low`, `high` (points,): mean, lowest and highest run. Empty arrays where no run has `key`
+        or the runs do not overlap.
+    """
+    curves = []
+    for rows in runs:
+        xs, ys = _points([row for row in rows if x in row], x, key, 1.0)
+        finite = [(a, b) for a, b in sorted(zip(xs, ys, strict=True)) if math.isfinite(b)]
+        if finite:
+            curves.append(np.array(finite, dtype=float).T)
+    if not curves:
+        return {name: np.empty(0) for name in ("x", "mean", "low", "high")}
+    start, stop = max(c[0, 0] for c in curves), min(c[0, -1] for c in curves)
+    if start > stop:
+        return {name: np.empty(0) for name in ("x", "mean", "low", "high")}
+    # A single common place is one point, not many of the same.
+    grid = np.linspace(start, stop, points) if stop > start else np.array([start])
+    values = np.stack([np.interp(grid, *curve) for curve in curves])
+    return {"x": grid, "mean": values.mean(0), "low": values.min(0), "high": values.max(0)}
+
+
+def seeds_figure(
+    groups: Mapping[str, Sequence[Rows]],
+    key: str,
+    *,
+    x: str = "env_steps",
+    theme: Theme = LIGHT,
+    title: str | None = None,
+) -> "Figure":
+    """A logged quantity of groups of runs: the mean over a group's runs, and a band from lowest to highest.
+
+    Args:
+        groups: label -> rows of each of its runs (seeds). A group of one run is a line without a band.
+        key: such as ``eval/policy/final_distance``; the last part decides name and unit (`QUANTITIES`).
+    """
+    figure, (axes,) = new_figure(theme=theme)
+    leaf = _leaf(key)
+    label, scale = QUANTITIES.get(leaf, (key, 1.0))
+    for index, (name, runs) in enumerate(groups.items()):
+        band = seed_bands(runs, key, x=x)
+        if not band["x"].size:
+            continue
+        light, dashes = style.series_style(index)
+        colour = theme.colour(light)
+        having = sum(any(key in row for row in rows) for rows in runs)
+        text = f"{name} ({having} runs)" if having > 1 else name
+        marker = "o" if band["x"].size == 1 else None
+        axes.plot(
+            band["x"],
+            scale * band["mean"],
+            color=colour,
+            linestyle=dashes,
+            linewidth=1.8,
+            label=text,
+            marker=marker,
         )
+        if having > 1:
+            axes.fill_between(
+                band["x"], scale * band["low"], scale * band["high"], color=colour, alpha=0.2, linewidth=0
+            )
+    _format_x(axes, x)
+    finish_axes(axes, x=X_LABELS.get(x, x), title=title or label, theme=theme)
+    if leaf == "success":
+        axes.set_ylim(-3, 103)
+    elif leaf == "final_distance":
+        axes.set_ylim(bottom=0)
+    return figure
 
-    _finish(distance, x, "final distance to the goal [cm]", has_data=bool(_keys(placed, "final_distance")))
-    distance.set_ylim(bottom=0)
-    _finish(success, x, "successful episodes [%]", has_data=bool(_keys(placed, "success")))
-    success.set_ylim(-3, 103)
-    _finish(losses, x, "losses", has_data=bool(loss_keys))
-    values = [v for key in loss_keys for v in _points(placed, x, key, 1)[1] if not math.isnan(v)]
+
+# -- drawing ---------------------------------------------------------------------------------------------
+
+
+def _draw_quantity(
+    axes: "Axes", rows: Rows, x: str, leaf: str, success_distance: float | None, theme: Theme
+) -> None:
+    title, scale = QUANTITIES[leaf]
+    keys = _keys(rows, leaf)
+    for key in keys:
+        _draw_policy(axes, rows, x, key, scale, theme)
+    if success_distance is not None and keys:
+        label = f"success: {style.centimetres(success_distance)}"
+        axes.axhline(
+            100 * success_distance, color=theme.colour(style.GREY), linestyle=":", linewidth=1, label=label
+        )
+    _format_x(axes, x)
+    finish_axes(axes, x=X_LABELS.get(x, x), title=title, theme=theme)
+    if leaf == "final_distance":
+        axes.set_ylim(bottom=0)
+    elif leaf == "success":
+        axes.set_ylim(-3, 103)
+
+
+def _draw_values(axes: "Axes", rows: Rows, x: str, keys: Sequence[str], title: str, theme: Theme) -> None:
+    values = []
+    for index, key in enumerate(keys):
+        light, dashes = style.series_style(index)
+        xs, ys = _points(rows, x, key, 1)
+        values += [y for y in ys if not math.isnan(y)]
+        axes.plot(
+            xs,
+            ys,
+            color=theme.colour(light),
+            linestyle=dashes,
+            linewidth=1.2,
+            label=_short(key),
+            marker="o" if len(xs) == 1 else None,
+            markersize=3.5,
+        )
+    _format_x(axes, x)
+    finish_axes(axes, x=X_LABELS.get(x, x), title=title, theme=theme)
     if values and min(values) > 0:
-        losses.set_yscale("log")
+        axes.set_yscale("log")
     elif any(values):
         # Some losses (a policy's) are negative; the scale is linear only around zero, up to a power of ten.
         linear_to = 10.0 ** (math.floor(math.log10(max(map(abs, values)))) - 2)
-        losses.set_yscale("symlog", linthresh=linear_to)
-    if title:
-        figure.suptitle(title, fontsize=11)
-    with written_whole(path) as temporary:
-        figure.savefig(temporary, format=kind, dpi=150)
-    return path
+        axes.set_yscale("symlog", linthresh=linear_to)
 
 
-def _leaf(key: str) -> str:
-    return key.rsplit("/", 1)[-1]
-
-
-def _keys(rows: Sequence[Mapping[str, float]], leaf: str) -> list[str]:
-    """The keys `…/leaf`, training last, so that the evaluations get the top of the legend."""
-    found = {key for row in rows for key in row if _leaf(key) == leaf}
-    return sorted(found, key=lambda key: (key.startswith("train"), key))
-
-
-def _points(
-    rows: Sequence[Mapping[str, float]], x: str, key: str, scale: float
-) -> tuple[list[float], list[float]]:
-    """The rows that hold `key`, as coordinates; a value that is not finite is NaN, which leaves a gap."""
-    present = [row for row in rows if row.get(key) is not None]
-    ys = [scale * row[key] if math.isfinite(row[key]) else math.nan for row in present]
-    return [row[x] for row in present], ys
-
-
-def _draw_policy(axes: "Axes", rows: Sequence[Mapping[str, float]], x: str, key: str, scale: float) -> None:
+def _draw_policy(axes: "Axes", rows: Rows, x: str, key: str, scale: float, theme: Theme) -> None:
     policy = key.split("/")[-2] if "/" in key else "train"
     xs, ys = _points(rows, x, key, scale)
     training = policy == "train"
     axes.plot(
         xs,
         ys,
-        color=style.policy_colour(policy),
+        color=theme.colour(style.policy_colour(policy)),
         linewidth=1.0 if training else 1.8,
         zorder=2 if training else 3,
         marker="o" if len(xs) <= 40 else None,
@@ -126,16 +253,55 @@ def _draw_policy(axes: "Axes", rows: Sequence[Mapping[str, float]], x: str, key:
     )
 
 
-def _finish(axes: "Axes", x: str, label: str, *, has_data: bool) -> None:
+def _format_x(axes: "Axes", x: str) -> None:
     from matplotlib.ticker import EngFormatter, MaxNLocator
 
     axes.xaxis.set_major_locator(MaxNLocator(5))
-    axes.xaxis.set_major_formatter(EngFormatter())  # 40 k, 1.5 M
-    axes.set_xlabel(_X_LABELS.get(x, x))
-    axes.set_title(label, fontsize=10)
-    axes.spines[["top", "right"]].set_visible(False)
-    axes.grid(alpha=0.25, linewidth=0.6)
-    if has_data:
-        axes.legend(frameon=False, fontsize=8)
-    else:
-        axes.text(0.5, 0.5, "nothing logged", transform=axes.transAxes, ha="center", color=style.GREY)
+    if x != "time_s":
+        axes.xaxis.set_major_formatter(EngFormatter())  # 40 k, 1.5 M
+
+
+# -- rows ------------------------------------------------------------------------------------------------
+
+
+def _placed(rows: Rows, x: str) -> list[Mapping[str, float]]:
+    placed = sorted((row for row in rows if x in row), key=lambda row: row[x])
+    if not placed:
+        raise UserError(f"no logged row has {x!r} to draw against; log it, or choose another with x=.")
+    return placed
+
+
+def _leaf(key: str) -> str:
+    return key.rsplit("/", 1)[-1]
+
+
+def _short(key: str) -> str:
+    """``loss_value`` → ``value``; ``grad_norm_model`` → ``gradient, model``."""
+    leaf = _leaf(key)
+    if leaf.startswith("grad_norm"):
+        return f"gradient, {leaf[9:].strip('_')}" if leaf[9:].strip("_") else "gradient"
+    if leaf.startswith("loss"):
+        return leaf[4:].strip("_") or key
+    return leaf.replace("_", " ")
+
+
+def _keys(rows: Rows, leaf: str) -> list[str]:
+    """The keys `…/leaf`, training last, so that the evaluations get the top of the legend."""
+    found = {key for row in rows for key in row if _leaf(key) == leaf}
+    return sorted(found, key=lambda key: (key.startswith("train"), key))
+
+
+def _loss_keys(rows: Rows) -> list[str]:
+    return sorted({key for row in rows for key in row if _leaf(key).startswith("loss")})
+
+
+def _gradient_keys(rows: Rows) -> list[str]:
+    found = {key for row in rows for key in row}
+    return sorted(k for k in found if _leaf(k).startswith("grad_norm") or _leaf(k) == "latent_norm")
+
+
+def _points(rows: Rows, x: str, key: str, scale: float) -> tuple[list[float], list[float]]:
+    """The rows that hold `key`, as coordinates; a value that is not finite is NaN, which leaves a gap."""
+    present = [row for row in rows if row.get(key) is not None]
+    ys = [scale * row[key] if math.isfinite(row[key]) else math.nan for row in present]
+    return [row[x] for row in present], ys

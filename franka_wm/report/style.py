@@ -1,8 +1,16 @@
-"""Colours of every figure, and how policies and distances are called in them.
+"""Colours of every figure in a light and a dark theme, and how policies and distances are called in them.
 
 The palette is Okabe & Ito's, "Color universal design" (2008): its colours stay apart for colour-blind
-readers. The same policy has the same colour everywhere.
+readers. On a dark ground every colour has a lighter partner that stays apart, too. The same policy has the
+same colour everywhere.
+
+Code names a colour by its light value (`BLUE`, `INK`, …); a theme translates it.
 """
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+from franka_wm.errors import UserError
 
 BLACK = "#000000"
 ORANGE = "#E69F00"
@@ -13,8 +21,84 @@ VERMILION = "#D55E00"
 PURPLE = "#CC79A7"
 GREY = "#8A8A8A"
 
+# Of the figure itself: ground, text, lines behind the data.
+PAPER = "#FFFFFF"
+INK = "#1F2328"
+FAINT = "#C9D1D9"
+
 # Yellow, the palette's eighth, is left out: too pale for lines on white.
 PALETTE = (BLUE, VERMILION, GREEN, PURPLE, ORANGE, SKY, BLACK)
+
+DASHES = ("-", "--", ":")
+"""Line styles, for more series than colours."""
+
+NAMES = {
+    BLACK: "black",
+    ORANGE: "orange",
+    SKY: "sky",
+    GREEN: "green",
+    BLUE: "blue",
+    VERMILION: "vermilion",
+    PURPLE: "purple",
+    GREY: "grey",
+    PAPER: "paper",
+    INK: "ink",
+    FAINT: "faint",
+}
+
+
+@dataclass(frozen=True)
+class Theme:
+    """What every named colour becomes on one ground.
+
+    Attributes:
+        name: ``light`` or ``dark``.
+        colours: by light value.
+    """
+
+    name: str
+    colours: Mapping[str, str]
+
+    def colour(self, light: str) -> str:
+        """The theme's partner of a named colour; any other colour is itself."""
+        return self.colours.get(light, light)
+
+    @property
+    def palette(self) -> tuple[str, ...]:
+        """`PALETTE` in this theme."""
+        return tuple(map(self.colour, PALETTE))
+
+
+LIGHT = Theme("light", {colour: colour for colour in NAMES})
+DARK = Theme(
+    "dark",
+    {
+        BLACK: "#F2F2F2",
+        ORANGE: "#F5C542",
+        SKY: "#A6DCFF",
+        GREEN: "#1FB889",
+        BLUE: "#4596E6",
+        VERMILION: "#F0743C",
+        PURPLE: "#E3A0C8",
+        GREY: "#8A8A8A",
+        PAPER: "#161B22",
+        INK: "#E6EDF3",
+        FAINT: "#3D444D",
+    },
+)
+THEMES = {theme.name: theme for theme in (LIGHT, DARK)}
+
+
+def theme_named(name: str) -> Theme:
+    """One of `THEMES`.
+
+    Raises:
+        UserError: there is none of that name.
+    """
+    if name not in THEMES:
+        raise UserError(f"no theme {name!r}; choose from {', '.join(THEMES)}.")
+    return THEMES[name]
+
 
 POLICY_COLOURS = {
     "planner": BLUE,
@@ -43,6 +127,11 @@ def policy_colour(policy: str) -> str:
 def policy_name(policy: str) -> str:
     """What a reader sees for a policy's key."""
     return POLICY_NAMES.get(policy, policy)
+
+
+def series_style(index: int) -> tuple[str, str]:
+    """Colour and dashes of the series with this number; 21 of them differ."""
+    return PALETTE[index % len(PALETTE)], DASHES[index // len(PALETTE) % len(DASHES)]
 
 
 def centimetres(distance: float | str) -> str:

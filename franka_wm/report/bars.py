@@ -1,0 +1,99 @@
+"""Bars with intervals: success rates, probes, what breaks under which change."""
+
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any
+
+from franka_wm.errors import UserError
+from franka_wm.report import style
+from franka_wm.report.figure import finish_axes, new_figure
+from franka_wm.report.style import INK, LIGHT, Theme
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+type Bar = float | Mapping[str, Any]
+"""A number, or an interval ``{"mean", "low", "high"}``."""
+
+
+def bars_figure(
+    values: Mapping[str, Mapping[str, Bar]],
+    *,
+    label: str = "",
+    scale: float = 1.0,
+    limits: tuple[float, float] | None = None,
+    colours: Mapping[str, str] | None = None,
+    title: str = "",
+    theme: Theme = LIGHT,
+) -> "Figure":
+    """Lying bars in groups, with a whisker from low to high: names stay readable however long they are.
+
+    Args:
+        values: group (from top to bottom) -> series -> number or interval. Missing series leave a gap.
+        label: of the horizontal axis.
+        scale: what all values are multiplied with, such as 100 for percent.
+        limits: of the horizontal axis, after scaling.
+        colours: series -> light colour; the palette in order if None.
+
+    Raises:
+        UserError: nothing to draw.
+    """
+    series = list(dict.fromkeys(name for group in values.values() for name in group))
+    if not series:
+        raise UserError("no bar to draw; give at least one group with one value.")
+    thick = 0.8 / len(series)
+    height = max(1.6, 0.9 + len(values) * max(0.26, 0.17 * len(series)))
+    figure, (axes,) = new_figure(theme=theme, height=height)
+    for index, name in enumerate(series):
+        colour = (colours or {}).get(name, style.series_style(index)[0])
+        places = [
+            k + (index - (len(series) - 1) / 2) * thick
+            for k, group in enumerate(values.values())
+            if name in group
+        ]
+        means, low, high = zip(
+            *(_ends(group[name], scale) for group in values.values() if name in group), strict=True
+        )
+        axes.barh(places, means, height=0.9 * thick, color=theme.colour(colour), label=name)
+        whiskers = [
+            [mean - a for mean, a in zip(means, low, strict=True)],
+            [b - mean for mean, b in zip(means, high, strict=True)],
+        ]
+        if any(map(any, whiskers)):
+            axes.errorbar(
+                means,
+                places,
+                xerr=whiskers,
+                fmt="none",
+                ecolor=theme.colour(INK),
+                elinewidth=1.1,
+                capsize=2,
+            )
+    axes.set_yticks(range(len(values)), list(values))
+    axes.invert_yaxis()
+    if limits is not None:
+        axes.set_xlim(*limits)
+    finish_axes(axes, x=label, title=title, theme=theme, legend=False, grid="x")
+    if len(series) > 1:
+        axes.legend(
+            frameon=False,
+            fontsize=8,
+            labelcolor=theme.colour(INK),
+            loc="lower center",
+            bbox_to_anchor=(0.5, 1.0),
+            ncols=min(3, len(series)),
+        )
+        axes.set_title("")
+        if title:
+            figure.suptitle(title, fontsize=10, color=theme.colour(INK))
+    axes.spines["left"].set_visible(False)
+    axes.tick_params(axis="y", length=0)
+    return figure
+
+
+def _ends(bar: Bar, scale: float) -> tuple[float, float, float]:
+    """Mean, low and high; a number is its own interval."""
+    if isinstance(bar, Mapping):
+        mean = float(bar["mean"])
+        return scale * mean, scale * float(bar.get("low", mean)), scale * float(bar.get("high", mean))
+    value = scale * float(bar)
+    return value, value, value

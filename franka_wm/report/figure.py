@@ -1,0 +1,154 @@
+"""Figures in one style: made, finished, saved as a file or as SVG inside a page.
+
+A function that draws takes data and gives a `Figure`; `save_figure` writes it. Figures are made without
+pyplot: no global state, no window, whatever backend the user has set.
+"""
+
+import hashlib
+import io
+import re
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+from xml.sax.saxutils import escape, quoteattr
+
+from franka_wm.errors import UserError
+from franka_wm.report import written_whole
+from franka_wm.report.style import FAINT, GREY, INK, LIGHT, NAMES, PAPER, Theme
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+FORMATS = ("pdf", "png", "svg")
+WIDTH, HEIGHT = 4.6, 3.1
+"""Size of one panel [inch]: still readable across a phone."""
+
+_VARIABLES = {light.lower(): f"var(--{name})" for light, name in NAMES.items()}
+
+
+def new_figure(
+    *,
+    rows: int = 1,
+    columns: int = 1,
+    width: float = WIDTH,
+    height: float = HEIGHT,
+    theme: Theme = LIGHT,
+    sharex: bool = False,
+) -> tuple["Figure", list["Axes"]]:
+    """An empty figure in the theme's colours, and its panels row by row; `width`, `height` of one [inch]."""
+    from matplotlib.figure import Figure
+
+    figure = Figure(
+        figsize=(columns * width, rows * height), layout="constrained", facecolor=theme.colour(PAPER)
+    )
+    grid: Any = figure.subplots(rows, columns, sharex=sharex, squeeze=False)
+    panels = list(grid.flat)
+    for axes in panels:
+        axes.set_facecolor(theme.colour(PAPER))
+        axes.tick_params(colors=theme.colour(INK), labelsize=8.5)
+        for side in axes.spines.values():
+            side.set_color(theme.colour(GREY))
+        axes.xaxis.label.set_color(theme.colour(INK))
+        axes.yaxis.label.set_color(theme.colour(INK))
+    return figure, panels
+
+
+def finish_axes(
+    axes: "Axes",
+    *,
+    x: str = "",
+    y: str = "",
+    title: str = "",
+    theme: Theme = LIGHT,
+    legend: bool = True,
+    grid: str = "both",
+) -> None:
+    """Labels, light grid, no box; a legend if anything is labelled. A panel without data says so."""
+    ink = theme.colour(INK)
+    axes.set_xlabel(x, color=ink, fontsize=9)
+    axes.set_ylabel(y, color=ink, fontsize=9)
+    axes.set_title(title, color=ink, fontsize=10)
+    axes.spines[["top", "right"]].set_visible(False)
+    axes.set_axisbelow(True)
+    if grid:
+        axes.grid(axis=grid, color=theme.colour(FAINT), linewidth=0.6)  # pyright: ignore[reportArgumentType]
+    if not axes.has_data():
+        empty(axes, theme=theme)
+    elif legend and axes.get_legend_handles_labels()[1]:
+        axes.legend(frameon=False, fontsize=8, labelcolor=ink)
+
+
+def empty(axes: "Axes", text: str = "nothing logged", *, theme: Theme = LIGHT) -> None:
+    """Says in the middle of a panel why it is empty."""
+    axes.text(0.5, 0.5, text, transform=axes.transAxes, ha="center", color=theme.colour(GREY))
+
+
+def title_figure(figure: "Figure", title: str | None, *, theme: Theme = LIGHT) -> None:
+    """A title above all panels; None for none."""
+    if title:
+        figure.suptitle(title, fontsize=11, color=theme.colour(INK))
+
+
+def check_format(path: str | Path) -> str:
+    """The format that a path's ending asks for.
+
+    Raises:
+        UserError: another one than `FORMATS`.
+    """
+    path = Path(path)
+    kind = path.suffix.removeprefix(".").lower()
+    if kind not in FORMATS:
+        raise UserError(f"cannot draw {path.name}: the file must end in .{', .'.join(FORMATS)}.")
+    return kind
+
+
+def save_figure(figure: "Figure", path: str | Path, *, dpi: int = 150) -> Path:
+    """Write a figure; its folder is made.
+
+    Returns:
+        `path`.
+
+    Raises:
+        UserError: an ending other than .pdf, .png, .svg, or the file cannot be written.
+    """
+    kind = check_format(path)
+    with written_whole(path) as temporary:
+        figure.savefig(temporary, format=kind, dpi=dpi, facecolor=figure.get_facecolor())
+    return Path(path)
+
+
+def inline_svg(figure: "Figure", label: str) -> str:
+    """The figure as an `<svg>` element for a page that gives the colours as CSS variables.
+
+    Draw it in `LIGHT`: every named colour becomes `var(--its-name)`, so that one picture follows the page's
+    light and dark theme. Text stays text, in the page's font. The same figure gives the same element.
+
+    Args:
+        label: what a screen reader says.
+    """
+    import matplotlib
+
+    buffer = io.StringIO()
+    # Ids of clip paths and markers must differ between the pictures of one page, and not between two runs.
+    salt = hashlib.sha256(label.encode()).hexdigest()[:12]
+    with matplotlib.rc_context({"svg.fonttype": "none", "svg.hashsalt": salt}):
+        figure.savefig(buffer, format="svg", metadata={"Date": None}, transparent=True)
+    svg = buffer.getvalue()
+    svg = svg[svg.index("<svg") :]
+    svg = re.sub(r"<metadata>.*?</metadata>\s*", "", svg, flags=re.DOTALL)
+    # Names of groups ("axes_1") repeat in every picture and nothing refers to them.
+    svg = re.sub(r' id="[a-zA-Z0-9]+_\d+"', "", svg)
+    svg = re.sub(
+        r"(fill|stroke): (#[0-9a-f]{6})\b",
+        lambda found: f"{found[1]}: {_VARIABLES.get(found[2], found[2])}",
+        svg,
+    )
+    svg = re.sub(r"(font: [^;\"]*?px) [^;\"]+", r"\1 var(--font)", svg)
+    size = re.search(r'viewBox="0 0 ([\d.]+) ([\d.]+)"', svg)
+    assert size is not None  # matplotlib always writes one
+    head = (
+        f'<svg class="chart" role="img" aria-label={quoteattr(label)} viewBox="{size[0][9:-1]}" '
+        'xmlns="http://www.w3.org/2000/svg" xmlns:xlink="http://www.w3.org/1999/xlink">'
+        f"<title>{escape(label)}</title>"
+    )
+    return head + svg[svg.index(">") + 1 :].strip()

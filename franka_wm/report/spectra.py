@@ -1,0 +1,135 @@
+"""What a latent space looks like: its singular values, and its points seen along its two main directions."""
+
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from franka_wm.errors import UserError
+from franka_wm.report import style
+from franka_wm.report.figure import finish_axes, new_figure
+from franka_wm.report.style import GREY, INK, LIGHT, Theme
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+SMALLEST = 1e-6
+"""Relative singular values below it are drawn here: a log scale has no zero."""
+
+
+class Projection(NamedTuple):
+    """Points along the first two principal directions.
+
+    Attributes:
+        points: (N, 2) coordinates; the second column is zero where there is one direction only.
+        explained: (2,) share of the variance along each, in [0, 1].
+    """
+
+    points: NDArray
+    explained: NDArray
+
+
+def principal_components(latents: ArrayLike) -> Projection:
+    """Latents (N, Z), N ≥ 2, along their first two principal directions.
+
+    Signs are fixed (the largest coordinate of each direction is positive), so that a picture does not flip.
+
+    Raises:
+        UserError: another shape, or values that are not finite.
+    """
+    values = np.asarray(latents, dtype=np.float64)
+    if values.ndim != 2 or values.shape[0] < 2 or values.shape[1] < 1:
+        raise UserError(f"latents have shape {values.shape}; (N, Z) with N ≥ 2 is needed.")
+    if not np.isfinite(values).all():
+        raise UserError("latents are not all finite; a projection of the rest would mislead.")
+    left, singular, right = np.linalg.svd(values - values.mean(0), full_matrices=False)
+    signs = np.sign(right[np.arange(len(right)), np.abs(right).argmax(1)])
+    points = (left * singular * np.where(signs == 0, 1, signs))[:, :2]
+    total = float((singular**2).sum())
+    share = singular[:2] ** 2 / total if total > 0 else np.zeros(min(2, singular.size))
+    missing = 2 - points.shape[1]
+    return Projection(np.pad(points, ((0, 0), (0, missing))), np.pad(share, (0, missing)))
+
+
+def spectrum_figure(
+    spectra: Mapping[str, Sequence[float]],
+    *,
+    marks: Mapping[str, float] | None = None,
+    title: str = "singular values of the latents",
+    theme: Theme = LIGHT,
+) -> "Figure":
+    """Singular values by rank, relative to the largest, on a log scale.
+
+    A collapsed latent space falls off at once; one that uses all its dimensions stays flat.
+
+    Args:
+        spectra: name -> singular values in any order, none negative.
+        marks: name -> a rank (effective rank, RankMe) to mark with an upright line.
+
+    Raises:
+        UserError: nothing to draw, or a negative value.
+    """
+    figure, (axes,) = new_figure(theme=theme)
+    if not spectra:
+        raise UserError("no singular values to draw; give at least one list by name.")
+    for index, (name, values) in enumerate(spectra.items()):
+        ordered = np.sort(np.asarray(values, dtype=np.float64))[::-1]
+        if ordered.size == 0 or ordered[-1] < 0 or not np.isfinite(ordered).all():
+            raise UserError(f"singular values of {name!r} must be finite, not negative, at least one.")
+        relative = ordered / ordered[0] if ordered[0] > 0 else ordered
+        colour, dashes = style.series_style(index)
+        axes.plot(
+            np.arange(1, ordered.size + 1),
+            relative.clip(SMALLEST),
+            color=theme.colour(colour),
+            linestyle=dashes,
+            linewidth=1.8,
+            marker="o" if ordered.size <= 64 else None,
+            markersize=3,
+            label=name,
+        )
+    for name, rank in (marks or {}).items():
+        axes.axvline(rank, color=theme.colour(GREY), linestyle=":", linewidth=1.2, label=f"{name} {rank:.1f}")
+    axes.set_yscale("log")
+    finish_axes(axes, x="rank", y="relative to the largest", title=title, theme=theme)
+    return figure
+
+
+def latent_figure(
+    points: ArrayLike,
+    quantity: ArrayLike,
+    *,
+    label: str,
+    explained: Sequence[float] | None = None,
+    title: str = "latents along their main directions",
+    theme: Theme = LIGHT,
+) -> "Figure":
+    """Points of `principal_components`, coloured by a quantity such as the distance to the goal.
+
+    Args:
+        points: (N, 2).
+        quantity: (N,) colour, on the map cividis, which colour-blind readers see the same.
+        label: the quantity's name and unit.
+        explained: (2,) share of the variance of both directions, for the labels.
+
+    Raises:
+        UserError: numbers of points and colours differ.
+    """
+    places, colours = np.asarray(points, dtype=np.float64), np.asarray(quantity, dtype=np.float64).reshape(-1)
+    if places.ndim != 2 or places.shape[1] != 2 or places.shape[0] != colours.size:
+        raise UserError(
+            f"points have shape {places.shape} and the quantity {colours.shape}; (N, 2) and (N,) are needed."
+        )
+    figure, (axes,) = new_figure(theme=theme)
+    # As a picture: thousands of vector points would make a page slow.
+    drawn: Any = axes.scatter(*places.T, c=colours, cmap="cividis", s=7, linewidths=0, rasterized=True)
+    bar = figure.colorbar(drawn, ax=axes)
+    bar.set_label(label, color=theme.colour(INK), fontsize=9)
+    bar.ax.tick_params(colors=theme.colour(INK), labelsize=8)
+    bar.outline.set_visible(False)  # pyright: ignore[reportCallIssue]
+    shares = ["", ""] if explained is None else [f" ({100 * share:.0f} %)" for share in explained]
+    finish_axes(axes, x=f"first{shares[0]}", y=f"second{shares[1]}", title=title, theme=theme, grid="")
+    axes.set_xticks([])
+    axes.set_yticks([])
+    return figure
