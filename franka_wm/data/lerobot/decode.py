@@ -1,0 +1,278 @@
+"""Rows and frames of a LeRobot dataset into plain arrays, front to back.
+
+Run in worker processes, ``python -m franka_wm.data.lerobot.decode``: neither torch nor LeRobot is imported here, and
+unlike with ``multiprocessing`` the user's script is not either. A worker reads one job per line (JSON) from its
+standard input, answers with one line, and ends with its input, so none outlives the program that started it.
+
+Every job writes its own rows of arrays that lie in files, and counts how often each was written, so that a frame too
+few or too many cannot go unnoticed.
+"""
+
+from __future__ import annotations
+
+import io
+import json
+import sys
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from franka_wm.errors import UserError
+
+ROWS_AT_A_TIME = 64
+
+
+@dataclass(frozen=True)
+class TableJob:
+    """Some row groups of a parquet file.
+
+    Attributes:
+        path: The file.
+        groups: Row groups to read.
+        numbers: Feature → [(array's name, first column, size)]: where its values go.
+        images: Feature → [(array's name, height, width)].
+        folder: Where the arrays are; ``episodes.npy`` among them says which rows are whose.
+    """
+
+    path: str
+    groups: list[int]
+    numbers: dict[str, list[tuple[str, int, int]]]
+    images: dict[str, list[tuple[str, int, int]]]
+    folder: str
+
+    def run(self) -> int:
+        """Reads them; returns the number of rows."""
+        import pyarrow as pa
+        import pyarrow.parquet as pq
+
+        arrays = _Arrays(self.folder)
+        starts, lengths = arrays["episodes"].T[:2]
+        done = 0
+        try:
+            with pq.ParquetFile(self.path) as file:
+                columns = ["episode_index", "frame_index", *self.numbers, *self.images]
+                for batch in file.iter_batches(ROWS_AT_A_TIME, row_groups=self.groups, columns=columns):
+                    rows = self._rows(batch, starts, lengths)
+                    for feature, places in self.numbers.items():
+                        values = self._values(batch.column(feature), feature, places[0][2])
+                        for name, first, size in places:
+                            target = arrays[name]
+                            if target.ndim == 1:
+                                target[rows] = values[:, 0]
+                            else:
+                                target[rows, first : first + size] = values
+                    for feature, places in self.images.items():
+                        cells = batch.column(feature)
+                        for row, cell in zip(rows, cells, strict=True):
+                            picture = self._picture(cell.as_py(), feature)
+                            for name, height, width in places:
+                                arrays[name][row] = resized(picture, height, width)
+                    arrays.mark("table", rows)
+                    done += len(rows)
+        except (pa.ArrowException, OSError) as error:
+            raise UserError(f"{self.path} cannot be read: {error}") from error
+        arrays.flush()
+        return done
+
+    def _rows(self, batch: Any, starts: np.ndarray, lengths: np.ndarray) -> np.ndarray:
+        episode = batch.column("episode_index").to_numpy(zero_copy_only=False)
+        frame = batch.column("frame_index").to_numpy(zero_copy_only=False)
+        inside = (episode >= 0) & (episode < len(starts))
+        inside[inside] &= (frame[inside] >= 0) & (frame[inside] < lengths[episode[inside]])
+        if not inside.all():
+            at = int(np.argmin(inside))
+            raise UserError(
+                f"{self.path}: a row of episode {episode[at]}, frame {frame[at]} that meta/episodes does not know"
+            )
+        return starts[episode] + frame
+
+    def _values(self, column: Any, feature: str, size: int) -> np.ndarray:
+        flat = column
+        while hasattr(flat, "flatten") and hasattr(flat.type, "value_type"):
+            flat = flat.flatten()
+        values = flat.to_numpy(zero_copy_only=False)
+        if column.null_count or values.size != len(column) * size:
+            raise UserError(f"{self.path}: {feature} should have {size} numbers in every row and has not")
+        values = values.reshape(len(column), size)
+        if values.dtype.kind == "f" and not np.isfinite(values).all():
+            raise UserError(
+                f"{self.path}: {feature} holds a number that is not finite; delete the episode (lerobot-edit-dataset)"
+            )
+        return values
+
+    def _picture(self, cell: Any, feature: str) -> np.ndarray:
+        from PIL import Image
+
+        data = cell.get("bytes") if isinstance(cell, dict) else cell
+        if not isinstance(data, bytes):
+            raise UserError(
+                f"{self.path}: {feature} holds no picture but a path; embed the pictures (LeRobot's own writer does)"
+            )
+        try:
+            with Image.open(io.BytesIO(data)) as picture:
+                return np.asarray(picture.convert("RGB"))
+        except (OSError, SyntaxError, ValueError) as error:
+            raise UserError(f"{self.path}: a picture of {feature} cannot be decoded: {error}") from error
+
+
+@dataclass(frozen=True)
+class VideoJob:
+    """One video file.
+
+    Attributes:
+        path: The file.
+        feature: Its feature.
+        fps: Of the dataset.
+        episodes: Those in this file.
+        begins: When each starts in the file [s].
+        targets: [(array's name, height, width)].
+        folder: Where the arrays are; ``episodes.npy`` among them says which rows are whose.
+    """
+
+    path: str
+    feature: str
+    fps: float
+    episodes: list[int]
+    begins: list[float]
+    targets: list[tuple[str, int, int]]
+    folder: str
+
+    def run(self) -> int:
+        """Decodes it; returns the number of frames."""
+        import av
+        from av.error import FFmpegError
+        from av.video.reformatter import VideoReformatter
+
+        arrays = _Arrays(self.folder)
+        row_at = self._row_at(arrays["episodes"][self.episodes])
+        total = len(row_at)
+        # One for all frames: it keeps the conversion's tables.
+        reformatter = VideoReformatter()
+        seen: list[int] = []
+        frames = 0
+        try:
+            with av.open(self.path) as container:
+                stream = container.streams.video[0]
+                stream.thread_type = "AUTO"
+                for frame in container.decode(stream):
+                    if frame.pts is None or stream.time_base is None:
+                        raise UserError(f"{self.path}: a frame without a time")
+                    frames += 1
+                    row = row_at.get(round(float(frame.pts * stream.time_base) * self.fps))
+                    if row is None:
+                        continue
+                    picture = reformatter.reformat(frame, format="rgb24").to_ndarray()
+                    for name, height, width in self.targets:
+                        arrays[name][row] = resized(picture, height, width)
+                    seen.append(row)
+        except (FFmpegError, OSError, IndexError) as error:
+            raise UserError(f"{self.path} cannot be decoded: {error}") from error
+        if frames != total:
+            raise UserError(
+                f"{self.path} has {frames} frames, its episodes have {total} rows: the encoder dropped or added "
+                "frames, so pictures and rows no longer belong together; record it again"
+            )
+        if len(set(seen)) != total:
+            raise UserError(
+                f"{self.path}: {total - len(set(seen))} of {total} rows have no frame at their time; "
+                f"is it really recorded at {self.fps:g} frames per second?"
+            )
+        arrays.mark(self.feature, np.asarray(seen))
+        arrays.flush()
+        return frames
+
+    def _row_at(self, episodes: np.ndarray) -> dict[int, int]:
+        """Number of a frame in the file → row in the arrays."""
+        out: dict[int, int] = {}
+        for (row, length), begin in zip(episodes[:, :2], self.begins, strict=True):
+            first = round(begin * self.fps)
+            for k in range(int(length)):
+                if first + k in out:
+                    raise UserError(
+                        f"{self.path}: two episodes claim frame {first + k}; meta/episodes and the video disagree"
+                    )
+                out[first + k] = int(row) + k
+        return out
+
+
+def resized(picture: np.ndarray, height: int, width: int) -> np.ndarray:
+    """(H, W, 3) uint8 at another size (bilinear, averaging when it shrinks), or as it is if that is its size."""
+    if picture.shape[:2] == (height, width):
+        return picture
+    from PIL import Image
+
+    return np.asarray(Image.fromarray(picture).resize((width, height), Image.Resampling.BILINEAR))
+
+
+class _Arrays:
+    """The cache's arrays, opened when first written."""
+
+    def __init__(self, folder: str):
+        self.folder = Path(folder)
+        self._open: dict[str, np.memmap] = {}
+
+    def __getitem__(self, name: str) -> np.ndarray:
+        if name not in self._open:
+            opened = np.lib.format.open_memmap(self.folder / f"{name}.npy", mode="r+")
+            self._open[name] = opened
+        return self._open[name]
+
+    def mark(self, what: str, rows: np.ndarray) -> None:
+        filled = self[filled_name(what)]
+        np.add.at(filled, rows, 1)
+
+    def flush(self) -> None:
+        for array in self._open.values():
+            array.flush()
+
+
+def filled_name(what: str) -> str:
+    """The array that counts how often each row was filled from a file of ``what``."""
+    return "filled." + what.replace("/", "_")
+
+
+def to_line(job: TableJob | VideoJob) -> str:
+    """A job as one line for a worker."""
+    return json.dumps({"kind": type(job).__name__, **asdict(job)}) + "\n"
+
+
+def row_groups(path: Path, rows: int) -> Sequence[tuple[tuple[int, ...], int]]:
+    """Row groups of a parquet file in portions of about ``rows`` rows, with the number of rows in each."""
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    try:
+        facts = pq.read_metadata(path)
+    except (pa.ArrowException, OSError) as error:
+        raise UserError(f"{path} cannot be read: {error}") from error
+    out: list[tuple[tuple[int, ...], int]] = []
+    groups: list[int] = []
+    count = 0
+    for group in range(facts.num_row_groups):
+        groups.append(group)
+        count += facts.row_group(group).num_rows
+        if count >= rows:
+            out.append((tuple(groups), count))
+            groups, count = [], 0
+    if groups:
+        out.append((tuple(groups), count))
+    return out
+
+
+def work() -> None:
+    """A worker's loop: a job per line in, ``{"done": rows}`` or ``{"error": text}`` per line out."""
+    kinds = {"TableJob": TableJob, "VideoJob": VideoJob}
+    for line in sys.stdin:
+        values = json.loads(line)
+        try:
+            answer: dict[str, Any] = {"done": kinds[values.pop("kind")](**values).run()}
+        except UserError as error:
+            answer = {"error": str(error)}
+        print(json.dumps(answer), flush=True)
+
+
+if __name__ == "__main__":
+    work()

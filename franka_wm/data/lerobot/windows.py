@@ -1,0 +1,526 @@
+"""Windows of recorded episodes, sampled for training as if from a replay buffer."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from tensordict import TensorDict
+from torch import Tensor
+
+from franka_wm.data.lerobot.cache import Cache, Say, open_cache
+from franka_wm.data.lerobot.mapping import FeatureMap, map_features
+from franka_wm.data.lerobot.source import find_dataset, read_source
+from franka_wm.errors import UserError
+
+SPLITS = ("train", "validation", "all")
+MEMORY_SHARE = 0.5
+"""How much of the free memory a dataset may take before it is read from the disk instead."""
+
+
+@dataclass(eq=False)
+class Recording:
+    """One or several datasets as the arrays that windows are cut from; shared by the splits.
+
+    Attributes:
+        caches: One for each dataset.
+        mapping: The same for all.
+        arrays: Name → tensors (R_k, …), one for each part; a single part where everything is in memory.
+        in_memory: Whether it is.
+        device: Where windows are given out.
+        episodes: (E, 4) int64 of all datasets: dataset, first row, rows, whether o_T is known. First rows count
+            through all datasets.
+        action_low, action_high: (A,) of the recorded actions, where they are scaled to [−1, 1]; else ``None``.
+        notes: What a user should know.
+    """
+
+    caches: list[Cache]
+    mapping: FeatureMap
+    arrays: dict[str, list[Tensor]]
+    in_memory: bool
+    device: torch.device
+    episodes: np.ndarray
+    action_low: np.ndarray | None
+    action_high: np.ndarray | None
+    notes: list[str] = field(default_factory=list)
+
+
+class RecordedWindows:
+    """Windows of H transitions within one episode, uniform over all that there are.
+
+    A batch is a TensorDict (B, H): observations, ``action`` and ``is_init`` at its root; the observations that
+    followed and, where the dataset has them, ``reward`` (float32), ``done``, ``terminated``, ``truncated``,
+    ``success`` (bool), each (B, H, 1), under ``next``. Pictures are uint8 (B, H, h, w, 3), vectors float32,
+    actions float32 (B, H, A) in [−1, 1] or int64 (B, H) where they are discrete.
+
+    So a window has H + 1 observations. Where the observation after an episode's last action is known (datasets
+    of this package), the last action is in some window; elsewhere it is left out.
+
+    **Actions** of a dataset of this package are in [−1, 1] already. Others are scaled linearly, each component
+    from its smallest and largest value in the dataset to [−1, 1] (a component that never changes becomes 0);
+    ``action_low`` and ``action_high`` record it, :meth:`recorded_action` undoes it.
+
+    Made by :func:`open_dataset`.
+
+    Args:
+        recording: The arrays.
+        window: Transitions per window, H.
+        batch_size: Windows per sample, B.
+        split: ``"train"``, ``"validation"`` or ``"all"``.
+        validation_fraction: Of each dataset's episodes, in [0, 1); at least one if it is above 0.
+        seed: Draws the validation episodes and the windows.
+
+    Attributes:
+        observation_sizes: Vector key → size.
+        image_sizes: Picture key → (h, w, 3).
+        action_dim: A; 0 where actions are discrete.
+        num_actions: Largest discrete action + 1; ``None`` where actions are continuous.
+        episode_length: Transitions of the longest episode.
+        fps: Frames per second.
+        episodes: (dataset, index in it) of every episode of this split.
+        notes: Lines about what was decided or is missing.
+    """
+
+    def __init__(
+        self,
+        recording: Recording,
+        *,
+        window: int,
+        batch_size: int,
+        split: str = "train",
+        validation_fraction: float = 0.1,
+        seed: int = 0,
+    ):
+        for name, value in (("window", window), ("batch_size", batch_size)):
+            if isinstance(value, bool) or not isinstance(value, int) or value < 1:
+                raise UserError(f"{name}={value!r}: must be a whole number of at least 1")
+        if split not in SPLITS:
+            raise UserError(f"split={split!r}: must be one of {', '.join(SPLITS)}")
+        if not 0 <= validation_fraction < 1:
+            raise UserError(
+                f"dataset.validation_fraction={validation_fraction}: must be at least 0 and below 1"
+            )
+        self.recording, self.split_name, self.seed = recording, split, seed
+        self.window, self.batch_size = window, batch_size
+        self.validation_fraction = validation_fraction
+        self.device = recording.device
+        mapping = recording.mapping
+        self.observation_sizes = {key: size for key, (_, size) in mapping.vectors.items()}
+        self.image_sizes = {key: shape for key, (_, shape) in mapping.images.items()}
+        self.action_dim = mapping.action[1]
+        self.fps = recording.caches[0].fps
+        self.notes = list(recording.notes)
+        chosen = _split(recording.episodes[:, 0], split, validation_fraction, seed)
+        if not len(chosen):
+            raise UserError(
+                f"no episode is left for {split}: {len(recording.episodes)} in all, "
+                f"dataset.validation_fraction={validation_fraction}; record more episodes, or change it"
+            )
+        dataset, start, length, known = recording.episodes[chosen].T
+        first = np.searchsorted(recording.episodes[:, 0], dataset)
+        self.episodes = list(zip(dataset.tolist(), (chosen - first).tolist(), strict=True))
+        self._all_lengths = recording.episodes[:, 2] + recording.episodes[:, 3] - 1
+        self.episode_length = int(self._all_lengths.max())
+        self._starts, self._lengths = start, length
+        transitions = length + known - 1
+        windows = np.maximum(transitions - window + 1, 0)
+        self._count = int(windows.sum())
+        if not self._count:
+            raise UserError(
+                f"no window of {window} transitions fits: the longest episode of {split} has {transitions.max()}; "
+                "shorten the window, or record longer episodes"
+            )
+        self.transitions = int(transitions.sum())
+        # Drawing and gathering happen where the arrays are.
+        self._home = self.device if recording.in_memory else torch.device("cpu")
+        useful = windows > 0
+        self._ends = torch.from_numpy(np.cumsum(windows[useful])).to(self._home)
+        shift = start[useful] - (np.cumsum(windows[useful]) - windows[useful])
+        self._shift = torch.from_numpy(shift).to(self._home)
+        self._first_rows = torch.from_numpy(start[useful]).to(self._home)
+        self._steps = torch.arange(window + 1, device=self._home)
+        self._generator = torch.Generator(device=self._home).manual_seed(seed)
+        self._bounds = torch.tensor([0, *np.cumsum([c.arrays["action"].shape[0] for c in recording.caches])])
+        if mapping.discrete:
+            self.num_actions = int(max(int(a.max()) for a in recording.arrays["action"])) + 1
+        else:
+            self.num_actions = None
+        self._scale: tuple[Tensor, Tensor] | None = None
+        if recording.action_low is not None and recording.action_high is not None:
+            centre, half = _centre_and_half(recording.action_low, recording.action_high)
+            self._scale = torch.from_numpy(centre).to(self.device), torch.from_numpy(half).to(self.device)
+
+    def __len__(self) -> int:
+        """Number of different windows."""
+        return self._count
+
+    @property
+    def action_low(self) -> np.ndarray | None:
+        """(A,) recorded value that became −1; ``None`` if actions are as recorded."""
+        return self.recording.action_low
+
+    @property
+    def action_high(self) -> np.ndarray | None:
+        """(A,) recorded value that became 1; ``None`` if actions are as recorded."""
+        return self.recording.action_high
+
+    def sample(self, batch_size: int | None = None) -> TensorDict:
+        """A batch of uniformly drawn windows, [B, H]; no wait for the device where the data lies on it."""
+        count = self.batch_size if batch_size is None else batch_size
+        draw = torch.randint(self._count, (count,), device=self._home, generator=self._generator)
+        return self.windows(draw)
+
+    def windows(self, indices: Tensor) -> TensorDict:
+        """The windows of these numbers.
+
+        Args:
+            indices: (B,) int64, from 0 to ``len(self)`` − 1: episode by episode, by first step.
+
+        Returns:
+            [B, H], on :attr:`device`.
+        """
+        indices = indices.to(self._home)
+        episode = torch.searchsorted(self._ends, indices, right=True)
+        first = indices + self._shift[episode]
+        rows = first.unsqueeze(1) + self._steps
+        batch, h = indices.shape[0], self.window
+        before, after = {}, {}
+        for key in (*self.observation_sizes, *self.image_sizes):
+            values = self._gather(f"observation.{key}", rows)
+            before[key], after[key] = values[:, :h], values[:, 1:]
+        action = self._gather("action", rows[:, :h])
+        if self._scale is not None:
+            centre, half = self._scale
+            action = torch.where(half > 0, (action - centre) / half.clamp_min(1e-30), 0.0).clamp(-1.0, 1.0)
+        is_init = (rows[:, :h] == self._first_rows[episode].unsqueeze(1)).unsqueeze(-1)
+        for name in self.recording.arrays:
+            if name.startswith("next."):
+                after[name.removeprefix("next.")] = self._gather(name, rows[:, :h])
+        root: dict[str, Any] = {
+            **before,
+            "action": action,
+            "is_init": is_init.to(self.device, non_blocking=True),
+            "next": TensorDict(after, batch_size=[batch, h], device=self.device),
+        }
+        return TensorDict(root, batch_size=[batch, h], device=self.device)
+
+    def batches(self, batch_size: int | None = None) -> Iterator[TensorDict]:
+        """Every window once, in order; the last batch may be smaller."""
+        count = self.batch_size if batch_size is None else batch_size
+        for first in range(0, self._count, count):
+            yield self.windows(torch.arange(first, min(first + count, self._count)))
+
+    def split(self, name: str) -> RecordedWindows:
+        """Another split (``"train"``, ``"validation"`` or ``"all"``) of the same data, without a copy."""
+        return RecordedWindows(
+            self.recording,
+            window=self.window,
+            batch_size=self.batch_size,
+            split=name,
+            validation_fraction=self.validation_fraction,
+            seed=self.seed,
+        )
+
+    def statistics(self) -> dict[str, dict[str, Tensor]]:
+        """``mean``, ``std``, ``min``, ``max`` of each vector observation and of ``action``, over this split.
+
+        Computed from the data, in float64; (size,) float32 on :attr:`device`. Actions are as they are given out.
+        """
+        out = {}
+        mask = np.zeros(int(self._bounds[-1]), bool)
+        action_mask = mask.copy()
+        _, start, length, known = self._chosen().T
+        for s, n, k in zip(start, length, known, strict=True):
+            mask[s : s + n + k] = True
+            action_mask[s : s + n] = True
+        for key in self.observation_sizes:
+            out[key] = _moments(self._whole(f"observation.{key}")[mask], self.device)
+        if self.num_actions is None:
+            action = self._whole("action")[action_mask].astype(np.float64)
+            if self.action_low is not None and self.action_high is not None:
+                centre, half = _centre_and_half(self.action_low, self.action_high)
+                action = np.where(half > 0, (action - centre) / np.maximum(half, 1e-30), 0.0)
+            out["action"] = _moments(action, self.device)
+        return out
+
+    def observation_statistics(self, keys: Sequence[str]) -> tuple[Tensor, Tensor]:
+        """Mean and standard deviation of vector observations, one behind the other, for a model's input.
+
+        A component that hardly changes gets a standard deviation of 1e-3, so that dividing is safe.
+        """
+        statistics = self.statistics()
+        mean = torch.cat([statistics[key]["mean"] for key in keys])
+        return mean, torch.cat([statistics[key]["std"] for key in keys]).clamp_min(1e-3)
+
+    def recorded_action(self, action: Tensor) -> Tensor:
+        """Actions (…, A) as given out → in the dataset's own units."""
+        if self._scale is None:
+            return action
+        centre, half = (t.to(action.device) for t in self._scale)
+        return action * half + centre
+
+    def check(
+        self, *, keys: Sequence[str] = (), fps: float | None = None, action_dim: int | None = None
+    ) -> None:
+        """Refuses what does not fit what is to be trained.
+
+        Args:
+            keys: Observations that the model reads.
+            fps: Frames per second of the environment that the model will act in.
+            action_dim: Size of that environment's actions.
+
+        Raises:
+            UserError: One line that names what is there.
+        """
+        there = {**self.observation_sizes, **self.image_sizes}
+        for key in keys:
+            if key not in there:
+                listed = ", ".join(f"{k} {v}" for k, v in there.items())
+                raise UserError(
+                    f"the model reads {key!r}, the dataset gives {listed}; choose with model.observations, or name its "
+                    f"feature: dataset.features={{{key}: …}}"
+                )
+        if fps is not None and abs(fps - self.fps) > 1e-6 * self.fps:
+            raise UserError(
+                f"the dataset has {self.fps:g} frames per second, the environment {fps:g}; a step would mean something "
+                f"else. Use env.fps={self.fps:g}"
+            )
+        if action_dim is not None and self.num_actions is None and action_dim != self.action_dim:
+            raise UserError(
+                f"the dataset's actions have {self.action_dim} numbers, the environment's {action_dim}; "
+                "choose another env.action_mode, or another dataset"
+            )
+
+    def _chosen(self) -> np.ndarray:
+        first = {
+            d: i for d, i in zip(*np.unique(self.recording.episodes[:, 0], return_index=True), strict=True)
+        }
+        return self.recording.episodes[[int(first[d]) + i for d, i in self.episodes]]
+
+    def _whole(self, name: str) -> np.ndarray:
+        return np.concatenate([part.cpu().numpy() for part in self.recording.arrays[name]])
+
+    def _gather(self, name: str, rows: Tensor) -> Tensor:
+        """(B, T) rows → (B, T, …) on the device."""
+        parts = self.recording.arrays[name]
+        flat = rows.reshape(-1)
+        if len(parts) == 1:
+            values = parts[0].index_select(0, flat)
+        else:
+            values = torch.empty((flat.shape[0], *parts[0].shape[1:]), dtype=parts[0].dtype)
+            dataset = torch.bucketize(flat, self._bounds[1:], right=True)
+            for k, part in enumerate(parts):
+                where = (dataset == k).nonzero().squeeze(1)
+                values[where] = part.index_select(0, flat[where] - self._bounds[k])
+        values = values.unflatten(0, rows.shape)
+        if values.device != self.device:
+            values = values.pin_memory().to(self.device, non_blocking=True)
+        return values
+
+
+def open_dataset(
+    root: str | Path | Sequence[str | Path] | None = None,
+    *,
+    repo_id: str | Sequence[str] | None = None,
+    window: int,
+    batch_size: int,
+    device: torch.device | str = "cpu",
+    split: str = "train",
+    validation_fraction: float = 0.1,
+    seed: int = 0,
+    features: Mapping[str, str | Sequence[str]] | None = None,
+    keys: Sequence[str] | None = None,
+    image_size: int | Sequence[int] | None = None,
+    normalize_actions: bool | None = None,
+    cache_dir: str | Path | None = None,
+    in_memory: bool | None = None,
+    workers: int | None = None,
+    say: Say = print,
+) -> RecordedWindows:
+    """Opens one or several LeRobot v3 datasets for training.
+
+    Each is decoded once into a cache (:mod:`franka_wm.data.lerobot.cache`); opening it again takes no time.
+
+    Args:
+        root: Folder of a dataset, or a list of them.
+        repo_id: Name on the Hub, or a list; LeRobot's own local copy is used if there is one. Besides ``root`` or
+            instead of it.
+        window: Transitions per window, H.
+        batch_size: Windows per sample.
+        device: Where batches are given out.
+        split, validation_fraction, seed: See :class:`RecordedWindows`.
+        features: Which feature becomes which entry; by convention if not given
+            (:func:`~franka_wm.data.lerobot.mapping.map_features`).
+        keys: Observations that are needed; others are not decoded.
+        image_size: Pictures are resized to this square, or to (height, width) [px].
+        normalize_actions: Scale actions to [−1, 1]; ``None``: where the dataset is not of this package.
+        cache_dir: Where caches are kept; ``~/.cache/franka_wm/datasets`` if not given.
+        in_memory: Keep everything in the device's memory, else read from the disk's cache; ``None``: where it
+            takes at most half of what is free.
+        workers: Processes that decode; ``None``: all cores.
+        say: Takes lines for the terminal.
+
+    Raises:
+        UserError: One line, for a dataset that cannot be used as asked.
+    """
+    roots = [Path(r) for r in _as_list(root)] + [find_dataset(name) for name in _as_list(repo_id)]
+    if not roots:
+        raise UserError("dataset=lerobot: give dataset.root=FOLDER or dataset.repo_id=USER/NAME")
+    device = torch.empty(0, device=device).device  # with its index
+    sources = [read_source(r) for r in roots]
+    mappings = [map_features(s, features=features, keys=keys, image_size=image_size) for s in sources]
+    for other, source in zip(mappings[1:], sources[1:], strict=True):
+        _check_alike(mappings[0], other, str(roots[0]), str(source.root))
+        if source.fps != sources[0].fps:
+            raise UserError(
+                f"{roots[0]} has {sources[0].fps:g} frames per second, {source.root} {source.fps:g}; "
+                "train on them separately"
+            )
+    caches = [
+        open_cache(s, m, cache_dir=cache_dir, workers=workers, say=say)
+        for s, m in zip(sources, mappings, strict=True)
+    ]
+    ours = all(m.ours for m in mappings)
+    notes = [note for m, c in zip(mappings, caches, strict=True) for note in (*m.notes, *c.notes)]
+    episodes, low, high = _join(caches)
+    scale = not ours if normalize_actions is None else normalize_actions
+    scale = scale and not mappings[0].discrete
+    if scale:
+        notes.append(
+            f"actions are scaled to [−1, 1] from {np.array2string(low, precision=3)} … "
+            f"{np.array2string(high, precision=3)}, what the data spans"
+        )
+    elif not mappings[0].discrete and (np.abs([low, high]) > 1 + 1e-6).any():
+        raise UserError(
+            f"{roots[0]}: actions reach from {low.min():.3g} to {high.max():.3g}, models take [−1, 1]; "
+            "set dataset.normalize_actions=true"
+        )
+    arrays, in_memory = _load(caches, device, in_memory)
+    recording = Recording(
+        caches,
+        mappings[0],
+        arrays,
+        in_memory,
+        device,
+        episodes,
+        low if scale else None,
+        high if scale else None,
+        list(dict.fromkeys(notes)),
+    )
+    windows = RecordedWindows(
+        recording,
+        window=window,
+        batch_size=batch_size,
+        split=split,
+        validation_fraction=validation_fraction,
+        seed=seed,
+    )
+    where = f"in {device} memory" if in_memory else "read from the disk's cache"
+    size = sum(c.nbytes for c in caches)
+    say(
+        f"recorded data: {len(windows.episodes)} of {len(episodes)} episodes ({split}), "
+        f"{windows.transitions} transitions, {len(windows)} windows of {window}; {size / 1e6:.0f} MB {where}"
+    )
+    for note in recording.notes:
+        say(f"  {note}")
+    return windows
+
+
+def _as_list(value: Any) -> list[Any]:
+    if value is None:
+        return []
+    return [value] if isinstance(value, (str, Path)) else list(value)
+
+
+def _check_alike(a: FeatureMap, b: FeatureMap, name_a: str, name_b: str) -> None:
+    """Refuses datasets that do not give the same entries of the same size."""
+    for what in ("images", "vectors"):
+        x = {key: size for key, (_, size) in getattr(a, what).items()}
+        y = {key: size for key, (_, size) in getattr(b, what).items()}
+        if x != y:
+            raise UserError(
+                f"{name_a} gives {x or 'no ' + what}, {name_b} {y or 'no ' + what}; several datasets must be alike: "
+                "choose entries with dataset.features, sizes of pictures with dataset.image_size"
+            )
+    if a.action[1] != b.action[1]:
+        raise UserError(f"actions have {a.action[1]} numbers in {name_a} and {b.action[1]} in {name_b}")
+    if sorted(a.after) != sorted(b.after):
+        raise UserError(
+            f"{name_a} has {', '.join(a.after) or 'no reward or end'}, {name_b} {', '.join(b.after) or 'none'}; "
+            "several datasets must be alike"
+        )
+
+
+def _join(caches: Sequence[Cache]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Episodes of all datasets, and the smallest and largest actions."""
+    episodes, lows, highs, offset = [], [], [], 0
+    for k, cache in enumerate(caches):
+        start, length, known = cache.episodes.T
+        episodes.append(np.stack([np.full_like(start, k), start + offset, length, known], 1))
+        action = cache.arrays["action"]
+        rows = np.zeros(len(action), bool)
+        for s, n in zip(start, length, strict=True):
+            rows[s : s + n] = True
+        lows.append(action[rows].min(0))
+        highs.append(action[rows].max(0))
+        offset += len(action)
+    return np.concatenate(episodes), np.minimum.reduce(lows), np.maximum.reduce(highs)
+
+
+def _load(
+    caches: Sequence[Cache], device: torch.device, in_memory: bool | None
+) -> tuple[dict[str, list[Tensor]], bool]:
+    if in_memory is None:
+        in_memory = sum(c.nbytes for c in caches) <= MEMORY_SHARE * _free_memory(device)
+    arrays: dict[str, list[Tensor]] = {}
+    for name in caches[0].arrays:
+        parts = [torch.from_numpy(np.asarray(c.arrays[name])) for c in caches]
+        if in_memory:
+            rows = sum(part.shape[0] for part in parts)
+            whole = torch.empty((rows, *parts[0].shape[1:]), dtype=parts[0].dtype, device=device)
+            first = 0
+            for part in parts:
+                whole[first : first + part.shape[0]].copy_(part)
+                first += part.shape[0]
+            parts = [whole]
+        arrays[name] = parts
+    return arrays, in_memory
+
+
+def _free_memory(device: torch.device) -> float:
+    """Bytes."""
+    if device.type == "cuda":
+        return torch.cuda.mem_get_info(device)[0]
+    try:
+        facts = Path("/proc/meminfo").read_text().split("MemAvailable:")[1].split()
+        return 1024 * int(facts[0])
+    except (OSError, IndexError, ValueError):  # not Linux
+        return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+
+
+def _split(dataset: np.ndarray, split: str, fraction: float, seed: int) -> np.ndarray:
+    """Numbers of the episodes of a split: a fraction of each dataset, drawn by seed alone."""
+    if split == "all":
+        return np.arange(len(dataset))
+    validation = np.zeros(len(dataset), bool)
+    for k in np.unique(dataset):
+        mine = np.flatnonzero(dataset == k)
+        count = min(max(1, round(fraction * len(mine))), len(mine) - 1) if fraction > 0 else 0
+        validation[np.random.default_rng(seed).permutation(mine)[:count]] = True
+    return np.flatnonzero(validation if split == "validation" else ~validation)
+
+
+def _centre_and_half(low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    low64, high64 = low.astype(np.float64), high.astype(np.float64)
+    return ((high64 + low64) / 2).astype(np.float32), ((high64 - low64) / 2).astype(np.float32)
+
+
+def _moments(values: np.ndarray, device: torch.device) -> dict[str, Tensor]:
+    wide = values.astype(np.float64)
+    out = {"mean": wide.mean(0), "std": wide.std(0), "min": wide.min(0), "max": wide.max(0)}
+    return {name: torch.from_numpy(v.astype(np.float32)).to(device) for name, v in out.items()}

@@ -1,0 +1,383 @@
+"""The cache: built once, whole or not at all, never out of date; and datasets that cannot be used."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import textwrap
+import threading
+import time
+from collections.abc import Callable
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import torch
+
+from franka_wm.data.lerobot import cache, decode, source
+from franka_wm.errors import UserError
+
+
+def folders(cache_dir: Path) -> list[str]:
+    return sorted(p.name for p in cache_dir.iterdir() if p.is_dir())
+
+
+def test_reused(pictures: Path, opened: Callable, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """The second time no picture is decoded and no table read."""
+    first = opened(pictures).windows(torch.arange(5))
+
+    def refuse(*_: object) -> None:
+        raise AssertionError("decoded again")
+
+    monkeypatch.setattr(decode.TableJob, "run", refuse)
+    monkeypatch.setattr("PIL.Image.open", refuse)
+    assert (opened(pictures).windows(torch.arange(5)) == first).all()
+    assert len(folders(tmp_path / "cache")) == 1
+    with pytest.raises(AssertionError, match="decoded again"):
+        opened(pictures, image_size=16)
+
+
+def test_built_again_when_the_dataset_changes(
+    pictures: Path, foreign, opened: Callable, tmp_path: Path
+) -> None:
+    root = tmp_path / "data"
+    shutil.copytree(pictures, root)
+    assert len(opened(root)) == 10
+    before = folders(tmp_path / "cache")
+    shutil.rmtree(root)
+    foreign.make_foreign(root, lengths=(4, 4))
+    assert len(opened(root)) == 4
+    after = folders(tmp_path / "cache")
+    assert len(after) == 1 and after != before  # the old one can never be asked for again
+
+
+def test_one_for_each_size(pictures: Path, opened: Callable, tmp_path: Path) -> None:
+    opened(pictures)
+    opened(pictures, image_size=16)
+    opened(pictures, keys=["joints"])
+    assert len(folders(tmp_path / "cache")) == 3
+
+
+@pytest.mark.parametrize("kind", ["pictures", "video"])
+def test_processes_give_the_same(
+    kind: str,
+    request: pytest.FixtureRequest,
+    opened: Callable,
+    monkeypatch: pytest.MonkeyPatch,
+    tmp_path: Path,
+) -> None:
+    root = request.getfixturevalue(kind)
+    alone = opened(root).windows(torch.arange(10))
+    monkeypatch.setattr(cache, "ROWS_WORTH_A_PROCESS", 0)
+    monkeypatch.setattr(cache, "ROWS_PER_JOB", 5)
+    lines: list[str] = []
+    monkeypatch.setattr(cache, "PROGRESS_EVERY", 0.0)
+    together = opened(root, workers=2, cache_dir=tmp_path / "other", say=lines.append)
+    assert (together.windows(torch.arange(10)) == alone).all()
+    assert any("rows/s" in line and "s left" in line for line in lines)
+
+
+def test_an_error_in_a_worker_is_one_line(
+    pictures: Path, opened: Callable, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setattr(cache, "ROWS_WORTH_A_PROCESS", 0)
+    monkeypatch.setattr(cache, "ROWS_PER_JOB", 5)
+    root = damaged_picture(pictures, tmp_path / "data")
+    with pytest.raises(
+        UserError, match=r"file-000\.parquet: a picture of observation\.images\.\w+ cannot be"
+    ):
+        opened(root, workers=2)
+    assert folders(tmp_path / "cache") == []
+
+
+def test_a_worker_that_dies(
+    pictures: Path, opened: Callable, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setattr(cache, "ROWS_WORTH_A_PROCESS", 0)
+    monkeypatch.setattr(cache, "ROWS_PER_JOB", 5)
+    start = cache._start_worker
+    died = []
+
+    def start_and_kill() -> subprocess.Popen[str]:
+        process = start()
+        if not died:
+            process.kill()
+            died.append(process)
+        return process
+
+    monkeypatch.setattr(cache, "_start_worker", start_and_kill)
+    with pytest.raises(UserError, match=r"ended \(exit status -9\); if it is out of memory"):
+        opened(pictures, workers=2)
+    assert folders(tmp_path / "cache") == []
+
+
+KILLED = """
+import sys, time
+from franka_wm.data.lerobot import cache
+from franka_wm.data.lerobot.windows import open_dataset
+cache.ROWS_WORTH_A_PROCESS, cache.ROWS_PER_JOB = 0, 5
+start = cache._start_worker
+def told():
+    process = start()
+    print("worker", process.pid, flush=True)
+    return process
+def wait(*_):
+    print("now", flush=True)
+    time.sleep(60)
+cache._start_worker = told
+setattr(cache, sys.argv[3], wait)
+open_dataset(sys.argv[1], window=2, batch_size=2, workers=2, cache_dir=sys.argv[2])
+"""
+
+
+@pytest.mark.parametrize("moment", ["_drive", "_terminals"])
+def test_killed_while_building(moment: str, pictures: Path, opened: Callable, tmp_path: Path) -> None:
+    """Nothing that looks like a cache is left, no process either, and the next to come starts clean."""
+    script = [sys.executable, "-c", textwrap.dedent(KILLED), str(pictures), str(tmp_path / "cache"), moment]
+    process = subprocess.Popen(script, stdout=subprocess.PIPE, text=True)
+    assert process.stdout is not None
+    workers = []
+    for line in process.stdout:
+        if line.startswith("worker"):
+            workers.append(int(line.split()[1]))
+        if line.startswith("now"):
+            break
+    process.send_signal(signal.SIGKILL)
+    process.wait()
+    process.stdout.close()
+    assert len(workers) == 2
+    assert all(".writing-" in name for name in folders(tmp_path / "cache"))
+    until = time.monotonic() + 10
+    while any(running(pid) for pid in workers) and time.monotonic() < until:
+        time.sleep(0.05)
+    assert not any(running(pid) for pid in workers)
+    assert len(opened(pictures)) == 10
+    (left,) = folders(tmp_path / "cache")
+    assert ".writing-" not in left
+
+
+def running(pid: int) -> bool:
+    """Whether a process is there and no zombie."""
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()[0] != "Z"
+    except FileNotFoundError:
+        return False
+
+
+def test_two_at_once(
+    pictures: Path, opened: Callable, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """One builds, the other waits and says so."""
+    builds, lines, counts = [], [], []
+    build = cache._build
+
+    def slowly(*args: object) -> None:
+        builds.append(1)
+        time.sleep(1.0)
+        build(*args)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(cache, "_build", slowly)
+    threads = [
+        threading.Thread(target=lambda: counts.append(len(opened(pictures, say=lines.append))))
+        for _ in range(2)
+    ]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert counts == [10, 10] and len(builds) == 1
+    assert any("another process" in line for line in lines)
+
+
+def test_a_damaged_cache_is_built_again(pictures: Path, opened: Callable, tmp_path: Path) -> None:
+    first = opened(pictures, in_memory=True).windows(torch.arange(10))
+    (name,) = folders(tmp_path / "cache")
+    with (tmp_path / "cache" / name / "observation.pixels.npy").open("r+b") as file:
+        file.truncate(1000)
+    lines: list[str] = []
+    assert (opened(pictures, say=lines.append).windows(torch.arange(10)) == first).all()
+    assert any("is damaged" in line for line in lines)
+
+
+def test_nothing_is_unpickled(pictures: Path, opened: Callable, tmp_path: Path) -> None:
+    opened(pictures)
+    (name,) = folders(tmp_path / "cache")
+    path = tmp_path / "cache" / name / "episodes.npy"
+    np.save(path, np.array([print], dtype=object), allow_pickle=True)
+    lines: list[str] = []
+    opened(pictures, say=lines.append)
+    assert any("is damaged" in line and "allow_pickle" in line for line in lines)
+
+
+def test_no_room(pictures: Path, opened: Callable, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setattr(cache.shutil, "disk_usage", lambda path: SimpleNamespace(free=1000))
+    with pytest.raises(UserError, match=r"needs 0\.0 GB.*dataset\.cache_dir"):
+        opened(pictures)
+    assert folders(tmp_path / "cache") == []
+
+
+def test_the_cache_folder_cannot_be_made(pictures: Path, opened: Callable, tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    with pytest.raises(UserError, match=r"cannot write the cache.*dataset\.cache_dir"):
+        opened(pictures, cache_dir=tmp_path / "file" / "cache")
+
+
+def test_changed_while_read(
+    pictures: Path, opened: Callable, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    root = tmp_path / "data"
+    shutil.copytree(pictures, root)
+    run = cache._run
+
+    def touched(*args: object) -> None:
+        run(*args)  # type: ignore[arg-type]
+        os.utime(root / "meta" / "info.json")
+
+    monkeypatch.setattr(cache, "_run", touched)
+    with pytest.raises(UserError, match="was changed while it was read"):
+        opened(root)
+    assert folders(tmp_path / "cache") == []
+
+
+# Datasets that cannot be used
+
+
+def edited_info(root: Path, to: Path, **changes: object) -> Path:
+    shutil.copytree(root, to)
+    path = to / "meta" / "info.json"
+    path.write_text(json.dumps(json.loads(path.read_text()) | changes))
+    return to
+
+
+def damaged_picture(root: Path, to: Path) -> Path:
+    """One PNG of the first column overwritten in the middle of the file."""
+    import pyarrow.parquet as pq
+
+    shutil.copytree(root, to)
+    path = next((to / "data").rglob("*.parquet"))
+    table = pq.read_table(path)
+    at = table.column_names.index("observation.images.top")
+    cells = table.column(at).to_pylist()
+    cells[7]["bytes"] = b"no picture"
+    table = table.set_column(at, table.field(at), [cells])
+    pq.write_table(table, path)
+    return to
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"codebase_version": "v2.1"}, r"format v2\.1; v3 is read.*convert_dataset_v21_to_v30"),
+        ({"total_episodes": 0}, "holds 0 episodes"),
+        ({"total_episodes": 5}, "tells of 5 episodes, meta/episodes of 3.*probably killed"),
+        ({"total_frames": 99}, "tells of 99 frames, its episodes of 16"),
+        ({"fps": 0}, "make no sense"),
+        ({"data_path": "../{chunk_index}"}, "leaves the dataset"),
+        ({"data_path": "{nothing}"}, "makes no path"),
+    ],
+)
+def test_metadata_that_cannot_be(
+    changes: dict, message: str, pictures: Path, opened: Callable, tmp_path: Path
+) -> None:
+    root = edited_info(pictures, tmp_path / "data", **changes)
+    with pytest.raises(UserError, match=message) as error:
+        opened(root)
+    assert "\n" not in str(error.value)
+
+
+def test_no_dataset(opened: Callable, tmp_path: Path) -> None:
+    with pytest.raises(UserError, match="no such folder"):
+        opened(tmp_path / "nothing")
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(UserError, match=r"no LeRobot dataset, meta/info\.json is missing"):
+        opened(tmp_path / "empty")
+    with pytest.raises(UserError, match="not on this machine, and HF_HUB_OFFLINE is set"):
+        source.find_dataset("nobody/nothing")
+    with pytest.raises(UserError, match="must look like user/name"):
+        source.find_dataset("a/b/c d")
+
+
+@pytest.mark.parametrize(
+    ("kind", "pattern"), [("pictures", "data"), ("video", "videos"), ("video", "meta/episodes")]
+)
+def test_missing_files(
+    kind: str, pattern: str, request: pytest.FixtureRequest, opened: Callable, tmp_path: Path
+) -> None:
+    root = tmp_path / "data"
+    shutil.copytree(request.getfixturevalue(kind), root)
+    for path in (root / pattern).rglob("file-*"):
+        path.unlink()
+    with pytest.raises(UserError, match=r"files are missing|meta/episodes is empty"):
+        opened(root)
+
+
+def test_a_writer_that_was_killed(pictures: Path, opened: Callable, tmp_path: Path) -> None:
+    """A parquet file without its end, as LeRobot's writer leaves it."""
+    root = tmp_path / "data"
+    shutil.copytree(pictures, root)
+    path = next((root / "meta" / "episodes").rglob("*.parquet"))
+    path.write_bytes(path.read_bytes()[:-50])
+    with pytest.raises(UserError, match=r"meta/episodes cannot be read.*probably killed"):
+        opened(root)
+
+
+def test_damaged_rows(pictures: Path, opened: Callable, tmp_path: Path) -> None:
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    with pytest.raises(UserError, match=r"a picture of .* cannot be decoded"):
+        opened(damaged_picture(pictures, tmp_path / "picture"))
+
+    def rewritten(name: str, change: Callable[[pa.Table], pa.Table]) -> Path:
+        shutil.copytree(pictures, tmp_path / name)
+        path = next((tmp_path / name / "data").rglob("*.parquet"))
+        pq.write_table(change(pq.read_table(path)), path)
+        return tmp_path / name
+
+    def with_column(table: pa.Table, name: str, values: list) -> pa.Table:
+        at = table.column_names.index(name)
+        return table.set_column(at, table.field(at), pa.array(values, table.schema.field(at).type))
+
+    with pytest.raises(
+        UserError, match=r"2 rows are missing or doubled \(table\), the first in episode 0, frame 3"
+    ):
+        opened(rewritten("fewer", lambda t: pa.concat_tables([t.slice(0, 3), t.slice(5)])))
+    with pytest.raises(UserError, match=r"1 rows are missing or doubled"):
+        opened(rewritten("doubled", lambda t: pa.concat_tables([t, t.slice(2, 1)])))
+    with pytest.raises(UserError, match="episode 9, frame 0 that meta/episodes does not know"):
+        opened(rewritten("unknown", lambda t: with_column(t, "episode_index", [0] * 5 + [9] * 11)))
+    nan = [[0.0, float("nan")]] + [[0.0, 0.0]] * 15
+    with pytest.raises(UserError, match=r"observation\.joints holds a number that is not finite"):
+        opened(rewritten("nan", lambda t: with_column(t, "observation.joints", nan)))
+
+
+def test_frames_and_rows_do_not_agree(video: Path, opened: Callable, tmp_path: Path) -> None:
+    """A dropped frame shifts all that follow: refused, not trained on."""
+    import av
+
+    root = tmp_path / "data"
+    shutil.copytree(video, root)
+    path = next((root / "videos" / "observation.images.side").rglob("*.mp4"))
+    with av.open(str(path)) as old:
+        frames = [frame.to_ndarray(format="rgb24") for frame in old.decode(video=0)]
+    assert len(frames) == 16
+    for kept, message in ((15, "has 15 frames, its episodes have 16 rows"), (17, "has 17 frames")):
+        with av.open(str(path), "w", format="mp4") as new:
+            stream = new.add_stream("mpeg4", rate=10)
+            stream.width = stream.height = 32  # type: ignore[attr-defined]
+            for picture in (frames + frames)[:kept]:
+                for packet in stream.encode(av.VideoFrame.from_ndarray(picture)):  # type: ignore[attr-defined]
+                    new.mux(packet)
+            new.mux(stream.encode(None))  # type: ignore[attr-defined]
+        with pytest.raises(UserError, match=message) as error:
+            opened(root)
+        assert "\n" not in str(error.value)
+    path.write_bytes(b"no video")
+    with pytest.raises(UserError, match="cannot be decoded"):
+        opened(root)
+    assert folders(tmp_path / "cache") == []

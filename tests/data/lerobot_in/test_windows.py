@@ -1,0 +1,179 @@
+"""Windows: of one episode, uniform, split by episodes, the same from memory and disk, alike to a replay's."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from scipy.stats import chisquare
+
+from franka_wm.errors import UserError
+
+LENGTHS = (5, 4, 7)
+
+
+@pytest.mark.parametrize("in_memory", [True, False])
+@pytest.mark.parametrize("window", [1, 3])
+def test_within_episodes_and_uniform(pictures: Path, opened: Callable, window: int, in_memory: bool) -> None:
+    windows = opened(pictures, window=window, in_memory=in_memory)
+    # The observation after the last action is not recorded: L rows are L − 1 transitions.
+    expected = {(e, t) for e, length in enumerate(LENGTHS) for t in range(length - window)}
+    assert len(windows) == len(expected)
+    counts: Counter = Counter()
+    for _ in range(40):
+        batch = windows.sample(200)
+        assert batch.batch_size == (200, window)
+        joints, after = batch["joints"], batch["next", "joints"]
+        assert (joints[..., 0] == joints[:, :1, 0]).all() and (after[..., 0] == joints[..., 0]).all()
+        assert (joints[..., 1] == joints[:, :1, 1] + torch.arange(window)).all()
+        assert (after[..., 1] == joints[..., 1] + 1).all()
+        assert (batch["is_init"].squeeze(-1) == (joints[..., 1] == 0)).all()
+        assert torch.allclose(batch["next", "reward"].squeeze(-1), -joints[..., 1] / 10)
+        counts.update(tuple(pair) for pair in joints[:, 0].int().tolist())
+    assert set(counts) == expected
+    assert chisquare([counts[w] for w in sorted(expected)]).pvalue > 1e-3
+
+
+def test_pictures_belong_to_their_rows(pictures: Path, foreign, opened: Callable) -> None:
+    for batch in opened(pictures).batches(1):
+        for step in batch[0]:
+            episode, frame = step["joints"].int().tolist()
+            assert np.array_equal(step["pixels"], foreign.picture(episode, frame, 0))
+            assert np.array_equal(step["next", "pixels_side"], foreign.picture(episode, frame + 1, 1))
+
+
+def test_video(video: Path, foreign, opened: Callable) -> None:
+    """Every frame is closest to its own picture of all, and is what LeRobot's own reader gives."""
+    from lerobot.datasets.lerobot_dataset import LeRobotDataset
+
+    theirs = LeRobotDataset("someone/else", root=video, video_backend="pyav")
+    windows = opened(video, window=1)
+    truth = {
+        (e, t): foreign.picture(e, t).astype(float) for e, length in enumerate(LENGTHS) for t in range(length)
+    }
+    first = np.cumsum([0, *LENGTHS])
+    for batch in windows.batches(1):
+        episode, frame = batch["joints"][0, 0].int().tolist()
+        picture = batch["pixels"][0, 0].numpy()
+        errors = {place: np.abs(other - picture).mean() for place, other in truth.items()}
+        assert min(errors, key=errors.__getitem__) == (episode, frame)
+        item = theirs[int(first[episode]) + frame]["observation.images.top"]
+        assert torch.equal((item * 255).round().to(torch.uint8).permute(1, 2, 0), batch["pixels"][0, 0])
+
+
+def test_actions_of_others_are_scaled(pictures: Path, foreign, opened: Callable) -> None:
+    windows = opened(pictures)
+    every = np.stack([foreign.action(e, t) for e, length in enumerate(LENGTHS) for t in range(length)])
+    assert np.array_equal(windows.action_low, every.min(0)) and np.array_equal(
+        windows.action_high, every.max(0)
+    )
+    assert any("scaled" in note for note in windows.notes)
+    seen = []
+    for batch in windows.batches(3):
+        episode, frame = batch["joints"].int().unbind(-1)
+        raw = np.array(
+            [
+                [foreign.action(int(e), int(t)) for e, t in zip(*row, strict=True)]
+                for row in zip(episode, frame, strict=True)
+            ]
+        )
+        assert np.allclose(windows.recorded_action(batch["action"]), raw, atol=1e-4)
+        seen.append(batch["action"])
+    action = torch.cat(seen)
+    assert action.min() >= -1 and action.max() <= 1 and (action[..., 2] == 0).all()
+    with pytest.raises(UserError, match="normalize_actions=true"):
+        opened(pictures, normalize_actions=False)
+
+
+def test_splits(pictures: Path, foreign, tmp_path: Path, opened: Callable) -> None:
+    root = foreign.make_foreign(tmp_path / "many", lengths=(4,) * 20, pictures=False)
+    train = opened(root, split="train", validation_fraction=0.2, seed=3)
+    validation = train.split("validation")
+    assert len(train.episodes) == 16 and len(validation.episodes) == 4
+    assert not set(train.episodes) & set(validation.episodes)
+    seen = {int(e) for batch in validation.batches() for e in batch["joints"][:, 0, 0]}
+    assert seen == {index for _, index in validation.episodes}
+    assert train.split("validation").episodes == validation.episodes
+    others = [opened(root, split="validation", validation_fraction=0.2, seed=s).episodes for s in (4, 5, 6)]
+    assert any(other != validation.episodes for other in others)
+    with pytest.raises(UserError, match="no episode is left for validation"):
+        opened(root, split="validation", validation_fraction=0.0)
+
+
+def test_same_seed_same_windows(pictures: Path, opened: Callable) -> None:
+    a, b, c = (opened(pictures, seed=seed) for seed in (1, 1, 2))
+    first, same, other = (w.sample(64) for w in (a, b, c))
+    assert (first == same).all() and not (first["joints"] == other["joints"]).all()
+    assert not (first["joints"] == a.sample(64)["joints"]).all()
+
+
+@pytest.mark.parametrize("in_memory", [True, False])
+def test_several_datasets(pictures: Path, foreign, tmp_path: Path, opened: Callable, in_memory: bool) -> None:
+    """Joined, scaled by what both span, and no window from one into the other."""
+    other = foreign.make_foreign(tmp_path / "other", lengths=(3, 9))
+    windows = opened([pictures, other], in_memory=in_memory)
+    assert [d for d, _ in windows.episodes] == [0, 0, 0, 1, 1]
+    assert len(windows) == sum(n - 2 for n in (*LENGTHS, 3, 9))
+    spans = np.array([foreign.action(e, t) for e, n in ((0, 5), (1, 4), (2, 7), (1, 9)) for t in range(n)])
+    assert np.array_equal(windows.action_high, spans.max(0)) and np.array_equal(
+        windows.action_low, spans.min(0)
+    )
+    for batch in windows.batches(1):
+        episode, frame = batch["joints"][0, 1].int().tolist()
+        assert np.array_equal(batch["pixels"][0, 1], foreign.picture(episode, frame))
+        assert torch.equal(batch["joints"][0, 0] + torch.tensor([0, 1]), batch["joints"][0, 1])
+    drawn = windows.sample(500)
+    assert (drawn["joints"][:, 0, 1] >= 6).any()  # only the other's long episode gets there
+
+
+def test_statistics(foreign, tmp_path: Path, opened: Callable) -> None:
+    root = foreign.make_foreign(tmp_path / "many", lengths=(4, 6, 5, 3, 8), pictures=False)
+    train = opened(root, split="train", validation_fraction=0.4)
+    rows = np.array(
+        [foreign.state(e, t) for _, e in train.episodes for t in range((4, 6, 5, 3, 8)[e])], np.float64
+    )
+    statistics = train.statistics()
+    for name, value in (
+        ("mean", rows.mean(0)),
+        ("std", rows.std(0)),
+        ("min", rows.min(0)),
+        ("max", rows.max(0)),
+    ):
+        assert np.allclose(statistics["joints"][name], value, atol=1e-6), name
+    mean, std = train.observation_statistics(["gripper", "joints"])
+    assert torch.equal(mean[1:], statistics["joints"]["mean"]) and std.shape == (3,)
+    assert (statistics["action"]["min"] >= -1).all() and float(statistics["action"]["std"][2]) == 0
+
+
+def test_check(pictures: Path, opened: Callable) -> None:
+    windows = opened(pictures)
+    windows.check(keys=["joints", "pixels"], fps=10, action_dim=3)
+    for options, message in (
+        ({"keys": ["state"]}, "reads 'state', the dataset gives joints 2, gripper 1, pixels"),
+        ({"fps": 30.0}, "10 frames per second, the environment 30"),
+        ({"action_dim": 7}, "have 3 numbers, the environment's 7"),
+    ):
+        with pytest.raises(UserError, match=message):
+            windows.check(**options)
+
+
+def test_refused(pictures: Path, foreign, tmp_path: Path, opened: Callable) -> None:
+    with pytest.raises(UserError, match="no window of 7 transitions fits: the longest episode of all has 6"):
+        opened(pictures, window=7)
+    assert len(opened(pictures, window=6)) == 1
+    for options in ({"window": 0}, {"batch_size": 0}, {"split": "test"}, {"validation_fraction": 1.0}):
+        with pytest.raises(UserError):
+            opened(pictures, **options)
+    slow = foreign.make_foreign(tmp_path / "slow", fps=5)
+    with pytest.raises(UserError, match=r"10 frames per second.* 5; train on them separately"):
+        opened([pictures, slow])
+    wide = foreign.make_foreign(tmp_path / "wide", width=48)
+    with pytest.raises(UserError, match=r"must be alike.*dataset\.image_size"):
+        opened([pictures, wide])
+    assert opened([pictures, wide], image_size=32).image_sizes["pixels"] == (32, 32, 3)
+    with pytest.raises(UserError, match=r"dataset\.root=FOLDER or dataset\.repo_id"):
+        opened(None)
