@@ -13,7 +13,6 @@ tool has dropped this folder, or has changed an episode's length, reading says s
 
 from __future__ import annotations
 
-import io
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -21,6 +20,7 @@ from typing import Any
 
 import numpy as np
 
+from franka_wm.data.lerobot.pictures import decode_png, encode_png
 from franka_wm.data.lerobot.schema import OWN_FOLDER
 from franka_wm.errors import UserError
 
@@ -139,20 +139,3 @@ def read_terminals(
             "not used where the observation after it is needed"
         )
     return Terminals(found, values, problem)
-
-
-def encode_png(picture: np.ndarray, *, level: int = 1) -> bytes:
-    """(H, W, 3) uint8 as PNG."""
-    from PIL import Image
-
-    buffer = io.BytesIO()
-    Image.fromarray(picture).save(buffer, format="png", compress_level=level)
-    return buffer.getvalue()
-
-
-def decode_png(data: bytes) -> np.ndarray:
-    """PNG as (H, W, 3) uint8."""
-    from PIL import Image
-
-    with Image.open(io.BytesIO(data)) as picture:
-        return np.asarray(picture.convert("RGB"))

@@ -1,0 +1,235 @@
+"""From (worlds, time) batches of a collector or a replay to whole episodes."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from tensordict import TensorDictBase
+
+from franka_wm.data.lerobot.schema import (
+    ACTION,
+    DONE,
+    EPISODE_KEY,
+    REWARD,
+    SEED,
+    SUCCESS,
+    TERMINATED,
+    TRUNCATED,
+    Schema,
+    episode_key,
+)
+from franka_wm.errors import UserError
+
+UNKNOWN_EPISODE = -1
+"""Number of an episode whose place in its world's history is not known (from a replay)."""
+
+
+@dataclass(frozen=True)
+class Episode:
+    """One whole episode in memory.
+
+    Attributes:
+        rows: Feature → (T, …), one row for each action, for every feature of the schema.
+        terminal: Feature → (…): what was observed after the last action, for ``schema.observed``.
+    """
+
+    rows: dict[str, np.ndarray]
+    terminal: dict[str, np.ndarray]
+
+    @property
+    def length(self) -> int:
+        """Number of actions, T."""
+        return len(next(iter(self.rows.values())))
+
+    @property
+    def key(self) -> int:
+        """The episode's fingerprint."""
+        return int(self.rows[EPISODE_KEY][0, 0])
+
+
+class EpisodeCutter:
+    """Turns consecutive batches into whole episodes, world by world.
+
+    Batches are (worlds, time) and continue one another. An episode starts where ``is_init`` is set and ends where
+    ``("next", "done")`` is; its last observation is the true one, from ``next``. What has not ended yet waits for
+    the next batch.
+
+    Args:
+        schema: What is kept.
+        seed: Of the run: the first number of the feature ``seed``.
+        first_episode: (worlds,) numbers of the episodes that the first batch starts with; 0 if not given.
+        discrete: Table (moves, A) that an integer action is a row of; for continuous actions ``None``.
+    """
+
+    def __init__(
+        self,
+        schema: Schema,
+        *,
+        seed: int,
+        first_episode: np.ndarray | None = None,
+        discrete: torch.Tensor | None = None,
+    ):
+        self.schema = schema
+        self.seed = seed
+        self._table = None if discrete is None else discrete.cpu().numpy()
+        self._numbers = first_episode
+        self._open: dict[str, np.ndarray] | None = None
+
+    @property
+    def waiting(self) -> int:
+        """Steps of episodes that have not ended."""
+        if self._open is None:
+            return 0
+        return int(np.cumsum(self._open["is_init"][..., 0], 1).astype(bool).sum())
+
+    def push(self, batch: TensorDictBase) -> list[Episode]:
+        """The episodes that end in this batch, in order of their end, then world.
+
+        Args:
+            batch: (worlds, time), with the schema's observations, ``action``, ``is_init`` and, under ``next``, the
+                observations, ``reward``, ``done``, ``terminated``, ``truncated``, ``success``.
+        """
+        arrays = self._arrays(batch)
+        if self._open is not None:
+            arrays = {key: np.concatenate([self._open[key], arrays[key]], 1) for key in arrays}
+        first = arrays["is_init"][..., 0]
+        done = arrays[DONE][..., 0]
+        worlds, steps = done.shape
+        if self._numbers is None:
+            self._numbers = np.zeros(worlds, np.int64)
+        # The start of the episode that each step belongs to; -1 before the first start that was seen.
+        start = np.maximum.accumulate(np.where(first, np.arange(steps), -1), 1)
+        number = self._numbers[:, None] + np.cumsum(first, 1) - 1
+        out = []
+        for time, world in zip(*np.nonzero(done.T), strict=True):
+            begin = start[world, time]
+            if begin >= 0:
+                out.append(
+                    self._episode(arrays, int(world), int(begin), int(time) + 1, int(number[world, time]))
+                )
+        # What is still open: from the earliest start that has no end. In other worlds older steps come along; they
+        # are cut off by forgetting their start.
+        ended = np.where(done.any(1), steps - np.argmax(done[:, ::-1], 1), 0)
+        opened = np.where(start[:, -1] >= ended, start[:, -1], steps)
+        keep = int(opened.min()) if worlds else steps
+        self._numbers = self._numbers + (first & (np.arange(steps) < opened[:, None])).sum(1)
+        if keep < steps:
+            self._open = {key: array[:, keep:].copy() for key, array in arrays.items()}
+            stale = np.arange(keep, steps) < opened[:, None]
+            self._open["is_init"][stale] = False
+            self._open[DONE][stale] = False
+        else:
+            self._open = None
+        return out
+
+    def _arrays(self, batch: TensorDictBase) -> dict[str, np.ndarray]:
+        """Everything that is kept, (worlds, time, …), on the host; ``next`` observations under ``next.KEY``."""
+
+        def host(value: torch.Tensor) -> np.ndarray:
+            return value.detach().cpu().numpy()
+
+        out = {}
+        for key in {*self.schema.sources.values(), *(key for key, _, _ in self.schema.derived.values())}:
+            if batch.get(key, None) is None or batch.get(("next", key), None) is None:
+                raise UserError(f"the data has no {key!r}; add it to env.observations")
+            out[key], out[f"next.{key}"] = host(batch.get(key)), host(batch.get(("next", key)))
+        action = host(batch.get("action"))
+        if self._table is not None:
+            action = self._table[action]
+        out[ACTION] = action
+        out["is_init"] = host(batch.get("is_init"))
+        for name in (REWARD, DONE, TERMINATED, TRUNCATED, SUCCESS):
+            if name in self.schema.features:
+                out[name] = host(batch.get(("next", name.removeprefix("next."))))
+        return out
+
+    def _episode(
+        self, arrays: dict[str, np.ndarray], world: int, begin: int, end: int, number: int
+    ) -> Episode:
+        schema = self.schema
+        rows, terminal = {}, {}
+        for feature, key in schema.sources.items():
+            rows[feature] = arrays[key][world, begin:end].copy()
+            terminal[feature] = arrays[f"next.{key}"][world, end - 1].copy()
+        for feature, (key, low, high) in schema.derived.items():
+            rows[feature] = arrays[key][world, begin:end, low:high].copy()
+            terminal[feature] = arrays[f"next.{key}"][world, end - 1, low:high].copy()
+        for name in (ACTION, REWARD, DONE, TERMINATED, TRUNCATED, SUCCESS):
+            if name in arrays:
+                rows[name] = arrays[name][world, begin:end].copy()
+        return complete(rows, terminal, seed=(self.seed, world, number))
+
+
+def complete(
+    rows: dict[str, np.ndarray], terminal: dict[str, np.ndarray], *, seed: tuple[int, int, int]
+) -> Episode:
+    """Adds ``seed`` and ``episode_key`` to an episode's rows.
+
+    Args:
+        rows, terminal: As in :class:`Episode`, without those two.
+        seed: Seed of the run, world, number of the episode in that world.
+    """
+    length = len(next(iter(rows.values())))
+    rows[SEED] = np.tile(np.array(seed, np.int64), (length, 1))
+    rows[EPISODE_KEY] = np.full((length, 1), episode_key(rows), np.int64)
+    return Episode(rows, terminal)
+
+
+def cut_replay(
+    data: TensorDictBase,
+    schema: Schema,
+    *,
+    seed: int,
+    episode_length: int,
+    success: Callable[[TensorDictBase], torch.Tensor] | None = None,
+    discrete: torch.Tensor | None = None,
+) -> tuple[list[Episode], int]:
+    """Whole episodes of a replay buffer, which keeps no flag for the end by time.
+
+    An episode is whole if its first step is there and it either terminated or has ``episode_length`` steps. The
+    oldest may have lost their start, the newest have not ended; a world that broke, or a run that was resumed,
+    leaves one that is cut short.
+
+    Args:
+        data: (worlds, time), oldest step first: observations, ``action``, ``is_init`` and, under ``next``,
+            observations, ``reward``, ``terminated``.
+        schema: What is kept.
+        seed: Of the run.
+        episode_length: Of the environment.
+        success: From ``data`` to (worlds, time, 1) bool; needed if the schema has ``next.success``.
+        discrete: As for :class:`EpisodeCutter`.
+
+    Returns:
+        The episodes, and how many partial ones were left out.
+    """
+    first = data.get("is_init")[..., 0]
+    terminated = data.get(("next", "terminated"))[..., 0]
+    time = torch.arange(first.shape[1], device=first.device)
+    start = torch.where(first, time, -1).cummax(1).values
+    age = time - start + 1
+    whole = (start >= 0) & (terminated | (age == episode_length))
+    data = data.clone(recurse=False)
+    after = data.get("next").clone(recurse=False)
+    after["done"] = whole.unsqueeze(-1)
+    after["terminated"] = (whole & terminated).unsqueeze(-1)
+    after["truncated"] = (whole & (age == episode_length)).unsqueeze(-1)
+    if success is not None:
+        after["success"] = success(data)
+    data["next"] = after
+    worlds = first.shape[0]
+    cutter = EpisodeCutter(
+        schema, seed=seed, first_episode=np.full(worlds, UNKNOWN_EPISODE, np.int64), discrete=discrete
+    )
+    # Every step of an episode that is not whole belongs to a start without an end, or to none.
+    pieces = first.clone()
+    pieces[:, :1] = True
+    partial = int(pieces.sum()) - int(whole.sum())
+    episodes = []
+    for episode in cutter.push(data):
+        world = int(episode.rows[SEED][0, 1])
+        del episode.rows[SEED], episode.rows[EPISODE_KEY]
+        episodes.append(complete(episode.rows, episode.terminal, seed=(seed, world, UNKNOWN_EPISODE)))
+    return episodes, partial

@@ -1,0 +1,62 @@
+"""How a dataset came about; ``meta/franka_wm/provenance.json`` travels with it."""
+
+from __future__ import annotations
+
+import json
+import platform
+import sys
+from collections.abc import Mapping
+from datetime import UTC, datetime
+from importlib import metadata
+from pathlib import Path
+from typing import Any
+
+from franka_wm.data.lerobot.schema import PROVENANCE
+from franka_wm.errors import UserError
+
+_PACKAGES = ("franka-wm", "torch", "torchrl", "newton", "warp-lang", "lerobot", "numpy")
+
+
+def describe(
+    *, policy: str, seed: int, config: Mapping[str, Any], command: str | None = None, **more: Any
+) -> dict[str, Any]:
+    """One session of gathering: what is needed to do it again.
+
+    Args:
+        policy: Who acted.
+        seed: Of the run.
+        config: The resolved configuration, plain values.
+        command: What was typed; this process's command line if not given.
+        more: Anything else, plain values.
+    """
+    return {
+        "command": " ".join([Path(sys.argv[0]).name, *sys.argv[1:]]) if command is None else command,
+        "policy": policy,
+        "seed": seed,
+        "date": datetime.now(UTC).isoformat(timespec="seconds"),
+        "versions": {"python": platform.python_version()} | {name: _version(name) for name in _PACKAGES},
+        "config": dict(config),
+        **more,
+    }
+
+
+def _version(package: str) -> str | None:
+    try:
+        return metadata.version(package)
+    except metadata.PackageNotFoundError:
+        return None
+
+
+def read_provenance(root: str | Path) -> dict[str, Any] | None:
+    """``sessions`` (what :func:`describe` returned, with ``episodes``) and ``schema``; ``None`` for others' datasets.
+
+    Raises:
+        UserError: The file cannot be read.
+    """
+    path = Path(root) / PROVENANCE
+    if not path.is_file():
+        return None
+    try:
+        return json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        raise UserError(f"{path} cannot be read ({error}); copy the dataset again") from error

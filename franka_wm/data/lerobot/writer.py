@@ -1,0 +1,433 @@
+"""Episodes from memory to a LeRobot dataset, through shards that other processes write.
+
+While a dataset is gathered, everything is in ``OUT.writing``:
+
+    writer.json            schema and sessions, to go on with
+    shards/shard-00000     a whole LeRobot dataset of some episodes
+    shards/….partial       one that is being written; becomes the above by a rename when all of it has been checked
+    merged                 all of them in one; becomes OUT by a rename
+
+So OUT is there whole or not at all, a kill at any moment loses no shard that was finished, and going on needs
+nothing but the folder.
+"""
+
+from __future__ import annotations
+
+import fcntl
+import json
+import multiprocessing
+import os
+import re
+import shutil
+import signal
+import time
+import traceback
+from collections.abc import Iterable, Mapping
+from importlib import import_module
+from multiprocessing.connection import Connection, wait
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from franka_wm.data.lerobot.episodes import Episode
+from franka_wm.data.lerobot.merge import merge
+from franka_wm.data.lerobot.provenance import read_provenance
+from franka_wm.data.lerobot.schema import Schema
+from franka_wm.data.lerobot.shard import check_episode, write_shard
+from franka_wm.errors import UserError
+
+SHARD_BYTES = 64_000_000
+"""Pictures and numbers of one shard in memory, before they are compressed."""
+
+ORPHANS_HAVE = 60.0
+"""Seconds that writing processes of a killed run get to finish their shard."""
+
+_PARTIAL = ".partial"
+
+
+class DatasetWriter:
+    """Gathers episodes into a dataset. Use it as a context manager; leaving it stops the writing processes.
+
+    Args:
+        out: The dataset's folder; appears when :meth:`finish` returns.
+        schema: What an episode holds.
+        provenance: Of this session (:func:`~franka_wm.data.lerobot.provenance.describe`).
+        workers: Writing processes; 0 writes in this one, which needs no time to start and gathers nothing meanwhile.
+        shard_frames: Steps in a shard; by their size if not given. A kill loses the shards that are not finished.
+        resume: Go on with what is in ``OUT.writing``, and add to ``OUT`` if it is there.
+
+    Attributes:
+        episodes, frames: Written or waiting to be, with those of earlier sessions.
+        resumed: How many of the episodes were there already.
+
+    Raises:
+        UserError: The folder exists, holds something else, or another process is writing it.
+    """
+
+    def __init__(
+        self,
+        out: str | Path,
+        schema: Schema,
+        *,
+        provenance: Mapping[str, Any],
+        workers: int = 2,
+        shard_frames: int | None = None,
+        resume: bool = False,
+    ):
+        for name, value, least in (("workers", workers, 0), ("shard_frames", shard_frames, 1)):
+            if value is not None and (isinstance(value, bool) or not isinstance(value, int) or value < least):
+                raise UserError(f"{name}={value!r}: must be a whole number of at least {least}")
+        self.out = Path(out).absolute()
+        self.schema = schema
+        self.working = self.out.with_name(self.out.name + ".writing")
+        self.shard_frames = _frames_of_a_shard(schema) if shard_frames is None else shard_frames
+        self._buffer: list[Episode] = []
+        self._buffered = 0
+        self._workers: list[_Worker | _Here] = []
+        self._session = dict(provenance)
+        self._number_of_workers = workers
+        self._lock = None
+        self._open(resume)
+
+    # -- before ------------------------------------------------------------------------------------------------
+
+    def _open(self, resume: bool) -> None:
+        if self.out.exists() and not resume:
+            raise UserError(f"out={self.out} exists; choose another folder, or add to it with resume=true")
+        if self.out.exists() and not (self.out / "meta" / "info.json").is_file():
+            raise UserError(f"out={self.out} is not a LeRobot dataset; choose another folder")
+        if self._shards() and not resume:
+            raise UserError(
+                f"{self.working} holds an unfinished dataset; go on with resume=true, or remove that folder"
+            )
+        try:
+            (self.working / "shards").mkdir(parents=True, exist_ok=True)
+            self._lock = _locked(self.working / "lock")
+        except OSError as error:
+            raise UserError(
+                f"out={self.out}: cannot write there ({error.strerror}); choose another"
+            ) from error
+        try:
+            _wait_for_orphans(self.working / "lock.workers")
+            self._recover()
+        except UserError:
+            if self._shards():
+                self.close()
+            else:
+                self._remove_working()
+            raise
+
+    def _recover(self) -> None:
+        """Puts what a kill has left in order, and counts what is there."""
+        state = self._state()
+        merged, previous = self.working / "merged", self.working / "previous"
+        if state.get("replacing"):  # killed while the finished dataset moved to its place
+            if merged.exists():
+                if previous.exists() and not self.out.exists():
+                    os.rename(previous, self.out)
+            else:  # it is in its place: what is left here is in it
+                shutil.rmtree(self.working / "shards")
+                (self.working / "shards").mkdir()
+            shutil.rmtree(previous, ignore_errors=True)
+        shutil.rmtree(merged, ignore_errors=True)
+        for folder in (self.working / "shards").glob("*" + _PARTIAL):
+            shutil.rmtree(folder)
+        kept = self._shards()
+        self._check_schema(state)
+        totals = [_totals(folder) for folder in ([self.out] if self.out.exists() else []) + kept]
+        self.resumed = self.episodes = sum(episodes for episodes, _ in totals)
+        self.frames = sum(frames for _, frames in totals)
+        self._next_shard = 1 + max((_number(folder) for folder in kept), default=-1)
+        earlier = state["sessions"] if kept else []
+        self._sessions = [*earlier, {"first_shard": self._next_shard} | self._session]
+        self._save_state()
+
+    def _state(self) -> dict[str, Any]:
+        path = self.working / "writer.json"
+        return json.loads(path.read_text(encoding="utf-8")) if path.is_file() else {}
+
+    def _check_schema(self, state: dict[str, Any]) -> None:
+        """Refuses to mix: the shards that are kept, and a finished dataset, must have our schema."""
+        finished = read_provenance(self.out) if self.out.exists() else None
+        if self.out.exists() and finished is None:
+            raise UserError(f"out={self.out} was not written by franka-wm; merge with lerobot-edit-dataset")
+        mine = json.loads(json.dumps(self.schema.to_dict()))
+        for other in (state if self._shards() else None, finished):
+            if other is not None and other["schema"] != mine:
+                what = next(key for key in mine if other["schema"].get(key) != mine[key])
+                raise UserError(
+                    f"out={self.out}: what is there has other {what}; give the same env and format, or another out"
+                )
+
+    def _save_state(self, **more: Any) -> None:
+        path = self.working / "writer.json"
+        state = {"schema": self.schema.to_dict(), "sessions": self._sessions} | more
+        path.with_suffix(".new").write_text(json.dumps(state, indent=1), encoding="utf-8")
+        path.with_suffix(".new").replace(path)
+
+    def _shards(self) -> list[Path]:
+        return sorted(
+            folder for folder in (self.working / "shards").glob("shard-*") if folder.suffix != _PARTIAL
+        )
+
+    # -- during ------------------------------------------------------------------------------------------------
+
+    def start(self) -> None:
+        """Starts the writing processes; otherwise done when there is something to write."""
+        if not self._workers:
+            numbers = range(self._number_of_workers)
+            self._workers = [_Worker(self.working, number) for number in numbers] or [_Here()]
+
+    def add(self, episodes: Iterable[Episode]) -> None:
+        """Takes episodes over; returns when they are in memory or on their way to a process.
+
+        Raises:
+            UserError: An episode that cannot be written (:func:`~franka_wm.data.lerobot.shard.check_episode`), or
+                writing failed.
+        """
+        for episode in episodes:
+            check_episode(self.schema, episode)
+            self._buffer.append(episode)
+            self._buffered += episode.length
+            self.episodes += 1
+            self.frames += episode.length
+            if self._buffered >= self.shard_frames:
+                self._dispatch()
+
+    def _dispatch(self) -> None:
+        self.start()
+        folder = self.working / "shards" / f"shard-{self._next_shard:05d}"
+        self._idle_worker().send(("shard", folder, self.schema, self._buffer))
+        self._next_shard += 1
+        self._buffer, self._buffered = [], 0
+
+    def _idle_worker(self) -> _Worker | _Here:
+        for worker in self._workers:
+            if not worker.busy:
+                return worker
+        self._receive()
+        return self._idle_worker()
+
+    def _receive(self) -> None:
+        """Waits until at least one busy process has answered."""
+        busy = [worker for worker in self._workers if isinstance(worker, _Worker) and worker.busy]
+        ready = wait([worker.connection for worker in busy])
+        for worker in busy:
+            if worker.connection in ready:
+                worker.receive()
+
+    def flush(self) -> None:
+        """Writes what is in memory as a shard and waits until all shards are on disk."""
+        if self._buffer:
+            self._dispatch()
+        while any(worker.busy for worker in self._workers):
+            self._receive()
+
+    # -- after -------------------------------------------------------------------------------------------------
+
+    def finish(self) -> Path:
+        """Merges the shards; the dataset is at ``out`` when this returns.
+
+        Raises:
+            UserError: There is no episode, or writing failed. What is finished stays in ``OUT.writing``.
+        """
+        self.flush()
+        shards = self._shards()
+        if not shards:
+            self._remove_working()
+            if self.out.exists():  # resumed, with nothing to add
+                return self.out
+            raise UserError("no episode was gathered, so there is no dataset to write")
+        self.start()
+        roots = ([self.out] if self.out.exists() else []) + shards
+        sessions = self._sessions_with_episodes(shards)
+        merged = self.working / "merged"
+        worker = self._idle_worker()
+        provenance = {"sessions": sessions, "schema": self.schema.to_dict()}
+        worker.send(("merge", merged, roots, provenance))
+        self.flush()
+        self._save_state(replacing=True)
+        if self.out.exists():
+            os.rename(self.out, self.working / "previous")
+        os.rename(merged, self.out)
+        self._remove_working()
+        return self.out
+
+    def _sessions_with_episodes(self, shards: list[Path]) -> list[dict[str, Any]]:
+        """Every session with the number of its episodes; those without any are left out."""
+        earlier = read_provenance(self.out) if self.out.exists() else None
+        out = [] if earlier is None else list(earlier["sessions"])
+        first = [session["first_shard"] for session in self._sessions] + [self._next_shard]
+        for session, low, high in zip(self._sessions, first[:-1], first[1:], strict=True):
+            episodes = sum(_totals(folder)[0] for folder in shards if low <= _number(folder) < high)
+            if episodes:
+                out.append({"episodes": episodes} | {k: v for k, v in session.items() if k != "first_shard"})
+        return out
+
+    def _remove_working(self) -> None:
+        self.close()
+        shutil.rmtree(self.working)
+
+    def close(self) -> None:
+        """Stops the writing processes. Finished shards stay where they are."""
+        for worker in self._workers:
+            worker.stop()
+        self._workers = []
+        if self._lock is not None:
+            os.close(self._lock)
+            self._lock = None
+
+    def __enter__(self) -> DatasetWriter:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+
+def _frames_of_a_shard(schema: Schema) -> int:
+    size = sum(
+        int(np.prod(feature["shape"])) * schema.numpy_dtype(name).itemsize
+        for name, feature in schema.features.items()
+    )
+    return max(200, min(20_000, SHARD_BYTES // size))
+
+
+def _number(shard: Path) -> int:
+    match = re.search(r"(\d+)$", shard.name)
+    assert match is not None
+    return int(match[1])
+
+
+def _totals(folder: Path) -> tuple[int, int]:
+    """Episodes and frames of a dataset."""
+    info = json.loads((folder / "meta" / "info.json").read_text(encoding="utf-8"))
+    return info["total_episodes"], info["total_frames"]
+
+
+def _locked(path: Path) -> int:
+    """A lock that ends with this process, however it ends."""
+    descriptor = os.open(path, os.O_RDWR | os.O_CREAT, 0o644)
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        os.close(descriptor)
+        raise UserError(
+            f"another process is writing {path.parent}; wait for it, or choose another out"
+        ) from None
+    return descriptor
+
+
+def _wait_for_orphans(path: Path) -> None:
+    """Writing processes outlive a killed run until their shard is done; they hold this lock together."""
+    descriptor = os.open(path, os.O_RDWR | os.O_CREAT, 0o644)
+    try:
+        deadline = time.monotonic() + ORPHANS_HAVE
+        while True:
+            try:
+                fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                return
+            except BlockingIOError:
+                if time.monotonic() > deadline:
+                    raise UserError(
+                        f"a process of an earlier run still writes {path.parent}; end it"
+                    ) from None
+                time.sleep(0.05)
+    finally:
+        os.close(descriptor)
+
+
+# -- the other processes -----------------------------------------------------------------------------------------
+
+
+class _Worker:
+    """A process that writes shards, and the connection to it. It ends when this process does, however that ends."""
+
+    def __init__(self, working: Path, number: int):
+        context = multiprocessing.get_context("spawn")
+        self.connection, theirs = context.Pipe()
+        self.log = working / f"worker-{number}.log"
+        self._process = context.Process(target=_work, args=(theirs, working, self.log), daemon=True)
+        self._process.start()
+        theirs.close()
+        self.busy = False
+
+    def send(self, job: tuple[Any, ...]) -> None:
+        try:
+            self.connection.send(job)
+        except OSError as error:
+            raise self._died() from error
+        self.busy = True
+
+    def receive(self) -> None:
+        try:
+            problem = self.connection.recv()
+        except (EOFError, OSError) as error:
+            raise self._died() from error
+        self.busy = False
+        _raise(problem)
+
+    def _died(self) -> UserError:
+        self.busy = False
+        self._process.join(5)
+        return UserError(
+            f"a writing process ended (exit code {self._process.exitcode}; {self.log} may say why); what is finished "
+            "is kept, go on with resume=true"
+        )
+
+    def stop(self) -> None:
+        self.connection.close()  # it reads the end of the connection, and ends
+        self._process.join(30)
+        if self._process.is_alive():
+            self._process.kill()
+            self._process.join()
+
+
+class _Here:
+    """Does the same jobs in this process."""
+
+    busy = False
+
+    def send(self, job: tuple[Any, ...]) -> None:
+        _raise(_do(*job))
+
+    def stop(self) -> None: ...
+
+
+def _raise(problem: str | None) -> None:
+    if problem is not None:
+        raise UserError(f"writing failed: {problem}; what is finished is kept, go on with resume=true")
+
+
+def _do(kind: str, *job: Any) -> str | None:
+    """Does a job; what went wrong, in one line."""
+    try:
+        {"shard": _write_shard, "merge": merge}[kind](*job)
+    except Exception as error:  # every reason goes to the one who asked
+        traceback.print_exc()
+        return str(error) if isinstance(error, UserError) else f"{type(error).__name__}: {error}"
+    return None
+
+
+def _work(connection: Connection, working: Path, log: Path) -> None:
+    """The process: does jobs until the connection ends."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the process that sends the jobs
+    descriptor = os.open(working / "lock.workers", os.O_RDWR | os.O_CREAT, 0o644)
+    fcntl.flock(descriptor, fcntl.LOCK_SH)
+    # Encoders and progress bars talk to standard error.
+    errors = os.open(log, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o644)
+    os.dup2(errors, 2)
+    os.environ["HF_HUB_OFFLINE"] = "1"  # nothing here has to ask anyone
+    os.environ["SVT_LOG"] = "1"
+    import_module("lerobot.datasets.dataset_metadata")  # takes seconds: while episodes are still gathered
+    while True:
+        try:
+            connection.send(_do(*connection.recv()))
+        except (EOFError, OSError):  # no one is there any more
+            return
+
+
+def _write_shard(folder: Path, schema: Schema, episodes: list[Episode]) -> None:
+    partial = folder.with_name(folder.name + _PARTIAL)
+    write_shard(partial, schema, episodes)
+    os.rename(partial, folder)
