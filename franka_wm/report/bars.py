@@ -32,7 +32,7 @@ def bars_figure(
         label: of the horizontal axis.
         scale: what all values are multiplied with, such as 100 for percent.
         limits: of the horizontal axis, after scaling.
-        colours: series -> light colour; the palette in order if None.
+        colours: series, or group where there is one series only -> light colour; others take the palette in order.
 
     Raises:
         UserError: nothing to draw.
@@ -45,6 +45,7 @@ def bars_figure(
     figure, (axes,) = new_figure(theme=theme, height=height)
     for index, name in enumerate(series):
         colour = (colours or {}).get(name, style.series_style(index)[0])
+        each = [theme.colour((colours or {}).get(group, colour)) for group in values if name in values[group]]
         places = [
             k + (index - (len(series) - 1) / 2) * thick
             for k, group in enumerate(values.values())
@@ -53,7 +54,7 @@ def bars_figure(
         means, low, high = zip(
             *(_ends(group[name], scale) for group in values.values() if name in group), strict=True
         )
-        axes.barh(places, means, height=0.9 * thick, color=theme.colour(colour), label=name)
+        axes.barh(places, means, height=0.9 * thick, color=each, label=name)
         whiskers = [
             [mean - a for mean, a in zip(means, low, strict=True)],
             [b - mean for mean, b in zip(means, high, strict=True)],

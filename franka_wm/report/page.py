@@ -1,0 +1,75 @@
+"""A run's page: ``report.html``, one file that says what was run and what came of it.
+
+What it shows is what lies in the run's folder: :mod:`franka_wm.report.run` says which files and which entries of
+``evaluation.json`` are read. A section is there only if there is something for it.
+"""
+
+from html import escape
+from pathlib import Path
+
+from franka_wm import __version__
+from franka_wm.errors import UserError
+from franka_wm.report.document import document, write_document
+from franka_wm.report.run import RunFiles, read_run
+from franka_wm.report.sections import headline, sections
+
+FILE = "report.html"
+
+
+def page(run: RunFiles) -> str:
+    """The page of a run as HTML."""
+    known = [run.environment, run.model] if run.config else []
+    known += [] if run.seed is None else [f"seed {run.seed}"]
+    return document(
+        run.name,
+        subtitle=" · ".join(known) or "an evaluation",
+        above=headline(run),
+        sections=sections(run),
+        below=f"Written by franka_wm {escape(__version__)}.",
+    )
+
+
+def write_page(folder: str | Path, out: str | Path | None = None) -> Path:
+    """Read a run's folder and write its page.
+
+    Args:
+        folder: of a run.
+        out: ends in .html; ``report.html`` in the folder if None.
+
+    Returns:
+        Where the page is.
+
+    Raises:
+        UserError: no run there, a file that cannot be read, or the page cannot be written.
+    """
+    run = read_run(folder)
+    return write_document(page(run), Path(folder) / FILE if out is None else out)
+
+
+def report(arguments: list[str]) -> None:
+    """``franka-wm report RUN [out=…]``: writes the page of a run."""
+    folders, options = split_arguments(arguments, {"out"}, "report RUN [out=PAGE.html]")
+    if len(folders) != 1:
+        raise UserError(f"report needs one folder of a run, got {len(folders)}: franka-wm report outputs/RUN")
+    print(write_page(folders[0], options.get("out")))
+
+
+def split_arguments(arguments: list[str], options: set[str], usage: str) -> tuple[list[str], dict[str, str]]:
+    """Folders, and what stands as ``name=value``.
+
+    Raises:
+        UserError: an option that does not exist.
+    """
+    if any(argument in ("--help", "-h") for argument in arguments):
+        print(f"usage: franka-wm {usage}")
+        raise SystemExit(0)
+    folders, given = [], {}
+    for argument in arguments:
+        name, equals, value = argument.partition("=")
+        if equals and name in options:
+            given[name] = value
+        elif argument.startswith("-") or (equals and not Path(argument).exists()):
+            raise UserError(f"unknown option {argument!r}; usage: franka-wm {usage}")
+        else:
+            folders.append(argument)
+    return folders, given
