@@ -1,0 +1,260 @@
+"""The live page: a session's scene, its controls and its plots, served to browsers on this machine."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import time
+from collections import deque
+from collections.abc import Callable
+from datetime import datetime
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from franka_wm.errors import UserError
+from franka_wm.live.scene import Scene
+from franka_wm.live.session import Frame, Session
+from franka_wm.live.settings import Setting
+from franka_wm.live.shapes import arm_shapes
+from franka_wm.report.style import BLUE, VERMILION, policy_name
+
+HOST = "127.0.0.1"
+"""The page takes orders from whoever reaches it, so only this machine does."""
+
+HISTORY = 300
+"""Steps in the plots."""
+REDRAW = 0.2
+"""Least time between two pictures of the plots and the status [s]; the arm moves in every step."""
+
+LABELS = {
+    "horizon": "horizon [steps]",
+    "num_samples": "candidates",
+    "iterations": "iterations",
+    "num_simulations": "simulations",
+    "temperature": "temperature",
+}
+
+
+def import_viser() -> Any:
+    """The module ``viser``.
+
+    Raises:
+        UserError: It is not installed; the message names the extra.
+    """
+    try:
+        import viser
+    except ImportError as error:
+        raise UserError(f"the live page needs viser ({error}): pip install 'franka-wm[view]'") from error
+    return viser
+
+
+class Page:
+    """Serves a session. Everything that a browser does goes through the session's methods.
+
+    Args:
+        session: What is shown; its thread is started.
+        port: On 127.0.0.1; 0 takes a free one, and so does a port in use: :attr:`address` tells which.
+        folder: Where recordings go.
+        title: Over the controls.
+
+    Raises:
+        UserError: viser is missing.
+    """
+
+    def __init__(
+        self, session: Session, *, port: int = 8080, folder: str | Path = ".", title: str = "franka_wm"
+    ):
+        viser = import_viser()
+        self.session, self.folder = session, Path(folder)
+        with contextlib.redirect_stdout(
+            io.StringIO()
+        ):  # its banner; whoever serves the page says where it is
+            self.server = viser.ViserServer(host=HOST, port=port, label=title, verbose=False)
+        arm = session.arm
+        first = session.frame()
+        self.scene = Scene(
+            self.server,
+            arm_shapes(arm.model),
+            bodies=len(first.bodies),
+            success_distance=arm.config.success_distance,
+            on_goal=session.ask_goal,
+        )
+        self._times: deque[float] = deque(maxlen=30)
+        self._history: deque[tuple[float, float, float]] = deque(maxlen=HISTORY)
+        self._drawn = 0.0
+        self._sliders: dict[str, Any] = {}
+        self._build(title)
+        session.listen(self.show)
+        self.show(first)
+        session.start()
+
+    @property
+    def port(self) -> int:
+        return self.server.get_port()
+
+    @property
+    def address(self) -> str:
+        return f"http://{HOST}:{self.port}"
+
+    def close(self) -> None:
+        """Stops the session's thread and the server."""
+        self.session.stop()
+        self.server.stop()
+
+    # -- controls ----------------------------------------------------------------------------------------
+
+    def _build(self, title: str) -> None:
+        gui, session = self.server.gui, self.session
+        red, green, blue = (int(BLUE[i : i + 2], 16) for i in (1, 3, 5))
+        gui.configure_theme(show_logo=False, show_share_button=False, brand_color=(red, green, blue))
+        self._status = gui.add_markdown("")
+        self._play = gui.add_button("Play", icon="player-play")
+        self._play.on_click(lambda _: self.toggle())
+        others = {"One step": self._step_once, "New episode": session.reset}
+        group = gui.add_button_group("", list(others))
+        group.on_click(lambda event: self._try(others[event.target.value]))
+        names = {policy_name(name): name for name in session.policies}
+        self._policy = gui.add_dropdown(
+            "acts",
+            list(names),
+            initial_value=policy_name(session.policy),
+            hint="Who decides what the arm does",
+        )
+        self._policy.on_update(lambda event: self._try(lambda: session.set_policy(names[event.target.value])))
+        speed = gui.add_slider("speed", 0.1, 1.0, 0.1, 1.0, hint="1: as fast as the real arm")
+        speed.on_update(lambda event: setattr(session, "speed", float(event.target.value)))
+        keep = gui.add_checkbox(
+            "keep the goal", session.keep_goal, hint="A dragged goal outlives the episode"
+        )
+        keep.on_update(lambda event: setattr(session, "keep_goal", bool(event.target.value)))
+        empty = (np.zeros(1), np.zeros(1))
+        self._distance = self._plot("distance to the goal [cm]", empty, VERMILION)
+        self._reward = self._plot("reward", empty, BLUE)
+        if session.settings:
+            with gui.add_folder("Planner"):
+                for setting in session.settings:
+                    self._add_slider(setting)
+        with gui.add_folder("Record", expand_by_default=False):
+            self._record = gui.add_button("Record a video", icon="video", color="gray")
+            self._record.on_click(lambda _: self._try(self.toggle_recording))
+
+    def _add_slider(self, setting: Setting) -> None:
+        slider = self.server.gui.add_slider(
+            LABELS.get(setting.name, setting.name),
+            setting.low,
+            setting.high,
+            setting.step,
+            setting.value,
+        )
+        self._sliders[setting.name] = slider
+        whole = isinstance(setting.value, int)
+
+        def moved(event: Any) -> None:
+            if event.client is None:  # put back by us
+                return
+            value = event.target.value
+            self._try(lambda: self.session.set_planner(**{setting.name: int(value) if whole else value}))
+            slider.value = getattr(self.session.planner, setting.name)
+
+        slider.on_update(moved)
+
+    def _plot(self, title: str, data: tuple[np.ndarray, ...], colour: str) -> Any:
+        return self.server.gui.add_uplot(
+            data,
+            ({"label": "s"}, {"label": title, "stroke": colour, "width": 2}),
+            title=title,
+            scales=axes(0.0, 1.0),
+            legend={"show": False},
+            height=115,
+            padding=(10, 18, 0, 0),
+        )
+
+    def _step_once(self) -> None:
+        self.session.pause()
+        self.session.step()
+
+    def toggle(self) -> None:
+        """Play or pause."""
+        if self.session.playing:
+            self.session.pause()
+        else:
+            self.session.play()
+        self.show(self.session.frame())
+
+    def toggle_recording(self) -> None:
+        """Starts to film, or writes ``live-DATE-TIME.mp4`` into the folder and says where."""
+        if not self.session.recording:
+            self.session.start_recording()
+            self._record.label = "Stop and save"
+            return
+        self._record.label = "Record a video"
+        name = f"live-{datetime.now():%Y-%m-%d-%H-%M-%S}.mp4"
+        path = self.session.stop_recording(self.folder / name)
+        self._notify("Saved", str(path.resolve()))
+
+    def _try(self, action: Callable[[], Any]) -> None:
+        """Does what a browser asked for; what cannot be done is said there."""
+        try:
+            action()
+        except UserError as error:
+            self._notify("That did not work", str(error), colour="red")
+
+    def _notify(self, title: str, body: str, *, colour: Any = "green") -> None:
+        for client in self.server.get_clients().values():
+            client.add_notification(title=title, body=body, color=colour, auto_close_seconds=8.0)
+
+    # -- what is shown -----------------------------------------------------------------------------------
+
+    def show(self, frame: Frame) -> None:
+        """Called by the session with every frame."""
+        self.scene.show(frame)
+        now = time.perf_counter()
+        if frame.stepped:
+            self._times.append(now)
+            seconds = frame.steps / self.session.arm.config.fps
+            self._history.append((seconds, 100.0 * frame.distance, frame.reward))
+        playing = self.session.playing
+        if playing and now - self._drawn < REDRAW:
+            return
+        self._drawn = now
+        self._play.label = "Pause" if playing else "Play"
+        self._play.icon = "player-pause" if playing else "player-play"
+        self._status.content = self._describe(frame)
+        if len(self._history) > 1:
+            seconds, distance, reward = np.array(self._history).T
+            draw(self._distance, seconds, distance, steps=10.0)
+            draw(self._reward, seconds, reward, steps=0.1)
+
+    def _describe(self, frame: Frame) -> str:
+        fps = self.session.arm.config.fps
+        state = "reached" if frame.success else f"{100 * frame.distance:.1f} cm to go"
+        lines = [f"**{state}** · {frame.steps / fps:.1f} s · episode {frame.episode + 1}"]
+        if self.session.playing and len(self._times) > 1:
+            rate = (len(self._times) - 1) / max(self._times[-1] - self._times[0], 1e-6)
+            lines.append(f"{rate:.0f} of {fps:.0f} steps/s · decision {1000 * frame.decision:.1f} ms")
+        else:
+            lines.append("paused")
+        if frame.recording is not None:
+            lines.append(f"recording: {frame.recording / fps:.1f} s")
+        return "  \n".join(lines)
+
+
+def draw(plot: Any, seconds: np.ndarray, values: np.ndarray, *, steps: float) -> None:
+    """Puts a curve into a plot, whose axis holds 0 and all values and grows and shrinks in whole ``steps``."""
+    low = steps * np.floor(min(0.0, float(values.min())) / steps)
+    high = steps * np.ceil(max(0.0, float(values.max())) / steps)
+    scales = axes(low, high if high > low else low + steps)
+    if plot.scales != scales:  # a browser builds the plot anew for other axes
+        plot.scales = scales
+    plot.data = (seconds, values)
+
+
+def axes(low: float, high: float) -> dict[str, Any]:
+    """Time as it comes, values from ``low`` to ``high`` with a margin."""
+    margin = 0.06 * (high - low)
+    return {
+        "x": {"time": False, "auto": True},
+        "y": {"range": (float(low - margin), float(high + margin)), "auto": True},
+    }

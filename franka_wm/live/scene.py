@@ -1,0 +1,159 @@
+"""The arm, its goal and its paths as a viser scene."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from franka_wm.live.shapes import Shape, wxyz
+
+if TYPE_CHECKING:
+    import viser
+
+    from franka_wm.live.session import Frame
+
+EYE, LOOK_AT = (1.42, 1.00, 0.90), (0.12, 0.13, 0.40)
+"""Where the page's camera starts [m]: the whole arm and its reach, seen from its left front."""
+FIELD_OF_VIEW = np.deg2rad(45.0)
+
+SKY, GROUND, CELL, SECTION = (236, 240, 245), (206, 211, 218), (186, 192, 201), (160, 167, 177)
+GOAL, REACHED, PATH, TRAIL = (213, 94, 0), (0, 158, 115), (0, 114, 178), (150, 156, 166)
+TRAIL_STEPS = 60
+DARKEST = 44
+"""Of a shape's red, green and blue: in black, shading shows no form."""
+
+
+class Scene:
+    """What a :class:`~franka_wm.live.session.Frame` looks like.
+
+    Args:
+        server: Where to draw.
+        shapes: The arm's, by :func:`~franka_wm.live.shapes.arm_shapes`.
+        bodies: Number of moving links.
+        success_distance: Radius of the goal's outer sphere [m].
+        on_goal: Called with (x, y, z) [m] while the goal is dragged in a browser; must return at once.
+    """
+
+    def __init__(
+        self,
+        server: viser.ViserServer,
+        shapes: Sequence[Shape],
+        *,
+        bodies: int,
+        success_distance: float,
+        on_goal: Callable[[tuple[float, float, float]], None],
+    ):
+        self._server, self._on_goal = server, on_goal
+        self._dragged = False
+        self._trail: deque[np.ndarray] = deque(maxlen=TRAIL_STEPS)
+        self._lines: dict[str, Any] = {}
+        self._reached: bool | None = None
+        self._stage()
+        self.links = [server.scene.add_frame(f"/arm/link{i + 1}", show_axes=False) for i in range(bodies)]
+        for shape in shapes:
+            parent = "/arm/base" if shape.body < 0 else f"/arm/link{shape.body + 1}"
+            server.scene.add_mesh_simple(
+                f"{parent}/{shape.name}",
+                shape.vertices,
+                shape.faces,
+                color=_lit(shape.colour),
+                position=shape.position,
+                wxyz=shape.wxyz,
+            )
+        self.goal = server.scene.add_transform_controls(
+            "/goal", scale=0.16, line_width=3.0, disable_rotations=True, depth_test=False
+        )
+        self._ball = server.scene.add_icosphere("/goal/ball", radius=0.018, color=GOAL, subdivisions=4)
+        self._halo = server.scene.add_icosphere(
+            "/goal/success",
+            radius=success_distance,
+            color=GOAL,
+            opacity=0.16,
+            subdivisions=4,
+            cast_shadow=False,
+            receive_shadow=False,
+        )
+        self.goal.on_update(self._drag)
+
+    def _stage(self) -> None:
+        scene = self._server.scene
+        scene.set_up_direction("+z")
+        scene.world_axes.visible = False
+        scene.set_background_image(np.full((2, 2, 3), SKY, dtype=np.uint8))
+        scene.configure_default_lights(enabled=False)
+        scene.configure_environment_map(hdri=None)
+        scene.add_light_hemisphere(
+            "/light/sky", sky_color=(255, 255, 255), ground_color=(176, 182, 194), intensity=1.9
+        )
+        scene.add_light_directional(
+            "/light/key", position=(1.2, 1.6, 2.6), intensity=2.2, color=(255, 248, 238), cast_shadow=True
+        )
+        scene.add_light_directional(
+            "/light/rim", position=(-1.5, -2.0, 1.5), intensity=0.8, color=(214, 228, 255)
+        )
+        scene.add_grid(
+            "/ground",
+            width=4.0,
+            height=4.0,
+            cell_size=0.1,
+            section_size=0.5,
+            cell_color=CELL,
+            section_color=SECTION,
+            plane_color=GROUND,
+            plane_opacity=1.0,
+            shadow_opacity=0.3,
+        )
+        camera = self._server.initial_camera
+        camera.position, camera.look_at, camera.fov = EYE, LOOK_AT, float(FIELD_OF_VIEW)
+
+    def show(self, frame: Frame) -> None:
+        """Moves everything to where the frame has it."""
+        with self._server.atomic():
+            for link, pose in zip(self.links, frame.bodies, strict=True):
+                link.position, link.wxyz = pose[:3], wxyz(pose[3:])
+            if not self._dragged:  # what is dragged is where the hand has it, not where it was a step ago
+                self.goal.position = frame.goal
+            if frame.success is not self._reached:
+                self._reached = frame.success
+                self._ball.color = self._halo.color = REACHED if frame.success else GOAL
+            self._draw_paths(frame)
+
+    def _draw_paths(self, frame: Frame) -> None:
+        if not frame.stepped and self._trail and np.linalg.norm(self._trail[-1] - frame.tool) > 1e-4:
+            self._trail.clear()  # set elsewhere by hand
+        if self._trail and np.linalg.norm(self._trail[-1] - frame.tool) > 0.3:
+            self._trail.clear()  # another episode
+        if frame.stepped:
+            self._trail.append(frame.tool)
+        trail = np.array(self._trail) if len(self._trail) > 1 else None
+        self._line("/trail", trail, TRAIL, thickness=0.003)
+        self._line("/plan", frame.path, PATH, thickness=0.007)
+
+    def _line(
+        self, name: str, points: np.ndarray | None, colour: tuple[int, int, int], *, thickness: float
+    ) -> None:
+        """A line through points (n, 3), or none."""
+        handle = self._lines.get(name)
+        if points is None or len(points) < 2:
+            if handle is not None:
+                handle.visible = False
+            return
+        segments = np.stack([points[:-1], points[1:]], 1).astype(np.float32)
+        if handle is not None and len(handle.points) == len(segments):
+            handle.points, handle.visible = segments, True
+            return
+        # Another number of points: viser replaces the node of this name.
+        self._lines[name] = self._server.scene.add_line_segments(name, segments, colour, thickness=thickness)
+
+    async def _drag(self, event: Any) -> None:  # async: viser then keeps the order of start, updates and end
+        self._dragged = event.phase != "end"
+        x, y, z = (float(v) for v in event.target.position)
+        self._on_goal((x, y, max(z, 0.02)))
+
+
+def _lit(colour: tuple[int, int, int]) -> tuple[int, int, int]:
+    red, green, blue = (max(c, DARKEST) for c in colour)
+    return red, green, blue

@@ -1,0 +1,362 @@
+"""One arm, simulated at the environment's own rate while somebody watches, drags its goal and switches policies.
+
+Nothing here knows of browsers: the page listens to :class:`Frame`s and calls the methods of :class:`Session`.
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+import warp as wp
+from tensordict import TensorDictBase
+from torchrl.envs.utils import ExplorationType, set_exploration_type
+
+from franka_wm.envs import FrankaEnv
+from franka_wm.errors import UserError
+from franka_wm.live.commanded import commanded_path
+from franka_wm.live.recorder import VideoRecorder
+from franka_wm.live.settings import Setting, planner_settings, rebuilt
+
+PREFERRED = ("planner", "oracle", "noop")
+"""Which policy starts, the first one that there is."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Frame:
+    """What there is to see of the first world, copied to the host.
+
+    Attributes:
+        steps: Simulated since the session began.
+        episode: Counts from 0.
+        stepped: Whether this is a step's end; otherwise something was set by hand.
+        policy: Who acts.
+        bodies: Poses of the moving links (bodies, 7): position [m], quaternion xyzw.
+        tool, goal: (3,) [m].
+        path: Tool positions that the plan commands (H + 1, 3) [m]; None where the policy has no plan.
+        reward: Of the last step; 0.0 before the first.
+        distance: From tool to goal, at the last step's end, before any reset [m].
+        success: Of the last step.
+        decision: Time that the policy took for the last step [s].
+        recording: Pictures taken so far; None where nothing is recorded.
+    """
+
+    steps: int
+    episode: int
+    stepped: bool
+    policy: str
+    bodies: np.ndarray
+    tool: np.ndarray
+    goal: np.ndarray
+    path: np.ndarray | None
+    reward: float
+    distance: float
+    success: bool
+    decision: float
+    recording: int | None
+
+
+class Session:
+    """Simulates one arm with one of several policies; every method may be called from any thread.
+
+    :meth:`step` works without a thread. :meth:`start` runs one that steps at the environment's rate while
+    :attr:`playing`, as well as it can: a policy that needs longer slows time down.
+
+    Args:
+        env: One world: :class:`~franka_wm.envs.FrankaEnv`, or transforms around one.
+        policies: By name; TensorDict modules that write ``action``.
+        policy: Who acts first; ``planner``, ``oracle`` or ``noop``, whichever there is, if not given.
+        seed: Of poses and goals.
+        keep_goal: Whether a goal set by hand outlives the episode.
+
+    Raises:
+        UserError: More than one world, or a policy that is not there.
+    """
+
+    def __init__(
+        self,
+        env: Any,
+        policies: Mapping[str, Any],
+        *,
+        policy: str | None = None,
+        seed: int = 0,
+        keep_goal: bool = False,
+    ):
+        self.env = env
+        self.arm: FrankaEnv = env if isinstance(env, FrankaEnv) else env.base_env
+        if self.arm.num_envs != 1:
+            raise UserError(f"a live session simulates one world, the environment has {self.arm.num_envs}")
+        self.policies = dict(policies)
+        self.keep_goal = keep_goal
+        self.speed = 1.0
+        self.error: Exception | None = None
+        self._lock = threading.RLock()
+        self._playing, self._stopping = threading.Event(), threading.Event()
+        self._thread: threading.Thread | None = None
+        self._listeners: list[Callable[[Frame], None]] = []
+        self._recorder: VideoRecorder | None = None
+        self._steps = self._episode = 0
+        self._reward = self._decision = 0.0
+        self._success = False
+        self._pinned: torch.Tensor | None = None
+        self._asked: Sequence[float] | None = None
+        self._path: torch.Tensor | None = None
+        self._policy = policy or next((name for name in PREFERRED if name in self.policies), "")
+        self._check_policy(self._policy)
+        self._now = env.reset(seed=seed)
+        self._observed = list(self._now.keys())
+        self._distance = float(self.arm.goal_distance()[0])
+
+    # -- what happens ------------------------------------------------------------------------------------
+
+    @torch.no_grad()
+    def step(self) -> Frame:
+        """One decision and one control step, played or paused."""
+        with self._lock, set_exploration_type(ExplorationType.DETERMINISTIC):
+            self._synchronize()
+            began = time.perf_counter()
+            decided = self.policies[self._policy](self._now)
+            self._synchronize()
+            self._decision = time.perf_counter() - began
+            self._path = self._planned(decided)
+            done, self._now = self.env.step_and_maybe_reset(decided)
+            after = done["next"]
+            self._reward = float(after["reward"])
+            self._success = bool(after["success"])
+            self._distance = float(self.arm.simulation.next_true_state[0, 17:20].norm())
+            self._steps += 1
+            if bool(after["done"]):
+                self._begin_episode()
+            if self._recorder is not None:
+                self._recorder.take()
+            frame = self._frame(stepped=True)
+        return self._tell(frame)
+
+    def reset(self) -> Frame:
+        """The next episode: another pose, and another goal unless :attr:`keep_goal` holds one set by hand."""
+        with self._lock:
+            self._now = self.env.reset()
+            self._begin_episode()
+            self._distance = float(self.arm.goal_distance()[0])
+            self._reward, self._success = 0.0, False
+            frame = self._frame()
+        return self._tell(frame)
+
+    def set_goal(self, goal: Sequence[float]) -> Frame:
+        """Moves the goal to a point (x, y, z) [m].
+
+        Raises:
+            UserError: Not three finite numbers.
+        """
+        with self._lock:
+            point = torch.tensor([float(x) for x in goal], dtype=torch.float32, device=self.arm.device)
+            self._place_goal(point)
+            self._pinned = point
+            self._distance = float(self.arm.goal_distance()[0])
+            frame = self._frame()
+        return self._tell(frame)
+
+    def ask_goal(self, goal: Sequence[float]) -> None:
+        """:meth:`set_goal` by the thread, as soon as it can; of several goals only the last one counts."""
+        self._asked = goal
+
+    def set_policy(self, name: str) -> Frame:
+        """From the next step on, ``name`` acts; what another one remembered is dropped.
+
+        Raises:
+            UserError: There is no such policy.
+        """
+        self._check_policy(name)
+        with self._lock:
+            self._policy = name
+            self._forget()
+            frame = self._frame()
+        return self._tell(frame)
+
+    def set_planner(self, **changes: float) -> None:
+        """Rebuilds the planner with other settings; its present plan is dropped.
+
+        Raises:
+            UserError: There is no planner, or it refuses the values; the present one stays.
+        """
+        with self._lock:
+            if self.planner is None:
+                raise UserError("this session has no planner; give a checkpoint")
+            self.policies["planner"].planner = rebuilt(self.planner, **changes)
+            self._forget()
+
+    # -- what is so --------------------------------------------------------------------------------------
+
+    @property
+    def policy(self) -> str:
+        """Who acts."""
+        return self._policy
+
+    @property
+    def planner(self) -> Any:
+        """The planner behind the policy ``planner``; None where there is none."""
+        return getattr(self.policies.get("planner"), "planner", None)
+
+    @property
+    def settings(self) -> list[Setting]:
+        """The planner's settings that can be moved."""
+        return planner_settings(self.planner)
+
+    @property
+    def playing(self) -> bool:
+        return self._playing.is_set()
+
+    @property
+    def period(self) -> float:
+        """Time from step to step at the present speed [s]."""
+        return 1.0 / (self.arm.config.fps * self.speed)
+
+    @property
+    def goal(self) -> np.ndarray:
+        """(3,) [m]."""
+        with self._lock:
+            return _host(self.arm.goal[0])
+
+    def frame(self) -> Frame:
+        """What there is to see now."""
+        with self._lock:
+            return self._frame()
+
+    def listen(self, listener: Callable[[Frame], None]) -> None:
+        """Calls ``listener`` with every frame, in the thread that made it."""
+        self._listeners.append(listener)
+
+    # -- recording ---------------------------------------------------------------------------------------
+
+    @property
+    def recording(self) -> bool:
+        return self._recorder is not None
+
+    def start_recording(self, **options: Any) -> None:
+        """Films every step from now on; ``options`` are those of :class:`VideoRecorder`."""
+        with self._lock:
+            self._recorder = VideoRecorder(self.arm, **options)
+
+    def stop_recording(self, path: str | Path) -> Path:
+        """Writes what was filmed since :meth:`start_recording`.
+
+        Raises:
+            UserError: Nothing was recorded, or the file cannot be written.
+        """
+        with self._lock:
+            recorder, self._recorder = self._recorder, None
+        if recorder is None:
+            raise UserError("nothing is being recorded")
+        return recorder.write(path)
+
+    # -- the thread --------------------------------------------------------------------------------------
+
+    def play(self) -> None:
+        self._playing.set()
+
+    def pause(self) -> None:
+        self._playing.clear()
+
+    def start(self) -> None:
+        """Starts the thread; it steps while :attr:`playing`.
+
+        An exception in it ends the playing and stays in :attr:`error`, which whoever waits must look at.
+        """
+        if self._thread is None:
+            self._stopping.clear()
+            self._thread = threading.Thread(target=self._run, name="franka-live", daemon=True)
+            self._thread.start()
+
+    def stop(self) -> None:
+        """Ends the thread, after the step that it is in."""
+        self._stopping.set()
+        if self._thread is not None and self._thread is not threading.current_thread():
+            self._thread.join()
+        self._thread = None
+
+    def _run(self) -> None:
+        due = time.perf_counter()
+        try:
+            while not self._stopping.is_set():
+                goal, self._asked = self._asked, None
+                if goal is not None:
+                    self.set_goal(goal)
+                if not self._playing.wait(timeout=0.03):
+                    due = time.perf_counter()
+                    continue
+                self.step()
+                # What could not be kept up with is not made up for. A thread that waits for the lock gets it
+                # only if this one lets go for a moment.
+                due = max(due + self.period, time.perf_counter() + 0.001)
+                self._stopping.wait(due - time.perf_counter())
+        except Exception as error:
+            self.error = error
+            self._playing.clear()
+
+    # -- parts -------------------------------------------------------------------------------------------
+
+    def _check_policy(self, name: str) -> None:
+        if name not in self.policies:
+            hint = "" if "planner" in self.policies else "; planner and policy need checkpoint=FOLDER"
+            raise UserError(f"policy={name!r}: choose from {', '.join(self.policies)}{hint}")
+
+    def _begin_episode(self) -> None:
+        self._episode += 1
+        self._path = None
+        if self.keep_goal and self._pinned is not None:
+            self._place_goal(self._pinned)
+        else:
+            self._pinned = None
+
+    def _place_goal(self, goal: torch.Tensor) -> None:
+        observed = self.arm.set_goal(goal)
+        for key in self.arm.observation_spec:
+            if key not in ("is_init", "success"):
+                self._now.set(key, observed[key])
+
+    def _forget(self) -> None:
+        """Drops what policies carry from step to step: plans and contexts."""
+        self._now = self._now.select(*self._observed)
+        self._path = None
+
+    def _planned(self, decided: TensorDictBase) -> torch.Tensor | None:
+        plan = decided.get("plan", None)
+        if plan is None or not plan.is_floating_point() or plan.shape[2:] != (self.arm.action_dim,):
+            return None  # no plan, or one of numbered moves
+        return commanded_path(self.arm, plan)
+
+    def _synchronize(self) -> None:
+        if self.arm.device.type == "cuda":
+            torch.cuda.synchronize(self.arm.device)
+
+    def _frame(self, *, stepped: bool = False) -> Frame:
+        return Frame(
+            steps=self._steps,
+            episode=self._episode,
+            stepped=stepped,
+            policy=self._policy,
+            bodies=_host(wp.to_torch(self.arm.simulation.warp.body_q)[0]),
+            tool=_host(self.arm.tool_position()[0]),
+            goal=_host(self.arm.goal[0]),
+            path=None if self._path is None else _host(self._path[0]),
+            reward=self._reward,
+            distance=self._distance,
+            success=self._success,
+            decision=self._decision,
+            recording=None if self._recorder is None else len(self._recorder.frames),
+        )
+
+    def _tell(self, frame: Frame) -> Frame:
+        for listener in self._listeners:
+            listener(frame)
+        return frame
+
+
+def _host(tensor: torch.Tensor) -> np.ndarray:
+    return tensor.detach().cpu().numpy().copy()

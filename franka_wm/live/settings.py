@@ -1,0 +1,67 @@
+"""The planner's settings that sliders move, and planners rebuilt with other ones."""
+
+from __future__ import annotations
+
+import inspect
+from dataclasses import dataclass
+from typing import Any
+
+from franka_wm.errors import UserError
+
+RANGES: dict[str, tuple[float, float, float]] = {
+    "horizon": (1, 24, 1),
+    "num_samples": (16, 2048, 16),
+    "iterations": (1, 16, 1),
+    "num_simulations": (2, 128, 2),
+    "temperature": (0.05, 10.0, 0.05),
+}
+"""Setting → lowest, highest, step of its slider."""
+
+
+@dataclass(frozen=True)
+class Setting:
+    """One number of a planner: its present value, and the range of its slider, which holds that value."""
+
+    name: str
+    value: float
+    low: float
+    high: float
+    step: float
+
+
+def planner_settings(planner: Any) -> list[Setting]:
+    """Those of :data:`RANGES` that this planner has; an empty list for None."""
+    out = []
+    for name, (low, high, step) in RANGES.items():
+        value = getattr(planner, name, None)
+        if name not in _parameters(planner) or isinstance(value, bool) or not isinstance(value, int | float):
+            continue
+        if name == "num_samples":  # its parts must stay within it
+            parts = [getattr(planner, part, 0) for part in ("num_elites", "num_policy_samples")]
+            low = max(low, *(part for part in parts if isinstance(part, int)))
+        out.append(Setting(name, value, min(low, value), max(high, value), step))
+    return out
+
+
+def rebuilt(planner: Any, **changes: Any) -> Any:
+    """A planner of the same kind with other settings; the given one is left as it is.
+
+    Raises:
+        UserError: A setting that the planner does not have, or a value that it refuses.
+    """
+    names = _parameters(planner)
+    for name in changes:
+        if name not in names:
+            raise UserError(
+                f"{type(planner).__name__} has no setting {name!r}; choose from {', '.join(names)}"
+            )
+    try:
+        values = {name: getattr(planner, name) for name in names}
+        return type(planner)(**(values | changes))
+    except (AttributeError, TypeError, ValueError) as error:
+        raise UserError(f"{type(planner).__name__}: {error}") from error
+
+
+def _parameters(planner: Any) -> list[str]:
+    """What the planner's constructor takes; a planner keeps each under the same name."""
+    return [] if planner is None else list(inspect.signature(type(planner)).parameters)

@@ -1,0 +1,208 @@
+"""``franka-wm view``: an arm in the browser, or an episode for the Rerun viewer."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, fields
+from typing import Any
+
+from omegaconf import OmegaConf
+from omegaconf.errors import OmegaConfBaseException
+
+from franka_wm.envs import FrankaConfig, FrankaEnv, TransformedFrankaEnv
+from franka_wm.errors import UserError
+from franka_wm.training.progress import announced, say
+
+USAGE = """usage: franka-wm view [key=value …]
+
+An arm in the browser, on this machine only: drag its goal, switch policies, move the planner's settings.
+
+  checkpoint=FOLDER   a run's folder, a checkpoint in it, or hf:user/name; without one the arm is moved by
+                      a planner that knows its geometry, inverse kinematics, random actions, or not at all
+  policy=NAME         who acts first: planner, policy, oracle, random, noop
+  port=8080           of http://127.0.0.1; 0 takes a free one
+  out=FOLDER          where videos go (the present folder)
+  seconds=S           ends after so long; without it, Ctrl-C ends it
+  seed=0  device=auto
+  env.KEY=VALUE       a field of the environment's configuration; episodes have no end unless
+                      env.episode_length is given
+  rerun=FILE.rrd      no page: writes one episode for the Rerun viewer (rerun FILE.rrd)"""
+
+ARM: dict[str, Any] = {
+    "observations": ("state", "joint_target"),
+    "goal_sampling": "reachable",
+    "action_scale": 0.085,
+    "limit_velocity": True,
+    "gravity_compensation": True,
+    "substeps": 4,
+}
+"""Without a checkpoint: what ``env=reach`` sets. Repeated here, since an installed package has no ``conf``."""
+
+ENDLESS = {"episode_length": 1_000_000, "terminate_on_success": False}
+"""While somebody watches, an episode ends when they ask for another."""
+
+EPISODE = 50
+"""Steps of a recorded episode where neither a checkpoint nor the command line says how many."""
+
+
+@dataclass
+class Options:
+    """The command line, checked."""
+
+    checkpoint: str | None = None
+    policy: str | None = None
+    port: int = 8080
+    out: str = "."
+    seconds: float | None = None
+    seed: int = 0
+    device: str = "auto"
+    rerun: str | None = None
+    env: dict[str, Any] = field(default_factory=dict)
+
+
+def parse(arguments: Sequence[str]) -> Options:
+    """``key=value`` arguments as :class:`Options`.
+
+    Raises:
+        UserError: An argument that is none of them, or a value that cannot be.
+    """
+    options = Options()
+    known = {f.name for f in fields(Options)}
+    numbers: Mapping[str, Callable[[str], Any]] = {"port": int, "seed": int, "seconds": float}
+    for argument in arguments:
+        key, equals, value = argument.partition("=")
+        key = key.lstrip("-")
+        if equals and key.startswith("env."):
+            try:
+                given: Any = OmegaConf.to_container(OmegaConf.from_dotlist([argument]))
+                options.env |= given["env"]
+            except OmegaConfBaseException as error:
+                raise UserError(f"{argument}: {error}") from error
+            continue
+        if not equals or not value or key == "env" or key not in known:
+            raise UserError(
+                f"view: {argument!r} is not key=value with a key that it knows; see franka-wm view --help"
+            )
+        try:
+            setattr(options, key, numbers.get(key, str)(value))
+        except ValueError as error:
+            raise UserError(f"view: {argument}: must be a number") from error
+    if not 0 <= options.port <= 65535:
+        raise UserError(f"view: port={options.port}: must be from 0 to 65535")
+    if options.seconds is not None and not 0 < options.seconds < float("inf"):
+        raise UserError(f"view: seconds={options.seconds:g}: must be above 0 and finite")
+    return options
+
+
+def view(arguments: Sequence[str]) -> None:
+    """The verb.
+
+    Raises:
+        UserError: Bad arguments, a missing extra, or a checkpoint that cannot be shown.
+    """
+    if any(argument in ("--help", "-h") for argument in arguments):
+        print(USAGE)
+        return
+    options = parse(arguments)
+    if options.rerun is not None:
+        record(options)
+        return
+    from franka_wm.live.page import import_viser
+
+    import_viser()  # before anything that takes time
+    serve(build(options), options)
+
+
+@dataclass
+class Stage:
+    """One world and who can act in it.
+
+    Attributes:
+        env: One world, whose episodes have no end unless the command line gives one.
+        policies: By name.
+        title: What acts, in a few words.
+        steps: Length of an ordinary episode.
+    """
+
+    env: Any
+    policies: dict[str, Any]
+    title: str
+    steps: int
+
+
+def build(options: Options) -> Stage:
+    """What the command line asks for.
+
+    Raises:
+        UserError: A checkpoint that cannot be loaded, or one of another environment.
+    """
+    changes = {**ENDLESS, **options.env}
+    with announced("building the arm; on a machine's first start this compiles kernels for a minute or two"):
+        if options.checkpoint is None:
+            return untrained(options, changes)
+        from franka_wm.training.load import load_agent
+
+        agent = load_agent(
+            options.checkpoint, num_envs=1, device=options.device, env_changes=changes, seed=options.seed
+        )
+    if not isinstance(agent.env, FrankaEnv | TransformedFrankaEnv):
+        raise UserError(f"{options.checkpoint}: acts in another environment than the arm; view shows the arm")
+    title = f"{agent.cfg.model.name}, {int(agent.counters.get('updates', 0)):,} updates"
+    return Stage(agent.env, agent.policies, title, int(agent.cfg.env.episode_length))
+
+
+def untrained(options: Options, changes: Mapping[str, Any]) -> Stage:
+    """The arm without a checkpoint."""
+    from franka_wm.data.policies import NoopPolicy, OraclePolicy, SmoothRandomPolicy
+    from franka_wm.live.commanded import kinematic_planner
+
+    config = FrankaConfig.from_mapping({**ARM, **changes})
+    env = FrankaEnv(config, num_envs=1, device=options.device, seed=options.seed)
+    policies: dict[str, Any] = {}
+    if "joint_target" in config.observations:
+        policies = {"planner": kinematic_planner(env), "oracle": OraclePolicy(env.kinematics, config)}
+    policies |= {"random": SmoothRandomPolicy(env.action_dim), "noop": NoopPolicy(env.action_dim)}
+    return Stage(env, policies, "planning with exact geometry", EPISODE)
+
+
+def record(options: Options) -> None:
+    """Writes one episode for the Rerun viewer."""
+    from franka_wm.live.rerun_recording import import_rerun, record_episode
+
+    import_rerun()  # before anything that takes time
+    assert options.rerun is not None
+    length = options.env.pop(
+        "episode_length", None
+    )  # of the recording; the world itself must not restart in it
+    stage = build(options)
+    steps = stage.steps if length is None else length
+    if options.seconds is not None:
+        steps = max(1, round(options.seconds * stage.env.config.fps))
+    with announced(f"recording {steps} steps"):
+        record_episode(
+            stage.env, stage.policies, options.rerun, policy=options.policy, seed=options.seed, steps=steps
+        )
+    say(f"look at it with: rerun {options.rerun}")
+
+
+def serve(stage: Stage, options: Options) -> None:
+    """Serves the page until the time is up or Ctrl-C."""
+    from franka_wm.live.page import Page
+    from franka_wm.live.session import Session
+
+    session = Session(stage.env, stage.policies, policy=options.policy, seed=options.seed)
+    page = Page(session, port=options.port, folder=options.out, title=stage.title)
+    try:
+        taken = f" (port {options.port} is taken)" if options.port not in (0, page.port) else ""
+        say(f"{page.address}{taken}   Ctrl-C ends it")
+        session.play()
+        end = float("inf") if options.seconds is None else time.monotonic() + options.seconds
+        while time.monotonic() < end and session.error is None:
+            time.sleep(min(0.2, max(0.0, end - time.monotonic())))
+    except KeyboardInterrupt:
+        pass  # the way to end it
+    finally:
+        page.close()
+    if session.error is not None:
+        raise session.error

@@ -1,0 +1,237 @@
+"""A live session without a browser: what its controls do to the arm."""
+
+from __future__ import annotations
+
+import threading
+import time
+from pathlib import Path
+
+import av
+import numpy as np
+import pytest
+import torch
+
+from franka_wm.errors import UserError
+from franka_wm.live.session import Frame, Session
+
+LEFT, RIGHT = (0.40, 0.25, 0.45), (0.40, -0.25, 0.45)
+
+
+def play(session: Session, steps: int) -> Frame:
+    frames = [session.step() for _ in range(steps)]
+    return frames[-1]
+
+
+def test_the_tool_follows_a_goal_that_is_dragged(make_session) -> None:
+    session = make_session(policy="oracle")
+    for goal in (LEFT, RIGHT, LEFT):
+        moved = session.set_goal(goal)
+        np.testing.assert_allclose(moved.goal, goal, atol=1e-6)
+        assert moved.distance > 0.1, "the goal must have been moved away from the tool"
+        frame = play(session, 40)
+        np.testing.assert_allclose(frame.tool, goal, atol=0.02)
+        assert frame.distance < 0.02
+        assert frame.success
+
+
+def test_the_planner_follows_it_too_and_shows_where_it_is_going(make_session) -> None:
+    torch.manual_seed(0)
+    session = make_session(policy="planner")
+    session.set_goal(RIGHT)
+    start = session.frame()
+    frame = session.step()
+    assert frame.path is not None
+    assert frame.path.shape == (session.planner.horizon + 1, 3)
+    ahead = np.linalg.norm(frame.path[-1] - np.array(RIGHT))
+    assert ahead < 0.8 * np.linalg.norm(start.tool - np.array(RIGHT)), "the path leads towards the goal"
+    assert np.linalg.norm(play(session, 30).tool - np.array(RIGHT)) < 0.05
+
+
+def test_doing_nothing_ignores_the_goal(make_session) -> None:
+    session = make_session(policy="noop")
+    before = session.frame().tool
+    session.set_goal(RIGHT)
+    frame = play(session, 20)
+    np.testing.assert_allclose(frame.tool, before, atol=0.02)
+    assert frame.distance == pytest.approx(float(np.linalg.norm(frame.tool - np.array(RIGHT))), abs=1e-5)
+
+
+def test_another_policy_acts_at_once_and_plans_are_dropped(make_session) -> None:
+    session = make_session(policy="planner")
+    assert play(session, 2).path is not None
+    frame = session.set_policy("noop")
+    assert frame.policy == "noop"
+    assert frame.path is None
+    frame = session.step()
+    assert frame.path is None
+    targets = session.arm.joint_targets()
+    session.step()
+    assert torch.equal(session.arm.joint_targets(), targets), "doing nothing commands nothing"
+    session.set_policy("planner")
+    assert session.step().path is not None
+    with pytest.raises(UserError, match="policy='fly': choose from planner, oracle, random, noop"):
+        session.set_policy("fly")
+    assert session.policy == "planner"
+
+
+def test_settings_rebuild_the_planner_between_two_steps(make_session) -> None:
+    session = make_session(policy="planner")
+    session.step()
+    before = session.planner
+    assert {s.name: s.value for s in session.settings} == {
+        "horizon": 6, "num_samples": 128, "iterations": 3, "temperature": 2.0,
+    }  # fmt: skip
+    session.set_planner(horizon=3, num_samples=32, temperature=1.0)
+    assert session.planner is not before
+    assert (session.planner.horizon, session.planner.num_samples, session.planner.iterations) == (3, 32, 3)
+    assert before.horizon == 6
+    assert session.step().path.shape == (4, 3)  # and the plan of 6 steps was not carried over
+
+
+def test_a_setting_that_cannot_be_leaves_the_planner_as_it_is(make_session) -> None:
+    session = make_session(policy="planner")
+    before = session.planner
+    with pytest.raises(UserError, match="num_elites must not exceed"):
+        session.set_planner(num_samples=4)
+    with pytest.raises(UserError, match="MPPI has no setting 'sharpness'"):
+        session.set_planner(sharpness=1.0)
+    assert session.planner is before
+    del session.policies["planner"]
+    with pytest.raises(UserError, match="no planner"):
+        session.set_planner(horizon=2)
+    assert session.settings == []
+
+
+def test_a_new_episode_has_another_pose_and_goal(make_session) -> None:
+    session = make_session(policy="oracle")
+    first = play(session, 5)
+    frame = session.reset()
+    assert frame.episode == first.episode + 1
+    assert not np.allclose(frame.goal, first.goal)
+    assert frame.reward == 0.0
+
+
+def test_a_goal_set_by_hand_outlives_the_episode_only_if_asked(make_session) -> None:
+    session = make_session(policy="oracle")
+    session.set_goal(LEFT)
+    assert not np.allclose(session.reset().goal, LEFT)
+    session.keep_goal = True
+    session.set_goal(LEFT)
+    np.testing.assert_allclose(session.reset().goal, LEFT, atol=1e-6)
+    np.testing.assert_allclose(play(session, 50).tool, LEFT, atol=0.02)
+
+
+def test_episodes_that_end_by_themselves_go_on_with_the_kept_goal(make_session) -> None:
+    session = make_session(policy="oracle", keep_goal=True, episode_length=3)
+    session.set_goal(LEFT)
+    frames = [session.step() for _ in range(7)]
+    assert [f.episode for f in frames] == [0, 0, 1, 1, 1, 2, 2]
+    for frame in frames:
+        np.testing.assert_allclose(frame.goal, LEFT, atol=1e-6)
+
+
+def test_reward_and_distance_are_the_environments(make_session) -> None:
+    session = make_session(policy="random")
+    session.set_goal(RIGHT)
+    frame = play(session, 3)
+    arm = session.arm
+    assert frame.distance == pytest.approx(float(arm.goal_distance()[0]), abs=1e-6)
+    assert frame.reward == pytest.approx(float(arm.simulation.reward[0]), abs=1e-6)
+    np.testing.assert_allclose(frame.bodies[:, :3], arm.body_positions()[0], atol=1e-6)
+
+
+def test_the_thread_steps_while_playing_and_rests_while_paused(make_session) -> None:
+    session = make_session(policy="oracle")
+    session.step()  # compiles
+    seen: list[Frame] = []
+    enough = threading.Event()
+
+    def listen(frame: Frame) -> None:
+        seen.append(frame)
+        if len(seen) >= 5:
+            enough.set()
+
+    session.listen(listen)
+    session.start()
+    try:
+        time.sleep(0.2)
+        assert not seen, "it must not step before it is told to play"
+        session.play()
+        assert enough.wait(20)
+        session.pause()
+        time.sleep(0.3)  # the step that is under way
+        count = len(seen)
+        time.sleep(0.3)
+        assert len(seen) == count
+        session.ask_goal(LEFT)  # also while it rests
+        deadline = time.monotonic() + 20
+        while not np.allclose(session.goal, LEFT, atol=1e-6) and time.monotonic() < deadline:
+            time.sleep(0.02)
+        np.testing.assert_allclose(session.goal, LEFT, atol=1e-6)
+        assert session.frame().steps == seen[-1].steps
+    finally:
+        session.stop()
+    assert session.error is None
+    assert [f.steps for f in seen if f.stepped] == list(range(2, 2 + sum(f.stepped for f in seen)))
+
+
+def test_time_runs_no_faster_than_the_environment(make_session) -> None:
+    session = make_session(policy="noop")
+    session.step()
+    session.speed = 0.5
+    steps = session.frame().steps
+    session.start()
+    session.play()
+    time.sleep(1.0)
+    session.stop()
+    assert 1 <= session.frame().steps - steps <= 0.5 * session.arm.config.fps * 1.0 + 2
+
+
+def test_what_breaks_in_the_thread_is_kept_and_stops_it(make_session) -> None:
+    session = make_session(policy="noop")
+
+    def broken(_tensordict):
+        raise RuntimeError("broken policy")
+
+    session.policies["noop"] = broken
+    session.start()
+    session.play()
+    deadline = time.monotonic() + 20
+    while session.error is None and time.monotonic() < deadline:
+        time.sleep(0.02)
+    session.stop()
+    assert str(session.error) == "broken policy"
+    assert not session.playing
+
+
+def test_a_recording_is_a_video_with_a_picture_for_every_step(make_session, tmp_path: Path) -> None:
+    session = make_session(policy="oracle")
+    session.set_goal(RIGHT)
+    assert session.step().recording is None
+    session.start_recording(size=64)
+    assert play(session, 6).recording == 6
+    path = session.stop_recording(tmp_path / "live.mp4")
+    with av.open(str(path)) as video:
+        frames = [frame.to_ndarray(format="rgb24") for frame in video.decode(video=0)]
+        assert float(video.streams.video[0].average_rate) == session.arm.config.fps
+    assert len(frames) == 6
+    assert frames[0].shape == (64, 64, 3)
+    assert not np.array_equal(frames[0], frames[-1]), "the arm moves"
+    assert not session.recording
+    with pytest.raises(UserError, match="nothing is being recorded"):
+        session.stop_recording(tmp_path / "again.mp4")
+
+
+def test_a_recording_stops_growing_and_an_empty_one_is_not_written(make_session, tmp_path: Path) -> None:
+    session = make_session(policy="noop")
+    session.start_recording(size=32, most=2)
+    assert play(session, 4).recording == 2
+    session.start_recording(size=32)
+    with pytest.raises(UserError, match="nothing was recorded"):
+        session.stop_recording(tmp_path / "empty.mp4")
+    assert not list(tmp_path.iterdir())
+
+
+def test_one_world_only(small_env) -> None:
+    with pytest.raises(UserError, match="one world, the environment has 2"):
+        Session(small_env(2), {"noop": lambda t: t})
