@@ -181,7 +181,7 @@ def _build(
     )
     _run(jobs, total, workers, say)
     _check_filled(source, folder, episodes, videos)
-    notes = _terminals(source, mapping, folder, episodes, arrays)
+    notes = _terminals(source, mapping, folder, episodes)
     _save(folder / "episodes.npy", episodes)
     _derive_terminated(mapping, folder, arrays)
     for path in folder.glob("filled.*.npy"):
@@ -406,13 +406,7 @@ def _check_filled(source: Source, folder: Path, episodes: np.ndarray, videos: Se
             )
 
 
-def _terminals(
-    source: Source,
-    mapping: FeatureMap,
-    folder: Path,
-    episodes: np.ndarray,
-    arrays: dict[str, tuple[list[int], str]],
-) -> list[str]:
+def _terminals(source: Source, mapping: FeatureMap, folder: Path, episodes: np.ndarray) -> list[str]:
     """Puts each known o_T into the row after its episode's last; notes what is missing."""
     if not mapping.ours:
         return [
@@ -428,7 +422,10 @@ def _terminals(
         lengths=episodes[:, 1].tolist(),
         features={name: source.features[name] for name in needed},
     )
+    notes = [] if terminals.problem is None else [terminals.problem]
     found = np.flatnonzero(terminals.found)
+    if not len(found):
+        return notes
     rows = episodes[found, 0] + episodes[found, 1]
     for key, (features, _) in mapping.vectors.items():
         target = _writable(folder, f"observation.{key}")
@@ -441,7 +438,7 @@ def _terminals(
             target[row] = resized(terminals.values[feature][episode], height, width)
         target.flush()
     episodes[found, 2] = 1
-    return [] if terminals.problem is None else [terminals.problem]
+    return notes
 
 
 def _derive_terminated(mapping: FeatureMap, folder: Path, arrays: dict[str, tuple[list[int], str]]) -> None:

@@ -6,7 +6,7 @@ import os
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -21,6 +21,10 @@ from franka_wm.errors import UserError
 SPLITS = ("train", "validation", "all")
 MEMORY_SHARE = 0.5
 """How much of the free memory a dataset may take before it is read from the disk instead."""
+
+
+class NoWindows(UserError):
+    """A split has no window of the length asked for."""
 
 
 @dataclass(eq=False)
@@ -48,6 +52,15 @@ class Recording:
     action_low: np.ndarray | None
     action_high: np.ndarray | None
     notes: list[str] = field(default_factory=list)
+
+
+class Moments(NamedTuple):
+    """Of a vector's components, (size,) float32 each."""
+
+    mean: Tensor
+    std: Tensor
+    min: Tensor
+    max: Tensor
 
 
 class RecordedWindows:
@@ -79,7 +92,7 @@ class RecordedWindows:
         observation_sizes: Vector key → size.
         image_sizes: Picture key → (h, w, 3).
         action_dim: A; 0 where actions are discrete.
-        num_actions: Largest discrete action + 1; ``None`` where actions are continuous.
+        num_actions: Largest discrete action + 1; 0 where actions are continuous.
         episode_length: Transitions of the longest episode.
         fps: Frames per second.
         episodes: (dataset, index in it) of every episode of this split.
@@ -117,7 +130,7 @@ class RecordedWindows:
         self.notes = list(recording.notes)
         chosen = _split(recording.episodes[:, 0], split, validation_fraction, seed)
         if not len(chosen):
-            raise UserError(
+            raise NoWindows(
                 f"no episode is left for {split}: {len(recording.episodes)} in all, "
                 f"dataset.validation_fraction={validation_fraction}; record more episodes, or change it"
             )
@@ -131,7 +144,7 @@ class RecordedWindows:
         windows = np.maximum(transitions - window + 1, 0)
         self._count = int(windows.sum())
         if not self._count:
-            raise UserError(
+            raise NoWindows(
                 f"no window of {window} transitions fits: the longest episode of {split} has {transitions.max()}; "
                 "shorten the window, or record longer episodes"
             )
@@ -149,7 +162,7 @@ class RecordedWindows:
         if mapping.discrete:
             self.num_actions = int(max(int(a.max()) for a in recording.arrays["action"])) + 1
         else:
-            self.num_actions = None
+            self.num_actions = 0
         self._scale: tuple[Tensor, Tensor] | None = None
         if recording.action_low is not None and recording.action_high is not None:
             centre, half = _centre_and_half(recording.action_low, recording.action_high)
@@ -226,10 +239,17 @@ class RecordedWindows:
             seed=self.seed,
         )
 
-    def statistics(self) -> dict[str, dict[str, Tensor]]:
-        """``mean``, ``std``, ``min``, ``max`` of each vector observation and of ``action``, over this split.
+    def validation(self) -> RecordedWindows | None:
+        """The validation split of the same data; ``None`` where it has no window."""
+        try:
+            return self.split("validation")
+        except NoWindows:
+            return None
 
-        Computed from the data, in float64; (size,) float32 on :attr:`device`. Actions are as they are given out.
+    def statistics(self) -> dict[str, Moments]:
+        """Mean, deviation, least and largest of each vector observation and of ``action``, over this split.
+
+        Computed from the data, in float64, and put on :attr:`device`. Actions are as they are given out.
         """
         out = {}
         mask = np.zeros(int(self._bounds[-1]), bool)
@@ -240,7 +260,7 @@ class RecordedWindows:
             action_mask[s : s + n] = True
         for key in self.observation_sizes:
             out[key] = _moments(self._whole(f"observation.{key}")[mask], self.device)
-        if self.num_actions is None:
+        if not self.num_actions:
             action = self._whole("action")[action_mask].astype(np.float64)
             if self.action_low is not None and self.action_high is not None:
                 centre, half = _centre_and_half(self.action_low, self.action_high)
@@ -254,8 +274,8 @@ class RecordedWindows:
         A component that hardly changes gets a standard deviation of 1e-3, so that dividing is safe.
         """
         statistics = self.statistics()
-        mean = torch.cat([statistics[key]["mean"] for key in keys])
-        return mean, torch.cat([statistics[key]["std"] for key in keys]).clamp_min(1e-3)
+        mean = torch.cat([statistics[key].mean for key in keys])
+        return mean, torch.cat([statistics[key].std for key in keys]).clamp_min(1e-3)
 
     def recorded_action(self, action: Tensor) -> Tensor:
         """Actions (…, A) as given out → in the dataset's own units."""
@@ -290,7 +310,7 @@ class RecordedWindows:
                 f"the dataset has {self.fps:g} frames per second, the environment {fps:g}; a step would mean something "
                 f"else. Use env.fps={self.fps:g}"
             )
-        if action_dim is not None and self.num_actions is None and action_dim != self.action_dim:
+        if action_dim is not None and not self.num_actions and action_dim != self.action_dim:
             raise UserError(
                 f"the dataset's actions have {self.action_dim} numbers, the environment's {action_dim}; "
                 "choose another env.action_mode, or another dataset"
@@ -520,7 +540,7 @@ def _centre_and_half(low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, np.
     return ((high64 + low64) / 2).astype(np.float32), ((high64 - low64) / 2).astype(np.float32)
 
 
-def _moments(values: np.ndarray, device: torch.device) -> dict[str, Tensor]:
+def _moments(values: np.ndarray, device: torch.device) -> Moments:
     wide = values.astype(np.float64)
-    out = {"mean": wide.mean(0), "std": wide.std(0), "min": wide.min(0), "max": wide.max(0)}
-    return {name: torch.from_numpy(v.astype(np.float32)).to(device) for name, v in out.items()}
+    out = (wide.mean(0), wide.std(0), wide.min(0), wide.max(0))
+    return Moments(*(torch.from_numpy(v.astype(np.float32)).to(device) for v in out))

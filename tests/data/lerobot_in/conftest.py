@@ -8,13 +8,24 @@ os.environ["HF_HUB_OFFLINE"] = "1"  # before LeRobot is imported: it reads this 
 
 import importlib.util
 from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 from types import ModuleType
 from typing import Any
 
 import pytest
+import torch
+from torchrl.collectors import Collector
+from torchrl.data import ReplayBuffer
 
+from franka_wm.data.lerobot.episodes import EpisodeCutter
+from franka_wm.data.lerobot.provenance import describe
+from franka_wm.data.lerobot.schema import schema_for
 from franka_wm.data.lerobot.windows import RecordedWindows, open_dataset
+from franka_wm.data.lerobot.writer import DatasetWriter
+from franka_wm.data.policies import SmoothRandomPolicy
+from franka_wm.data.replay import make_replay
+from franka_wm.envs import FrankaConfig, FrankaEnv
 
 
 @pytest.fixture(scope="session")
@@ -55,3 +66,57 @@ def opened(tmp_path: Path) -> Callable[..., RecordedWindows]:
         return open_dataset(root, **(defaults | options))
 
     return open_
+
+
+EPISODE_LENGTH = 6
+ARM: dict[str, Any] = {
+    "substeps": 2,
+    "gravity_compensation": True,
+    "goal_sampling": "reachable",
+    "observations": ("pixels", "state", "joint_target"),
+    "image_size": 32,
+    "episode_length": EPISODE_LENGTH,
+}
+"""Settings of the arm that the exported datasets were recorded with."""
+
+
+@dataclass(frozen=True)
+class Recorded:
+    """Data of this package: as a replay buffer, and exported."""
+
+    replay: ReplayBuffer
+    root: Path
+
+
+@pytest.fixture(scope="session")
+def export(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., Recorded]:
+    """Collects with the arm into a replay and exports it; ``format`` is that of the pictures."""
+
+    def make(format: str = "exact", *, steps: int = 20, worlds: int = 3, window: int = 3) -> Recorded:
+        config = FrankaConfig(**ARM)
+        env = FrankaEnv(config, num_envs=worlds, device="cpu", seed=1)
+        policy = SmoothRandomPolicy(7, generator=torch.Generator().manual_seed(0))
+        collector = Collector(
+            env, policy, frames_per_batch=steps * worlds, total_frames=steps * worlds, track_traj_ids=False
+        )
+        batch = next(iter(collector)).clone()
+        collector.shutdown()
+        replay = make_replay(
+            capacity=steps * worlds, num_envs=worlds, window=window, batch_size=8, device="cpu"
+        )
+        replay.extend(batch)
+        schema = schema_for(config, format=format)
+        root = tmp_path_factory.mktemp("export") / format
+        session = describe(policy="smooth", seed=1, config={"env": {**ARM, "kind": "franka"}})
+        with DatasetWriter(root, schema, provenance=session, workers=1) as writer:
+            writer.add(EpisodeCutter(schema, seed=1).push(batch))
+            writer.finish()
+        return Recorded(replay, root)
+
+    return make
+
+
+@pytest.fixture(scope="session")
+def exact(export: Callable[..., Recorded]) -> Recorded:
+    """Nine whole episodes of six steps, three worlds, pictures bit for bit."""
+    return export("exact")

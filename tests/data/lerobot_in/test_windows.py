@@ -102,6 +102,11 @@ def test_splits(pictures: Path, foreign, tmp_path: Path, opened: Callable) -> No
     assert any(other != validation.episodes for other in others)
     with pytest.raises(UserError, match="no episode is left for validation"):
         opened(root, split="validation", validation_fraction=0.0)
+    assert opened(root, split="train", validation_fraction=0.0).validation() is None
+    same = train.validation()
+    assert same is not None and same.episodes == validation.episodes
+    mean, deviation = train.statistics()["joints"][:2]  # what a trainer takes
+    assert torch.equal(mean, train.statistics()["joints"].mean) and deviation.shape == (2,)
 
 
 def test_same_seed_same_windows(pictures: Path, opened: Callable) -> None:
@@ -143,10 +148,10 @@ def test_statistics(foreign, tmp_path: Path, opened: Callable) -> None:
         ("min", rows.min(0)),
         ("max", rows.max(0)),
     ):
-        assert np.allclose(statistics["joints"][name], value, atol=1e-6), name
+        assert np.allclose(getattr(statistics["joints"], name), value, atol=1e-6), name
     mean, std = train.observation_statistics(["gripper", "joints"])
-    assert torch.equal(mean[1:], statistics["joints"]["mean"]) and std.shape == (3,)
-    assert (statistics["action"]["min"] >= -1).all() and float(statistics["action"]["std"][2]) == 0
+    assert torch.equal(mean[1:], statistics["joints"].mean) and std.shape == (3,)
+    assert (statistics["action"].min >= -1).all() and float(statistics["action"].std[2]) == 0
 
 
 def test_check(pictures: Path, opened: Callable) -> None:
