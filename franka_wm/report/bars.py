@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 from franka_wm.errors import UserError
 from franka_wm.report import style
 from franka_wm.report.figure import finish_axes, new_figure
-from franka_wm.report.style import INK, LIGHT, Theme
+from franka_wm.report.style import INK, LIGHT, PAPER, Theme
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -37,6 +37,8 @@ def bars_figure(
     Raises:
         UserError: nothing to draw.
     """
+    from matplotlib.patheffects import withStroke
+
     series = list(dict.fromkeys(name for group in values.values() for name in group))
     if not series:
         raise UserError("no bar to draw; give at least one group with one value.")
@@ -60,7 +62,7 @@ def bars_figure(
             [b - mean for mean, b in zip(means, high, strict=True)],
         ]
         if any(map(any, whiskers)):
-            axes.errorbar(
+            drawn = axes.errorbar(
                 means,
                 places,
                 xerr=whiskers,
@@ -69,6 +71,8 @@ def bars_figure(
                 elinewidth=1.1,
                 capsize=2,
             )
+            for line in (*drawn.lines[1], *drawn.lines[2]):  # caps and bars stay visible on a dark bar
+                line.set_path_effects([withStroke(linewidth=2.8, foreground=theme.colour(PAPER))])
     axes.set_yticks(range(len(values)), list(values))
     axes.invert_yaxis()
     if limits is not None:

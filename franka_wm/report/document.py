@@ -239,13 +239,15 @@ section{padding:28px 0 4px;scroll-margin-top:40px}
 .cards{display:grid;gap:16px;grid-template-columns:repeat(auto-fit,minmax(min(100%,340px),1fr));align-items:start;
 margin:12px 0}
 .cards>.card{margin:0}
+.cards>.card:only-child:not(.wide){max-width:620px}
 .card{background:var(--paper);border:1px solid var(--faint);border-radius:10px;padding:12px;margin:12px 0;min-width:0}
 .card.wide{grid-column:1/-1}
 .card img,.card video{display:block;width:100%;height:auto;border-radius:6px}
 .card.single{max-width:620px}
 .card.strip{overflow-x:auto}
 .card.strip img{min-width:620px}
-.chart{display:block;width:100%;height:auto;max-width:560px;margin:0 auto}
+/* matplotlib leaves black fills out: they inherit */
+.chart{fill:var(--black);display:block;width:100%;height:auto;max-width:560px;margin:0 auto}
 figcaption,.note{font-size:14px;opacity:.8;margin:8px 2px 0}
 section>p{margin:0 0 12px;max-width:70ch}
 .tiles{display:grid;gap:12px;grid-template-columns:repeat(auto-fit,minmax(142px,1fr));margin:22px 0 0}

@@ -1,0 +1,246 @@
+"""Several runs on one page: results side by side, curves over each other, and what was configured differently."""
+
+import json
+import shlex
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from franka_wm.errors import UserError
+from franka_wm.report import style
+from franka_wm.report.bars import bars_figure
+from franka_wm.report.curves import seeds_figure
+from franka_wm.report.document import (
+    Section,
+    cards,
+    chart,
+    commands,
+    document,
+    folded,
+    scrolling,
+    write_document,
+)
+from franka_wm.report.horizon import horizon_figure
+from franka_wm.report.page import split_arguments
+from franka_wm.report.run import RunFiles, read_run
+from franka_wm.report.sections import SHOWN
+from franka_wm.report.spectra import spectrum_figure
+from franka_wm.report.table import Table, evaluation_tables, html, is_interval
+
+FILE = "compare.html"
+
+MISSING = "–"
+SAME_BUT = ("seed", "device", "resume")
+"""Runs whose configurations differ in these alone are repetitions of one another."""
+
+QUANTITIES = ("final_distance", "success", "return")
+
+
+def compare_page(runs: Sequence[RunFiles]) -> str:
+    """The page of several runs as HTML.
+
+    Raises:
+        UserError: fewer than two runs.
+    """
+    if len(runs) < 2:
+        raise UserError(
+            f"compare needs at least two runs, got {len(runs)}: franka-wm compare outputs/RUN outputs/RUN"
+        )
+    named = dict(zip(unique_names(runs), runs, strict=True))
+    different = differences({name: run.config for name, run in named.items()})
+    groups = repetitions(named)
+    parts = [
+        Section("result", "Results", _results(named)),
+        Section("curves", "Learning curves", _curves(groups)),
+        Section("horizon", "Open loop", _horizons(named)),
+        Section("latents", "Latent space", _spectra(named)),
+        Section("config", "What differs", _differences(different, list(named))),
+        Section("reproduce", "Reproduce", _reproduce(runs)),
+    ]
+    count = f"{len(runs)} runs" + (f" in {len(groups)} groups" if len(groups) < len(runs) else "")
+    return document(
+        "Runs compared",
+        subtitle=f"{count}: {', '.join(named)}",
+        sections=parts,
+        below="Written by franka_wm.",
+    )
+
+
+def unique_names(runs: Sequence[RunFiles]) -> list[str]:
+    """Names that tell the runs apart: as much of the end of each path as it takes.
+
+    Raises:
+        UserError: the same run twice.
+    """
+    paths = [run.folder.parts for run in runs]
+    if len(set(paths)) < len(paths):
+        raise UserError("the same run is given twice; give each folder once.")
+    depth = 1
+    while len({path[-depth:] for path in paths}) < len(paths):
+        depth += 1
+    return ["/".join(path[-depth:]) for path in paths]
+
+
+def flat_config(config: Mapping[str, Any], above: str = "") -> dict[str, Any]:
+    """``{"env": {"task": "reach"}}`` → ``{"env.task": "reach"}``; lists are values."""
+    flat: dict[str, Any] = {}
+    for name, value in config.items():
+        if isinstance(value, Mapping) and value:
+            flat |= flat_config(value, f"{above}{name}.")
+        else:
+            flat[f"{above}{name}"] = value
+    return flat
+
+
+def differences(configs: Mapping[str, Mapping[str, Any]]) -> dict[str, dict[str, Any]]:
+    """Entries that are not the same in all runs.
+
+    Args:
+        configs: run -> configuration.
+
+    Returns:
+        entry -> run -> value; a run that lacks the entry is not there.
+    """
+    flat = {name: flat_config(config) for name, config in configs.items()}
+    entries = dict.fromkeys(entry for values in flat.values() for entry in values)
+    out = {}
+    for entry in entries:
+        having = {name: values[entry] for name, values in flat.items() if entry in values}
+        # As text: 1 and True and 1.0 are not the same in a configuration.
+        if len(having) < len(flat) or len({json.dumps(v, default=str) for v in having.values()}) > 1:
+            out[entry] = having
+    return out
+
+
+def repetitions(runs: Mapping[str, RunFiles]) -> dict[str, dict[str, RunFiles]]:
+    """Runs grouped by configuration, whatever their seed; a group is called by its run, or by the first of them."""
+    groups: dict[str, dict[str, RunFiles]] = {}
+    for name, run in runs.items():
+        flat = {k: v for k, v in flat_config(run.config).items() if k not in SAME_BUT}
+        # Runs without a configuration are known to be the same as nothing.
+        key = json.dumps(flat, sort_keys=True, default=str) if flat else name
+        groups.setdefault(key, {})[name] = run
+    return {next(iter(group)): group for group in groups.values()}
+
+
+def compare(arguments: list[str]) -> None:
+    """``franka-wm compare RUN RUN … [out=compare.html]``: writes a page that shows runs side by side."""
+    folders, options = split_arguments(arguments, {"out"}, "compare RUN RUN … [out=compare.html]")
+    text = compare_page([read_run(folder) for folder in folders])
+    print(write_document(text, Path(options.get("out", FILE))))
+
+
+# -- sections --------------------------------------------------------------------------------------------
+
+
+def _results(runs: Mapping[str, RunFiles]) -> str:
+    policies = list(dict.fromkeys(policy for run in runs.values() for policy in run.policies))
+    body, rest = "", ""
+    for policy in sorted(policies, key=lambda name: SHOWN.index(name) if name in SHOWN else len(SHOWN)):
+        having = {name: run.policies[policy] for name, run in runs.items() if policy in run.policies}
+        tables = [
+            Table(["run", *table.header[1:]], table.rows) for table in evaluation_tables(having) if table.rows
+        ]
+        text = f"<h3>{style.policy_name(policy)}</h3>" + "".join(scrolling(html(table)) for table in tables)
+        if policy not in SHOWN:
+            rest += text
+            continue
+        distances = {
+            name: {"": values["final_distance"]}
+            for name, values in having.items()
+            if is_interval(values.get("final_distance"))
+        }
+        drawn = ""
+        if distances:
+            colours = dict.fromkeys(distances, style.policy_colour(policy))
+            drawn = chart(
+                bars_figure(distances, label="final distance to the goal [cm]", scale=100, colours=colours),
+                f"final distance of {style.policy_name(policy)} in every run",
+                "Shorter is better; whiskers are 95 % intervals over episodes.",
+            )
+        body += text + cards(drawn)
+    return body + (folded("Baselines", rest) if rest else "")
+
+
+def _curves(groups: Mapping[str, Mapping[str, RunFiles]]) -> str:
+    rows = {name: [run.rows for run in group.values()] for name, group in groups.items()}
+    logged = [row for runs in rows.values() for one in runs for row in one]
+    x = next((key for key in ("env_steps", "updates") if all(key in row for row in logged)), None)
+    if not logged or x is None:
+        return ""
+    found = {key for row in logged for key in row}
+    drawn = []
+    for key in [_best(found, quantity) for quantity in QUANTITIES] + ["loss"]:
+        if key in found:
+            who = "" if key.count("/") < 2 else f"Of {style.policy_name(key.split('/')[1])}. "
+            many = any(len(group) > 1 for group in groups.values())
+            note = who + (
+                "Mean over runs that differ in their seed alone; bands from lowest to highest."
+                if many
+                else ""
+            )
+            drawn.append(
+                chart(seeds_figure(rows, key, x=x), f"{key} of all runs while training", note.strip())
+            )
+    return cards(*drawn)
+
+
+def _best(keys: set[str], quantity: str) -> str:
+    """The evaluation of the planner if it was logged, else of another policy, else what was seen while collecting."""
+    having = [key for key in keys if key.rsplit("/", 1)[-1] == quantity]
+    order = [f"eval/{policy}/{quantity}" for policy in SHOWN]
+    return min(
+        having,
+        key=lambda key: (order.index(key) if key in order else len(order), key.startswith("train"), key),
+        default="",
+    )
+
+
+def _horizons(runs: Mapping[str, RunFiles]) -> str:
+    curves, unit = {}, "error"
+    for name, run in runs.items():
+        found = run.extras.get("open_loop") or {}
+        if found.get("curves", {}).get("model"):
+            curves[name] = found["curves"]["model"]
+            unit = found.get("unit", unit)
+    lengths = {len(curve["mean"]) for curve in curves.values()}
+    if not curves:
+        return ""
+    shortest = min(lengths)  # runs may have been looked at over other horizons
+    cut = {
+        name: {part: values[:shortest] for part, values in curve.items()} for name, curve in curves.items()
+    }
+    return cards(
+        chart(
+            horizon_figure(cut, unit=unit), "prediction error by steps ahead in every run", "Lower is better."
+        )
+    )
+
+
+def _spectra(runs: Mapping[str, RunFiles]) -> str:
+    spectra = {
+        name: run.extras["spectrum"]["singular_values"]
+        for name, run in runs.items()
+        if (run.extras.get("spectrum") or {}).get("singular_values")
+    }
+    if not spectra:
+        return ""
+    return cards(chart(spectrum_figure(spectra), "singular values of the latents in every run"))
+
+
+def _differences(different: Mapping[str, Mapping[str, Any]], names: Sequence[str]) -> str:
+    if not different:
+        return "<p>Nothing: the configurations are the same.</p>"
+    rows = [
+        [entry, *(_text(values[name]) if name in values else MISSING for name in names)]
+        for entry, values in different.items()
+    ]
+    return scrolling(html(Table(["entry", *names], rows), kind="texts"))
+
+
+def _text(value: Any) -> str:
+    return value if isinstance(value, str) else json.dumps(value, default=str)
+
+
+def _reproduce(runs: Sequence[RunFiles]) -> str:
+    return commands([f"franka-wm compare {shlex.join(str(run.folder) for run in runs)}"])
