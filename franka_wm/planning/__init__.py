@@ -6,6 +6,7 @@ Nothing here knows a model family: models enter as callables.
 from franka_wm.planning.cem import CEM
 from franka_wm.planning.gradient import GradientPlanner
 from franka_wm.planning.icem import ICEM
+from franka_wm.planning.mcts import MCTS
 from franka_wm.planning.mppi import MPPI
 from franka_wm.planning.objectives import (
     ActionPenalty,
@@ -17,10 +18,12 @@ from franka_wm.planning.objectives import (
 )
 from franka_wm.planning.policy import ModelPolicy, PlannerPolicy
 from franka_wm.planning.sampling import Planner
+from franka_wm.planning.search_policy import SearchPolicy
 
 __all__ = [
     "CEM",
     "ICEM",
+    "MCTS",
     "MPPI",
     "ActionPenalty",
     "GoalDistance",
@@ -30,6 +33,7 @@ __all__ = [
     "Planner",
     "PlannerPolicy",
     "RewardPlusValue",
+    "SearchPolicy",
     "Smoothness",
     "Sum",
 ]

@@ -1,0 +1,346 @@
+"""Monte Carlo tree search in a learned model, for all environments at once and without a loop over depth."""
+
+import math
+from collections.abc import Callable
+from typing import Literal
+
+import torch
+from tensordict import TensorDict
+from torch import Tensor
+
+from franka_wm.planning.tree import Recurrent, Tree
+
+
+class MCTS:
+    """Tree search over a model of E environments, as MuZero or as Gumbel MuZero acts.
+
+    Every simulation walks from the root to a move not tried yet, asks the model for what it leads to, and adds
+    the return found to every move on the way. The two variants differ in how they walk, act and teach:
+
+    `puct` (MuZero, Schrittwieser et al., arXiv:1911.08265). At each node the move of the largest
+    Q̂ + P · √N / (1 + n) · (`pb_c_init` + log((N + `pb_c_base` + 1) / `pb_c_base`)), with n the visits of the
+    move, N those of the node, and Q̂ the mean return of the move, scaled to [0, 1] by the smallest and largest
+    in the tree; 0 where n = 0. With `explore`, the priors of the root are mixed with Dirichlet noise, and the
+    action is drawn from visits^(1/`temperature`); else the most visited one is taken. The policy target is the
+    share of visits.
+
+    `gumbel` (Danihelka et al., "Policy improvement by planning with Gumbel", ICLR 2022). The root takes the
+    `max_num_considered_actions` best by Gumbel noise + logits and halves them in rounds by noise + logits +
+    σ(Q). σ(Q) = (`c_visit` + max n) · `c_scale` · Q, with Q completed (a move without visits counts as the
+    mixed value of its node) and scaled to [0, 1] within its node. Other nodes take, without noise, the move
+    whose share of visits lags furthest behind softmax(logits + σ(Q)). The action is the best of the most
+    visited; the policy target is softmax(logits + σ(Q)) at the root. The noise is there with `explore` alone.
+    It improves the policy with any number of simulations, 2 as well, where PUCT may worsen it.
+
+    What differs from the papers' own code: a node counts itself as a visit (N = 1 + Σ n), also the root, so
+    the root's priors matter in the first simulation; the smallest and largest Q̂ are those of the tree as it
+    stands, without the history; equal scores are not broken at random.
+
+    Plain tensor code: static shapes, no data-dependent control flow, no host synchronisation. All nodes choose
+    at once and the tree (`franka_wm.planning.tree`) needs no loop over depth, so every simulation is the same
+    few operations, however deep it goes. Memory is about E · N · (Z + 2 M + 3 N) numbers with
+    N = `num_simulations` + 1.
+
+    Args:
+        num_actions: M.
+        num_simulations: model calls per search, one new node each.
+        variant: `puct` or `gumbel`.
+        max_depth: the longest path in moves; None: as deep as the simulations reach.
+        pb_c_init, pb_c_base: weight of the prior, see above (PUCT).
+        dirichlet_alpha, dirichlet_fraction: noise of the root (PUCT).
+        temperature: of the drawn action (PUCT); 0 takes the most visited.
+        max_num_considered_actions: at the root (Gumbel).
+        c_visit, c_scale: σ, see above (Gumbel).
+
+    Raises:
+        ValueError: a setting that cannot work.
+    """
+
+    def __init__(
+        self,
+        *,
+        num_actions: int,
+        num_simulations: int = 50,
+        variant: Literal["puct", "gumbel"] = "puct",
+        max_depth: int | None = None,
+        pb_c_init: float = 1.25,
+        pb_c_base: float = 19652.0,
+        dirichlet_alpha: float = 0.3,
+        dirichlet_fraction: float = 0.25,
+        temperature: float = 1.0,
+        max_num_considered_actions: int = 16,
+        c_visit: float = 50.0,
+        c_scale: float = 0.1,
+    ) -> None:
+        for name, count in (
+            ("num_actions", num_actions),
+            ("num_simulations", num_simulations),
+            ("max_num_considered_actions", max_num_considered_actions),
+            ("max_depth", 1 if max_depth is None else max_depth),
+        ):
+            if count < 1:
+                raise ValueError(f"{name} must be at least 1, got {count}")
+        if variant not in ("puct", "gumbel"):
+            raise ValueError(f"variant must be puct or gumbel, got {variant!r}")
+        for name, value in (("pb_c_base", pb_c_base), ("dirichlet_alpha", dirichlet_alpha)):
+            if not value > 0.0:
+                raise ValueError(f"{name} must be positive, got {value}")
+        for name, value in (
+            ("pb_c_init", pb_c_init),
+            ("temperature", temperature),
+            ("c_visit", c_visit),
+            ("c_scale", c_scale),
+        ):
+            if not value >= 0.0:
+                raise ValueError(f"{name} must not be negative, got {value}")
+        if not 0.0 <= dirichlet_fraction <= 1.0:
+            raise ValueError(f"dirichlet_fraction must be in [0, 1], got {dirichlet_fraction}")
+        self.num_actions, self.num_simulations, self.variant = num_actions, num_simulations, variant
+        # No path is longer than the number of simulations.
+        self.max_depth = None if max_depth is None or max_depth >= num_simulations else max_depth
+        self.pb_c_init, self.pb_c_base = pb_c_init, pb_c_base
+        self.dirichlet_alpha, self.dirichlet_fraction = dirichlet_alpha, dirichlet_fraction
+        self.temperature, self.max_num_considered_actions = temperature, max_num_considered_actions
+        self.c_visit, self.c_scale = c_visit, c_scale
+
+    @torch.no_grad()
+    def search(
+        self,
+        root_logits: Tensor,
+        root_value: Tensor,
+        root_embedding: Tensor,
+        recurrent: Recurrent,
+        *,
+        explore: bool = False,
+        generator: torch.Generator | None = None,
+    ) -> TensorDict:
+        """Search for E environments.
+
+        Args:
+            root_logits: (E, M) prior of the moves; need not be normalised.
+            root_value: (E, 1) the model's value of the root.
+            root_embedding: (E, Z) latent of the root.
+            recurrent: the model: (z (E, Z), action (E,) int64) -> next z (E, Z), reward (E, 1), discount
+                (E, 1), logits (E, M) and value (E, 1) of the next z. A discount of 0 ends the episode.
+            explore: noise at the root and, with PUCT, a drawn action.
+            generator: source of the noise, on the device of the tensors.
+
+        Returns:
+            TensorDict of batch size [E]: `action` (E,) int64; `policy` (E, M), the improved policy to learn
+            from; `value` (E, 1), the root's mean return over all simulations and the model's own value;
+            `visits` (E, M), which sum to `num_simulations`.
+
+        Raises:
+            ValueError: a tensor of another shape.
+        """
+        envs, moves = root_logits.shape[0], self.num_actions
+        if root_logits.shape != (envs, moves):
+            raise ValueError(f"root_logits must be (E, {moves}), got {tuple(root_logits.shape)}")
+        if root_value.shape != (envs, 1):
+            raise ValueError(f"root_value must be ({envs}, 1), got {tuple(root_value.shape)}")
+        if root_embedding.dim() != 2 or root_embedding.shape[0] != envs:
+            raise ValueError(f"root_embedding must be ({envs}, Z), got {tuple(root_embedding.shape)}")
+        tree = Tree(self.num_simulations + 1, root_value, root_embedding, self.max_depth)
+        rule = (_Puct if self.variant == "puct" else _Gumbel)(self, tree, root_logits, explore, generator)
+        for node in range(1, self.num_simulations + 1):
+            astray, moves_of = rule.choose(node)
+            last = tree.last(astray)
+            move = moves_of(last)
+            logits, used = tree.grow(node, last, move, recurrent)
+            if logits.shape != root_logits.shape:
+                raise ValueError(
+                    f"recurrent must return logits of shape ({envs}, {moves}), got {tuple(logits.shape)}"
+                )
+            rule.add(node, logits, last, used)
+        action, policy, visits = rule.result()
+        value = (tree.returns[:, 0] / tree.visits[:, 0]).unsqueeze(-1)
+        return TensorDict(
+            {"action": action, "policy": policy, "value": value, "visits": visits}, batch_size=[envs]
+        )
+
+
+class _Puct:
+    """How MuZero walks and acts.
+
+    Among the moves of a node that were not tried yet, the one of the largest prior scores highest. So moves
+    are tried in the order of their priors, which is sorted once, and a node has one candidate besides the
+    moves that have slots: everything is (E, n) for n slots, whatever the number of moves.
+    """
+
+    def __init__(
+        self, settings: MCTS, tree: Tree, logits: Tensor, explore: bool, generator: torch.Generator | None
+    ) -> None:
+        self.settings, self.tree, self.explore, self.generator = settings, tree, explore, generator
+        (envs, moves), slots = logits.shape, tree.slot.shape[0]
+        self.moves = moves
+        # One more column than moves: nothing is left to try.
+        self.priors = logits.new_full((envs, slots, moves + 1), -math.inf)
+        self.order = torch.zeros(envs, slots, moves + 1, device=logits.device, dtype=torch.int64)
+        self.tried = torch.zeros_like(tree.parent)
+        self.prior = torch.zeros_like(tree.value)  # of the move into each slot
+        count = torch.arange(slots + 2, device=logits.device, dtype=logits.dtype)
+        self.weight = count.sqrt() * (
+            ((count + settings.pb_c_base + 1.0) / settings.pb_c_base).log() + settings.pb_c_init
+        )
+        prior = logits.softmax(-1)
+        if explore:
+            prior = prior.lerp(self._dirichlet(prior), settings.dirichlet_fraction)
+        self._sort(0, prior)
+
+    def _dirichlet(self, like: Tensor) -> Tensor:
+        """Dirichlet noise of the shape of `like` (E, M)."""
+        # torch.distributions takes no generator. A draw may underflow, hence the smallest number.
+        draw = torch._standard_gamma(  # pyright: ignore[reportPrivateImportUsage]
+            torch.full_like(like, self.settings.dirichlet_alpha), generator=self.generator
+        ).clamp_min(torch.finfo(like.dtype).tiny)
+        return draw / draw.sum(-1, keepdim=True)
+
+    def _sort(self, node: int, prior: Tensor) -> None:
+        self.priors[:, node, : self.moves], self.order[:, node, : self.moves] = prior.sort(
+            dim=-1, descending=True, stable=True
+        )
+
+    def choose(self, nodes: int) -> tuple[Tensor, Callable[[Tensor], Tensor]]:
+        tree = self.tree
+        visits = tree.visits[:, :nodes]
+        weight = self.weight[visits.long()]
+        untried = self.priors[:, :nodes].gather(2, self.tried[:, :nodes, None]).squeeze(-1)
+        best = weight * untried
+        astray = torch.zeros_like(best, dtype=torch.bool)
+        if nodes > 1:
+            q, parent = tree.q(nodes), tree.parent[:, 1:nodes]
+            low, high = self._range(q)
+            score = (q - low) / (high - low).clamp_min(_tiny(q))
+            score = torch.addcmul(
+                score, weight.gather(1, parent), self.prior[:, 1:nodes] / (visits[:, 1:] + 1.0)
+            )
+            best.scatter_reduce_(1, parent, score, "amax")
+            astray[:, 1:] = score < best.gather(1, parent)
+        return astray, lambda last: self.order[tree.env, last, self.tried[tree.env, last]]
+
+    def _range(self, q: Tensor) -> tuple[Tensor, Tensor]:
+        """The smallest and largest Q of the tree (E, 1)."""
+        attached = self.tree.attached
+        if attached is None:
+            return torch.aminmax(q, dim=1, keepdim=True)
+        unused = ~attached[:, 1 : q.shape[1] + 1]
+        return (
+            q.masked_fill(unused, math.inf).amin(1, keepdim=True),
+            q.masked_fill(unused, -math.inf).amax(1, keepdim=True),
+        )
+
+    def add(self, node: int, logits: Tensor, last: Tensor, used: Tensor | None) -> None:
+        env = self.tree.env
+        tried = self.tried[env, last]
+        self.prior[:, node] = self.priors[env, last, tried]
+        self.tried[env, last] = tried + 1 if used is None else tried + used
+        self._sort(node, logits.softmax(-1))
+
+    def result(self) -> tuple[Tensor, Tensor, Tensor]:
+        visits = self.tree.root_visits(self.moves)
+        score = visits
+        if self.explore and self.settings.temperature > 0.0:
+            # The largest of log p + Gumbel noise is a draw from p; a move without visits has p = 0.
+            score = visits.log() / self.settings.temperature + _gumbel_noise(visits, self.generator)
+        return score.argmax(-1), visits / visits.sum(-1, keepdim=True), visits
+
+
+class _Gumbel:
+    """How Gumbel MuZero walks and acts; scores of all moves of all nodes, (E, n, M)."""
+
+    def __init__(
+        self, settings: MCTS, tree: Tree, logits: Tensor, explore: bool, generator: torch.Generator | None
+    ) -> None:
+        self.settings, self.tree = settings, tree
+        self.moves, slots = logits.shape[1], tree.slot.shape[0]
+        self.logits = logits.new_zeros(logits.shape[0], slots, self.moves)
+        self.logits[:, 0] = logits.log_softmax(-1)
+        self.noise = _gumbel_noise(logits, generator) if explore else torch.zeros_like(logits)
+        self.schedule = sequential_halving(
+            min(settings.max_num_considered_actions, self.moves), settings.num_simulations
+        )
+
+    def _sigma(self, nodes: int, slots: int) -> tuple[Tensor, Tensor]:
+        """Visits, and σ of the completed Q, of the moves of the first `nodes` (E, nodes, M).
+
+        Args:
+            slots: how many are filled.
+        """
+        tree, shape = self.tree, (self.logits.shape[0], nodes, self.moves)
+        visits = self.logits.new_zeros(shape[0], slots * self.moves)
+        q = torch.zeros_like(visits)
+        if slots > 1:
+            index = torch.add(tree.move[:, 1:slots], tree.parent[:, 1:slots], alpha=self.moves)
+            visits.scatter_(1, index, tree.visits[:, 1:slots])
+            q.scatter_(1, index, tree.q(slots))
+        visits, q = (x[:, : nodes * self.moves].view(shape) for x in (visits, q))
+        visited = visits > 0
+        # The mixed value: the model's own, and the mean Q of what was visited, by prior.
+        tiny = torch.finfo(q.dtype).tiny
+        prior = self.logits[:, :nodes].exp().clamp_min(tiny).masked_fill(~visited, 0.0)
+        weighted = (prior * q).sum(-1, keepdim=True) / prior.sum(-1, keepdim=True).clamp_min(tiny)
+        total = tree.visits[:, :nodes, None]  # counts the node itself
+        mixed = weighted + (tree.value[:, :nodes, None] - weighted) / total
+        q = torch.where(visited, q, mixed)
+        low, high = torch.aminmax(q, dim=-1, keepdim=True)
+        scale = (self.settings.c_visit + visits.amax(-1, keepdim=True)) * self.settings.c_scale
+        return visits, scale * ((q - low) / (high - low).clamp_min(_tiny(q)))
+
+    def _root_score(self, visits: Tensor, sigma: Tensor, considered: Tensor | int) -> Tensor:
+        """noise + logits + σ(Q) of the root's moves (E, M); -inf unless they have `considered` visits."""
+        score = self.noise + self.logits[:, 0] + sigma[:, 0]
+        # A floor, or a move with a prior of nearly 0 would be no better than one out of turn.
+        return score.clamp_min(-1e9).masked_fill(visits[:, 0] != considered, -math.inf)
+
+    def choose(self, nodes: int) -> tuple[Tensor, Callable[[Tensor], Tensor]]:
+        tree = self.tree
+        visits, sigma = self._sigma(nodes, nodes)
+        improved = (self.logits[:, :nodes] + sigma).softmax(-1)
+        choice = (improved - visits / tree.visits[:, :nodes, None]).argmax(-1)
+        choice[:, 0] = self._root_score(visits, sigma, self.schedule[nodes - 1]).argmax(-1)
+        astray = choice.gather(1, tree.parent[:, :nodes]) != tree.move[:, :nodes]
+        astray[:, 0] = False
+        return astray, lambda last: choice[tree.env, last]
+
+    def add(self, node: int, logits: Tensor, last: Tensor, used: Tensor | None) -> None:
+        self.logits[:, node] = logits.log_softmax(-1)
+
+    def result(self) -> tuple[Tensor, Tensor, Tensor]:
+        visits, sigma = self._sigma(1, self.tree.slot.shape[0])
+        score = self._root_score(visits, sigma, visits[:, 0].amax(-1, keepdim=True))
+        policy = (self.logits[:, 0] + sigma[:, 0]).softmax(-1)
+        return score.argmax(-1), policy, visits[:, 0].clone()
+
+
+def sequential_halving(considered: int, simulations: int) -> list[int]:
+    """How many visits a root move must have to be eligible, for each simulation in turn.
+
+    The moves with that many visits are the ones still considered; each round gives them equally many visits
+    and keeps the better half, never fewer than two (Danihelka et al., ICLR 2022, figure 1).
+
+    Args:
+        considered: moves in the first round.
+        simulations: length of the result.
+    """
+    if considered <= 1:
+        return list(range(simulations))
+    rounds = math.ceil(math.log2(considered))
+    visits, sequence, left = [0] * considered, [], considered
+    while len(sequence) < simulations:
+        for _ in range(max(1, simulations // (rounds * left))):
+            sequence.extend(visits[:left])
+            visits[:left] = [count + 1 for count in visits[:left]]
+        left = max(2, left // 2)
+    return sequence[:simulations]
+
+
+def _gumbel_noise(like: Tensor, generator: torch.Generator | None) -> Tensor:
+    """Standard Gumbel noise of the shape of `like`: -log of an exponential draw."""
+    # The draw may be 0 in float32, whose logarithm would beat everything.
+    draw = torch.empty_like(like).exponential_(generator=generator)
+    return -draw.clamp_min(torch.finfo(like.dtype).tiny).log()
+
+
+def _tiny(q: Tensor) -> float:
+    """The least range of Q that counts as a difference: below it rounding decides."""
+    return 1e-8 if q.dtype == torch.float64 else 1e-6

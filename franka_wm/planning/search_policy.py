@@ -1,0 +1,108 @@
+"""A policy that a TorchRL collector can run: tree search over a world model with a discrete set of moves."""
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import torch
+from tensordict import TensorDictBase
+from tensordict.nn import InteractionType, TensorDictModuleBase
+from tensordict.nn.probabilistic import interaction_type
+from torch import Tensor, nn
+
+from franka_wm.planning.mcts import MCTS
+from franka_wm.planning.tree import Recurrent
+
+
+class SearchPolicy(TensorDictModuleBase):
+    """Encode, search, act.
+
+    Reads the observation keys. Writes `action` (E,) int64, and what a model learns from the search:
+    `search_policy` (E, M), the improved policy, and `search_value` (E, 1). The batch size is [E]. No gradient
+    is recorded.
+
+    Args:
+        search: MCTS or anything with its `search`.
+        encode: observation TensorDict of batch size [E] -> latents (E, Z).
+        prediction: z -> logits (E, M) and value (E, 1).
+        recurrent: see `MCTS.search`.
+        observation_keys: what `encode` reads.
+        explore: noise at the root and, with PUCT, drawn actions; None follows TorchRL's exploration type.
+        model: the module behind the callables, so that collectors find its parameters and move it along. If
+            the policy is to be copied, pass bound methods, not closures.
+        generator: source of the noise.
+    """
+
+    def __init__(
+        self,
+        search: MCTS,
+        *,
+        encode: Callable[[TensorDictBase], Tensor],
+        prediction: Callable[[Tensor], tuple[Tensor, Tensor]],
+        recurrent: Recurrent,
+        observation_keys: Sequence[str],
+        explore: bool | None = None,
+        model: nn.Module | None = None,
+        generator: torch.Generator | None = None,
+    ) -> None:
+        super().__init__()
+        self.in_keys = list(observation_keys)
+        self.out_keys = ["action", "search_policy", "search_value"]
+        self.search, self.explore, self.model, self.generator = search, explore, model, generator
+        self.encode, self.prediction, self.recurrent = encode, prediction, recurrent
+
+    @classmethod
+    def for_model(
+        cls,
+        model: Any,
+        search: MCTS,
+        *,
+        explore: bool | None = None,
+        generator: torch.Generator | None = None,
+    ) -> "SearchPolicy":
+        """Search with a model that has `encode`, `prediction`, `recurrent` and `num_actions`.
+
+        Raises:
+            ValueError: the model lacks one of them, or has another number of actions than the search.
+        """
+        lacking = [
+            name for name in ("encode", "prediction", "recurrent", "num_actions") if not hasattr(model, name)
+        ]
+        if lacking:
+            raise ValueError(
+                f"{type(model).__name__} has no {', '.join(lacking)}: tree search needs a model of discrete "
+                "actions such as muzero"
+            )
+        if model.num_actions != search.num_actions:
+            raise ValueError(
+                f"the search has num_actions={search.num_actions}, the model {model.num_actions}: make them equal"
+            )
+        keys = getattr(model, "observation_keys", None) or list(getattr(model, "observation_sizes", ()))
+        return cls(
+            search,
+            encode=model.encode,
+            prediction=model.prediction,
+            recurrent=model.recurrent,
+            observation_keys=keys,
+            explore=explore,
+            model=model if isinstance(model, nn.Module) else None,
+            generator=generator,
+        )
+
+    @torch.no_grad()
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Write `action`, `search_policy` and `search_value`.
+
+        Raises:
+            ValueError: the batch size is not [E].
+        """
+        if len(tensordict.batch_size) != 1:
+            raise ValueError(f"expected batch size [E], got {list(tensordict.batch_size)}")
+        z = self.encode(tensordict)
+        logits, value = self.prediction(z)
+        explore = interaction_type() is InteractionType.RANDOM if self.explore is None else self.explore
+        found = self.search.search(
+            logits, value, z, self.recurrent, explore=explore, generator=self.generator
+        )
+        for key, entry in (("action", "action"), ("search_policy", "policy"), ("search_value", "value")):
+            tensordict.set(key, found.get(entry))
+        return tensordict

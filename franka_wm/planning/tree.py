@@ -1,0 +1,140 @@
+"""The tree of a Monte Carlo search, for E environments at once, as a fixed set of tensors."""
+
+from collections.abc import Callable
+
+import torch
+from torch import Tensor
+
+Recurrent = Callable[[Tensor, Tensor], tuple[Tensor, Tensor, Tensor, Tensor, Tensor]]
+
+_ABOVE, _DISCOUNT, _REWARD = 0, 1, 2  # planes of `Tree.paths`
+_BITS = 62  # of an int64, so that no sum of bits overflows
+
+
+class Tree:
+    """N slots for each of E environments: slot 0 is the root, slot n what simulation n reached.
+
+    A slot stands for a node and for the move into it. Walking down and adding up need no loop over depth,
+    because each slot keeps which slots are above it, as bits (`above`), and the discounted reward on the way
+    from each of them (`paths`): to find the nodes on a chosen path is one comparison, and to update them one
+    addition.
+
+    Attributes:
+        embedding: (E, N, Z) latents.
+        value, reward, discount: (E, N), the model's value of the node, and what the move into it brought.
+        parent, move, depth: (E, N) int64: the slot above, the move that led here, moves from the root.
+        visits: (E, N), simulations that ended here or passed through; 1 at first, for the root too.
+        returns: (E, N), the sum over these visits of the return from here on.
+        above: (E, N, W) int64, the slots above and the slot itself as bits, `_BITS` to a word.
+        paths: (E, N, 3, N), [n, :, k] for each slot n and each slot k: whether k is above n or n itself (1 or
+            0), the product of discounts from k to n, the discounted sum of rewards from k to n.
+        attached: (E, N) bool, or None without a limit of depth: False in slots that stand for nothing.
+
+    Args:
+        slots: N.
+        value: (E, 1) of the root.
+        embedding: (E, Z) of the root.
+        max_depth: the longest path in moves; None: no limit.
+    """
+
+    def __init__(self, slots: int, value: Tensor, embedding: Tensor, max_depth: int | None = None) -> None:
+        envs, device, dtype = value.shape[0], value.device, value.dtype
+
+        def numbers(*shape: int, of: torch.dtype = dtype) -> Tensor:
+            return torch.zeros(envs, slots, *shape, device=device, dtype=of)
+
+        self.embedding = embedding.new_empty(envs, slots, embedding.shape[1])
+        self.value, self.reward, self.discount = numbers(), numbers(), numbers()
+        self.parent, self.move = numbers(of=torch.int64), numbers(of=torch.int64)
+        self.visits, self.returns = torch.ones_like(self.value), numbers()
+        self.paths = numbers(3, slots)
+        self.paths[:, :, :_REWARD].diagonal(dim1=1, dim2=3).fill_(1.0)  # a slot from itself
+        self.max_depth = max_depth
+        self.depth = numbers(of=torch.int64)
+        self.attached = None if max_depth is None else torch.ones_like(self.depth, dtype=torch.bool)
+        self.slot = torch.arange(slots, device=device)
+        self.env = torch.arange(envs, device=device)
+        word = torch.arange((slots + _BITS - 1) // _BITS, device=device)
+        bit = torch.ones_like(self.slot) << (self.slot % _BITS)
+        self.bits = (self.slot.unsqueeze(-1) // _BITS == word) * bit.unsqueeze(-1)  # (N, W)
+        self.above = self.bits.repeat(envs, 1, 1)
+        self.embedding[:, 0] = embedding
+        self.value[:, 0] = self.returns[:, 0] = value.squeeze(-1)
+
+    def q(self, slots: int) -> Tensor:
+        """Mean return (E, slots - 1) of the moves into slots 1 … slots - 1, from the slots above them."""
+        held = slice(1, slots)
+        mean = self.returns[:, held] / self.visits[:, held]
+        return torch.addcmul(self.reward[:, held], self.discount[:, held], mean)
+
+    def last(self, astray: Tensor) -> Tensor:
+        """The slot (E,) where the chosen path ends.
+
+        Args:
+            astray: (E, n) bool for the first n slots: the slot above would choose another move. Where equal
+                moves are all chosen, the path to the newest slot counts.
+        """
+        nodes = astray.shape[1]
+        off = (astray.unsqueeze(-1) * self.bits[:nodes]).sum(1, keepdim=True)  # (E, 1, W)
+        on_path = ((self.above[:, :nodes] & off) == 0).all(-1)
+        if self.attached is not None:
+            on_path = on_path & self.attached[:, :nodes]
+        # A slot comes after the one above it, so the deepest on a path is the last.
+        return (on_path * self.slot[:nodes]).amax(-1)
+
+    def grow(
+        self, node: int, last: Tensor, move: Tensor, recurrent: Recurrent
+    ) -> tuple[Tensor, Tensor | None]:
+        """Ask the model what `move` (E,) leads to from the slots `last` (E,), put it into slot `node`, and add
+        its return to every slot above.
+
+        Where `last` is at `max_depth` it is itself what is evaluated, once more, and slot `node` stays unused.
+
+        Returns:
+            The model's logits (E, M), and where the slot is used (E,) bool; None: everywhere.
+        """
+        parent, used = last, None
+        if self.attached is not None and self.max_depth is not None:
+            used = self.depth[self.env, last] < self.max_depth
+            parent = torch.where(used, last, self.parent[self.env, last])
+            move = torch.where(used, move, self.move[self.env, last])
+            # A slot that stands for nothing hangs on itself.
+            self.parent[:, node] = torch.where(used, parent, node)
+            self.depth[:, node] = self.depth[self.env, parent] + 1
+            self.attached[:, node] = used
+        else:
+            self.parent[:, node] = parent
+        self.move[:, node] = move
+
+        embedding, reward, discount, logits, value = recurrent(self.embedding[self.env, parent], move)
+        if node == 1:
+            _check(self.visits.shape[0], reward=reward, discount=discount, value=value)
+        self.embedding[:, node] = embedding
+        self.reward[:, node], self.discount[:, node] = reward.squeeze(-1), discount.squeeze(-1)
+        self.value[:, node] = self.returns[:, node] = value.squeeze(-1)
+        if used is not None:
+            reward = torch.where(used.unsqueeze(-1), reward, 0.0)
+            discount = torch.where(used.unsqueeze(-1), discount, 1.0)
+
+        self.above[:, node] |= self.above[self.env, last]
+        above, scale, gained = self.paths[self.env, last, :, :node].unbind(1)
+        gained = torch.addcmul(gained, scale, reward)
+        scale = scale * discount
+        path = self.paths[:, node, :, :node]
+        path[:, _ABOVE], path[:, _DISCOUNT], path[:, _REWARD] = above, scale, gained
+        self.visits[:, :node] += above
+        self.returns[:, :node] += torch.addcmul(gained, scale, value)  # 0 where not above
+        return logits, used
+
+    def root_visits(self, moves: int) -> Tensor:
+        """Visits (E, M) of the root's moves."""
+        under_root = (self.parent[:, 1:] == 0) * self.visits[:, 1:]
+        return self.visits.new_zeros(self.visits.shape[0], moves).scatter_add_(
+            1, self.move[:, 1:], under_root
+        )
+
+
+def _check(envs: int, **columns: Tensor) -> None:
+    for name, column in columns.items():
+        if column.shape != (envs, 1):
+            raise ValueError(f"recurrent must return {name} of shape ({envs}, 1), got {tuple(column.shape)}")

@@ -1,0 +1,145 @@
+# pyright: reportArgumentType=false, reportAttributeAccessIssue=false, reportCallIssue=false, reportOptionalMemberAccess=false, reportIncompatibleMethodOverride=false
+import copy
+
+import pytest
+import torch
+from tensordict import TensorDict
+from torch import nn
+from torchrl.collectors import Collector
+from torchrl.data import Categorical, Composite, Unbounded
+from torchrl.envs import EnvBase
+from torchrl.envs.utils import ExplorationType, check_env_specs, set_exploration_type
+
+from franka_wm.planning import MCTS, SearchPolicy
+
+LEFT, RIGHT, STAY = 0, 1, 2
+
+
+@pytest.fixture(autouse=True)
+def _seed():
+    torch.manual_seed(0)
+
+
+class Line(EnvBase):
+    """N walkers on a line; a step costs the distance to 3."""
+
+    def __init__(self, n: int = 4) -> None:
+        super().__init__(device="cpu", batch_size=[n])
+        self.observation_spec = Composite(state=Unbounded((n, 1)), shape=(n,))
+        self.action_spec = Categorical(3, shape=(n,), dtype=torch.int64)
+        self.reward_spec = Unbounded((n, 1))
+
+    def _reset(self, tensordict=None):
+        self.state = torch.arange(self.batch_size[0]).float().unsqueeze(-1) * 2
+        done = torch.zeros(*self.batch_size, 1, dtype=torch.bool)
+        return TensorDict({"state": self.state, "done": done, "terminated": done.clone()}, self.batch_size)
+
+    def _step(self, tensordict):
+        self.state = move(self.state, tensordict["action"])
+        done = torch.zeros(*self.batch_size, 1, dtype=torch.bool)
+        return TensorDict(
+            {
+                "state": self.state,
+                "reward": -(self.state - 3).abs(),
+                "done": done,
+                "terminated": done.clone(),
+            },
+            self.batch_size,
+        )
+
+    def _set_seed(self, seed): ...
+
+
+def move(state, action):
+    return state + torch.tensor([-1.0, 1.0, 0.0])[action].unsqueeze(-1)
+
+
+class Known(nn.Module):
+    """The line's own law as a model, without an opinion of its own."""
+
+    num_actions = 3
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.observation_sizes = {"state": 1}
+        self.gain = nn.Parameter(torch.ones(()))
+
+    def encode(self, observation):
+        return observation.get("state") * self.gain
+
+    def prediction(self, z):
+        return torch.zeros(len(z), 3), -5.0 * (z - 3).abs()
+
+    def recurrent(self, z, action):
+        after = move(z, action)
+        return after, -(after - 3).abs(), torch.full_like(z, 0.9), *self.prediction(after)
+
+
+def acting(variant="puct", **options) -> SearchPolicy:
+    return SearchPolicy.for_model(
+        Known(), MCTS(num_actions=3, num_simulations=24, variant=variant), **options
+    )
+
+
+def test_the_toy_environment_is_sound():
+    check_env_specs(Line())
+
+
+@pytest.mark.parametrize("variant", ["puct", "gumbel"])
+def test_it_acts_well_and_records_what_a_model_learns_from(variant):
+    with set_exploration_type(ExplorationType.DETERMINISTIC):
+        rollout = Line().rollout(6, acting(variant))
+    assert (rollout["next", "state"][:, -1] == 3).all()
+    assert rollout["action"].shape == (4, 6) and rollout["action"].dtype == torch.int64
+    assert rollout["search_policy"].shape == (4, 6, 3) and rollout["search_value"].shape == (4, 6, 1)
+    torch.testing.assert_close(rollout["search_policy"].sum(-1), torch.ones(4, 6))
+    assert not rollout["search_value"].requires_grad
+
+
+def test_it_runs_inside_a_collector():
+    collector = Collector(Line(), acting(), frames_per_batch=4 * 5, total_frames=4 * 10)
+    batches = list(collector)
+    collector.shutdown()
+    assert len(batches) == 2 and batches[0]["search_policy"].shape == (4, 5, 3)
+
+
+def test_exploration_follows_torchrl_unless_told():
+    start = TensorDict({"state": torch.full((200, 1), 3.0)}, [200])
+
+    def distinct(explore, kind):
+        policy = acting(explore=explore)
+        with set_exploration_type(kind):
+            return len(policy(start.clone())["action"].unique())
+
+    assert distinct(None, ExplorationType.RANDOM) > 1
+    assert distinct(None, ExplorationType.DETERMINISTIC) == 1
+    assert distinct(True, ExplorationType.DETERMINISTIC) > 1
+    assert distinct(False, ExplorationType.RANDOM) == 1
+
+
+def test_a_copy_of_the_policy_uses_its_own_model():
+    original = acting(explore=False)
+    duplicate = copy.deepcopy(original)
+    with torch.no_grad():
+        duplicate.model.gain.zero_()
+    start = TensorDict({"state": torch.full((2, 1), 6.0)}, [2])
+    assert (original(start.clone())["action"] == LEFT).all()
+    assert (duplicate(start.clone())["action"] == RIGHT).all()  # it believes to be at 0
+
+
+def test_its_own_generator_makes_actions_repeat():
+    start = TensorDict({"state": torch.full((200, 1), 3.0)}, [200])
+    first, second = (
+        acting(explore=True, generator=torch.Generator().manual_seed(7))(start.clone())["action"]
+        for _ in range(2)
+    )
+    assert torch.equal(first, second)
+
+
+def test_mistakes_are_named():
+    with pytest.raises(ValueError, match=r"batch size \[E\]"):
+        acting()(TensorDict({"state": torch.zeros(2, 3, 1)}, [2, 3]))
+    with pytest.raises(ValueError, match="no encode, prediction, recurrent, num_actions"):
+        SearchPolicy.for_model(nn.Linear(1, 1), MCTS(num_actions=3))
+    with pytest.raises(ValueError, match="num_actions=4"):
+        SearchPolicy.for_model(Known(), MCTS(num_actions=4))
