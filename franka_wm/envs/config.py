@@ -16,6 +16,9 @@ CAMERAS = ("front", "wrist")
 ACTION_MODES = {"joint_delta": 7, "joint_position": 7, "ee_delta": 3}
 """Meaning of an action, and its size."""
 
+TASKS = ["reach", "track"]
+"""What ``task`` may be; :func:`franka_wm.envs.tasks.register` adds to it."""
+
 HOME = (0.0, -0.4, 0.0, -2.0, 0.0, 1.6, 0.8)
 """Home pose of the seven arm joints [rad]."""
 
@@ -249,7 +252,7 @@ class FrankaConfig:
         self._check_choice("robot", tuple(SOURCES))
         self._check_choice("goal_sampling", ("fixed", "reachable"))
         self._check_choice("action_mode", tuple(ACTION_MODES))
-        self._check_choice("task", ("reach", "track"))
+        self._check_choice("task", TASKS)
         self._check_choice("reward", ("dense", "sparse", "normalized"))
         self._check_choice("auto_reset", ("native", "standard"))
         for name in (f.name for f in fields(self) if isinstance(f.default, bool)):
@@ -308,7 +311,7 @@ class FrankaConfig:
             bounds = f"above {low:g} and at most {high:g}" if open_low else f"from {low:g} to {high:g}"
             raise UserError(f"{name}={value!r}: must be {bounds} ({unit})")
 
-    def _check_choice(self, name: str, allowed: tuple[str, ...]) -> None:
+    def _check_choice(self, name: str, allowed: Sequence[str]) -> None:
         value = getattr(self, name)
         if value not in allowed:
             raise UserError(f"{name}={value!r}: must be one of {', '.join(allowed)}")

@@ -2,7 +2,8 @@
 
 Every family is a `torch.nn.Module` with `encode(observation) -> z`, `next(z, action) -> z'` and
 `loss(batch) -> TensorDict`, and, where it has them, `reward(z, action)`, `value(z)` and `policy(z)`.
-To add one, write one file here and one line in `_FAMILIES`. A family is imported when it is made.
+To add one, write one file here and one line in `_FAMILIES`, or call `register` with a class of your own. A family
+is imported when it is made.
 """
 
 from importlib import import_module
@@ -16,11 +17,24 @@ _FAMILIES: dict[str, tuple[str, str, str]] = {
         "TD-MPC2: latent dynamics, reward, value and policy, no decoder",
     ),
 }
+_REGISTERED: dict[str, tuple[type, str]] = {}
+
+
+def register(name: str, cls: type, *, line: str = "") -> None:
+    """Make a family of one's own known, for this process.
+
+    Args:
+        name: what `model.name` will say.
+        cls: a `torch.nn.Module` with the methods above.
+        line: what it is.
+    """
+    _REGISTERED[name] = (cls, line)
 
 
 def available() -> dict[str, str]:
     """The families that `make` knows: name -> one line of description."""
-    return {name: line for name, (_, _, line) in _FAMILIES.items()}
+    ours = {name: line for name, (_, _, line) in _FAMILIES.items()}
+    return ours | {name: line for name, (_, line) in _REGISTERED.items()}
 
 
 def family(name: str) -> type:
@@ -29,8 +43,10 @@ def family(name: str) -> type:
     Raises:
         ValueError: no family has this name; the message lists those that exist.
     """
+    if name in _REGISTERED:
+        return _REGISTERED[name][0]
     if name not in _FAMILIES:
-        raise ValueError(f"unknown model {name!r}; available: {', '.join(sorted(_FAMILIES))}")
+        raise ValueError(f"unknown model {name!r}; available: {', '.join(sorted(available()))}")
     module, cls, _ = _FAMILIES[name]
     return getattr(import_module(module), cls)
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from typing import Any
 
 import torch
@@ -21,7 +20,7 @@ from franka_wm.data.replay import make_replay
 from franka_wm.envs import FrankaConfig, FrankaEnv, TransformedFrankaEnv, resolve_device
 from franka_wm.envs.discretize import DiscreteActions
 from franka_wm.errors import UserError
-from franka_wm.planning import ModelPolicy, PlannerPolicy
+from franka_wm.planning import ModelPolicy, PlannerPolicy, registry
 from franka_wm.training.spaces import Spaces
 
 ACTORS = {"policy": "policy", "planner": "planner", "smooth": "random", "noop": "noop", "ik": "oracle"}
@@ -144,18 +143,6 @@ def make_model(cfg: DictConfig, surroundings: Any, device: torch.device | str | 
 
 # -- planners and policies ----------------------------------------------------------------------------------
 
-PLANNERS: Mapping[str, tuple[str, str]] = {
-    "mppi": ("franka_wm.planning.mppi", "MPPI"),
-    "cem": ("franka_wm.planning.cem", "CEM"),
-    "icem": ("franka_wm.planning.icem", "ICEM"),
-    "gradient": ("franka_wm.planning.gradient", "GradientPlanner"),
-    "mcts": ("franka_wm.planning.mcts", "MCTS"),
-}
-"""Name → module and class. To add a planner: a file, a line here, a file in ``conf/planner``."""
-
-SEARCHES = ("mcts",)
-"""Planners for numbered moves; the others are for continuous actions."""
-
 
 def make_planner(cfg: DictConfig, actions: int) -> Any:
     """The planner that ``cfg.planner`` names.
@@ -163,26 +150,24 @@ def make_planner(cfg: DictConfig, actions: int) -> Any:
     Args:
         actions: Size of a continuous action, or the number of moves.
     """
-    from importlib import import_module
-
     values = plain(cfg.planner)
     name = values.pop("name")
-    if name not in PLANNERS:
-        raise UserError(f"planner={name!r}: must be one of {', '.join(PLANNERS)}")
     discrete = is_discrete(cfg)
-    if discrete != (name in SEARCHES):
-        fitting = [one for one in PLANNERS if (one in SEARCHES) == discrete]
-        what = "chooses among moves" if discrete else "has continuous actions"
-        raise UserError(f"planner={name}: model={cfg.model.name} {what}; use planner={' or '.join(fitting)}")
-    for key, value in values.items():
-        counts = key in ("horizon", "iterations") or key.startswith("num_")
-        if counts and (isinstance(value, bool) or not isinstance(value, int)):
-            raise UserError(f"planner.{key}={value!r}: must be a whole number")
-    module, kind = PLANNERS[name]
-    size = {"num_actions": actions} if discrete else {"action_dim": actions}
     try:
-        return getattr(import_module(module), kind)(**size, **values)
+        if registry.is_search(name) != discrete:
+            fitting = [one for one in registry.available() if registry.is_search(one) == discrete]
+            what = "chooses among moves" if discrete else "has continuous actions"
+            raise UserError(
+                f"planner={name}: model={cfg.model.name} {what}; use planner={' or '.join(fitting)}"
+            )
+        for key, value in values.items():
+            counts = key in ("horizon", "iterations") or key.startswith("num_")
+            if counts and (isinstance(value, bool) or not isinstance(value, int)):
+                raise UserError(f"planner.{key}={value!r}: must be a whole number")
+        return registry.make(name, **values, **{"num_actions" if discrete else "action_dim": actions})
     except (TypeError, ValueError) as error:
+        if isinstance(error, UserError):
+            raise
         raise UserError(f"planner={name}: {error}") from error
 
 

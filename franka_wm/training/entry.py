@@ -13,7 +13,7 @@ from typing import Any
 
 from omegaconf import DictConfig, OmegaConf
 
-from franka_wm.errors import FrankaError
+from franka_wm.errors import FrankaError, UserError
 from franka_wm.training.progress import announced, say
 
 INTERRUPTED = 130
@@ -93,6 +93,7 @@ def check_command(arguments: list[str]) -> str | None:
     try:
         with initialize_config_dir(folder, version_base="1.3"):
             cfg = compose("config", overrides=arguments)
+        import_plugins(cfg)
         if cfg.resume is None:
             check(cfg)
         else:
@@ -112,6 +113,25 @@ def check_command(arguments: list[str]) -> str | None:
         GlobalHydra.instance().clear()
     chosen = next((a.split("=", 1)[1] for a in arguments if a.startswith("hydra.run.dir=")), "outputs")
     return unwritable(Path(chosen))
+
+
+def import_plugins(cfg: DictConfig) -> None:
+    """Imports the modules that ``cfg.plugins`` names; they register tasks, models and planners of the user's.
+
+    Raises:
+        UserError: There is no such module.
+    """
+    import importlib
+
+    for name in cfg.plugins:
+        if str(Path.cwd()) not in sys.path:
+            sys.path.insert(0, str(Path.cwd()))  # as for python -m: modules beside the one who starts the run
+        try:
+            importlib.import_module(name)
+        except ModuleNotFoundError as error:
+            raise UserError(
+                f"plugins: no module {error.name!r}; name modules as in `import`, from {Path.cwd()}"
+            ) from error
 
 
 def unwritable(folder: Path) -> str | None:
@@ -230,6 +250,7 @@ def start(cfg: DictConfig) -> Run:
 
     folder = Path(HydraConfig.get().runtime.output_dir)
     checkpoint = None
+    import_plugins(cfg)  # those of the command line: what a checkpoint names is never imported
     if cfg.resume is not None:
         checkpoint, cfg = resumed(cfg, list(HydraConfig.get().overrides.task))
     check(cfg)
@@ -256,7 +277,7 @@ def resumed(cfg: DictConfig, overrides: list[str]) -> tuple[Any, DictConfig]:
     changes = []
     for override in overrides:
         name = override.split("=", 1)[0].lstrip("+~")
-        if name in ("resume", "scale"):
+        if name in ("resume", "scale", "plugins"):
             continue
         if "." not in name and name not in ("seed", "device"):
             raise FrankaError(

@@ -1,8 +1,8 @@
 """What is asked of the arm: goal, reward, success. One file for each task.
 
 A task launches Warp kernels, so that it is part of the captured step; :class:`Task` says when. The pure tensor
-functions of a task say the same in torch, for users and for the tests. To add one: a file here with a subclass,
-and a line in :func:`make_task`; ``docs/tasks.md`` walks through an example.
+functions of a task say the same in torch, for users and for the tests. To add one: a subclass, made
+known by :func:`register`; ``docs/tasks.md`` walks through an example.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 import warp as wp
 
-from franka_wm.envs.config import FrankaConfig
+from franka_wm.envs.config import TASKS, FrankaConfig
 
 if TYPE_CHECKING:
     from franka_wm.envs.simulation import Simulation
@@ -49,10 +49,25 @@ def make_task(config: FrankaConfig) -> Task:
     from franka_wm.envs.tasks.reach import Reach
     from franka_wm.envs.tasks.track import Track
 
-    return {"reach": Reach, "track": Track}[config.task](config)
+    return ({"reach": Reach, "track": Track} | _REGISTERED)[config.task](config)
+
+
+_REGISTERED: dict[str, type[Task]] = {}
+
+
+def register(name: str, task: type[Task]) -> None:
+    """Makes a task of one's own known, for this process: ``env.task=NAME``.
+
+    Args:
+        name: What ``FrankaConfig.task`` will say.
+        task: Built with the config alone.
+    """
+    _REGISTERED[name] = task
+    if name not in TASKS:
+        TASKS.append(name)
 
 
 from franka_wm.envs.tasks.reach import Reach, goal_distance, reach_reward  # noqa: E402  (needs Task)
 from franka_wm.envs.tasks.track import Track  # noqa: E402
 
-__all__ = ["Reach", "Task", "Track", "goal_distance", "make_task", "reach_reward"]
+__all__ = ["Reach", "Task", "Track", "goal_distance", "make_task", "reach_reward", "register"]

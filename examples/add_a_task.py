@@ -1,0 +1,49 @@
+"""A task of your own: raise the tool. Goal, reward and success are Warp kernels, part of the captured step.
+
+python train.py plugins=[examples.add_a_task] env.task=raise_tool
+"""
+
+import warp as wp
+
+from franka_wm.envs import FrankaConfig
+from franka_wm.envs.tasks import Task, register
+
+HEIGHT = 0.75
+"""Where the tool shall be [m]."""
+
+
+@wp.kernel
+def place_goal(mask: wp.array[wp.bool], height: float, goal: wp.array2d[float]):
+    world = wp.tid()
+    if mask[world]:
+        goal[world, 0] = 0.3
+        goal[world, 1] = 0.0
+        goal[world, 2] = height
+
+
+@wp.kernel
+def judge_height(
+    state: wp.array2d[float], height: float, reward: wp.array2d[float], success: wp.array2d[wp.bool]
+):
+    world = wp.tid()
+    missing = wp.max(height - state[world, 16], 0.0)  # 16: the tool's z
+    reward[world, 0] = -missing
+    success[world, 0] = missing == 0.0
+
+
+class RaiseTool(Task):
+    """The reward is minus what is missing to the height [m]; a success is to be above it."""
+
+    def __init__(self, config: FrankaConfig):
+        super().__init__(config)
+
+    def reset(self, sim, mask):
+        wp.launch(place_goal, sim.num_envs, [mask, HEIGHT, sim.warp.task_goal], device=sim.device)
+
+    def judge(self, sim):
+        w = sim.warp
+        inputs = [w.next_true_state, HEIGHT, w.reward, w.success]
+        wp.launch(judge_height, sim.num_envs, inputs, device=sim.device)
+
+
+register("raise_tool", RaiseTool)

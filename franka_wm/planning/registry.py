@@ -1,0 +1,74 @@
+"""Planners by name, as `conf/planner` and `planner=` name them.
+
+To add one: a file with a class that has `plan` (see `Planner`), a line in `_PLANNERS` or a call of `register`, and a
+file in `conf/planner` with `name:` and the constructor's arguments.
+"""
+
+from importlib import import_module
+from typing import Any
+
+# name -> (module, class, whether it chooses among moves, what it is in one line)
+_PLANNERS: dict[str, tuple[str, str, bool, str]] = {
+    "mppi": (
+        "franka_wm.planning.mppi",
+        "MPPI",
+        False,
+        "sampling with elites, a policy's candidates and warm start",
+    ),
+    "cem": ("franka_wm.planning.cem", "CEM", False, "cross-entropy method"),
+    "icem": ("franka_wm.planning.icem", "ICEM", False, "cross-entropy with coloured noise and memory"),
+    "gradient": (
+        "franka_wm.planning.gradient",
+        "GradientPlanner",
+        False,
+        "descent through the model, several starts",
+    ),
+    "mcts": ("franka_wm.planning.mcts", "MCTS", True, "tree search, PUCT or Gumbel"),
+}
+_REGISTERED: dict[str, tuple[type, bool, str]] = {}
+
+
+def available() -> dict[str, str]:
+    """The planners that `make` knows: name -> one line of description."""
+    ours = {name: line for name, (_, _, _, line) in _PLANNERS.items()}
+    return ours | {name: line for name, (_, _, line) in _REGISTERED.items()}
+
+
+def is_search(name: str) -> bool:
+    """Whether the planner chooses among numbered moves (tree search), instead of continuous actions.
+
+    Raises:
+        ValueError: no planner has this name.
+    """
+    _require(name)
+    return _REGISTERED[name][1] if name in _REGISTERED else _PLANNERS[name][2]
+
+
+def register(name: str, cls: type, *, search: bool = False, line: str = "") -> None:
+    """Makes a planner of one's own known, for this process.
+
+    Args:
+        name: what `planner.name` will say.
+        cls: built with `action_dim=…` (with `num_actions=…` if `search`) and the rest of the configuration.
+        search: whether it chooses among numbered moves.
+        line: what it is.
+    """
+    _REGISTERED[name] = (cls, search, line)
+
+
+def make(name: str, **arguments: Any) -> Any:
+    """Build the planner `name`.
+
+    Raises:
+        ValueError: no planner has this name, or an argument that cannot work.
+    """
+    _require(name)
+    if name in _REGISTERED:
+        return _REGISTERED[name][0](**arguments)
+    module, cls, _, _ = _PLANNERS[name]
+    return getattr(import_module(module), cls)(**arguments)
+
+
+def _require(name: str) -> None:
+    if name not in _PLANNERS and name not in _REGISTERED:
+        raise ValueError(f"must be one of {', '.join(available())}, got {name!r}")

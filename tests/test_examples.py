@@ -1,0 +1,64 @@
+"""The examples, run as their own first lines say."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+
+def run(root: Path, *arguments: str) -> str:
+    """What the command prints; it must end well."""
+    done = subprocess.run(
+        [sys.executable, *arguments], cwd=root, capture_output=True, text=True, timeout=300,
+        env=os.environ | {"PYTHONPATH": str(root)},
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr[-3000:]
+    return done.stdout
+
+
+def test_use_the_environment(root: Path) -> None:
+    out = run(root, "examples/use_the_environment.py")
+    centimetres = float(out.split("steps: ")[1].split(" cm")[0])
+    assert centimetres < 5  # by inverse kinematics, in 20 steps
+    assert "(64, 32, 32, 3)" in out
+
+
+CONF = "hydra.searchpath=[file://examples/conf]"
+RUN = ("scale=smoke", "logger=none", "evaluation.video_episodes=0", "device=cpu")
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ("plugins=[examples.add_a_task]", "env.task=raise_tool"),
+        ("plugins=[examples.add_a_model]", CONF, "model=linear", "collector.acts=planner"),
+        ("plugins=[examples.add_a_planner]", CONF, "planner=shooting"),
+        (
+            "plugins=[examples.add_a_model,examples.add_a_planner]",
+            CONF,
+            "model=linear",
+            "planner=shooting",
+            "collector.acts=planner",
+        ),
+    ],
+    ids=["task", "model", "planner", "both"],
+)
+def test_add(arguments: tuple[str, ...], root: Path, tmp_path: Path) -> None:
+    out = run(root, "train.py", *RUN, *arguments, f"hydra.run.dir={tmp_path}/run")
+    assert (tmp_path / "run" / "evaluation.json").is_file()
+    assert "planner" in out
+
+
+def test_a_plugin_that_is_not_there(root: Path, tmp_path: Path) -> None:
+    done = subprocess.run(
+        [sys.executable, "train.py", "plugins=[no_such_module]", f"hydra.run.dir={tmp_path}/run"],
+        cwd=root,
+        capture_output=True,
+        text=True,
+    )
+    assert done.returncode == 1 and "no_such_module" in done.stderr
+    assert not (tmp_path / "run").exists()
