@@ -4,10 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
-import torch
-from tensordict import TensorDictBase
 
 from franka_wm.data.lerobot.schema import (
     ACTION,
@@ -22,6 +21,10 @@ from franka_wm.data.lerobot.schema import (
     episode_key,
 )
 from franka_wm.errors import UserError
+
+if TYPE_CHECKING:  # writing processes unpickle episodes, and need no torch
+    import torch
+    from tensordict import TensorDictBase
 
 UNKNOWN_EPISODE = -1
 """Number of an episode whose place in its world's history is not known (from a replay)."""
@@ -205,6 +208,8 @@ def cut_replay(
     Returns:
         The episodes, and how many partial ones were left out.
     """
+    import torch
+
     first = data.get("is_init")[..., 0]
     terminated = data.get(("next", "terminated"))[..., 0]
     time = torch.arange(first.shape[1], device=first.device)

@@ -17,6 +17,8 @@ from typing import Any
 import numpy as np
 
 from franka_wm.data.lerobot.schema import EPISODE_KEY, PROVENANCE
+from franka_wm.data.lerobot.shard import INFO_PATH, STATS_PATH, TASKS_PATH, write_json
+from franka_wm.data.lerobot.stats import aggregate
 from franka_wm.data.lerobot.terminal import TERMINAL_FOLDER
 from franka_wm.errors import UserError
 
@@ -34,13 +36,10 @@ def merge(out: Path, roots: Sequence[Path], provenance: dict[str, Any]) -> None:
     Raises:
         UserError: The result does not hold the rows that went in.
     """
-    from lerobot.datasets.compute_stats import aggregate_stats
-    from lerobot.datasets.io_utils import load_stats, write_stats
-
-    infos = [json.loads((root / "meta" / "info.json").read_text(encoding="utf-8")) for root in roots]
+    infos = [json.loads((root / INFO_PATH).read_text(encoding="utf-8")) for root in roots]
     videos = [name for name, feature in infos[0]["features"].items() if feature["dtype"] == "video"]
     (out / "meta").mkdir(parents=True)
-    shutil.copyfile(roots[0] / "meta" / "tasks.parquet", out / "meta" / "tasks.parquet")
+    shutil.copyfile(roots[0] / TASKS_PATH, out / TASKS_PATH)
     data, meta = _places(infos[0]["chunks_size"]), _places(infos[0]["chunks_size"])
     video = {name: _places(infos[0]["chunks_size"]) for name in videos}
     episodes = frames = 0
@@ -56,9 +55,11 @@ def merge(out: Path, roots: Sequence[Path], provenance: dict[str, Any]) -> None:
         "total_frames": frames,
         "splits": {"train": f"0:{episodes}"},
     }
-    (out / "meta" / "info.json").write_text(json.dumps(info, indent=4, ensure_ascii=False), encoding="utf-8")
-    stats = [load_stats(root) for root in roots]
-    write_stats(aggregate_stats([one for one in stats if one is not None]), out)
+    write_json(out / INFO_PATH, info)
+    stats = aggregate([json.loads((root / STATS_PATH).read_text(encoding="utf-8")) for root in roots])
+    write_json(
+        out / STATS_PATH, {name: {k: v.tolist() for k, v in one.items()} for name, one in stats.items()}
+    )
     merge_terminals(out, roots)
     (out / PROVENANCE).write_text(json.dumps(provenance, indent=1), encoding="utf-8")
     check_merged(out, roots)
@@ -178,7 +179,7 @@ def check_merged(out: Path, roots: Sequence[Path]) -> None:
     Raises:
         UserError: They differ.
     """
-    info = json.loads((out / "meta" / "info.json").read_text(encoding="utf-8"))
+    info = json.loads((out / INFO_PATH).read_text(encoding="utf-8"))
     rows = _column(out, EPISODE_KEY)
     expected = np.concatenate([_column(root, EPISODE_KEY) for root in roots])
     if not np.array_equal(rows, expected) or info["total_frames"] != len(rows):

@@ -33,12 +33,14 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from franka_wm.envs.config import NUM_JOINTS, STATE_DIM, FrankaConfig
 from franka_wm.errors import UserError
+
+if TYPE_CHECKING:  # writing processes need this module, and neither torch nor the simulator
+    from franka_wm.envs import FrankaConfig
 
 FORMATS = {
     "exact": "PNG inside parquet: every picture comes back bit for bit; for training",
@@ -62,7 +64,7 @@ OWN_FOLDER = "meta/franka_wm"
 PROVENANCE = f"{OWN_FOLDER}/provenance.json"
 
 _AXES = ("x", "y", "z")
-_JOINT_NAMES = [f"joint_{i}" for i in range(1, NUM_JOINTS + 1)]
+_JOINT_NAMES = [f"joint_{i}" for i in range(1, 8)]
 
 
 def _named(prefix: str) -> list[str]:
@@ -200,10 +202,10 @@ def schema_for(
     for flag in (DONE, TERMINATED, TRUNCATED, SUCCESS):
         features[flag] = {"dtype": "bool", "shape": (1,), "names": [flag.removeprefix("next.")]}
     if "state" in keys:
-        features[JOINTS] = _vector(NUM_JOINTS, _STATE_NAMES[:NUM_JOINTS])
-        derived[JOINTS] = ("state", 0, NUM_JOINTS)
+        features[JOINTS] = _vector(len(_JOINT_NAMES), _STATE_NAMES[: len(_JOINT_NAMES)])
+        derived[JOINTS] = ("state", 0, len(_JOINT_NAMES))
         features[TOOL] = _vector(3, _named("tool"))
-        derived[TOOL] = ("state", STATE_DIM - 6, STATE_DIM - 3)
+        derived[TOOL] = ("state", len(_STATE_NAMES) - 6, len(_STATE_NAMES) - 3)
     if "joint_target" in keys:
         observed(TARGET, "joint_target", [f"{joint}.target" for joint in _JOINT_NAMES])
     features[SEED] = {"dtype": "int64", "shape": (3,), "names": ["run", "world", "episode"]}

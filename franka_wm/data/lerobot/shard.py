@@ -1,13 +1,16 @@
 """One shard: some episodes in memory become one small LeRobot dataset on disk.
 
 LeRobot's recorder takes one frame at a time, through a PNG file on disk for each, and rewrites its metadata and
-video after every episode. Here all episodes are there at once, so each file is written once, by what LeRobot's own
-classes would have put into it; the tests compare the two.
+video after every episode. Here all episodes are there at once, so each file is written once. Nothing of LeRobot is
+imported, which takes a process several seconds; the format (v3.0) is written out here, and the tests compare every
+file with what LeRobot's recorder makes of the same episodes.
 """
 
 from __future__ import annotations
 
+import json
 from collections.abc import Sequence
+from dataclasses import dataclass
 from fractions import Fraction
 from pathlib import Path
 from typing import Any
@@ -16,13 +19,16 @@ import numpy as np
 
 from franka_wm.data.lerobot.episodes import Episode
 from franka_wm.data.lerobot.pictures import encode_png
-from franka_wm.data.lerobot.schema import DONE, Schema
-from franka_wm.data.lerobot.stats import episode_stats
+from franka_wm.data.lerobot.schema import AUTOMATIC, DONE, Schema
+from franka_wm.data.lerobot.stats import aggregate, episode_stats
 from franka_wm.data.lerobot.terminal import TERMINAL_FOLDER, write_terminals
 from franka_wm.errors import UserError
 
-FILES = {"chunk_index": 0, "file_index": 0}
-"""A shard has one file of each kind."""
+_FILE = "chunk-{chunk_index:03d}/file-{file_index:03d}"
+DATA_PATH = f"data/{_FILE}.parquet"
+VIDEO_PATH = f"videos/{{video_key}}/{_FILE}.mp4"
+EPISODES_PATH = f"meta/episodes/{_FILE}.parquet"
+TASKS_PATH, INFO_PATH, STATS_PATH = "meta/tasks.parquet", "meta/info.json", "meta/stats.json"
 
 
 def check_episode(schema: Schema, episode: Episode) -> None:
@@ -68,17 +74,7 @@ def write_shard(folder: Path, schema: Schema, episodes: Sequence[Episode]) -> No
     Raises:
         UserError: The files do not hold as many frames as were given.
     """
-    from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
-
-    meta = LeRobotDatasetMetadata.create(
-        repo_id=folder.name,
-        fps=schema.fps,
-        features=schema.features,
-        robot_type=schema.robot_type,
-        root=folder,
-        use_videos=schema.format != "exact",
-    )
-    meta.save_episode_tasks([schema.task])
+    folder.mkdir(parents=True)
     columns = [_columns(schema, episode) for episode in episodes]
     begin = 0
     for number, one in enumerate(columns):
@@ -90,14 +86,15 @@ def write_shard(folder: Path, schema: Schema, episodes: Sequence[Episode]) -> No
         one["task_index"] = np.zeros(length, np.int64)
         begin += length
     stats = [episode_stats(one) for one in columns]
+    features = _features(schema)
     if schema.format != "exact":
         for name in schema.images:
-            video = folder / meta.info.video_path.format(video_key=name, **FILES)  # pyright: ignore[reportOptionalMemberAccess]
-            encoder = encode_video(video, [one[name] for one in columns], schema)
-            check_video(video, begin, schema.fps)
-            meta.update_video_info(name, video_encoder=encoder)
-    _write_rows(folder / meta.info.data_path.format(**FILES), meta.features, columns)
-    _write_meta(meta, schema, episodes, stats)
+            path = folder / VIDEO_PATH.format(video_key=name, chunk_index=0, file_index=0)
+            encode_video(path, [one[name] for one in columns], schema)
+            check_video(path, begin, schema.fps)
+            features[name]["info"] = _video_info(path, schema)
+    _write_rows(folder / DATA_PATH.format(chunk_index=0, file_index=0), features, columns)
+    _write_meta(folder, schema, features, episodes, stats)
     write_terminals(
         folder / TERMINAL_FOLDER / "file-000.parquet",
         keys=[episode.key for episode in episodes],
@@ -114,44 +111,76 @@ def _columns(schema: Schema, episode: Episode) -> dict[str, np.ndarray]:
     }
 
 
+def _features(schema: Schema) -> dict[str, dict[str, Any]]:
+    """As in ``info.json``: those of the schema and the automatic ones."""
+    features = {
+        name: feature | {"shape": list(feature["shape"])} for name, feature in schema.features.items()
+    }
+    for name in AUTOMATIC:
+        dtype = "float32" if name == "timestamp" else "int64"
+        features[name] = {"dtype": dtype, "shape": [1], "names": None}
+    return features
+
+
 def _write_rows(path: Path, features: dict[str, Any], columns: Sequence[dict[str, np.ndarray]]) -> None:
     """One row group for each episode, as LeRobot writes it: readers of single episodes skip the others."""
-    import pyarrow as pa
     import pyarrow.parquet as pq
-    from lerobot.datasets.feature_utils import get_hf_features_from_features
 
-    arrow = get_hf_features_from_features(features).arrow_schema
+    arrow = arrow_schema(features)
     path.parent.mkdir(parents=True, exist_ok=True)
     with pq.ParquetWriter(path, arrow, compression="snappy", use_dictionary=True) as writer:
         for one in columns:
-            arrays = [_arrow(one[field.name], field.type) for field in arrow]
-            writer.write_table(pa.Table.from_arrays(arrays, schema=arrow))
+            writer.write_table(_table(one, arrow))
 
 
-def _arrow(array: np.ndarray, kind: Any) -> Any:
+def arrow_schema(features: dict[str, Any]) -> Any:
+    """Of the data files, with the note that tells ``datasets`` what is a picture."""
     import pyarrow as pa
 
-    if array.dtype == np.uint8 and array.ndim == 4:
-        data = pa.array([encode_png(picture) for picture in array], pa.binary())
-        names = pa.array([f"frame-{i:06d}.png" for i in range(len(array))], pa.string())
-        return pa.StructArray.from_arrays([data, names], fields=list(kind))
-    if array.ndim == 1:
-        return pa.array(array, kind)
-    flat = pa.array(np.ascontiguousarray(array).reshape(-1), kind.value_type)
-    if pa.types.is_fixed_size_list(kind):
-        return pa.FixedSizeListArray.from_arrays(flat, type=kind)
-    offsets = np.arange(0, array.size + 1, array.shape[1], dtype=np.int32)
-    return pa.ListArray.from_arrays(offsets, flat, type=kind)
+    fields, notes = [], {}
+    for name, feature in features.items():
+        if feature["dtype"] == "video":
+            continue
+        if feature["dtype"] == "image":
+            fields.append((name, pa.struct([("bytes", pa.binary()), ("path", pa.string())])))
+            notes[name] = {"_type": "Image"}
+            continue
+        kind = pa.bool_() if feature["dtype"] == "bool" else pa.type_for_alias(feature["dtype"])
+        note: dict[str, Any] = {"dtype": feature["dtype"], "_type": "Value"}
+        (size,) = feature["shape"]
+        fields.append((name, kind if size == 1 else pa.list_(kind, size)))
+        notes[name] = note if size == 1 else {"feature": note, "length": size, "_type": "List"}
+    return pa.schema(fields, {"huggingface": json.dumps({"info": {"features": notes}})})
+
+
+def _table(columns: dict[str, np.ndarray], arrow: Any) -> Any:
+    import pyarrow as pa
+
+    arrays = []
+    for field in arrow:
+        array = columns[field.name]
+        if array.ndim == 4:
+            data = pa.array([encode_png(picture) for picture in array], pa.binary())
+            names = pa.array([f"frame-{i:06d}.png" for i in range(len(array))], pa.string())
+            arrays.append(pa.StructArray.from_arrays([data, names], fields=list(field.type)))
+        elif array.ndim == 2:
+            flat = pa.array(np.ascontiguousarray(array).reshape(-1))
+            arrays.append(pa.FixedSizeListArray.from_arrays(flat, type=field.type))
+        else:
+            arrays.append(pa.array(array, field.type))
+    return pa.Table.from_arrays(arrays, schema=arrow)
 
 
 def _write_meta(
-    meta: Any, schema: Schema, episodes: Sequence[Episode], stats: Sequence[dict[str, dict[str, np.ndarray]]]
+    folder: Path,
+    schema: Schema,
+    features: dict[str, dict[str, Any]],
+    episodes: Sequence[Episode],
+    stats: Sequence[dict[str, dict[str, np.ndarray]]],
 ) -> None:
+    import pandas as pd
     import pyarrow as pa
     import pyarrow.parquet as pq
-    from lerobot.datasets.compute_stats import aggregate_stats
-    from lerobot.datasets.io_utils import write_info, write_stats
-    from lerobot.datasets.utils import DEFAULT_EPISODES_PATH
 
     rows: dict[str, list[Any]] = {}
     begin = 0
@@ -168,41 +197,107 @@ def _write_meta(
         }
         if schema.format != "exact":
             for name in schema.images:
-                row |= {f"videos/{name}/{index}": 0 for index in FILES}
+                row[f"videos/{name}/chunk_index"] = 0
+                row[f"videos/{name}/file_index"] = 0
                 row[f"videos/{name}/from_timestamp"] = begin / schema.fps
                 row[f"videos/{name}/to_timestamp"] = end / schema.fps
         for name, values in stats[number].items():
             row |= {f"stats/{name}/{stat}": value.tolist() for stat, value in values.items()}
-        row |= {f"meta/episodes/{index}": 0 for index in FILES}
+        row |= {"meta/episodes/chunk_index": 0, "meta/episodes/file_index": 0}
         for name, value in row.items():
             rows.setdefault(name, []).append(value)
         begin = end
-    path = meta.root / DEFAULT_EPISODES_PATH.format(**FILES)
-    path.parent.mkdir(parents=True, exist_ok=True)
+    path = folder / EPISODES_PATH.format(chunk_index=0, file_index=0)
+    path.parent.mkdir(parents=True)
     pq.write_table(pa.Table.from_pydict(rows), path)
-    meta.info.total_episodes = len(episodes)
-    meta.info.total_frames = begin
-    meta.info.total_tasks = 1
-    meta.info.splits = {"train": f"0:{len(episodes)}"}
-    write_info(meta.info, meta.root)
-    write_stats(aggregate_stats(list(stats)), meta.root)
+    tasks = pd.DataFrame({"task_index": [0]}, index=pd.Index([schema.task], name="task"))
+    tasks.to_parquet(folder / TASKS_PATH)
+    info = {
+        "codebase_version": "v3.0",
+        "fps": schema.fps,
+        "features": features,
+        "total_episodes": len(episodes),
+        "total_frames": begin,
+        "total_tasks": 1,
+        "chunks_size": 1000,
+        "data_files_size_in_mb": 100,
+        "video_files_size_in_mb": 200,
+        "data_path": DATA_PATH,
+        "video_path": None if schema.format == "exact" else VIDEO_PATH,
+        "robot_type": schema.robot_type,
+        "splits": {"train": f"0:{len(episodes)}"},
+    }
+    write_json(folder / INFO_PATH, info)
+    write_json(folder / STATS_PATH, _lists(aggregate(list(stats))))
 
 
-# -- pictures -----------------------------------------------------------------------------------------------
+def write_json(path: Path, value: Any) -> None:
+    """As LeRobot writes its JSON files."""
+    path.write_text(json.dumps(value, indent=4, ensure_ascii=False), encoding="utf-8")
 
 
-def encoder_config(schema: Schema) -> Any:
-    """LeRobot's encoder settings for the schema's video format."""
-    from lerobot.configs.video import RGBEncoderConfig
-
-    if schema.format == "video":
-        return RGBEncoderConfig()
-    # B-frames would come out in another order than they were shown in; readers jump to single frames.
-    return RGBEncoderConfig(vcodec="h264", pix_fmt="yuv444p", crf=0, extra_options={"bf": 0})
+def _lists(stats: dict[str, dict[str, np.ndarray]]) -> dict[str, dict[str, Any]]:
+    return {name: {stat: value.tolist() for stat, value in one.items()} for name, one in stats.items()}
 
 
-def encode_video(path: Path, pictures: Sequence[np.ndarray], schema: Schema) -> Any:
-    """Writes the episodes' pictures, one after the other, as one video; returns the encoder's settings.
+# -- videos -------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Encoder:
+    """How a video is encoded: the fields of LeRobot's ``RGBEncoderConfig``, and what they mean to the codec."""
+
+    codec: str
+    pix_fmt: str
+    options: dict[str, str]
+    fields: dict[str, Any]
+
+
+ENCODERS = {
+    "video": Encoder(  # LeRobot's default
+        "libsvtav1",
+        "yuv420p",
+        {"g": "2", "crf": "30", "preset": "12", "svtav1-params": "fast-decode=0:lp=1"},
+        {"g": 2, "crf": 30, "preset": 12, "fast_decode": 0, "video_backend": "pyav", "extra_options": {}},
+    ),
+    # B-frames would be stored in another order than they are shown in; readers jump to single frames.
+    "video_near_lossless": Encoder(
+        "h264",
+        "yuv444p",
+        {"g": "2", "crf": "0", "threads": "1", "bf": "0"},
+        {
+            "g": 2,
+            "crf": 0,
+            "preset": None,
+            "fast_decode": 0,
+            "video_backend": "pyav",
+            "extra_options": {"bf": 0},
+        },
+    ),
+}
+
+
+def _video_info(path: Path, schema: Schema) -> dict[str, Any]:
+    """What LeRobot keeps about a video in ``info.json``."""
+    import av
+
+    with av.open(str(path)) as container:
+        stream = container.streams.video[0]
+        info = {
+            "video.height": stream.height,
+            "video.width": stream.width,
+            "video.codec": stream.codec.canonical_name,
+            "video.pix_fmt": stream.pix_fmt,
+            "video.fps": schema.fps,
+            "video.channels": 3,
+            "has_audio": False,
+        }
+    fields = ENCODERS[schema.format].fields
+    return info | {f"video.{name}": value for name, value in fields.items()} | {"is_depth_map": False}
+
+
+def encode_video(path: Path, pictures: Sequence[np.ndarray], schema: Schema) -> None:
+    """Writes the episodes' pictures, one after the other, as one video.
 
     Args:
         path: The mp4 file.
@@ -211,14 +306,12 @@ def encode_video(path: Path, pictures: Sequence[np.ndarray], schema: Schema) -> 
     """
     import av
 
-    config = encoder_config(schema)
+    encoder = ENCODERS[schema.format]
     path.parent.mkdir(parents=True, exist_ok=True)
     height, width = pictures[0].shape[1:3]
     with av.open(str(path), "w") as container:
-        stream: Any = container.add_stream(
-            config.vcodec, schema.fps, options=config.get_codec_options(1, as_strings=True)
-        )
-        stream.pix_fmt, stream.width, stream.height = config.pix_fmt, width, height
+        stream: Any = container.add_stream(encoder.codec, schema.fps, options=dict(encoder.options))
+        stream.pix_fmt, stream.width, stream.height = encoder.pix_fmt, width, height
         stream.time_base = Fraction(1, schema.fps)
         time = 0
         for episode in pictures:
@@ -228,7 +321,6 @@ def encode_video(path: Path, pictures: Sequence[np.ndarray], schema: Schema) -> 
                 container.mux(stream.encode(frame))
                 time += 1
         container.mux(stream.encode())
-    return config
 
 
 def check_video(path: Path, frames: int, fps: int) -> None:

@@ -7,7 +7,7 @@ exact order statistics, for all dimensions at once, which is where most of the t
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
@@ -60,3 +60,25 @@ def episode_stats(columns: Mapping[str, np.ndarray]) -> dict[str, dict[str, np.n
         name: picture_stats(array) if array.dtype == np.uint8 and array.ndim == 4 else vector_stats(array)
         for name, array in columns.items()
     }
+
+
+def aggregate(stats: Sequence[Mapping[str, Mapping[str, np.ndarray]]]) -> dict[str, dict[str, np.ndarray]]:
+    """Of several episodes or datasets, from those of each: as LeRobot's ``aggregate_stats``.
+
+    Mean and deviation are those of all values together; quantiles are means of quantiles, weighted by count.
+    """
+    out = {}
+    for name in stats[0]:
+        each = {stat: np.stack([np.asarray(one[name][stat]) for one in stats]) for stat in stats[0][name]}
+        count = each["count"].reshape(len(stats), *[1] * (each["mean"].ndim - 1))
+        total = count.sum(0)
+        mean = (each["mean"] * count).sum(0) / total
+        variance = ((each["std"] ** 2 + (each["mean"] - mean) ** 2) * count).sum(0) / total
+        out[name] = {
+            "min": each["min"].min(0),
+            "max": each["max"].max(0),
+            "mean": mean,
+            "std": np.sqrt(variance),
+            "count": each["count"].sum(0),
+        } | {q: (each[q] * count).sum(0) / total for q in QUANTILES}
+    return out

@@ -23,7 +23,6 @@ import signal
 import time
 import traceback
 from collections.abc import Iterable, Mapping
-from importlib import import_module
 from multiprocessing.connection import Connection, wait
 from pathlib import Path
 from typing import Any
@@ -417,9 +416,7 @@ def _work(connection: Connection, working: Path, log: Path) -> None:
     # Encoders and progress bars talk to standard error.
     errors = os.open(log, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o644)
     os.dup2(errors, 2)
-    os.environ["HF_HUB_OFFLINE"] = "1"  # nothing here has to ask anyone
     os.environ["SVT_LOG"] = "1"
-    import_module("lerobot.datasets.dataset_metadata")  # takes seconds: while episodes are still gathered
     while True:
         try:
             connection.send(_do(*connection.recv()))
