@@ -303,7 +303,8 @@ class Session:
 
     def _check_policy(self, name: str) -> None:
         if name not in self.policies:
-            hint = "" if "planner" in self.policies else "; planner and policy need checkpoint=FOLDER"
+            learned = name in ("planner", "policy")
+            hint = "; that one needs a checkpoint of a family that has it" if learned else ""
             raise UserError(f"policy={name!r}: choose from {', '.join(self.policies)}{hint}")
 
     def _begin_episode(self) -> None:

@@ -1,0 +1,176 @@
+"""``franka-wm view``: its arguments, its errors, and that it serves this machine only."""
+
+from __future__ import annotations
+
+import builtins
+import re
+import socket
+import sys
+from pathlib import Path
+
+import pytest
+from omegaconf import OmegaConf
+
+from franka_wm import cli
+from franka_wm.envs import FrankaConfig
+from franka_wm.errors import UserError
+from franka_wm.live import view
+
+CHEAP = ["env.substeps=2", "device=cpu"]
+
+
+def test_arguments() -> None:
+    options = view.parse(
+        ["port=0", "policy=noop", "seconds=2.5", "env.goal=[0.3,0,0.5]", "env.episode_length=20"]
+    )
+    assert (options.port, options.policy, options.seconds) == (0, "noop", 2.5)
+    assert options.env == {"goal": [0.3, 0, 0.5], "episode_length": 20}
+    assert view.parse([]) == view.Options()
+
+
+@pytest.mark.parametrize(
+    ("argument", "said"),
+    [
+        ("page=3", "'page=3' is not key=value with a key that it knows"),
+        ("--fast", "see franka-wm view --help"),
+        ("env=reach", "'env=reach' is not"),
+        ("port=http", "port=http: must be a number"),
+        ("port=70000", "must be from 0 to 65535"),
+        ("seconds=0", "must be above 0"),
+        ("seconds=nan", "must be above 0"),
+    ],
+)
+def test_bad_arguments_are_one_line(argument: str, said: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.main(["view", argument]) == 1
+    captured = capsys.readouterr()
+    assert said in captured.err
+    assert captured.err.count("\n") == 1
+
+
+def test_bad_worlds_policies_and_checkpoints_are_one_line(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for arguments, said in (
+        (["env.arms=2"], "unknown environment option 'arms'"),
+        (["policy=policy"], "policy='policy': choose from planner, oracle, random, noop; that one needs"),
+        ([f"checkpoint={tmp_path}"], str(tmp_path)),
+    ):
+        assert cli.main(["view", *CHEAP, "seconds=1", *arguments]) == 1
+        captured = capsys.readouterr()
+        assert said in captured.err
+        assert captured.err.count("\n") == 1
+
+
+def test_help_names_every_option(capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.main(["view", "--help"]) == 0
+    out = capsys.readouterr().out
+    for name in vars(view.Options()):
+        assert f"{name}=" in out or f"{name}." in out
+
+
+@pytest.mark.parametrize(
+    ("module", "arguments", "extra"),
+    [("viser", [], "franka-wm[view]"), ("rerun", ["rerun=x.rrd"], "franka-wm[rerun]")],
+)
+def test_without_the_extra_it_says_which(
+    module: str,
+    arguments: list[str],
+    extra: str,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    real = builtins.__import__
+
+    def absent(name: str, *args, **kwargs):
+        if name.split(".")[0] == module:
+            raise ModuleNotFoundError(f"No module named {module!r}", name=module)
+        return real(name, *args, **kwargs)
+
+    for loaded in [m for m in sys.modules if m.split(".")[0] == module]:
+        monkeypatch.delitem(sys.modules, loaded)
+    monkeypatch.setattr(builtins, "__import__", absent)
+    assert cli.main(["view", *arguments]) == 1
+    captured = capsys.readouterr()
+    assert f"pip install '{extra}'" in captured.err
+    assert captured.out == "", "before anything that takes time"
+
+
+def test_without_a_checkpoint_the_arm_is_that_of_the_preset(root: Path) -> None:
+    base = OmegaConf.load(root / "conf" / "env" / "franka.yaml")
+    preset = OmegaConf.to_container(
+        OmegaConf.merge(base, OmegaConf.load(root / "conf" / "env" / "reach.yaml"))
+    )
+    for other in ("defaults", "kind", "urdf_path", "episode_length"):
+        del preset[other]
+    assert FrankaConfig.from_mapping(view.ARM | {"episode_length": 50}) == FrankaConfig.from_mapping(
+        preset | {"episode_length": 50}
+    )
+
+
+def test_it_serves_this_machine_only_and_ends_in_time(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    from franka_wm.live import page
+
+    served = []
+    real = page.Page
+
+    class Watched(real):
+        def close(self) -> None:
+            here = reachable("127.0.0.1", self.port)
+            served.append((self.server.get_host(), self.port, here, outside(self.port)))
+            steps.append(self.session.frame().steps)
+            super().close()
+
+    steps: list[int] = []
+    monkeypatch.setattr(page, "Page", Watched)
+    assert cli.main(["view", *CHEAP, "port=0", "policy=oracle", "seconds=2"]) == 0
+    [(host, port, here, elsewhere)] = served
+    assert host == "127.0.0.1"
+    assert here
+    assert not elsewhere, "the page must not be reachable by this machine's other addresses"
+    assert steps[0] > 3, "it plays from the start"
+    out = capsys.readouterr().out
+    assert re.search(rf"^http://127\.0\.0\.1:{port}   Ctrl-C ends it$", out, re.MULTILINE)
+
+
+def reachable(host: str, port: int) -> bool:
+    with socket.socket() as probe:
+        probe.settimeout(1.0)
+        return probe.connect_ex((host, port)) == 0
+
+
+def outside(port: int) -> bool:
+    """Whether any other address of this machine answers; 127.0.0.2 is one everywhere on Linux."""
+    addresses = {info[4][0] for info in socket.getaddrinfo(socket.gethostname(), None, socket.AF_INET)}
+    return any(reachable(str(a), port) for a in (addresses | {"127.0.0.2"}) - {"127.0.0.1"})
+
+
+def test_a_port_in_use_is_said(capsys: pytest.CaptureFixture[str]) -> None:
+    with socket.socket() as other:
+        other.bind(("127.0.0.1", 0))
+        other.listen()
+        taken = other.getsockname()[1]
+        assert cli.main(["view", *CHEAP, f"port={taken}", "policy=noop", "seconds=0.1"]) == 0
+    assert f"(port {taken} is taken)" in capsys.readouterr().out
+
+
+def test_an_exception_while_it_plays_ends_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    stage = view.build(view.parse([*CHEAP, "policy=noop", "port=0"]))
+
+    def broken(_tensordict):
+        raise UserError("the oracle is out")
+
+    stage.policies["noop"] = broken
+    with pytest.raises(UserError, match="the oracle is out"):
+        view.serve(stage, view.parse(["policy=noop", "port=0"]))
+
+
+def test_rerun_writes_an_episode(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    pytest.importorskip("rerun", reason="needs the extra rerun")
+    path = tmp_path / "arm.rrd"
+    assert cli.main(["view", *CHEAP, f"rerun={path}", "policy=oracle", "env.episode_length=4"]) == 0
+    assert path.stat().st_size > 1000
+    out = capsys.readouterr().out
+    assert "recording 4 steps" in out
+    assert f"rerun {path}" in out
