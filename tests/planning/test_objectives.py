@@ -1,0 +1,213 @@
+# pyright: reportArgumentType=false, reportCallIssue=false
+import copy
+
+import pytest
+import torch
+from tensordict import TensorDict
+from torchrl.data import Bounded, Composite, Unbounded
+from torchrl.envs import EnvBase, InitTracker, TransformedEnv
+
+from franka_wm.planning import (
+    CEM,
+    ActionPenalty,
+    GoalDistance,
+    GoalImage,
+    PlannerPolicy,
+    RewardPlusValue,
+    Smoothness,
+    Sum,
+)
+from franka_wm.planning.objectives import bind
+
+# Two environments, three candidates, two steps, latents of two numbers.
+E, S, H, D = 2, 3, 2, 2
+
+
+@pytest.fixture
+def trajectory():
+    return torch.randn(E, S, H + 1, D, generator=torch.Generator().manual_seed(0))
+
+
+@pytest.fixture
+def actions():
+    return torch.randn(E, S, H, 2, generator=torch.Generator().manual_seed(1))
+
+
+@pytest.mark.parametrize("summed", [True, False])
+@pytest.mark.parametrize("metric", ["l2", "l1", "cosine"])
+def test_goal_distance_is_what_it_says(trajectory, actions, metric, summed):
+    goal = torch.tensor([[1.0, -2.0], [0.5, 3.0]])
+
+    def distance(x, g):
+        if metric == "l2":
+            return sum((a - b) ** 2 for a, b in zip(x, g, strict=True))
+        if metric == "l1":
+            return sum(abs(a - b) for a, b in zip(x, g, strict=True))
+        size = (sum(a * a for a in x) * sum(b * b for b in g)) ** 0.5
+        return 1 - sum(a * b for a, b in zip(x, g, strict=True)) / size
+
+    expected = [
+        [
+            -sum(
+                distance(trajectory[e, s, t].tolist(), goal[e].tolist())
+                for t in (range(1, H + 1) if summed else [H])
+            )
+            for s in range(S)
+        ]
+        for e in range(E)
+    ]
+    score = GoalDistance(goal, summed, metric=metric)(trajectory, actions)
+    torch.testing.assert_close(score, torch.tensor(expected))
+    # one goal for all
+    one = GoalDistance(goal[1], summed, metric=metric)(trajectory, actions)
+    torch.testing.assert_close(one[1], score[1])
+
+
+def test_cosine_only_sees_the_direction():
+    trajectory = torch.tensor([[0.0, 0.0], [2.0, 0.0], [0.0, -3.0]]).view(1, 1, 3, 2)
+    objective = GoalDistance(torch.tensor([5.0, 0.0]), metric="cosine")
+    assert objective(trajectory, torch.zeros(1, 1, 2, 1)).item() == pytest.approx(-0.0 - 1.0)
+    backwards = GoalDistance(torch.tensor([0.0, 1.0]), summed=False, metric="cosine")
+    assert backwards(trajectory, torch.zeros(1, 1, 2, 1)).item() == pytest.approx(-2.0)
+
+
+def test_distances_are_measured_on_the_embedding(trajectory, actions):
+    embed = lambda z: z[..., :1] * 10  # noqa: E731
+    goal = torch.tensor([[3.0], [4.0]])
+    expected = -(10 * trajectory[:, :, 1:, 0] - goal[:, None]).square().sum(-1)
+    torch.testing.assert_close(GoalDistance(goal, embed=embed)(trajectory, actions), expected)
+    with pytest.raises(ValueError, match="embed"):
+        GoalDistance(goal)(trajectory, actions)
+    with pytest.raises(ValueError, match="cosine"):
+        GoalDistance(goal, metric="l3")
+
+
+def test_actions_and_their_changes_are_penalised():
+    trajectory = torch.zeros(1, 2, 4, 1)
+    actions = torch.tensor([[[[1.0, 2.0], [0.0, 2.0], [0.0, -1.0]], [[0.0, 0.0]] * 3]])
+    assert ActionPenalty(0.5)(trajectory, actions).tolist() == [[-5.0, 0.0]]
+    assert Smoothness(2.0)(trajectory, actions).tolist() == [[-2.0 * (1 + 9), 0.0]]
+    for kind in (ActionPenalty, Smoothness):
+        with pytest.raises(ValueError, match=kind.__name__):
+            kind(-1.0)
+
+
+def test_smoothness_counts_the_step_from_the_last_executed_action_unless_an_episode_begins():
+    actions = torch.tensor([[[[1.0], [1.0]]], [[[1.0], [1.0]]]])
+    last = torch.tensor([[3.0], [torch.nan]])  # what lies in a buffer before the first action
+    td = TensorDict({"action": last, "is_init": torch.tensor([[False], [True]])}, [2])
+    free = Smoothness(0.5)
+    bound = free.bind(td)
+    assert bound(torch.zeros(2, 1, 3, 1), actions).flatten().tolist() == [-0.5 * 4, 0.0]
+    assert free(torch.zeros(2, 1, 3, 1), actions).flatten().tolist() == [0.0, 0.0]  # itself unchanged
+    td["action"].fill_(100.0)  # the policy writes the next action into the same memory
+    assert bound(torch.zeros(2, 1, 3, 1), actions).flatten().tolist() == [-0.5 * 4, 0.0]
+    reset = free.bind(td.exclude("action"))
+    assert reset(torch.zeros(2, 1, 3, 1), actions).flatten().tolist() == [0.0, 0.0]
+
+
+def encode_goal(observation):
+    assert set(observation.keys()) == {"pixels"}  # not the present joint angles
+    return observation["pixels"].float().mean((-3, -2)) / 255.0
+
+
+def test_a_goal_picture_becomes_a_distance(trajectory, actions):
+    picture = torch.randint(256, (E, 4, 4, D), dtype=torch.uint8)
+    td = TensorDict({"goal_pixels": picture, "pixels": 255 - picture, "state": torch.zeros(E, 1)}, [E])
+    objective = GoalImage(encode_goal, embed=torch.tanh, metric="l1", summed=False)
+    expected = GoalDistance(picture.float().mean((1, 2)) / 255, False, metric="l1", embed=torch.tanh)
+    bound = objective.bind(td)
+    torch.testing.assert_close(bound(trajectory, actions), expected(trajectory, actions))
+    assert objective.in_keys == ["goal_pixels"]
+    with pytest.raises(ValueError, match="'goal_pixels'"):
+        objective.bind(td.exclude("goal_pixels"))
+    with pytest.raises(ValueError, match="bind"):
+        objective(trajectory, actions)
+    with pytest.raises(ValueError, match="metric"):
+        GoalImage(encode_goal, metric="euclid")
+
+
+def test_other_names_for_pictures():
+    td = TensorDict({"wanted": torch.full((1, 2, 2, 1), 255, dtype=torch.uint8)}, [1])
+    objective = GoalImage(lambda o: o["eye"].float().mean((1, 2)), pixels="eye", goal="wanted")
+    assert objective.bind(td).goal_latent.tolist() == [[255.0]]
+
+
+def test_a_sum_adds_weighted_terms_and_binds_them(trajectory, actions):
+    goal = GoalDistance(torch.zeros(D))
+    both = Sum([(2.0, goal), (0.5, ActionPenalty(3.0))])
+    expected = 2 * goal(trajectory, actions) + 0.5 * ActionPenalty(3.0)(trajectory, actions)
+    torch.testing.assert_close(both(trajectory, actions), expected)
+
+    picture = torch.randint(256, (E, 4, 4, D), dtype=torch.uint8)
+    td = TensorDict(
+        {"goal_pixels": picture, "action": torch.ones(E, 2), "is_init": torch.zeros(E, 1).bool()}, [E]
+    )
+    image, smooth = GoalImage(encode_goal), Smoothness(1.0)
+    nested = Sum([(0.3, Sum([(2.0, image), (1.0, ActionPenalty(1.0))])), (4.0, smooth)])
+    assert nested.in_keys == ["goal_pixels"]
+    expected = (
+        0.6 * image.bind(td)(trajectory, actions)
+        + 0.3 * ActionPenalty(1.0)(trajectory, actions)
+        + 4.0 * smooth.bind(td)(trajectory, actions)
+    )
+    torch.testing.assert_close(bind(nested, td)(trajectory, actions), expected)
+    assert bind(goal, td) is goal
+    with pytest.raises(ValueError, match="at least one"):
+        Sum([])
+    with pytest.raises(ValueError, match="ActionPenalty"):
+        Sum([(float("nan"), ActionPenalty(1.0))])
+
+
+def test_objectives_can_be_copied():
+    copied = copy.deepcopy(Sum([(1.0, RewardPlusValue(encode_goal, encode_goal, 0.9)), (1.0, Smoothness(1))]))
+    assert len(copied.terms) == 2
+
+
+class Noisy(EnvBase):
+    """A point that is thrown about at every step, so that plain planning is jerky."""
+
+    def __init__(self, n: int) -> None:
+        super().__init__(device="cpu", batch_size=[n])
+        self.observation_spec = Composite(state=Unbounded((n, 1)), shape=(n,))
+        self.action_spec = Bounded(-1.0, 1.0, (n, 1))
+        self.reward_spec = Unbounded((n, 1))
+        self.generator = torch.Generator().manual_seed(0)
+        self.state = torch.zeros(n, 1)
+
+    def _draw(self):
+        return torch.randn(self.state.shape, generator=self.generator)
+
+    def _reset(self, tensordict=None):
+        self.state = self._draw()
+        return TensorDict({"state": self.state}, self.batch_size)
+
+    def _step(self, tensordict):
+        self.state = 0.2 * self._draw() + self.state + 0.5 * tensordict["action"]
+        done = torch.zeros_like(self.state, dtype=torch.bool)
+        reward = -self.state.square()
+        return TensorDict({"state": self.state, "reward": reward, "done": done}, self.batch_size)
+
+    def _set_seed(self, seed):
+        self.generator.manual_seed(seed or 0)
+
+
+def test_smoothness_smooths_what_is_executed():
+    """An environment carries its last action to the next decision, where `bind` finds it."""
+
+    def roughness(weight):
+        env = TransformedEnv(Noisy(16), InitTracker())
+        objective = Sum([(1.0, GoalDistance(torch.zeros(1))), (1.0, Smoothness(weight))])
+        policy = PlannerPolicy(
+            CEM(action_dim=1, horizon=3, num_samples=64, num_elites=8, iterations=4),
+            encode=lambda td: td["state"],
+            next=lambda z, a: z + 0.5 * a,
+            objective=objective,
+            observation_keys=["state"],
+            explore=False,
+        )
+        torch.manual_seed(0)
+        actions = env.rollout(12, policy)["action"]
+        return actions[:, 2:].diff(dim=1).square().mean().item()
+
+    assert roughness(1.0) < 0.3 * roughness(0.0)
