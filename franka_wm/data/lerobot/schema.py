@@ -139,7 +139,7 @@ def schema_for(
     *,
     format: str = "exact",
     keys: Sequence[str] | None = None,
-    action_dim: int | None = None,
+    success: bool = True,
 ) -> Schema:
     """The schema of data from an environment.
 
@@ -148,7 +148,7 @@ def schema_for(
         format: How pictures are stored; one of :data:`FORMATS`.
         keys: Observations that the data has (a replay keeps fewer than the environment emits). If not given:
             what the environment emits.
-        action_dim: Size of an action; the config's if not given.
+        success: Whether the data says if the task was solved.
 
     Raises:
         UserError: An unknown format, a frame rate that is not whole, or an observation that has no place in a
@@ -199,7 +199,7 @@ def schema_for(
         )
     features[ACTION] = _vector(len(names), names)
     features[REWARD] = {"dtype": "float32", "shape": (1,), "names": ["reward"]}
-    for flag in (DONE, TERMINATED, TRUNCATED, SUCCESS):
+    for flag in (DONE, TERMINATED, TRUNCATED, *([SUCCESS] if success else [])):
         features[flag] = {"dtype": "bool", "shape": (1,), "names": [flag.removeprefix("next.")]}
     if "state" in keys:
         features[JOINTS] = _vector(len(_JOINT_NAMES), _STATE_NAMES[: len(_JOINT_NAMES)])

@@ -80,7 +80,7 @@ class DatasetWriter:
         self.out = Path(out).absolute()
         self.schema = schema
         self.working = self.out.with_name(self.out.name + ".writing")
-        self.shard_frames = _frames_of_a_shard(schema) if shard_frames is None else shard_frames
+        self.shard_frames = default_shard_frames(schema) if shard_frames is None else shard_frames
         self._buffer: list[Episode] = []
         self._buffered = 0
         self._workers: list[_Worker | _Here] = []
@@ -284,7 +284,8 @@ class DatasetWriter:
         self.close()
 
 
-def _frames_of_a_shard(schema: Schema) -> int:
+def default_shard_frames(schema: Schema) -> int:
+    """Steps that :data:`SHARD_BYTES` hold, within reason."""
     size = sum(
         int(np.prod(feature["shape"])) * schema.numpy_dtype(name).itemsize
         for name, feature in schema.features.items()

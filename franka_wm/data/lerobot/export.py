@@ -1,0 +1,226 @@
+"""``franka-wm export``: a replay buffer becomes a dataset."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from franka_wm.data.lerobot.command import required, split
+from franka_wm.data.lerobot.episodes import cut_replay
+from franka_wm.data.lerobot.provenance import describe
+from franka_wm.data.lerobot.schema import FORMATS, schema_for
+from franka_wm.data.lerobot.writer import DatasetWriter
+from franka_wm.errors import UserError
+
+if TYPE_CHECKING:
+    import torch
+    from tensordict import TensorDictBase
+
+    from franka_wm.envs import FrankaConfig
+
+OPTIONS: dict[str, Any] = {"source": "", "out": "", "format": "exact", "workers": 2}
+
+USAGE = f"""usage: franka-wm export source=RUN out=FOLDER [key=value …]
+
+  source=RUN        a run's folder, or a checkpoint in it, saved with its replay (trainer.checkpoint_replay=true)
+  out=FOLDER        where the dataset goes; it appears whole, at the end
+  format=exact      {"; ".join(f"{name}: {line}" for name, line in FORMATS.items())}
+  workers=2         writing processes
+
+Only whole episodes are written; how many partial ones the buffer holds is said."""
+
+
+@dataclass(frozen=True)
+class Exported:
+    """What became of a replay.
+
+    Attributes:
+        out: The dataset.
+        episodes, frames: In it.
+        partial: Episodes of which the buffer holds only a part; they were left out.
+    """
+
+    out: Path
+    episodes: int
+    frames: int
+    partial: int
+
+
+def export(arguments: Sequence[str]) -> int:
+    """The verb."""
+    from omegaconf import OmegaConf
+
+    from franka_wm.training.checkpoint import latest_checkpoint, load_checkpoint
+    from franka_wm.training.progress import announced
+
+    if not arguments or arguments[0] in ("--help", "-h"):
+        print(USAGE)
+        return 0
+    options, _ = split("export", arguments, OPTIONS)
+    required("export", options, "source", "out")
+    checkpoint = load_checkpoint(latest_checkpoint(options["source"]))
+    data = checkpoint.replay()
+    if data is None:
+        raise UserError(
+            f"export: {checkpoint.folder} was saved without its replay; train with trainer.checkpoint_replay=true"
+        )
+    resolved: Any = OmegaConf.to_container(checkpoint.config, resolve=True)
+    with announced(f"writing {data.numel()} steps"):
+        done = export_replay(
+            data,
+            config=arm_config(resolved),
+            out=options["out"],
+            seed=int(resolved["seed"]),
+            policy=f"training run {options['source']}",
+            settings=resolved,
+            format=options["format"],
+            workers=options["workers"],
+        )
+    tell(done)
+    return 0
+
+
+def tell(done: Exported) -> None:
+    """Says what was written and what was not."""
+    from franka_wm.training.progress import say
+
+    left = f"; {done.partial} partial episodes in the buffer were left out" if done.partial else ""
+    say(f"dataset: {done.out}   {done.episodes} episodes, {done.frames} steps{left}")
+
+
+def arm_config(settings: Mapping[str, Any]) -> FrankaConfig:
+    """The arm's config in a run's resolved configuration.
+
+    Raises:
+        UserError: The run was not about the arm.
+    """
+    from franka_wm.envs import FrankaConfig
+
+    env = dict(settings["env"])
+    if env.pop("kind") != "franka":
+        raise UserError("export: the run's environment is not the arm; there is no schema for its data")
+    env.pop("urdf_path", None)
+    return FrankaConfig.from_mapping(env)
+
+
+def export_replay(
+    data: TensorDictBase,
+    *,
+    config: FrankaConfig,
+    out: str | Path,
+    seed: int,
+    policy: str,
+    settings: Mapping[str, Any],
+    format: str = "exact",
+    workers: int = 2,
+) -> Exported:
+    """Writes the whole episodes of a replay.
+
+    A replay keeps what its model reads, so a dataset may have fewer features than one that was collected. The goal
+    and success are not kept; they follow from ``state``, the goal within the rounding of one subtraction.
+
+    Args:
+        data: (worlds, time), oldest step first: observations, ``action``, ``is_init`` and, under ``next``,
+            observations, ``reward``, ``terminated``.
+        config: The environment's.
+        out, format, workers: As for :class:`~franka_wm.data.lerobot.writer.DatasetWriter`.
+        seed: Of the run.
+        policy, settings: Who acted, and the resolved configuration, for the provenance.
+
+    Raises:
+        UserError: There is no whole episode, or it cannot be written.
+    """
+    from franka_wm.envs.discretize import discrete_action_table
+
+    after = data.get("next")
+    known = ("state", "joint_target")
+    keys = [key for key in data.keys() if key in known or str(key).startswith(("pixels", "goal_pixels"))]  # noqa: SIM118
+    keys = [str(key) for key in keys if key in after.keys()]  # noqa: SIM118
+    success = None
+    if "state" in keys:
+        data = data.clone(recurse=False)
+        after = after.clone(recurse=False)
+        for part in (data, after):
+            state = part.get("state")
+            part.set("goal", state[..., 14:17] - state[..., 17:20])
+        data.set("next", after)
+        keys.append("goal")
+
+        def success(data: TensorDictBase) -> torch.Tensor:
+            distance = data.get(("next", "state"))[..., 17:20].norm(dim=-1, keepdim=True)
+            return distance < config.success_distance
+
+    schema = schema_for(config, format=format, keys=keys, success=success is not None)
+    discrete = None
+    if not data.get("action").is_floating_point():
+        discrete = discrete_action_table(config.action_dim)
+    episodes, partial = cut_replay(
+        data,
+        schema,
+        seed=seed,
+        episode_length=config.episode_length,
+        success=success,
+        discrete=discrete,
+    )
+    if not episodes:
+        raise UserError(
+            f"export: the buffer holds no whole episode of {config.episode_length} steps, only {partial} partial "
+            "ones; gather more first"
+        )
+    provenance = describe(policy=policy, seed=seed, config=settings)
+    with DatasetWriter(out, schema, provenance=provenance, workers=workers) as writer:
+        writer.add(episodes)
+        return Exported(writer.finish(), len(episodes), sum(e.length for e in episodes), partial)
+
+
+def export_run(settings: Mapping[str, Any], data: TensorDictBase | None, *, folder: Path) -> Exported | None:
+    """The end of a training run: what ``export`` in its configuration asks for.
+
+    Args:
+        settings: The run's resolved configuration, plain; ``export`` has ``kind`` (none, lerobot), ``out`` (``None``:
+            ``dataset`` in the run's folder), ``format``, ``workers`` and ``repo_id`` (published there if given).
+        data: The replay, oldest step first; ``None`` if there is none.
+        folder: Of the run.
+    """
+    wanted = settings["export"]
+    if wanted["kind"] == "none":
+        return None
+    if data is None:
+        raise UserError(
+            "export=lerobot: this run has gathered nothing; export the dataset that it was trained on"
+        )
+    done = export_replay(
+        data,
+        config=arm_config(settings),
+        out=wanted["out"] or folder / "dataset",
+        seed=int(settings["seed"]),
+        policy=f"training run, {settings['collector']['acts']}",
+        settings=settings,
+        format=wanted["format"],
+        workers=int(wanted["workers"]),
+    )
+    tell(done)
+    if wanted["repo_id"]:
+        from franka_wm.data.lerobot.publish import publish_dataset
+
+        publish_dataset(done.out, wanted["repo_id"])
+    return done
+
+
+def check_export(settings: Mapping[str, Any]) -> None:
+    """What can be refused before a run starts.
+
+    Raises:
+        UserError: One line.
+    """
+    wanted = settings["export"]
+    if wanted["kind"] not in ("none", "lerobot"):
+        raise UserError(f"export.kind={wanted['kind']!r}: must be none or lerobot")
+    if wanted["kind"] == "none":
+        return
+    schema_for(arm_config(settings), format=wanted["format"])
+    out = wanted["out"]
+    if out and Path(out).exists():
+        raise UserError(f"export.out={out} exists; choose another folder")
