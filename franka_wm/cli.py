@@ -22,7 +22,21 @@ from franka_wm.errors import FrankaError, UserError
 VERBS: dict[str, tuple[str, str, str]] = {
     "list": ("franka_wm.cli:show_list", "", "environments, robots, tasks, models and planners"),
     "summary": ("franka_wm.report.seeds:summary", "RUN …", "runs of several seeds in one table"),
-    "view": ("franka_wm.live.view:view", "[checkpoint=RUN]", "an arm in the browser: drag its goal; view --help"),
+    "report": (
+        "franka_wm.report.page:report",
+        "RUN [out=…]",
+        "a run's page: report.html, one self-contained file",
+    ),
+    "compare": (
+        "franka_wm.report.compare:compare",
+        "RUN RUN … [out=…]",
+        "several runs side by side on one page",
+    ),
+    "view": (
+        "franka_wm.live.view:view",
+        "[checkpoint=RUN]",
+        "an arm in the browser: drag its goal; view --help",
+    ),
     "bench": ("franka_wm.cli:bench", "NAME [options]", "run a benchmark of this checkout"),
 }
 
