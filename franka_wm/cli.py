@@ -37,6 +37,21 @@ VERBS: dict[str, tuple[str, str, str]] = {
         "[checkpoint=RUN]",
         "an arm in the browser: drag its goal; view --help",
     ),
+    "collect": (
+        "franka_wm.data.lerobot.collect:collect",
+        "out=FOLDER …",
+        "gather a LeRobot dataset with any policy",
+    ),
+    "export": (
+        "franka_wm.data.lerobot.export:export",
+        "source=RUN out=…",
+        "a run's replay as a LeRobot dataset",
+    ),
+    "publish": (
+        "franka_wm.data.lerobot.publish:publish",
+        "root=… repo_id=…",
+        "a dataset or a model to the Hub",
+    ),
     "bench": ("franka_wm.cli:bench", "NAME [options]", "run a benchmark of this checkout"),
 }
 

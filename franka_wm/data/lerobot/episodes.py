@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -187,7 +186,6 @@ def cut_replay(
     *,
     seed: int,
     episode_length: int,
-    success: Callable[[TensorDictBase], torch.Tensor] | None = None,
     discrete: torch.Tensor | None = None,
 ) -> tuple[list[Episode], int]:
     """Whole episodes of a replay buffer, which keeps no flag for the end by time.
@@ -198,11 +196,10 @@ def cut_replay(
 
     Args:
         data: (worlds, time), oldest step first: observations, ``action``, ``is_init`` and, under ``next``,
-            observations, ``reward``, ``terminated``.
+            observations, ``reward``, ``terminated``, and ``success`` if the schema has it.
         schema: What is kept.
         seed: Of the run.
         episode_length: Of the environment.
-        success: From ``data`` to (worlds, time, 1) bool; needed if the schema has ``next.success``.
         discrete: As for :class:`EpisodeCutter`.
 
     Returns:
@@ -221,8 +218,6 @@ def cut_replay(
     after["done"] = whole.unsqueeze(-1)
     after["terminated"] = (whole & terminated).unsqueeze(-1)
     after["truncated"] = (whole & (age == episode_length)).unsqueeze(-1)
-    if success is not None:
-        after["success"] = success(data)
     data["next"] = after
     worlds = first.shape[0]
     cutter = EpisodeCutter(

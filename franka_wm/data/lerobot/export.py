@@ -15,7 +15,6 @@ from franka_wm.data.lerobot.writer import DatasetWriter
 from franka_wm.errors import UserError
 
 if TYPE_CHECKING:
-    import torch
     from tensordict import TensorDictBase
 
     from franka_wm.envs import FrankaConfig
@@ -138,21 +137,18 @@ def export_replay(
     known = ("state", "joint_target")
     keys = [key for key in data.keys() if key in known or str(key).startswith(("pixels", "goal_pixels"))]  # noqa: SIM118
     keys = [str(key) for key in keys if key in after.keys()]  # noqa: SIM118
-    success = None
-    if "state" in keys:
+    has_state = "state" in keys
+    if has_state:
         data = data.clone(recurse=False)
         after = after.clone(recurse=False)
         for part in (data, after):
             state = part.get("state")
             part.set("goal", state[..., 14:17] - state[..., 17:20])
+        distance = after.get("state")[..., 17:20].norm(dim=-1, keepdim=True)
+        after.set("success", distance < config.success_distance)
         data.set("next", after)
         keys.append("goal")
-
-        def success(data: TensorDictBase) -> torch.Tensor:
-            distance = data.get(("next", "state"))[..., 17:20].norm(dim=-1, keepdim=True)
-            return distance < config.success_distance
-
-    schema = schema_for(config, format=format, keys=keys, success=success is not None)
+    schema = schema_for(config, format=format, keys=keys, success=has_state)
     discrete = None
     if not data.get("action").is_floating_point():
         discrete = discrete_action_table(config.action_dim)
@@ -161,7 +157,6 @@ def export_replay(
         schema,
         seed=seed,
         episode_length=config.episode_length,
-        success=success,
         discrete=discrete,
     )
     if not episodes:

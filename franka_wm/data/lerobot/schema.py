@@ -193,10 +193,6 @@ def schema_for(
     if "goal" in keys:
         observed(GOAL, "goal", _named("goal"))
     names = _ACTION_NAMES[config.action_mode]
-    if action_dim not in (None, len(names)):
-        raise UserError(
-            f"actions have {action_dim} numbers; action_mode={config.action_mode} has {len(names)}"
-        )
     features[ACTION] = _vector(len(names), names)
     features[REWARD] = {"dtype": "float32", "shape": (1,), "names": ["reward"]}
     for flag in (DONE, TERMINATED, TRUNCATED, *([SUCCESS] if success else [])):

@@ -1,0 +1,210 @@
+"""The page that a published dataset or model shows: what it is, how it came about, how to use it."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from franka_wm.data.lerobot.provenance import read_provenance
+from franka_wm.data.lerobot.schema import OWN_FOLDER
+from franka_wm.errors import UserError
+
+PICTURE = f"{OWN_FOLDER}/picture.png"
+_CITATION = """```bibtex
+@software{franka_wm,
+  title  = {franka_wm: latent world models of a simulated Franka arm},
+  author = {franka_wm contributors},
+  year   = {2026},
+}
+```"""
+
+
+def front_matter(**values: Any) -> str:
+    """The YAML that the Hub reads."""
+    from omegaconf import OmegaConf
+
+    return f"---\n{OmegaConf.to_yaml(OmegaConf.create(values))}---\n"
+
+
+def dataset_card(root: Path, *, repo_id: str, license: str) -> str:
+    """README.md of a dataset.
+
+    Args:
+        root: The dataset.
+        repo_id: Where it goes.
+        license: Identifier, as the Hub knows them (``apache-2.0``, ``cc-by-4.0``, …).
+    """
+    info = json.loads((root / "meta" / "info.json").read_text(encoding="utf-8"))
+    provenance = read_provenance(root)
+    sessions = [] if provenance is None else provenance["sessions"]
+    task = "" if provenance is None else provenance["schema"]["task"]
+    head = front_matter(
+        license=license,
+        task_categories=["robotics"],
+        tags=["LeRobot", "franka", "simulation", "world-model"],
+        configs=[{"config_name": "default", "data_files": "data/*/*.parquet"}],
+    )
+    picture = f"\n![Frames of one episode]({PICTURE})\n" if (root / PICTURE).is_file() else ""
+    table = "\n".join(
+        f"| `{name}` | {feature['dtype']} | {tuple(feature['shape'])} | {_names(feature.get('names'))} |"
+        for name, feature in info["features"].items()
+    )
+    gathered = "\n".join(
+        f"- {one['episodes']} episodes by `{one['policy']}`, seed {one['seed']}, {one['date']}, "
+        f"franka-wm {one['versions'].get('franka-wm')}:\n\n  ```bash\n  {one['command']}\n  ```"
+        for one in sessions
+    )
+    return f"""{head}
+# {repo_id.split("/")[-1]}
+
+{info["total_episodes"]} episodes, {info["total_frames"]} steps at {info["fps"]} Hz of a simulated {info["robot_type"]}
+arm. {task} A [LeRobot](https://github.com/huggingface/lerobot) dataset (v3.0), gathered with franka_wm in NVIDIA
+Newton.
+{picture}
+## How it was gathered
+
+{gathered or "Not recorded."}
+
+Settings in full: [meta/franka_wm/provenance.json]({OWN_FOLDER}/provenance.json).
+
+## Use it
+
+```python
+from lerobot.datasets.lerobot_dataset import LeRobotDataset
+
+dataset = LeRobotDataset("{repo_id}")
+```
+
+```bash
+python train.py dataset=lerobot dataset.repo_id={repo_id}   # a world model, with franka_wm
+```
+
+## What a row holds
+
+Row t is (o_t, a_t, and what followed a_t). The observation after the last action of each episode is in
+`{OWN_FOLDER}/terminal`, found by `episode_key`.
+
+| feature | dtype | shape | names |
+|---|---|---|---|
+{table}
+
+## License
+
+{license}
+
+## Citation
+
+{_CITATION}
+"""
+
+
+def _names(names: Any) -> str:
+    if not isinstance(names, list):
+        return ""
+    return ", ".join(names) if len(names) <= 7 else f"{names[0]}, … {names[-1]} ({len(names)})"
+
+
+def make_picture(root: Path, *, frames: int = 6) -> None:
+    """Frames of the first episode, side by side, as ``meta/franka_wm/picture.png``; nothing without pictures.
+
+    Args:
+        root: The dataset.
+        frames: How many.
+    """
+    from franka_wm.data.lerobot.pictures import encode_png
+    from franka_wm.report import written_whole
+
+    info = json.loads((root / "meta" / "info.json").read_text(encoding="utf-8"))
+    kinds = {
+        name: feature["dtype"]
+        for name, feature in info["features"].items()
+        if feature["dtype"] in ("image", "video")
+    }
+    if not kinds:
+        return
+    name, kind = next(iter(kinds.items()))
+    episode = _first_episode(root, info, name, kind)
+    chosen = episode[np.linspace(0, len(episode) - 1, min(frames, len(episode))).round().astype(int)]
+    with written_whole(root / PICTURE) as path:
+        path.write_bytes(encode_png(np.concatenate(list(chosen), axis=1)))
+
+
+def _first_episode(root: Path, info: Mapping[str, Any], name: str, kind: str) -> np.ndarray:
+    """(T, H, W, 3) uint8."""
+    import pyarrow.parquet as pq
+
+    from franka_wm.data.lerobot.pictures import decode_png
+
+    data = root / info["data_path"].format(chunk_index=0, file_index=0)
+    if kind == "image":
+        group = pq.ParquetFile(data).read_row_group(0, columns=[name, "episode_index"])
+        rows = zip(group[name].to_pylist(), group["episode_index"].to_pylist(), strict=True)
+        return np.stack([decode_png(cell["bytes"]) for cell, episode in rows if episode == 0])
+    import av
+
+    length = pq.read_table(data, columns=["episode_index"])["episode_index"].to_pylist().count(0)
+    frames = []
+    with av.open(str(root / info["video_path"].format(video_key=name, chunk_index=0, file_index=0))) as video:
+        for frame in video.decode(video=0):
+            frames.append(frame.to_ndarray(format="rgb24"))
+            if len(frames) == length:
+                break
+    return np.stack(frames)
+
+
+def model_card(folder: Path, run: Path, *, repo_id: str, license: str) -> str:
+    """README.md of a trained model.
+
+    Args:
+        folder: The files that are published; has ``config.yaml`` and ``counters.json``.
+        run: The run's folder, where ``evaluation.md`` is if it was evaluated.
+        repo_id: Where it goes.
+        license: Identifier.
+    """
+    from omegaconf import DictConfig, OmegaConf
+
+    cfg = OmegaConf.load(folder / "config.yaml")
+    if not isinstance(cfg, DictConfig):
+        raise UserError(f"{folder / 'config.yaml'} is not a configuration")
+    counters = json.loads((folder / "counters.json").read_text(encoding="utf-8"))
+    evaluation = run / "evaluation.md"
+    table = evaluation.read_text(encoding="utf-8") if evaluation.is_file() else "Not evaluated."
+    head = front_matter(
+        license=license,
+        library_name="franka_wm",
+        tags=["world-model", "robotics", "franka", str(cfg.model.name)],
+    )
+    return f"""{head}
+# {repo_id.split("/")[-1]}
+
+A latent world model ({cfg.model.name}) of a simulated Franka arm, trained with franka_wm:
+{counters.get("updates", 0):,} updates, {counters.get("env_steps", 0):,} environment steps, seed {cfg.seed}.
+
+## Evaluation
+
+{table}
+
+## Use it
+
+```python
+from franka_wm.training.load import load_agent
+
+agent = load_agent("hf:{repo_id}")
+rollout = agent.env.rollout(50, agent.policies["planner"])
+```
+
+Weights are safetensors, everything else is JSON and YAML; nothing is unpickled or executed. The configuration is in
+[config.yaml](config.yaml).
+
+## License
+
+{license}
+
+## Citation
+
+{_CITATION}
+"""

@@ -1,0 +1,275 @@
+"""``franka-wm publish``: a dataset or a trained model to the Hugging Face Hub, privately unless told otherwise."""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import json
+import shutil
+import tempfile
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from franka_wm.data.lerobot.card import dataset_card, make_picture, model_card
+from franka_wm.data.lerobot.command import split
+from franka_wm.data.lerobot.hub import check_repo_id, explained
+from franka_wm.errors import UserError
+
+OPTIONS: dict[str, Any] = {
+    "root": "",
+    "checkpoint": "",
+    "repo_id": "",
+    "private": True,
+    "license": "apache-2.0",
+    "update": False,
+    "dry_run": False,
+}
+
+USAGE = """usage: franka-wm publish root=DATASET repo_id=USER/NAME [key=value …]
+       franka-wm publish checkpoint=RUN repo_id=USER/NAME [key=value …]
+
+  root=DATASET         a LeRobot dataset on disk
+  checkpoint=RUN       a run's folder, or a checkpoint in it: weights, configuration and evaluation go, no replay
+  repo_id=USER/NAME    where it goes
+  private=true         who may see it; private=false: everybody
+  license=apache-2.0   as the Hub names licenses
+  update=true          the repository exists already: replace what is in it
+  dry_run=true         (or --dry-run) show what would go, send nothing
+
+Needs a token that may write: hf auth login, or the variable HF_TOKEN."""
+
+VERSION_TAG = "v3.0"
+"""LeRobot loads the revision of this name from the Hub."""
+
+README = "README.md"
+
+
+def publish(arguments: Sequence[str]) -> int:
+    """The verb."""
+    if not arguments or arguments[0] in ("--help", "-h"):
+        print(USAGE)
+        return 0
+    options, _ = split("publish", arguments, OPTIONS)
+    if bool(options["root"]) == bool(options["checkpoint"]):
+        raise UserError("publish: give root=DATASET or checkpoint=RUN, one of them")
+    if not options["repo_id"]:
+        raise UserError("publish: give repo_id=USER/NAME")
+    shared = {key: options[key] for key in ("private", "license", "update", "dry_run")}
+    if options["root"]:
+        publish_dataset(options["root"], options["repo_id"], **shared)
+    else:
+        publish_model(options["checkpoint"], options["repo_id"], **shared)
+    return 0
+
+
+def publish_dataset(
+    root: str | Path,
+    repo_id: str,
+    *,
+    private: bool = True,
+    license: str = "apache-2.0",
+    update: bool = False,
+    dry_run: bool = False,
+) -> None:
+    """Sends a dataset with LeRobot's ``push_to_hub``, then our card, then the tag that LeRobot loads.
+
+    ``push_to_hub`` writes a card of its own over the one that is there, and tags before; so it is told not to tag,
+    the card is sent after it, and the tag is set and checked last.
+
+    Args:
+        root: A LeRobot dataset on disk. Gets a README.md and a picture.
+        repo_id: ``user/name``.
+        private: Whether only you can see it.
+        license: Of the data.
+        update: Allow a repository that exists; files in it that the dataset has not are removed.
+        dry_run: Only say what would go.
+
+    Raises:
+        UserError: One line: not a dataset, no token, the name is taken, no network.
+    """
+    from franka_wm.training.progress import announced, say
+
+    root = Path(root).absolute()
+    check_repo_id(repo_id)
+    info_path = root / "meta" / "info.json"
+    if not info_path.is_file():
+        raise UserError(f"publish: root={root} is not a LeRobot dataset (no meta/info.json)")
+    info = json.loads(info_path.read_text(encoding="utf-8"))
+    if not info["total_episodes"]:
+        raise UserError(f"publish: root={root} has no episodes")
+    if info["codebase_version"] != VERSION_TAG:
+        raise UserError(f"publish: root={root} is of version {info['codebase_version']}, not {VERSION_TAG}")
+    make_picture(root)
+    card = dataset_card(root, repo_id=repo_id, license=license)
+    (root / README).write_text(card, encoding="utf-8")
+    files = _files(root)
+    _show(files, root, repo_id, private, "dataset")
+    if dry_run:
+        say("dry run: nothing was sent")
+        return
+    api = _api(repo_id)
+    with explained(repo_id):
+        _check_name(api, repo_id, "dataset", update)
+        with announced(f"sending {len(files)} files"):
+            from lerobot.datasets.lerobot_dataset import LeRobotDataset
+
+            LeRobotDataset(repo_id, root=root).push_to_hub(
+                private=private, license=license, tag_version=False
+            )
+            _remove_stale(api, repo_id, "dataset", files)
+            api.upload_file(
+                path_or_fileobj=card.encode(),
+                path_in_repo=README,
+                repo_id=repo_id,
+                repo_type="dataset",
+                commit_message="Card of franka_wm",
+            )
+            _tag(api, repo_id)
+    say(f"published: {api.endpoint}/datasets/{repo_id} ({'private' if private else 'public'})")
+
+
+def publish_model(
+    checkpoint: str | Path,
+    repo_id: str,
+    *,
+    private: bool = True,
+    license: str = "apache-2.0",
+    update: bool = False,
+    dry_run: bool = False,
+) -> None:
+    """Sends a trained model: what ``load_agent("hf:user/name")`` needs, the evaluation, and a card.
+
+    Args:
+        checkpoint: A run's folder, or a checkpoint in it.
+        repo_id, private, license, update, dry_run: As for :func:`publish_dataset`.
+
+    Raises:
+        UserError: One line.
+    """
+    from franka_wm.training.progress import announced, say
+
+    check_repo_id(repo_id)
+    with tempfile.TemporaryDirectory() as place:
+        staged = stage_model(Path(checkpoint), Path(place), repo_id=repo_id, license=license)
+        files = _files(staged)
+        _show(files, staged, repo_id, private, "model")
+        if dry_run:
+            say("dry run: nothing was sent")
+            return
+        api = _api(repo_id)
+        with explained(repo_id):
+            _check_name(api, repo_id, "model", update)
+            with announced(f"sending {len(files)} files"):
+                api.create_repo(repo_id=repo_id, private=private, repo_type="model", exist_ok=update)
+                api.upload_folder(repo_id=repo_id, folder_path=staged, repo_type="model")
+                _remove_stale(api, repo_id, "model", files)
+        say(f"published: {api.endpoint}/{repo_id} ({'private' if private else 'public'})")
+
+
+def stage_model(checkpoint: Path, place: Path, *, repo_id: str, license: str) -> Path:
+    """A checkpoint without what only training needs: no optimiser, no replay, no random states, no local paths.
+
+    Args:
+        checkpoint: A run's folder, or a checkpoint in it.
+        place: An empty folder.
+        repo_id, license: For the card.
+
+    Returns:
+        ``place``, which is a checkpoint now.
+    """
+    from omegaconf import OmegaConf
+
+    from franka_wm.training.checkpoint import latest_checkpoint, load_checkpoint
+
+    opened = load_checkpoint(latest_checkpoint(checkpoint))
+    manifest = json.loads((opened.folder / "manifest.json").read_text(encoding="utf-8"))
+    kept = ("model.safetensors", "counters.json", "extra.json", "extra.safetensors")
+    for name in kept:
+        if name in manifest["files"]:
+            shutil.copyfile(opened.folder / name, place / name)
+    config = opened.config.copy()
+    if "resume" in config:
+        config.resume = None
+    OmegaConf.save(config, place / "config.yaml")
+    manifest["files"] = {
+        path.name: {
+            "bytes": path.stat().st_size,
+            "sha256": hashlib.sha256(path.read_bytes()).hexdigest(),
+        }
+        for path in sorted(place.iterdir())
+    }
+    (place / "manifest.json").write_text(json.dumps(manifest, indent=1), encoding="utf-8")
+    run = opened.folder.parent.parent if opened.folder.parent.name == "checkpoints" else opened.folder
+    for name in ("evaluation.json", "evaluation.md"):
+        if (run / name).is_file():
+            shutil.copyfile(run / name, place / name)
+    card = model_card(place, run, repo_id=repo_id, license=license)
+    (place / README).write_text(card, encoding="utf-8")
+    return place
+
+
+# -- the Hub -------------------------------------------------------------------------------------------------------
+
+
+def _files(root: Path) -> list[str]:
+    """What goes, relative to ``root``: everything but recorders' scratch and what is hidden."""
+    names = [path.relative_to(root).as_posix() for path in sorted(root.rglob("*")) if path.is_file()]
+    return [name for name in names if not name.startswith(("images/", ".")) and "/." not in name]
+
+
+def _show(files: Sequence[str], root: Path, repo_id: str, private: bool, kind: str) -> None:
+    from franka_wm.training.progress import count, say
+
+    size = sum((root / name).stat().st_size for name in files)
+    say(f"{kind} {repo_id} ({'private' if private else 'public'}): {len(files)} files, {count(size)}B")
+    for name in files:
+        say(f"  {name}   {count((root / name).stat().st_size)}B")
+
+
+def _api(repo_id: str) -> Any:
+    """The Hub's client; the token is its own business."""
+    from huggingface_hub import HfApi, constants, get_token
+
+    if constants.HF_HUB_OFFLINE:
+        raise UserError(f"publish: HF_HUB_OFFLINE is set, so nothing can be sent to {repo_id}; unset it")
+    if not get_token():
+        raise UserError("publish: no token for the Hub; log in with: hf auth login (or set HF_TOKEN)")
+    return HfApi()
+
+
+def _check_name(api: Any, repo_id: str, kind: str, update: bool) -> None:
+    if not update and api.repo_exists(repo_id=repo_id, repo_type=kind):
+        raise UserError(
+            f"publish: {repo_id} exists already; choose another repo_id, or replace what is there with update=true"
+        )
+
+
+def _remove_stale(api: Any, repo_id: str, kind: str, files: Sequence[str]) -> None:
+    """What an earlier version left there: readers would take it for part of this one."""
+    there = api.list_repo_files(repo_id=repo_id, repo_type=kind)
+    stale = [name for name in there if name not in {*files, README, ".gitattributes"}]
+    if stale:
+        api.delete_files(
+            repo_id=repo_id,
+            delete_patterns=stale,
+            repo_type=kind,
+            commit_message="Remove an earlier version's files",
+        )
+
+
+def _tag(api: Any, repo_id: str) -> None:
+    """Moves the tag to the newest commit, and checks that it is there."""
+    from huggingface_hub.errors import RevisionNotFoundError
+
+    with contextlib.suppress(RevisionNotFoundError):  # a new repository has none
+        api.delete_tag(repo_id, tag=VERSION_TAG, repo_type="dataset")
+    api.create_tag(repo_id, tag=VERSION_TAG, repo_type="dataset")
+    refs = api.list_repo_refs(repo_id=repo_id, repo_type="dataset")
+    tagged = {ref.name: ref.target_commit for ref in refs.tags}.get(VERSION_TAG)
+    newest = {ref.name: ref.target_commit for ref in refs.branches}.get("main")
+    if tagged is None or tagged != newest:
+        raise UserError(
+            f"publish: the tag {VERSION_TAG} of {repo_id} is not at its newest version, so LeRobot would not load "
+            "it; run the same command again with update=true"
+        )
