@@ -1,5 +1,6 @@
 """Bars with intervals: success rates, probes, what breaks under which change."""
 
+import math
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
@@ -11,7 +12,7 @@ from franka_wm.report.style import INK, LIGHT, PAPER, Theme
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-type Bar = float | Mapping[str, Any]
+type Bar = float | Mapping[str, Any] | None
 """A number, or an interval ``{"mean", "low", "high"}``."""
 
 
@@ -28,7 +29,8 @@ def bars_figure(
     """Lying bars in groups, with a whisker from low to high: names stay readable however long they are.
 
     Args:
-        values: group (from top to bottom) -> series -> number or interval. Missing series leave a gap.
+        values: group (from top to bottom) -> series -> number or interval. What is missing, None or not finite
+            leaves a gap.
         label: of the horizontal axis.
         scale: what all values are multiplied with, such as 100 for percent.
         limits: of the horizontal axis, after scaling.
@@ -39,6 +41,9 @@ def bars_figure(
     """
     from matplotlib.patheffects import withStroke
 
+    values = {
+        name: {series: bar for series, bar in group.items() if _known(bar)} for name, group in values.items()
+    }
     series = list(dict.fromkeys(name for group in values.values() for name in group))
     if not series:
         raise UserError("no bar to draw; give at least one group with one value.")
@@ -95,7 +100,13 @@ def bars_figure(
     return figure
 
 
-def _ends(bar: Bar, scale: float) -> tuple[float, float, float]:
+def _known(bar: Bar) -> bool:
+    """Whether there is something to draw."""
+    parts = bar.values() if isinstance(bar, Mapping) else [bar]
+    return all(isinstance(part, (int, float)) and math.isfinite(part) for part in parts)
+
+
+def _ends(bar: Any, scale: float) -> tuple[float, float, float]:
     """Mean, low and high; a number is its own interval."""
     if isinstance(bar, Mapping):
         mean = float(bar["mean"])

@@ -21,7 +21,7 @@ from franka_wm.report.document import (
     write_document,
 )
 from franka_wm.report.horizon import horizon_figure
-from franka_wm.report.page import split_arguments
+from franka_wm.report.page import split_arguments, wants_help
 from franka_wm.report.run import RunFiles, read_run
 from franka_wm.report.sections import SHOWN
 from franka_wm.report.spectra import spectrum_figure
@@ -125,7 +125,10 @@ def repetitions(runs: Mapping[str, RunFiles]) -> dict[str, dict[str, RunFiles]]:
 
 def compare(arguments: list[str]) -> None:
     """``franka-wm compare RUN RUN … [out=compare.html]``: writes a page that shows runs side by side."""
-    folders, options = split_arguments(arguments, {"out"}, "compare RUN RUN … [out=compare.html]")
+    usage = "compare RUN RUN … [out=compare.html]"
+    if wants_help(arguments, usage):
+        return
+    folders, options = split_arguments(arguments, {"out"}, usage)
     text = compare_page([read_run(folder) for folder in folders])
     print(write_document(text, Path(options.get("out", FILE))))
 

@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 # name -> {"mean": (H,), "low": (H,), "high": (H,)}; the last two may be missing.
-type HorizonCurves = Mapping[str, Mapping[str, Sequence[float]]]
+type HorizonCurves = Mapping[str, Mapping[str, Sequence[float | None]]]
 
 NO_CHANGE = ("no_change", "no change", "copy")
 """Names of the baseline that predicts that nothing changes; drawn grey and dashed."""
@@ -30,7 +30,7 @@ def horizon_figure(
     """Error against steps ahead, with intervals.
 
     Args:
-        curves: by name; `mean` (H,) and, for a band, `low` and `high` (H,).
+        curves: by name; `mean` (H,) and, for a band, `low` and `high` (H,). None and what is not finite leave a gap.
         steps: (H,) steps ahead; 1 … H if None.
         unit: label of the vertical axis, which starts at zero.
 
@@ -55,7 +55,7 @@ def horizon_figure(
         drawn = theme.colour(colour)
         axes.plot(
             places,
-            [y if math.isfinite(y) else math.nan for y in curve["mean"]],
+            _numbers(curve["mean"]),
             color=drawn,
             linestyle="--" if baseline else "-",
             linewidth=1.8,
@@ -64,7 +64,13 @@ def horizon_figure(
             label=name.replace("_", " "),
         )
         if "low" in curve and "high" in curve:
-            axes.fill_between(places, curve["low"], curve["high"], color=drawn, alpha=0.2, linewidth=0)
+            axes.fill_between(
+                places, _numbers(curve["low"]), _numbers(curve["high"]), color=drawn, alpha=0.2, linewidth=0
+            )
     finish_axes(axes, x="steps ahead", y=unit, title=title, theme=theme)
     axes.set_ylim(bottom=0)
     return figure
+
+
+def _numbers(values: Sequence[float | None]) -> list[float]:
+    return [math.nan if y is None or not math.isfinite(y) else float(y) for y in values]

@@ -48,10 +48,21 @@ def write_page(folder: str | Path, out: str | Path | None = None) -> Path:
 
 def report(arguments: list[str]) -> None:
     """``franka-wm report RUN [out=…]``: writes the page of a run."""
-    folders, options = split_arguments(arguments, {"out"}, "report RUN [out=PAGE.html]")
+    usage = "report RUN [out=PAGE.html]"
+    if wants_help(arguments, usage):
+        return
+    folders, options = split_arguments(arguments, {"out"}, usage)
     if len(folders) != 1:
         raise UserError(f"report needs one folder of a run, got {len(folders)}: franka-wm report outputs/RUN")
     print(write_page(folders[0], options.get("out")))
+
+
+def wants_help(arguments: list[str], usage: str) -> bool:
+    """Prints the usage if that is what is asked for."""
+    asked = any(argument in ("--help", "-h") for argument in arguments)
+    if asked:
+        print(f"usage: franka-wm {usage}")
+    return asked
 
 
 def split_arguments(arguments: list[str], options: set[str], usage: str) -> tuple[list[str], dict[str, str]]:
@@ -60,9 +71,6 @@ def split_arguments(arguments: list[str], options: set[str], usage: str) -> tupl
     Raises:
         UserError: an option that does not exist.
     """
-    if any(argument in ("--help", "-h") for argument in arguments):
-        print(f"usage: franka-wm {usage}")
-        raise SystemExit(0)
     folders, given = [], {}
     for argument in arguments:
         name, equals, value = argument.partition("=")

@@ -6,6 +6,8 @@
     evaluation.json         results; see below
     checkpoints/…           counters and the logged rows; without a checkpoint, rows come from ``csv/``
     video.mp4, last_frame.png, imagined.mp4, imagined.png, masks.png    pictures
+    evaluation/             what ``franka-wm evaluate`` wrote: evaluation.json, timing.json and pictures; they stand
+                            for those above, which training wrote, since they rest on more episodes
 
 ``evaluation.json`` is an object whose entries are policies (``planner``, ``noop``, …), or one with those under
 ``policies``. A policy holds numbers and intervals (``{"mean", "low", "high"}``). Beside the policies there may be
@@ -20,7 +22,9 @@
     health        {name: number}, and "warnings": [text]
     protocol      {name: text or number}: how it was evaluated
 
-All of them are optional; `franka_wm.report.page` shows what there is.
+``timing.json`` holds {policy: {"seconds_per_decision", "worlds"}}.
+
+A number that is not known is null. All of them are optional; `franka_wm.report.page` shows what there is.
 """
 
 import json
@@ -65,6 +69,7 @@ class RunFiles:
         rows: logged while training.
         counters: of the checkpoint: ``updates``, ``env_steps``, ``seconds``.
         pictures: name -> path, of `PICTURES`.
+        timing: policy -> ``seconds_per_decision``, ``worlds``.
     """
 
     folder: Path
@@ -76,6 +81,7 @@ class RunFiles:
     rows: list[dict[str, float]] = field(default_factory=list)
     counters: Mapping[str, float] = field(default_factory=dict)
     pictures: Mapping[str, Path] = field(default_factory=dict)
+    timing: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
 
     @property
     def name(self) -> str:
@@ -115,7 +121,11 @@ def read_run(folder: str | Path) -> RunFiles:
     if not run.is_dir():
         raise UserError(f"{run} is not a folder; give the folder of a run, as train.py prints it last.")
     config = _yaml(run / "config.yaml")
-    evaluation = _json(run / "evaluation.json")
+    # The command's own evaluation first; then what the end of training found.
+    places = [place for place in (run / "evaluation", run) if place.is_dir()]
+    source = next((p / "evaluation.json" for p in places if (p / "evaluation.json").is_file()), None)
+    evaluation = None if source is None else _json(source)
+    timing = next((found for place in places if (found := _json(place / "timing.json"))), {})
     if config is None and evaluation is None:
         raise UserError(
             f"{run} holds neither config.yaml nor evaluation.json; give the folder of a run, "
@@ -123,7 +133,7 @@ def read_run(folder: str | Path) -> RunFiles:
         )
     rows, counters, version = _history(run)
     versions = _json(run / "versions.json") or ({"franka_wm": version} if version else {})
-    policies, extras = split_evaluation(evaluation or {}, source=run / "evaluation.json")
+    policies, extras = split_evaluation(evaluation or {}, source=source or run)
     return RunFiles(
         folder=run.resolve(),
         config=config or {},
@@ -133,7 +143,8 @@ def read_run(folder: str | Path) -> RunFiles:
         extras=extras,
         rows=rows,
         counters=counters,
-        pictures={name: run / name for name in PICTURES if (run / name).is_file()},
+        pictures={name: p / name for p in reversed(places) for name in PICTURES if (p / name).is_file()},
+        timing=timing,
     )
 
 

@@ -30,7 +30,7 @@ from franka_wm.report.document import (
 from franka_wm.report.horizon import horizon_figure
 from franka_wm.report.run import RunFiles
 from franka_wm.report.spectra import latent_figure, spectrum_figure
-from franka_wm.report.table import evaluation_tables, html, is_interval, nested_table
+from franka_wm.report.table import Table, evaluation_tables, html, is_interval, nested_table
 
 SHOWN = ("planner", "policy")
 """Whose results stand at the top of the page, the first that there is."""
@@ -122,6 +122,13 @@ def result(run: RunFiles) -> str:
     tables = scrolling(html(outcome)) + cards(*pictures)
     if motion.rows:
         tables += "<h3>On the way</h3>" + scrolling(html(motion))
+    if run.timing:
+        rows = [
+            [style.policy_name(name), f"{1000 * one['seconds_per_decision']:.2f}", f"{one['worlds']:g}"]
+            for name, one in run.timing.items()
+        ]
+        header = ["policy", "one decision for all worlds [ms]", "worlds"]
+        tables += folded("Time per decision", scrolling(html(Table(header, rows))))
     return tables + described
 
 
@@ -336,9 +343,8 @@ def reproduce(run: RunFiles) -> str:
         lines += ["# train it again", f"python train.py {shlex.join(run.overrides)}", ""]
     if run.counters and "evaluate" in VERBS:
         lines += [
-            "# evaluate it again, on more episodes, under changes",
-            f"franka-wm evaluate checkpoint={place} out={place}",
-            f"franka-wm evaluate checkpoint={place} out={place} robustness=true",
+            "# evaluate it, also in shifted worlds",
+            f"franka-wm evaluate checkpoint={place}{_episodes(run)} robustness=true",
             "",
         ]
     if run.counters and "view" in VERBS:
@@ -355,7 +361,7 @@ def reproduce(run: RunFiles) -> str:
 def _outcome(values: Mapping[str, Any], who: str) -> list[tuple[str, str, str]]:
     out = []
     distance = values.get("final_distance") or {}
-    if is_interval(distance):
+    if is_interval(distance) and None not in distance.values():
         mean, low, high = (f"{100 * distance[k]:.2g}" for k in ("mean", "low", "high"))
         out.append(("final distance", f"{mean} cm", f"{low} – {high}, {who}"))
     rates = _success({who: values}).get(who, {})
@@ -409,8 +415,8 @@ def _plain(value: Any) -> str:
     return "–" if value is None else str(value)
 
 
-def _number(value: float) -> str:
-    return f"{value:.4g}" if math.isfinite(value) else "not finite"
+def _number(value: float | None) -> str:
+    return f"{value:.4g}" if value is not None and math.isfinite(value) else "not finite"
 
 
 def _range(values: list[float]) -> str:
@@ -421,7 +427,7 @@ def _range(values: list[float]) -> str:
 def _least(groups: Mapping[str, Mapping[str, Any]]) -> float:
     """The lowest value, but not below −1: one probe far off would squeeze all others."""
     low = min(
-        float(v["mean"]) if isinstance(v, Mapping) else float(v)
+        float((v["mean"] if isinstance(v, Mapping) else v) or 0)
         for group in groups.values()
         for v in group.values()
     )
@@ -439,6 +445,12 @@ def _duration(seconds: float) -> str:
     if seconds < 90:
         return f"{seconds:.0f} s"
     return f"{seconds / 60:.0f} min" if seconds < 5400 else f"{seconds / 3600:.1f} h"
+
+
+def _episodes(run: RunFiles) -> str:
+    """As many as it was evaluated over by the command, if it was."""
+    episodes = (run.extras.get("protocol") or {}).get("episodes")
+    return f" episodes={episodes}" if isinstance(episodes, int) else ""
 
 
 def _near(folder: Path) -> Path:
