@@ -16,6 +16,11 @@ _FAMILIES: dict[str, tuple[str, str, str]] = {
         "TDMPC2",
         "TD-MPC2: latent dynamics, reward, value and policy, no decoder",
     ),
+    "muzero": (
+        "franka_wm.models.muzero",
+        "MuZero",
+        "MuZero: a latent model for tree search over a few discrete moves",
+    ),
 }
 _REGISTERED: dict[str, tuple[type, str]] = {}
 

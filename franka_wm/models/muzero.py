@@ -1,0 +1,425 @@
+"""MuZero: a latent model for tree search (Schrittwieser et al., Nature 2020, arXiv:1911.08265)."""
+
+from collections.abc import Mapping
+from typing import Any
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+from franka_wm.models.groups import decay_groups
+from franka_wm.models.parts import NormedLinear, SimNorm, TwoHotSymlog, initialize, mlp
+from franka_wm.models.pixel_encoder import PixelEncoder
+from franka_wm.models.vision import RandomShift, check_image_sizes, check_pictures
+
+
+class MuZero(nn.Module):
+    """Representation, dynamics and prediction, trained by what a search found and what then happened.
+
+    z = h(s);  z', r = g(z, a);  logits, v = f(z). Actions are one of M moves. Latents (..., `latent_dim`) are
+    simplices of `simnorm_dim` features, from h and g alike. Rewards and values are in the units of the
+    environment's reward.
+
+    The loss unrolls g for `unroll` moves from one observation of a window and compares each step with the
+    reward received, the n-step return (see `value_targets`), the policy that the search arrived at, and the
+    latent of the observation that came (EfficientZero's consistency, Ye et al., arXiv:2111.00210). The first
+    step weighs 1, each later one 1 / `unroll`, and the gradient into z is halved at each use of g.
+
+    Half of the unrolls start at the first step of their window, the others anywhere in it. Past the end of an
+    episode that terminated, moves are random, rewards and values 0: so the search learns that nothing is
+    earned there, and no state is left untrained because it is near the end. Past any other end nothing is
+    learned.
+
+    Deliberate differences from the papers:
+      * Small networks with LayerNorm, and SimNorm in place of min-max scaling, as in TD-MPC2
+        (arXiv:2310.16828); rewards and values as two-hot symlog.
+      * Raw physical observations can be standardised at the encoder's input, see
+        `set_observation_statistics`; the default is the identity.
+
+    Args:
+        observation_sizes: observation key -> size of its last dimension; encoded in this order. May be empty
+            where there are pictures.
+        image_sizes: picture key -> (height, width, channels), uint8; shifted at random in `loss`.
+        num_actions: M.
+        episode_length: T, steps of an episode, from which the discount follows if it is not given:
+            clamp((T/5 - 1) / (T/5), 0.95, 0.995).
+        discount: per step, in [0, 1]; without `episode_length` 0.997, as published.
+        latent_dim: size of z.
+        simnorm_dim: features per simplex; divides `latent_dim`.
+        encoder_dim: width of the encoder's hidden layers.
+        encoder_layers: layers of the encoder, its output layer included.
+        hidden_dim: width of the two hidden layers of g and of f.
+        projector_dim: width of the consistency loss's projector; its predictor is half as wide inside.
+        channels: of each convolution over pictures.
+        random_shift: pixels by which pictures are shifted at most, in each direction.
+        unroll: moves, K.
+        n_step: rewards in a value target before the stored value of the search takes over.
+        bins, value_low, value_high: two-hot code of rewards and values; the range is in symlog space.
+        reward_coef, value_coef, policy_coef, consistency_coef: weights of the losses.
+        weight_decay: of the matrices.
+
+    Raises:
+        ValueError: a size or coefficient that cannot work.
+    """
+
+    discrete = True
+    replay_keys = ("search_policy", "search_value")
+    observation_mean: Tensor
+    observation_std: Tensor
+    moves: Tensor
+
+    def __init__(
+        self,
+        *,
+        observation_sizes: Mapping[str, int] | None = None,
+        image_sizes: Mapping[str, tuple[int, int, int]] | None = None,
+        num_actions: int,
+        episode_length: int | None = None,
+        discount: float | None = None,
+        latent_dim: int = 256,
+        simnorm_dim: int = 8,
+        encoder_dim: int = 256,
+        encoder_layers: int = 2,
+        hidden_dim: int = 256,
+        projector_dim: int = 256,
+        channels: int = 32,
+        random_shift: int = 3,
+        unroll: int = 5,
+        n_step: int = 5,
+        bins: int = 101,
+        value_low: float = -10.0,
+        value_high: float = 10.0,
+        reward_coef: float = 1.0,
+        value_coef: float = 0.25,
+        policy_coef: float = 1.0,
+        consistency_coef: float = 2.0,
+        weight_decay: float = 1e-4,
+    ) -> None:
+        super().__init__()
+        sizes = {str(key): int(size) for key, size in (observation_sizes or {}).items()}
+        self.image_sizes = check_image_sizes(image_sizes or {})
+        if (not sizes and not self.image_sizes) or min(sizes.values(), default=1) < 1:
+            raise ValueError(
+                f"observation_sizes or image_sizes needs at least one key, each of size 1 or more, got {sizes}"
+            )
+        for name, count, least in (
+            ("num_actions", num_actions, 1),
+            ("encoder_layers", encoder_layers, 1),
+            ("projector_dim", projector_dim, 2),
+            ("unroll", unroll, 1),
+            ("n_step", n_step, 1),
+        ):
+            if count < least:
+                raise ValueError(f"{name} must be at least {least}, got {count}")
+        if simnorm_dim < 1 or latent_dim % simnorm_dim:
+            raise ValueError(f"simnorm_dim must divide latent_dim, got {simnorm_dim} and {latent_dim}")
+        self.observation_sizes, self.observation_keys = sizes, [*sizes, *self.image_sizes]
+        self.num_actions, self.latent_dim = num_actions, latent_dim
+        self.discount = _discount(discount, episode_length)
+        self.unroll, self.n_step, self.weight_decay = unroll, n_step, weight_decay
+        self.reward_coef, self.value_coef = reward_coef, value_coef
+        self.policy_coef, self.consistency_coef = policy_coef, consistency_coef
+
+        observation_dim = sum(sizes.values())
+        if self.image_sizes:
+            self.encoder: nn.Module = PixelEncoder(
+                image_sizes=self.image_sizes,
+                observation_dim=observation_dim,
+                hidden=(encoder_dim,) * max(1, encoder_layers - 1),
+                latent_dim=latent_dim,
+                simnorm_dim=simnorm_dim,
+                channels=channels,
+            )
+        else:
+            hidden = (encoder_dim,) * (encoder_layers - 1)
+            self.encoder = mlp(observation_dim, hidden, latent_dim, output=SimNorm(simnorm_dim))
+        self.random_shift = RandomShift(random_shift)
+        # g and f each have one body and two heads: a search calls them once per simulation.
+        self.dynamics_body = _body(latent_dim + num_actions, hidden_dim)
+        self.dynamics_head = mlp(hidden_dim, (), latent_dim, output=SimNorm(simnorm_dim))
+        self.reward_head = nn.Linear(hidden_dim, bins)
+        self.prediction_body = _body(latent_dim, hidden_dim)
+        self.policy_head = nn.Linear(hidden_dim, num_actions)
+        self.value_head = nn.Linear(hidden_dim, bins)
+        for head in (self.reward_head, self.policy_head, self.value_head):
+            nn.init.zeros_(head.weight)  # first predictions: exactly 0, and all moves alike
+            nn.init.zeros_(head.bias)
+        self.projector = mlp(latent_dim, (projector_dim,), projector_dim)
+        self.predictor = mlp(projector_dim, (projector_dim // 2,), projector_dim)
+        self.two_hot = TwoHotSymlog(bins, value_low, value_high)
+        self.register_buffer("moves", torch.arange(num_actions), persistent=False)
+        self.register_buffer("observation_mean", torch.zeros(observation_dim))
+        self.register_buffer("observation_std", torch.ones(observation_dim))
+
+    @property
+    def window(self) -> int:
+        """Transitions of a window for which every unroll from its first step has full value targets."""
+        return self.unroll + self.n_step
+
+    # ------------------------------------------------------------------ what a search and a policy use
+
+    @torch.no_grad()
+    def set_observation_statistics(self, mean: Tensor, std: Tensor) -> None:
+        """Standardise vectors at the encoder's input from now on: (s - mean) / std.
+
+        Saved with the weights and never trained. A feature of zero standard deviation is centred only.
+
+        Args:
+            mean, std: (sum of `observation_sizes`), in the order of `observation_sizes`.
+
+        Raises:
+            ValueError: a wrong shape, a value that is not finite, or a negative standard deviation.
+        """
+        for name, value in (("mean", mean), ("std", std)):
+            if value.shape != self.observation_mean.shape:
+                expected = tuple(self.observation_mean.shape)
+                raise ValueError(f"{name} must have shape {expected}, got {tuple(value.shape)}")
+            if not bool(torch.isfinite(value).all()):
+                raise ValueError(f"{name} of the observations must be finite")
+        if bool((std < 0).any()):
+            raise ValueError("std of the observations must not be negative")
+        # In place, so that a captured CUDA graph sees the new values.
+        self.observation_mean.copy_(mean)
+        self.observation_std.copy_(torch.where(std > 1e-6, std, torch.ones_like(std)))
+
+    def encode(self, observation: TensorDictBase) -> Tensor:
+        """Observations with keys `observation_sizes`, each (..., size), and `image_sizes`, each
+        (..., height, width, C) uint8 -> latents (..., latent_dim)."""
+        return self._encode({key: observation.get(key) for key in self.observation_keys})
+
+    def next(self, z: Tensor, action: Tensor) -> Tensor:
+        """Latents (..., latent_dim) and moves (...) int64 -> next latents (..., latent_dim)."""
+        return self.dynamics_head(self._body(z, action))
+
+    def reward(self, z: Tensor, action: Tensor) -> Tensor:
+        """Expected reward (..., 1) of a move (...) int64 in z (..., latent_dim)."""
+        return self.two_hot.decode(self.reward_head(self._body(z, action)))
+
+    def value(self, z: Tensor) -> Tensor:
+        """Expected discounted return (..., 1) from z (..., latent_dim)."""
+        return self.two_hot.decode(self.value_head(self.prediction_body(z)))
+
+    def policy(self, z: Tensor, deterministic: bool = False) -> Tensor:
+        """Moves (...) int64 for z (..., latent_dim), without search: a sample, or the likeliest."""
+        logits = self.policy_head(self.prediction_body(z))
+        if not deterministic:
+            # The largest of logits + Gumbel noise is a draw from their softmax.
+            draw = torch.empty_like(logits).exponential_().clamp_min(torch.finfo(logits.dtype).tiny)
+            logits = logits - draw.log()
+        return logits.argmax(-1)
+
+    def prediction(self, z: Tensor) -> tuple[Tensor, Tensor]:
+        """z (..., latent_dim) -> logits (..., M) and value (..., 1)."""
+        body = self.prediction_body(z)
+        return self.policy_head(body), self.two_hot.decode(self.value_head(body))
+
+    def recurrent(self, z: Tensor, action: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+        """One step of a search: z (..., latent_dim), move (...) -> next z, reward (..., 1), discount (..., 1),
+        and the next z's logits (..., M) and value (..., 1)."""
+        body = self._body(z, action)
+        after, reward = self.dynamics_head(body), self.two_hot.decode(self.reward_head(body))
+        return after, reward, torch.full_like(reward, self.discount), *self.prediction(after)
+
+    # ------------------------------------------------------------------ training
+
+    def forward(self, batch: TensorDictBase) -> TensorDict:
+        """Same as `loss`, for wrappers that call the module."""
+        return self.loss(batch)
+
+    def loss(self, batch: TensorDictBase) -> TensorDict:
+        """Losses of a batch of windows; call `backward` once on the entry `loss`.
+
+        Args:
+            batch: batch size [B, H], H ≥ `unroll`: H contiguous transitions, all of one episode, with the
+                observation keys, `action` (B, H) int64, `search_policy` (B, H, M), `search_value` (B, H, 1),
+                and in `next` the observation keys, `reward` (B, H, 1) and `terminated` (B, H, 1) bool, which
+                only the last may be. An entry `weight` (B, H) or (B, H, 1), if there, weighs the windows by its
+                first step. With H < `window`, value targets are shorter.
+
+        Returns:
+            batch size []: `loss` to differentiate, and detached: `loss_reward`, `loss_value`, `loss_policy`,
+            `loss_consistency`, `value_mean`, `value_target_mean`, `policy_entropy` [nat], `search_entropy`
+            [nat], `reward_error` (mean absolute), `latent_norm`.
+
+        Raises:
+            ValueError: another batch size, windows shorter than `unroll`, or no entries of a search.
+        """
+        if len(batch.batch_size) != 2:
+            raise ValueError(f"a batch of windows has batch size [B, H], got {list(batch.batch_size)}")
+        count, length = batch.batch_size
+        if length < self.unroll:
+            raise ValueError(
+                f"windows have {length} transitions, unroll={self.unroll} needs as many; use "
+                f"replay.window={self.window}"
+            )
+        lacking = [key for key in self.replay_keys if batch.get(key, None) is None]
+        if lacking:
+            raise ValueError(
+                f"the batch has no {', '.join(lacking)}: MuZero learns from episodes that a search acted in"
+            )
+        action, reward, terminated = (
+            batch.get(key) for key in ("action", ("next", "reward"), ("next", "terminated"))
+        )
+        returns = self.value_targets(reward, terminated, batch.get("search_value"))
+        row = torch.arange(count, device=action.device).unsqueeze(-1)
+        step = self._starts(count, length, action.device) + torch.arange(
+            self.unroll + 1, device=action.device
+        )  # (B, K+1)
+        inside, held = step < length, step.clamp_max(length - 1)
+
+        def at(values: Tensor, steps: int) -> Tensor:
+            """Entries of windows (B, H, ...) at the first `steps` of the unroll, 0 past the window's end."""
+            picked = values[row, held[:, :steps]]
+            return torch.where(inside[:, :steps, None], picked, torch.zeros_like(picked))
+
+        moves = torch.where(
+            inside[:, :-1],
+            action[row, held[:, :-1]],
+            torch.randint(self.num_actions, (count, self.unroll), device=action.device),
+        )
+        observations = self._at(batch, row, step.clamp_max(length))
+        latents = [self._encode({key: value[:, 0] for key, value in observations.items()})]
+        with torch.no_grad():
+            came = self._encode({key: value[:, 1:] for key, value in observations.items()})
+        reward_logits = []
+        z = latents[0]
+        for k in range(self.unroll):
+            body = self._body(z, moves[:, k])
+            reward_logits.append(self.reward_head(body))
+            latents.append(self.dynamics_head(body))
+            z = 0.5 * latents[-1] + 0.5 * latents[-1].detach()  # half the gradient
+        reward_logits, predicted = torch.stack(reward_logits, 1), torch.stack(latents, 1)
+        body = self.prediction_body(predicted)
+        policy_logits, value_logits = self.policy_head(body).log_softmax(-1), self.value_head(body)
+
+        over = terminated[:, -1]  # (B, 1)
+        known = (inside | over).unsqueeze(-1)
+        scale = torch.full((self.unroll + 1, 1), 1.0 / self.unroll, device=z.device, dtype=z.dtype)
+        scale[0] = 1.0
+        weight = batch.get("weight", None)
+        weight = 1.0 if weight is None else weight.reshape(count, length, 1)[:, :1]
+
+        def total(values: Tensor, mask: Tensor, scale: Tensor) -> Tensor:
+            """Mean over windows of the sum over the steps (B, steps, 1) that count."""
+            return (weight * scale * torch.where(mask, values, torch.zeros_like(values))).sum(1).mean()
+
+        reward_target, value_target = at(reward, self.unroll), at(returns, self.unroll + 1)
+        policy_target = at(batch.get("search_policy"), self.unroll + 1)
+        reward_loss = total(self.two_hot.loss(reward_logits, reward_target), known[:, :-1], scale[1:])
+        value_loss = total(self.two_hot.loss(value_logits, value_target), known, scale)
+        policy_loss = total(
+            -(policy_target * policy_logits).sum(-1, keepdim=True), inside.unsqueeze(-1), scale
+        )
+        seen = (step[:, 1:] <= length).unsqueeze(-1)
+        consistency_loss = total(self._consistency(predicted[:, 1:], came), seen, scale[1:])
+        loss = (
+            self.reward_coef * reward_loss
+            + self.value_coef * value_loss
+            + self.policy_coef * policy_loss
+            + self.consistency_coef * consistency_loss
+        )
+        with torch.no_grad():
+            root = policy_logits[:, 0]
+            wanted = policy_target[:, 0]
+            error = (self.two_hot.decode(reward_logits) - reward_target).abs()
+            metrics = {
+                "loss_reward": reward_loss.detach(),
+                "loss_value": value_loss.detach(),
+                "loss_policy": policy_loss.detach(),
+                "loss_consistency": consistency_loss.detach(),
+                "value_mean": self.two_hot.decode(value_logits[:, 0]).mean(),
+                "value_target_mean": value_target[:, 0].mean(),
+                "policy_entropy": -(root.exp() * root).sum(-1).mean(),
+                "search_entropy": -torch.xlogy(wanted, wanted).sum(-1).mean(),
+                "reward_error": (error * known[:, :-1]).sum() / known[:, :-1].sum(),
+                "latent_norm": predicted[:, 0].norm(dim=-1).mean(),
+            }
+        return TensorDict({"loss": loss, **metrics}, batch_size=[])
+
+    def value_targets(self, reward: Tensor, terminated: Tensor, search_value: Tensor) -> Tensor:
+        """n-step returns of the H steps of windows, each within its window.
+
+        Step t sums `n_step` discounted rewards and adds the discounted `search_value` of the step that
+        follows. Near the end of a window that ends with the episode terminated, what is left of the rewards is
+        all. Near any other end, the last step of the window lends its search value, however near.
+
+        Args:
+            reward, search_value: (B, H, 1).
+            terminated: (B, H, 1) bool; only the last may be True.
+
+        Returns:
+            (B, H, 1).
+        """
+        length, n = reward.shape[1], self.n_step
+        over = terminated[:, -1:]  # (B, 1, 1)
+        to_end = [torch.where(over, reward[:, -1:], search_value[:, -1:])]
+        for t in range(length - 2, -1, -1):
+            to_end.append(reward[:, t : t + 1] + self.discount * to_end[-1])
+        if length <= n:
+            return torch.cat(to_end[::-1], dim=1)
+        full = self.discount**n * search_value[:, n:]
+        for k in range(n):
+            full = full + self.discount**k * reward[:, k : k + length - n]
+        return torch.cat((full, *to_end[n - 1 :: -1]), dim=1)
+
+    def parameter_groups(self, lr: float) -> list[dict[str, Any]]:
+        """Parameter groups for AdamW: matrices with weight decay, the rest without; one gradient norm."""
+        return decay_groups(self.parameters(), lr, weight_decay=self.weight_decay)
+
+    def after_update(self) -> None:
+        """Nothing: MuZero has no slow copies; its targets come from the searches that were stored."""
+
+    # ------------------------------------------------------------------ pieces
+
+    def _body(self, z: Tensor, action: Tensor) -> Tensor:
+        chosen = (action.unsqueeze(-1) == self.moves).to(z.dtype)  # one-hot, without a check on the host
+        return self.dynamics_body(torch.cat((z, chosen), dim=-1))
+
+    def _encode(self, observation: Mapping[str, Tensor]) -> Tensor:
+        pictures = {key: check_pictures(observation[key]) for key in self.image_sizes}
+        vectors = None
+        if self.observation_sizes:
+            x = torch.cat([observation[key] for key in self.observation_sizes], dim=-1)
+            vectors = (x.to(self.observation_mean.dtype) - self.observation_mean) / self.observation_std
+        return self.encoder(pictures, vectors) if pictures else self.encoder(vectors)
+
+    def _starts(self, count: int, length: int, device: torch.device) -> Tensor:
+        """Where unrolls begin (B, 1): half at 0, half anywhere in the window."""
+        anywhere = torch.randint(length, (count, 1), device=device)
+        return anywhere * torch.randint(2, (count, 1), device=device)
+
+    def _at(self, batch: TensorDictBase, row: Tensor, step: Tensor) -> dict[str, Tensor]:
+        """Observations (B, K+1, ...) at the steps (B, K+1) of the H + 1 of each window."""
+        last, found = batch.get("next")[:, -1:], {}
+        for key in self.observation_keys:
+            found[key] = torch.cat((batch.get(key), last.get(key)), dim=1)[row, step]
+            if key in self.image_sizes:
+                found[key] = self.random_shift(check_pictures(found[key]))
+        return found
+
+    def _consistency(self, predicted: Tensor, came: Tensor) -> Tensor:
+        """1 - cosine (..., 1) of projections; no gradient through those of the latents that came (SimSiam)."""
+        with torch.no_grad():
+            target = self.projector(came)
+        online = self.predictor(self.projector(predicted))
+        return 1.0 - F.cosine_similarity(online, target, dim=-1, eps=1e-6).unsqueeze(-1)
+
+
+def _body(in_features: int, hidden: int) -> nn.Sequential:
+    body = nn.Sequential(NormedLinear(in_features, hidden), NormedLinear(hidden, hidden))
+    initialize(body)
+    return body
+
+
+def _discount(discount: float | None, episode_length: int | None) -> float:
+    if discount is not None:
+        if not 0.0 <= discount <= 1.0:
+            raise ValueError(f"discount must be in [0, 1], got {discount}")
+        return float(discount)
+    if episode_length is None:
+        return 0.997
+    if episode_length < 1:
+        raise ValueError(f"episode_length must be at least 1, got {episode_length}")
+    fifth = episode_length / 5.0
+    return min(max((fifth - 1.0) / fifth, 0.95), 0.995)

@@ -1,0 +1,427 @@
+# pyright: reportIndexIssue=false, reportArgumentType=false, reportAttributeAccessIssue=false, reportCallIssue=false, reportOptionalMemberAccess=false
+
+import pytest
+import torch
+from tensordict import TensorDict
+from torch._subclasses.fake_tensor import FakeTensorMode
+from torch.nn import functional as F
+
+from franka_wm.models import make
+from franka_wm.models.muzero import MuZero
+from franka_wm.planning import MCTS, SearchPolicy
+
+MOVES = 3
+SMALL = dict(
+    latent_dim=32, simnorm_dim=8, encoder_dim=32, hidden_dim=32, projector_dim=16, unroll=3, n_step=2
+)
+
+
+@pytest.fixture(autouse=True)
+def _seed():
+    torch.manual_seed(0)
+
+
+def small(**overrides) -> MuZero:
+    settings = dict(
+        observation_sizes={"state": 3, "joint_target": 2}, num_actions=MOVES, discount=0.9, **SMALL
+    )
+    return make("muzero", **{**settings, **overrides})
+
+
+def windows(batch: int = 6, length: int = 5, *, terminated: bool = False, **images) -> TensorDict:
+    def observation() -> dict[str, torch.Tensor]:
+        vectors = {"state": torch.randn(batch, length, 3), "joint_target": torch.randn(batch, length, 2)}
+        pictures = {
+            key: torch.randint(0, 256, (batch, length, *size), dtype=torch.uint8)
+            for key, size in images.items()
+        }
+        return vectors | pictures
+
+    ends = torch.zeros(batch, length, 1, dtype=torch.bool)
+    ends[:, -1] = terminated
+    data = TensorDict(
+        {
+            **observation(),
+            "action": torch.randint(MOVES, (batch, length)),
+            "search_policy": torch.randn(batch, length, MOVES).softmax(-1),
+            "search_value": torch.randn(batch, length, 1),
+            "next": {**observation(), "reward": torch.randn(batch, length, 1), "terminated": ends},
+        },
+        batch_size=[batch, length],
+    )
+    for key in ("state", "joint_target", *images):
+        data["next", key][:, :-1] = data[key][:, 1:]
+    return data
+
+
+def start_at(model: MuZero, step: int) -> None:
+    model._starts = lambda count, length, device: torch.full((count, 1), step)  # type: ignore[method-assign]
+
+
+def randomise(model: MuZero) -> None:
+    """Leave the zero initialisation of the heads, behind which gradients vanish."""
+    for head in (model.reward_head, model.value_head, model.policy_head):
+        torch.nn.init.normal_(head.weight, std=0.3)
+
+
+# ------------------------------------------------------------------ the parts
+
+
+@pytest.mark.parametrize("leading", [(), (4,), (2, 3, 4)])
+def test_every_part_takes_any_leading_dimensions(leading):
+    model = small()
+    observation = TensorDict(
+        {"state": torch.randn(*leading, 3), "joint_target": torch.randn(*leading, 2)}, leading
+    )
+    z, action = model.encode(observation), torch.randint(MOVES, leading)
+    assert z.shape == model.next(z, action).shape == (*leading, 32)
+    assert model.reward(z, action).shape == model.value(z).shape == (*leading, 1)
+    for deterministic in (True, False):
+        move = model.policy(z, deterministic=deterministic)
+        assert move.shape == leading and move.dtype == torch.int64
+    logits, value = model.prediction(z)
+    assert logits.shape == (*leading, MOVES) and value.shape == (*leading, 1)
+    after, reward, discount, logits, value = model.recurrent(z, action)
+    torch.testing.assert_close(after, model.next(z, action))
+    torch.testing.assert_close(reward, model.reward(z, action))
+    torch.testing.assert_close(value, model.value(after))
+    torch.testing.assert_close(logits, model.prediction(after)[0])
+    assert discount.shape == (*leading, 1) and (discount == 0.9).all()
+
+
+def test_latents_are_simplices_and_moves_matter():
+    model = small()
+    z = model.encode(windows())
+    afters = [model.next(z, torch.full((6, 5), move)) for move in range(MOVES)]
+    for latent in (z, *afters):
+        torch.testing.assert_close(latent.unflatten(-1, (4, 8)).sum(-1), torch.ones(6, 5, 4))
+    assert not torch.allclose(afters[0], afters[1])
+
+
+def test_first_predictions_are_zero_and_all_moves_alike():
+    model = small()
+    z = model.encode(windows())
+    logits, value = model.prediction(z)
+    assert logits.abs().max() == 0 and value.abs().max() < 1e-5
+    assert model.reward(z, torch.zeros(6, 5, dtype=torch.int64)).abs().max() < 1e-5
+
+
+def test_the_sampled_policy_follows_its_logits():
+    model = small()
+    with torch.no_grad():
+        model.policy_head.bias.copy_(torch.tensor([1.0, 0.0, -1.0]))
+    z = model.encode(windows())[0, 0].expand(5000, -1)
+    shares = F.one_hot(model.policy(z), MOVES).float().mean(0)
+    torch.testing.assert_close(shares, model.policy_head.bias.softmax(-1).detach(), atol=0.03, rtol=0)
+    assert (model.policy(z, deterministic=True) == 0).all()
+
+
+def test_observation_statistics_standardise_vectors():
+    model, batch = small(), windows()
+    mean, std = torch.randn(5), torch.rand(5) + 0.5
+    plain = model.encode(batch)
+    moved = batch.clone()
+    moved["state"] = batch["state"] * std[:3] + mean[:3]
+    moved["joint_target"] = batch["joint_target"] * std[3:] + mean[3:]
+    model.set_observation_statistics(mean, std)
+    torch.testing.assert_close(model.encode(moved), plain)
+    with pytest.raises(ValueError, match="finite"):
+        model.set_observation_statistics(mean * torch.nan, std)
+    with pytest.raises(ValueError, match="shape"):
+        model.set_observation_statistics(mean[:3], std)
+
+
+def test_discount_is_given_or_follows_the_episode_length():
+    assert small(discount=None).discount == 0.997
+    assert small(discount=None, episode_length=20).discount == pytest.approx(0.95)
+    assert small(discount=None, episode_length=250).discount == pytest.approx(0.98)
+
+
+@pytest.mark.parametrize(
+    ("overrides", "said"),
+    [
+        (dict(simnorm_dim=7), "simnorm_dim"),
+        (dict(num_actions=0), "num_actions"),
+        (dict(observation_sizes={}), "observation_sizes"),
+        (dict(discount=1.1), "discount"),
+        (dict(unroll=0), "unroll"),
+        (dict(n_step=0), "n_step"),
+    ],
+)
+def test_settings_that_cannot_work_are_refused(overrides, said):
+    with pytest.raises(ValueError, match=said):
+        small(**overrides)
+
+
+# ------------------------------------------------------------------ targets
+
+
+def returns_by_hand(reward, ends, value, discount, n):
+    """One window, as a sentence would say it."""
+    length, found = len(reward), []
+    for t in range(length):
+        last = min(t + n, length if ends else length - 1)
+        total = sum(discount ** (k - t) * reward[k] for k in range(t, last))
+        if last < length:
+            total += discount ** (last - t) * value[last]
+        found.append(total)
+    return found
+
+
+@pytest.mark.parametrize("ends", [False, True])
+@pytest.mark.parametrize(("length", "n"), [(5, 2), (7, 3), (4, 1), (3, 3), (3, 8), (1, 5)])
+def test_value_targets_are_the_n_step_returns(ends, length, n):
+    model, batch = small(n_step=n), windows(4, length, terminated=ends)
+    reward, value = batch["next", "reward"], batch["search_value"]
+    targets = model.value_targets(reward, batch["next", "terminated"], value)
+    for b in range(4):
+        wanted = returns_by_hand(reward[b, :, 0].tolist(), ends, value[b, :, 0].tolist(), 0.9, n)
+        torch.testing.assert_close(targets[b, :, 0], torch.tensor(wanted))
+
+
+def test_value_targets_in_numbers():
+    reward = torch.tensor([1.0, 2.0, 3.0, 4.0]).view(1, 4, 1)
+    value = torch.tensor([10.0, 20.0, 30.0, 40.0]).view(1, 4, 1)
+    model = small(discount=0.5, n_step=2)
+    going, over = torch.zeros(1, 4, 1, dtype=torch.bool), torch.zeros(1, 4, 1, dtype=torch.bool)
+    over[:, -1] = True
+    # 1 + 2/2 + 30/4;  2 + 3/2 + 40/4;  3 + 40/2 (the window is over);  40
+    assert model.value_targets(reward, going, value).flatten().tolist() == [9.5, 13.5, 23.0, 40.0]
+    # …;  3 + 4/2;  4: the episode is over
+    assert model.value_targets(reward, over, value).flatten().tolist() == [9.5, 13.5, 5.0, 4.0]
+
+
+@pytest.mark.parametrize("ends", [False, True])
+@pytest.mark.parametrize("start", [0, 2, 4])
+def test_the_losses_are_those_of_a_plain_unroll(ends, start):
+    """One window at a time, one step at a time; steps past the end count only where the episode terminated."""
+    model, length = small(random_shift=0), 5
+    randomise(model)
+    start_at(model, start)
+    batch = windows(1, length, terminated=ends)
+    losses = model.loss(batch)
+
+    returns = model.value_targets(batch["next", "reward"], batch["next", "terminated"], batch["search_value"])
+    frames = torch.cat((model.encode(batch), model.encode(batch["next"])[:, -1:]), 1)[0]
+    z, policy, value, reward, consistency = frames[start], 0.0, 0.0, 0.0, 0.0
+    for k in range(model.unroll + 1):
+        t, scale = start + k, 1.0 if k == 0 else 1.0 / model.unroll
+        logits, _ = model.prediction(z)
+        value_logits = model.value_head(model.prediction_body(z))
+        if t < length:
+            value += scale * model.two_hot.loss(value_logits, returns[0, t]).item()
+            policy += scale * F.cross_entropy(logits, batch["search_policy"][0, t]).item()
+        elif ends:
+            value += scale * model.two_hot.loss(value_logits, torch.zeros(1)).item()
+        if k == model.unroll or t >= length:
+            break  # moves past the end are random: checked below
+        body = model._body(z, batch["action"][0, t])
+        target = batch["next", "reward"][0, t]
+        reward += model.two_hot.loss(model.reward_head(body), target).item() / model.unroll
+        z = model.next(z, batch["action"][0, t])
+        consistency += model._consistency(z, frames[t + 1]).item() / model.unroll
+    assert losses["loss_policy"].item() == pytest.approx(policy, rel=1e-4)
+    assert losses["loss_consistency"].item() == pytest.approx(consistency, rel=1e-4)
+    if start + model.unroll <= length or not ends:
+        assert losses["loss_value"].item() == pytest.approx(value, rel=1e-4)
+        assert losses["loss_reward"].item() == pytest.approx(reward, rel=1e-4)
+    else:  # there is more to learn past the end
+        assert losses["loss_value"].item() > value * (1 + 1e-4)
+        assert losses["loss_reward"].item() > reward * (1 + 1e-4)
+    total = losses["loss_reward"] + 0.25 * losses["loss_value"] + losses["loss_policy"]
+    total = total + 2.0 * losses["loss_consistency"]
+    torch.testing.assert_close(losses["loss"].detach(), total)
+
+
+def test_unrolls_start_everywhere_and_at_the_first_step_most():
+    starts = small()._starts(20_000, 5, torch.device("cpu")).flatten()
+    shares = starts.bincount(minlength=5) / 20_000
+    torch.testing.assert_close(shares, torch.tensor([0.6, 0.1, 0.1, 0.1, 0.1]), atol=0.02, rtol=0)
+
+
+def test_weights_scale_the_loss_of_their_window():
+    model, batch = small(), windows(2)
+    randomise(model)
+    start_at(model, 0)
+    first, second = (model.loss(batch[b : b + 1])["loss"] for b in range(2))
+    batch["weight"] = torch.tensor([2.0, 0.5]).view(2, 1, 1).expand(2, 5, 1)
+    torch.testing.assert_close(model.loss(batch)["loss"], (2.0 * first + 0.5 * second) / 2)
+
+
+# ------------------------------------------------------------------ gradients
+
+
+def test_gradients_reach_everything_and_every_parameter_is_in_one_group():
+    model = small()
+    randomise(model)
+    model.loss(windows())["loss"].backward()
+    for name, parameter in model.named_parameters():
+        assert parameter.grad is not None and parameter.grad.abs().max() > 0, name
+    groups = model.parameter_groups(1e-3)
+    grouped = [id(p) for group in groups for p in group["params"]]
+    assert len(grouped) == len(set(grouped)) == len(list(model.parameters()))
+    assert {group["weight_decay"] for group in groups} == {0.0, 1e-4}
+
+
+def test_no_gradient_passes_through_what_came():
+    """Only the first observation of an unroll is learned from as an input."""
+    model = small()
+    randomise(model)
+    start_at(model, 1)
+    batch = windows()
+    batch["state"].requires_grad_()
+    batch["next", "state"].requires_grad_()
+    batch["search_value"].requires_grad_()
+    model.loss(batch)["loss"].backward()
+    reached = batch["state"].grad.abs().amax((0, 2)) > 0
+    assert reached.tolist() == [False, True, False, False, False]
+    assert batch["next", "state"].grad is None or batch["next", "state"].grad.abs().max() == 0
+    assert batch["search_value"].grad is None
+
+
+def test_the_gradient_is_halved_at_each_use_of_the_dynamics():
+    """With a value loss at the last step alone: a chain of K - 1 halvings against none."""
+    batch = windows(4, 5)
+    gradients = []
+    for halve in (True, False):
+        torch.manual_seed(1)
+        model = small(policy_coef=0.0, consistency_coef=0.0, value_coef=0.0, reward_coef=1.0)
+        randomise(model)
+        start_at(model, 0)
+        z = model.encode(batch)[:, 0].detach().requires_grad_()
+        latents, here = [], z
+        for k in range(3):
+            here = model.next(here, batch["action"][:, k])
+            latents.append(here)
+            if halve:
+                here = 0.5 * here + 0.5 * here.detach()
+        last = model._body(here, batch["action"][:, 3])
+        gradients.append(torch.autograd.grad(model.reward_head(last).square().sum(), z)[0])
+    torch.testing.assert_close(gradients[0] * 8, gradients[1])
+
+    # And the loss does just that: its encoder gradient from the rewards is that of the halved chain.
+    model = small(policy_coef=0.0, consistency_coef=0.0, value_coef=0.0)
+    randomise(model)
+    start_at(model, 0)
+    model.loss(batch)["loss"].backward()
+    got = model.encoder[0].linear.weight.grad.clone()
+    model.zero_grad()
+    here, total = model.encode(batch)[:, 0], 0.0
+    for k in range(3):
+        body = model._body(here, batch["action"][:, k])
+        target = batch["next", "reward"][:, k]
+        total = total + model.two_hot.loss(model.reward_head(body), target).mean() / 3
+        here = model.dynamics_head(body)
+        here = 0.5 * here + 0.5 * here.detach()
+    total.backward()
+    torch.testing.assert_close(got, model.encoder[0].linear.weight.grad)
+
+
+# ------------------------------------------------------------------ form
+
+
+def test_pictures_with_and_without_vectors():
+    for sizes in ({"state": 3, "joint_target": 2}, {}):
+        model = small(observation_sizes=sizes, image_sizes={"pixels": (64, 64, 3)})
+        assert model.observation_keys == [*sizes, "pixels"]
+        batch = windows(2, 4, pixels=(64, 64, 3))
+        assert model.encode(batch[0]).shape == (4, 32)
+        losses = model.loss(batch)
+        losses["loss"].backward()
+        assert torch.isfinite(losses["loss"])
+        assert any(p.grad.abs().max() > 0 for n, p in model.named_parameters() if "convolutions" in n)
+
+
+@pytest.mark.parametrize("scale", [0.0, 1e6])
+def test_extreme_inputs_stay_finite(scale):
+    model, batch = small(), windows(terminated=True)
+    for key in ("state", "joint_target", ("next", "state"), ("next", "reward"), "search_value"):
+        batch[key] = batch[key] * scale
+    batch["search_policy"] = F.one_hot(batch["action"], MOVES).float()  # no mass at all on the others
+    optimiser = torch.optim.AdamW(model.parameter_groups(1e-2))
+    for _ in range(20):
+        losses = model.loss(batch)
+        optimiser.zero_grad()
+        losses["loss"].backward()
+        optimiser.step()
+        assert all(torch.isfinite(value).all() for value in losses.values())
+    assert all(torch.isfinite(p).all() for p in model.parameters())
+
+
+def test_mistakes_are_named():
+    model, batch = small(), windows()
+    with pytest.raises(ValueError, match=r"\[B, H\]"):
+        model.loss(batch[0])
+    with pytest.raises(ValueError, match="unroll=3"):
+        model.loss(batch[:, :2])
+    with pytest.raises(ValueError, match="search_policy"):
+        model.loss(batch.exclude("search_policy"))
+
+
+def test_the_loss_reads_nothing_on_the_host():
+    with FakeTensorMode():
+        model, batch = small(), windows()
+        losses = model.loss(batch)
+        losses["loss"].backward()
+    assert losses["loss"].shape == ()
+
+
+# ------------------------------------------------------------------ learning
+
+
+class Chain:
+    """Five states in a row, ten steps. Left in the first state pays 0.1 at once; right in the last pays 1.
+
+    Who goes right from the first state earns nothing four times, then 6 in all; who stays there earns 1.
+    """
+
+    STEPS, BEST = 10, [6.0, 7.0, 8.0, 9.0, 10.0]
+
+    def __init__(self, state: torch.Tensor) -> None:
+        self.state = state
+
+    def observation(self):
+        return F.one_hot(self.state, 5).float()
+
+    def step(self, action):
+        left, right = action == 0, action == 1
+        reward = 0.1 * (left & (self.state == 0)) + 1.0 * (right & (self.state == 4))
+        self.state = (self.state + right.long() - left.long()).clamp(0, 4)
+        return reward.unsqueeze(-1)
+
+
+def episodes(env, policy, steps):
+    rows = []
+    for _ in range(steps):
+        td = TensorDict({"state": env.observation()}, [len(env.state)])
+        policy(td)
+        reward = env.step(td["action"])
+        ends = torch.zeros_like(reward, dtype=torch.bool)
+        td["next"] = TensorDict({"state": env.observation(), "reward": reward, "terminated": ends}, td.shape)
+        rows.append(td)
+    return torch.stack(rows, 1)
+
+
+@pytest.mark.parametrize("variant", ["gumbel", "puct"])
+def test_it_learns_a_chain_from_its_own_searches(variant):
+    settings = {**SMALL, "latent_dim": 64, "hidden_dim": 64, "encoder_dim": 64, "n_step": 3}
+    model = make("muzero", observation_sizes={"state": 5}, num_actions=2, discount=0.95, **settings)
+    search = MCTS(num_actions=2, num_simulations=12, variant=variant)
+    explores, decides = (SearchPolicy.for_model(model, search, explore=e) for e in (True, False))
+    optimiser = torch.optim.AdamW(model.parameter_groups(3e-3))
+    replay, earned = [], []
+    for _ in range(25):
+        replay = [*replay[-7:], episodes(Chain(torch.randint(5, (16,))), explores, Chain.STEPS)]
+        data = torch.cat(replay)
+        for _ in range(12):
+            row = torch.randint(len(data), (64, 1))
+            at = torch.randint(Chain.STEPS - 5, (64, 1)) + torch.arange(6)
+            losses = model.loss(data[row, at])
+            optimiser.zero_grad()
+            losses["loss"].backward()
+            optimiser.step()
+        final = episodes(Chain(torch.arange(5)), decides, Chain.STEPS)
+        earned = final["next", "reward"].sum((1, 2)).tolist()
+        if earned == Chain.BEST:
+            break
+    assert earned == Chain.BEST
