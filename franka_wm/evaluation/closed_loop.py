@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from typing import Any
 
 import torch
 from tensordict import TensorDict, TensorDictBase
+from torch import Tensor, nn
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from franka_wm.envs import FrankaEnv
@@ -22,11 +25,40 @@ EVALUATION_SEED = 1_000_003
 Policy = Callable[[TensorDictBase], TensorDictBase]
 
 
+def arm_of(env: Any) -> FrankaEnv | None:
+    """The arm inside an environment, under whatever transforms; ``None`` for one of another library."""
+    while env is not None and not isinstance(env, FrankaEnv):
+        env = getattr(env, "base_env", None)
+    return env
+
+
+def begin(env: Any, seed: int) -> TensorDictBase:
+    """The first observations of the episodes that ``seed`` names; the same whenever it is asked for."""
+    if arm_of(env) is not None:
+        return env.reset(seed=seed)
+    env.set_seed(seed)
+    return env.reset()
+
+
+@contextmanager
+def seeded(seed: int, *policies: Any) -> Iterator[None]:
+    """Random numbers of torch, and of the policies' own generators, from ``seed``; torch's are put back after."""
+    devices = list(range(torch.cuda.device_count())) if torch.cuda.is_initialized() else []
+    with torch.random.fork_rng(devices=devices):
+        torch.manual_seed(seed)
+        for policy in policies:
+            for module in policy.modules() if isinstance(policy, nn.Module) else (policy,):
+                for value in vars(module).values() if hasattr(module, "__dict__") else ():
+                    if isinstance(value, torch.Generator):
+                        value.manual_seed(seed)
+        yield
+
+
 @torch.no_grad()
 def play_episodes(
-    env: FrankaEnv, policy: Policy, *, seed: int, video: Callable[[], None] | None = None
+    env: Any, policy: Policy, *, seed: int, video: Callable[[], None] | None = None
 ) -> TensorDict:
-    """Plays one episode in every world and records how it ended.
+    """Plays one episode in every world and records how it went.
 
     Args:
         env: Its number of worlds is the number of episodes.
@@ -35,49 +67,125 @@ def play_episodes(
         video: Called before every step, to take a picture; after the last one the worlds have been reset.
 
     Returns:
-        Batch size (N,): ``final_distance``, ``return``, ``length``, ``success_once`` (all float32), of the true
-        last observation of each world's first episode.
+        Batch size (N,), all float32, of each world's first episode up to its true last observation. ``return``
+        and ``length`` of any environment. Of the arm also:
+
+        * ``final_distance`` and ``closest_distance``, tool to goal [m];
+        * ``success_once``, by the task's own measure, 0 or 1;
+        * ``path_length`` of the tool [m];
+        * ``action_change``: mean over steps and components of the squared change of the action as the servo
+          gets it, in units of the action;
+        * ``jerk``: root mean square of the tool's third difference × fps³ [m/s³]; 0 for episodes of under three steps.
     """
     n, device = env.num_envs, env.device
-    distance = torch.zeros(n, device=device)
+    arm = arm_of(env)
+    motion = None if arm is None else _Motion(arm)
     total, length = torch.zeros(n, device=device), torch.zeros(n, device=device)
-    once = torch.zeros(n, dtype=torch.bool, device=device)
     running = torch.ones(n, dtype=torch.bool, device=device)
-    tensordict = env.reset(seed=seed)
+    tensordict = begin(env, seed)
+    if motion is not None:
+        motion.start()
     with set_exploration_type(ExplorationType.DETERMINISTIC):
         for _ in range(env.config.episode_length):
             if video is not None:
                 video()
             tensordict, following = env.step_and_maybe_reset(policy(tensordict))
             after = tensordict.get("next")
-            reached = env.simulation.next_true_state[:, 17:20].norm(dim=-1)
-            distance = torch.where(running, reached, distance)
             total += running * after.get("reward").squeeze(-1)
             length += running
-            once |= running & after.get("success").squeeze(-1)
+            if motion is not None:
+                motion.see(running, after)
             running &= ~after.get("done").squeeze(-1)
             tensordict = following
-    out = {"final_distance": distance, "return": total, "length": length, "success_once": once.float()}
-    return TensorDict(out, batch_size=[n])
+            if arm is None and not bool(running.any()):  # lives on the host: nothing waits for a device here
+                break
+    out = {"return": total, "length": length}
+    return TensorDict(out if motion is None else motion.summary(length) | out, batch_size=[n])
+
+
+class _Motion:
+    """What the tool and the actions do over each world's first episode."""
+
+    def __init__(self, arm: FrankaEnv):
+        n, device = arm.num_envs, arm.device
+        self.arm = arm
+        self.distance, self.path, self.change, self.jerk = torch.zeros(4, n, device=device)
+        self.closest = torch.full((n,), torch.inf, device=device)
+        self.once = torch.zeros(n, dtype=torch.bool, device=device)
+
+    def start(self) -> None:
+        """After the reset."""
+        self._tools = [self.arm.simulation.true_state[:, 14:17].clone()]
+        self._action: Tensor | None = None
+
+    def see(self, running: Tensor, after: TensorDictBase) -> None:
+        """After a step; ``running`` are the worlds whose first episode it belongs to."""
+        sim = self.arm.simulation
+        reached = sim.next_true_state[:, 17:20].norm(dim=-1)
+        self.distance = torch.where(running, reached, self.distance)
+        self.closest = torch.where(running, torch.minimum(reached, self.closest), self.closest)
+        self.once |= running & after.get("success").squeeze(-1)
+        self._tools = [*self._tools[-3:], sim.next_true_state[:, 14:17].clone()]
+        self.path += running * (self._tools[-1] - self._tools[-2]).norm(dim=-1)
+        if len(self._tools) == 4:
+            a, b, c, d = self._tools
+            self.jerk += running * (d - 3 * c + 3 * b - a).square().sum(-1)
+        action = sim.action.clone()
+        if self._action is not None:
+            self.change += running * (action - self._action).square().mean(-1)
+        self._action = action
+
+    def summary(self, length: Tensor) -> dict[str, Tensor]:
+        changes, thirds = (length - 1).clamp_min(1), (length - 2).clamp_min(1)
+        return {
+            "final_distance": self.distance,
+            "closest_distance": self.closest,
+            "success_once": self.once.float(),
+            "path_length": self.path,
+            "action_change": self.change / changes,
+            "jerk": (self.jerk / thirds).sqrt() * self.arm.config.fps**3,
+        }
 
 
 def summarize(episodes: TensorDictBase, *, thresholds: Sequence[float] = THRESHOLDS) -> dict[str, Any]:
-    """Means with 95 % intervals: bootstrap for distances and returns, Wilson for rates of success."""
-    distance = episodes.get("final_distance").cpu()
-    count = distance.numel()
+    """Means with 95 % intervals: bootstrap for distances, returns and motion, Wilson for rates of success.
+
+    Args:
+        episodes: As :func:`play_episodes` gives them, or some of their entries.
+        thresholds: Distances that count as success [m].
+
+    Returns:
+        What there is: ``final_distance`` [m], ``success`` (at the end) and ``success_once`` (at any step) by
+        threshold, ``return``, ``path_length``, ``action_change``, ``jerk``, ``length``, each with its
+        interval; and ``episodes``, the count.
+    """
+    present = {str(name): episodes.get(name).cpu() for name in episodes.keys()}  # noqa: SIM118
+    count = episodes.numel()
+
+    def means(*names: str) -> dict[str, Any]:
+        return {name: bootstrap_mean(present[name]).as_dict() for name in names if name in present}
+
+    def rates(name: str, distance: str) -> dict[str, Any]:
+        if distance not in present:
+            return {}
+        within = {f"{t:g}": int((present[distance] < t).sum()) for t in thresholds}
+        return {name: {t: wilson(hits, count).as_dict() for t, hits in within.items()}}
+
     return {
-        "final_distance": bootstrap_mean(distance).as_dict(),
-        "success": {f"{t:g}": wilson(int((distance < t).sum()), count).as_dict() for t in thresholds},
-        "return": bootstrap_mean(episodes.get("return").cpu()).as_dict(),
+        **means("final_distance"),
+        **rates("success", "final_distance"),
+        **rates("success_once", "closest_distance"),
+        **means("return", "path_length", "action_change", "jerk", "length"),
         "episodes": count,
     }
 
 
 def evaluate_policies(
-    env: FrankaEnv,
+    env: Any,
     policies: Mapping[str, Policy],
     *,
     seed: int,
+    thorough: bool = False,
     report: Callable[[str, dict[str, Any]], None] | None = None,
 ) -> dict[str, dict[str, Any]]:
     """Evaluates policies on the same episodes.
@@ -86,13 +194,53 @@ def evaluate_policies(
         env: Its number of worlds is the number of episodes; at least 2, for the intervals.
         policies: By name.
         seed: The run's; the evaluation's own is derived from it.
+        thorough: Everything that :func:`summarize` knows, not the outcome alone.
         report: Called with each name and summary as they come.
+
+    Raises:
+        UserError: Fewer than two worlds.
     """
     if env.num_envs < 2:
         raise UserError(f"evaluation over {env.num_envs} episodes has no interval; use at least 2")
+    outcome = ("return", "length") if arm_of(env) is None else ("final_distance", "return")
     results = {}
     for name, policy in policies.items():
-        results[name] = summarize(play_episodes(env, policy, seed=seed + EVALUATION_SEED))
+        episodes = play_episodes(env, policy, seed=seed + EVALUATION_SEED)
+        results[name] = summarize(episodes if thorough else episodes.select(*outcome))
         if report is not None:
             report(name, results[name])
     return results
+
+
+@torch.no_grad()
+def decision_times(
+    env: Any, policy: Policy, *, seed: int = EVALUATION_SEED, decisions: int = 20, warm_up: int = 3
+) -> Tensor:
+    """How long a policy takes to decide for all worlds of the environment at once.
+
+    The device is waited for before and after each decision; the environment's own step is not counted.
+
+    Args:
+        decisions: How many to measure.
+        warm_up: How many before that, not measured.
+
+    Returns:
+        (decisions,) float64 [s]; take the median, the first may still compile or allocate.
+    """
+
+    def wait() -> None:
+        if env.device.type == "cuda":
+            torch.cuda.synchronize(env.device)
+
+    tensordict = begin(env, seed)
+    times = []
+    with set_exploration_type(ExplorationType.DETERMINISTIC):
+        for k in range(warm_up + decisions):
+            wait()
+            started = time.perf_counter()
+            tensordict = policy(tensordict)
+            wait()
+            if k >= warm_up:
+                times.append(time.perf_counter() - started)
+            tensordict = env.step_and_maybe_reset(tensordict)[1]
+    return torch.tensor(times, dtype=torch.float64)

@@ -82,6 +82,46 @@ def bootstrap_mean(
     return Interval(mean, min(float(low), mean), max(float(high), mean))
 
 
+def bootstrap_ratio(
+    numerators: Tensor | NDArray[np.floating] | Sequence[float],
+    denominators: Tensor | NDArray[np.floating] | Sequence[float],
+    confidence: float = 0.95,
+    resamples: int = 2_000,
+    seed: int = 0,
+) -> Interval:
+    """Ratio of two means, with its percentile bootstrap interval; pairs are drawn together.
+
+    Deterministic. The `mean` is Σ numerators / Σ denominators, not the mean of ratios, which a single small
+    denominator would rule.
+
+    Args:
+        numerators, denominators: (n,) one pair per independent unit (an episode); denominators ≥ 0, their
+            sum above 0.
+        confidence, resamples, seed: as for `bootstrap_mean`.
+
+    Raises:
+        UserError: other shapes, values that are not finite, denominators that sum to 0, or a parameter out of
+            range.
+    """
+    _check_confidence(confidence)
+    if resamples < 100:
+        raise UserError(f"resamples is {resamples}; at least 100 are needed for an interval.")
+    top, bottom = (np.asarray(x, dtype=np.float64) for x in (numerators, denominators))
+    if top.ndim != 1 or top.shape != bottom.shape or top.size == 0:
+        raise UserError(f"shapes are {top.shape} and {bottom.shape}; one pair per unit is needed, (n,) each.")
+    if not (np.isfinite(top).all() and np.isfinite(bottom).all()):
+        raise UserError("a ratio needs finite values; leave out or repair what is not.")
+    if bottom.min() < 0 or bottom.sum() <= 0:
+        raise UserError("a ratio needs denominators of at least 0 that do not sum to 0.")
+    drawn = np.random.default_rng(seed).integers(top.size, size=(resamples, top.size))
+    below = bottom[drawn].sum(axis=1)
+    ratios = top[drawn].sum(axis=1)[below > 0] / below[below > 0]
+    tail = (1 - confidence) / 2
+    low, high = np.quantile(ratios, (tail, 1 - tail))
+    ratio = float(top.sum() / bottom.sum())
+    return Interval(ratio, min(float(low), ratio), max(float(high), ratio))
+
+
 def wilson(successes: int, n: int, confidence: float = 0.95) -> Interval:
     """Success rate with its Wilson score interval.
 

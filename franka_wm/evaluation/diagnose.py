@@ -1,0 +1,233 @@
+"""All diagnostics of an agent from one set of held-out episodes."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from tensordict import TensorDict
+from torch import Tensor
+
+from franka_wm.evaluation.closed_loop import arm_of, begin, seeded
+from franka_wm.evaluation.decoder import (
+    SIZES,
+    Decoder,
+    Imagined,
+    decoder_error,
+    imagined_beside_real,
+    train_decoder,
+)
+from franka_wm.evaluation.health import paired_gain, planner_health
+from franka_wm.evaluation.open_loop import (
+    cost_ranks,
+    horizon_error,
+    spearman,
+    steps_until_forgotten,
+    value_calibration,
+)
+from franka_wm.evaluation.probes import probe
+from franka_wm.evaluation.protocol import Evaluation
+from franka_wm.evaluation.rollouts import (
+    ROLLOUT_SEED,
+    discounted_returns,
+    embedding,
+    encode_episodes,
+    encoded_validly,
+    gather_episodes,
+    mixture,
+)
+from franka_wm.evaluation.spectrum import spectrum
+from franka_wm.report.spectra import principal_components
+
+EPISODES = 48
+"""Held-out episodes of the diagnostics, at most; half of them random, half the model's own."""
+
+PICTURED = 16
+"""Of how many of them pictures are taken."""
+
+HORIZON = 10
+POINTS = 600
+
+
+@dataclass
+class Held:
+    """Held-out episodes and what the model makes of them.
+
+    Attributes:
+        episodes: Batch size (E, T).
+        latents: (E, T + 1, Z).
+        valid: (E, T + 1) bool.
+        pictures: (P, T, S, S, 3) uint8 of the first P episodes, or ``None``.
+    """
+
+    episodes: TensorDict
+    latents: Tensor
+    valid: Tensor
+    pictures: Tensor | None
+
+
+def hold_out(agent: Any, *, pictures: bool = True, seed: int = ROLLOUT_SEED) -> Held:
+    """Plays the episodes that the diagnostics look at: smooth random and the model's own behaviour, in turns."""
+    env, model = agent.env, agent.model
+    keys = list(getattr(model, "observation_keys", model.observation_sizes))
+    shown = min(PICTURED, env.num_envs) if pictures and arm_of(env) is not None else 0
+    episodes, seen = gather_episodes(
+        env,
+        mixture(agent.policies),
+        seed=seed,
+        keys=keys,
+        picture_size=picture_size(model),
+        pictures=shown,
+    )
+    episodes = episodes[:EPISODES]
+    with torch.no_grad():
+        latents = encode_episodes(model, episodes)
+    return Held(episodes, latents, encoded_validly(episodes), seen)
+
+
+def picture_size(model: Any) -> int:
+    """Side of the decoder's pictures [px]: what the model itself reads if that is small, else 64."""
+    sizes = [shape[0] for shape in getattr(model, "image_sizes", {}).values()]
+    return min(SIZES, key=lambda size: abs(size - (sizes[0] if sizes else 64)))
+
+
+def open_loop(agent: Any, held: Held, *, horizon: int = HORIZON) -> dict[str, Any]:
+    """Latent error by horizon and rank correlations; empty for a model without ``next``."""
+    model = agent.model
+    out: dict[str, Any] = {}
+    if hasattr(model, "next"):
+        actions = held.episodes.get("action")
+        out |= horizon_error(model, held.latents, actions, horizon=horizon, valid=held.valid)
+    if "physical" in held.episodes.keys():  # noqa: SIM118
+        positions = held.episodes.get("physical")[..., 14:17]
+        ranks = cost_ranks(held.latents[:, :-1], positions, embed=embedding(model), valid=held.valid[:, :-1])
+        out["rank_correlation"] = ranks["within"]
+        out["rank_correlation_across_episodes"] = ranks["across"]
+    return out
+
+
+def probes(held: Held, model: Any) -> dict[str, Any]:
+    """R² of joints, velocities, tool, goal, read off the latents; of other environments, of what the model reads."""
+    use = held.valid[:, :-1]
+    if held.latents.shape[0] < 3:
+        return {}
+    if "physical" in held.episodes.keys():  # noqa: SIM118
+        s = held.episodes.get("physical")
+        targets = {
+            "joints": s[..., :7],
+            "velocities": s[..., 7:14],
+            "tool": s[..., 14:17],
+            "goal": s[..., 14:17] - s[..., 17:20],
+            "tool to goal": s[..., 17:20],
+        }
+    else:
+        targets = {key: held.episodes.get(key) for key in model.observation_sizes}
+    return probe(held.latents[:, :-1], targets, valid=use) if targets else {}
+
+
+def representation(held: Held, model: Any) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Spectrum with collapse warning, and the latents along their two main directions for a picture."""
+    use = held.valid[:, :-1]
+    embedded = embedding(model)(held.latents[:, :-1])[use].float()
+    seen = spectrum(embedded)
+    plane = principal_components(embedded.cpu().numpy())
+    every = max(1, len(embedded) // POINTS)
+    if "physical" in held.episodes.keys():  # noqa: SIM118
+        quantity, label = (
+            held.episodes.get("physical")[..., 17:20].norm(dim=-1)[use],
+            "distance to the goal [m]",
+        )
+    else:
+        quantity, label = held.episodes.get(("next", "reward")).squeeze(-1)[use], "reward"
+    latents = {
+        "points": plane.points[::every].tolist(),
+        "quantity": quantity[::every].tolist(),
+        "label": label,
+        "explained": plane.explained.tolist(),
+    }
+    return seen, latents
+
+
+def calibration(agent: Any, *, episodes: int = 32) -> dict[str, Any]:
+    """The value against true discounted returns of the policy that it is the value of.
+
+    Played in episodes that are long enough for what is cut off to weigh less than 2 %, since a value looks
+    beyond the end of an episode that time cut off. Empty for families without ``value``, ``policy`` and ``discount``.
+    """
+    from franka_wm.training import build
+
+    model = agent.model
+    if not all(hasattr(model, name) for name in ("value", "discount")) or "policy" not in agent.policies:
+        return {}
+    length = agent.env.config.episode_length
+    tail = steps_until_forgotten(model.discount)
+    env = build.make_evaluation_env(
+        agent.cfg, num_envs=min(episodes, agent.env.num_envs), episode_length=length + tail
+    )
+    keys = list(getattr(model, "observation_keys", model.observation_sizes))
+    played, _ = gather_episodes(env, agent.policies["policy"], keys=keys)
+    returns = discounted_returns(
+        played.get(("next", "reward")), played.get(("next", "terminated")), model.discount
+    )[:, :length]
+    with torch.no_grad(), seeded(ROLLOUT_SEED):
+        latents = encode_episodes(model, played)[:, :length]
+        values = model.value(latents)
+    use = played.get("valid")[:, :length]
+    result = value_calibration(values[use].squeeze(-1), returns[use].squeeze(-1))
+    if arm_of(env) is not None:
+        distance = played.get("physical")[:, :length, 17:20].norm(dim=-1)[use].cpu()
+        result["rank_with_goal_distance"] = spearman(-values[use].squeeze(-1).cpu(), distance).as_dict()
+    return result | {"tail": tail}
+
+
+def health(agent: Any, evaluation: Evaluation | None) -> dict[str, Any]:
+    """How the planner searches on held-out first states, and what it gains over its prior in truth."""
+    out: dict[str, Any] = {}
+    planner = agent.policies.get("planner")
+    if hasattr(planner, "planner") and hasattr(planner, "objective"):
+        with seeded(ROLLOUT_SEED, planner):
+            searched = planner_health(planner, begin(agent.env, ROLLOUT_SEED))
+        out |= {f"planner {name.replace('_', ' ')}": value for name, value in searched.items()}
+    if evaluation is not None and {"planner", "policy"} <= evaluation.episodes.keys():
+        gains = paired_gain(evaluation.episodes["planner"], evaluation.episodes["policy"])
+        out |= {f"true gain over the policy, {name.replace('_', ' ')}": v for name, v in gains.items()}
+    return out
+
+
+def imagine(
+    agent: Any, held: Held, *, steps: int = 8, say: Callable[[str], None] = lambda text: None
+) -> tuple[Imagined, Decoder, dict[str, float]] | None:
+    """Trains a decoder on the pictures and draws what the model imagines in an episode that it has not seen.
+
+    Args:
+        steps: Imagined, at most.
+        say: Called with one line when the training starts.
+
+    Returns:
+        ``None`` without pictures or without ``next``; else strip and film, the decoder, and its errors on the
+        episodes left out (:func:`~franka_wm.evaluation.decoder.decoder_error`).
+    """
+    if held.pictures is None or not hasattr(agent.model, "next") or held.pictures.shape[0] < 4:
+        return None
+    pictures = held.pictures
+    count, length = pictures.shape[:2]
+    device = held.latents.device
+    seen = embedding(agent.model)(held.latents[:count, :length]).float()
+    fit = count - max(2, count // 4)
+    valid = held.valid[:count, :length].cpu()
+    known, unknown = valid.clone(), valid.clone()
+    known[fit:], unknown[:fit] = False, False
+    say(f"training a decoder on {int(known.sum())} pictures, for looking only …")
+    decoder = train_decoder(seen[known.to(device)], pictures[known])
+    errors = decoder_error(decoder, seen[unknown.to(device)], pictures[unknown])
+    world = (
+        count - 1 if count % 2 == 0 else count - 2
+    )  # odd: the model's own behaviour, which moves with a purpose
+    steps = min(steps, int(valid[world].sum()) - 1)
+    actions = held.episodes.get("action")[world, :steps]
+    shown = imagined_beside_real(
+        agent.model, decoder, held.latents[world, 0], actions, pictures[world, : steps + 1]
+    )
+    return shown, decoder, errors

@@ -1,0 +1,313 @@
+"""``franka-wm evaluate``: everything that can be said about a checkpoint, measured from the checkpoint alone."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from franka_wm.errors import UserError
+from franka_wm.evaluation import diagnose
+from franka_wm.evaluation.closed_loop import arm_of
+from franka_wm.evaluation.decoder import Imagined
+from franka_wm.evaluation.protocol import EPISODES, INTERVALS, Evaluation, describe, evaluate_agent
+from franka_wm.evaluation.robustness import robustness
+from franka_wm.evaluation.tables import (
+    horizon_table,
+    interval,
+    motion_table,
+    number,
+    outcome_table,
+    probe_table,
+    robustness_table,
+    terminal,
+    timing_table,
+)
+from franka_wm.report import written_whole
+from franka_wm.report.table import Table, markdown
+
+WORLDS = 256
+"""Simulated at once, at most; more episodes are played in rounds."""
+
+Say = Callable[[str], None]
+
+USAGE = """usage: franka-wm evaluate checkpoint=FOLDER [key=value …]
+
+  checkpoint=FOLDER   a run's folder, a checkpoint in it, or hf:user/name
+  out=FOLDER          where results go; RUN/evaluation, or outputs/evaluation/user--name for hf:
+  episodes=100        per policy, on fixed held-out seeds
+  device=auto         auto, cpu, cuda, cuda:K
+  open_loop=true      latent error by horizon, rank correlation, value calibration, imagined beside real
+  probes=true         what can be read off the latents; their spectrum
+  robustness=false    the same in shifted worlds: looks, camera, dynamics, delay, noise
+
+Writes evaluation.json and evaluation.md (the same twice on a CPU), timing.json, imagined.png, imagined.mp4."""
+
+
+@dataclass(frozen=True)
+class Options:
+    """What was asked for on the command line."""
+
+    checkpoint: str
+    out: Path
+    episodes: int = EPISODES
+    device: str = "auto"
+    open_loop: bool = True
+    probes: bool = True
+    robustness: bool = False
+
+
+def main(arguments: list[str]) -> int:
+    """The verb. Arguments are ``key=value``; see :data:`USAGE`.
+
+    Raises:
+        UserError: One line, for bad arguments and unusable checkpoints.
+    """
+    if not arguments or arguments[0] in ("--help", "-h"):
+        print(USAGE)
+        return 0 if arguments else 2
+    import warp as wp
+
+    wp.config.log_level = wp.LOG_WARNING
+    run(parse(arguments))
+    return 0
+
+
+def parse(arguments: list[str]) -> Options:
+    """``key=value`` … as :class:`Options`.
+
+    Raises:
+        UserError: An argument that is none, twice, unknown, or of the wrong kind; no checkpoint.
+    """
+    known = ("checkpoint", "out", "episodes", "device", "open_loop", "probes", "robustness")
+    given: dict[str, str] = {}
+    for argument in arguments:
+        name, equals, value = argument.partition("=")
+        if not equals or not value:
+            raise UserError(
+                f"evaluate: {argument!r} is not key=value; franka-wm evaluate --help lists the keys"
+            )
+        if name not in known:
+            raise UserError(f"evaluate: unknown key {name!r}; choose from {', '.join(known)}")
+        if name in given:
+            raise UserError(f"evaluate: {name}= is given twice")
+        given[name] = value
+    if "checkpoint" not in given:
+        raise UserError(
+            "evaluate: give checkpoint=FOLDER (a run's folder, a checkpoint in it, or hf:user/name)"
+        )
+    values: dict[str, Any] = dict(given)
+    if "episodes" in given:
+        if not given["episodes"].isdecimal() or int(given["episodes"]) < 2:
+            raise UserError(f"evaluate: episodes={given['episodes']}: must be a whole number of at least 2")
+        values["episodes"] = int(given["episodes"])
+    for name in ("open_loop", "probes", "robustness"):
+        if name in given:
+            if given[name] not in ("true", "false"):
+                raise UserError(f"evaluate: {name}={given[name]}: must be true or false")
+            values[name] = given[name] == "true"
+    values["out"] = Path(given["out"]) if "out" in given else default_folder(given["checkpoint"])
+    return Options(**values)
+
+
+def default_folder(checkpoint: str) -> Path:
+    """Where results go if not said: beside the run's own, or under ``outputs`` for one from the Hub."""
+    if checkpoint.startswith("hf:"):
+        return Path("outputs") / "evaluation" / checkpoint.removeprefix("hf:").replace("/", "--")
+    folder = Path(checkpoint)
+    run = next((f for f in (folder, *folder.parents) if (f / "checkpoints").is_dir()), folder)
+    return run / "evaluation"
+
+
+def run(options: Options) -> dict[str, Any]:
+    """Evaluates, prints tables, writes files; returns the content of ``evaluation.json``.
+
+    Raises:
+        UserError: The checkpoint cannot be used, or the folder not be written.
+    """
+    from rich.console import Console
+
+    from franka_wm.training.load import load_agent
+    from franka_wm.training.progress import announced, say
+
+    console = Console(width=120)
+    with announced(f"loading {options.checkpoint} and building {min(options.episodes, WORLDS)} worlds"):
+        agent = load_agent(
+            options.checkpoint, num_envs=min(options.episodes, WORLDS), device=options.device, seed=0
+        )
+    results: dict[str, Any] = {"protocol": protocol(options, agent)}
+    say(f"{options.episodes} held-out episodes for each of {', '.join(agent.policies)} …")
+    evaluation = evaluate_agent(
+        agent, episodes=options.episodes, report=lambda name, r: say(describe(name, r, agent.env))
+    )
+    results["protocol"]["seeds"] = ", ".join(map(str, evaluation.seeds))
+    results["policies"] = evaluation.policies
+    console.print(terminal(outcome_table(evaluation.policies)))
+    motion = motion_table(evaluation.policies)
+    if motion.rows:
+        console.print(terminal(motion))
+    console.print(terminal(timing_table(evaluation.seconds, evaluation.worlds)))
+    imagined = None
+    if options.open_loop or options.probes:
+        say("held-out episodes for the diagnostics …")
+        held = diagnose.hold_out(agent, pictures=options.open_loop)
+        if options.open_loop:
+            imagined = _look_ahead(agent, held, evaluation, results, say)
+        if options.probes:
+            _look_inside(agent, held, results, say)
+    if options.robustness:
+        _shift(agent, options, results, say)
+    tables = diagnostic_tables(results, agent.env.config)
+    for title, table in tables.items():
+        console.print(terminal(table, title))
+    text = "\n".join(
+        [evaluation.markdown(), *(f"### {t}\n\n{markdown(table)}" for t, table in tables.items())]
+    )
+    _write(options.out, results, text, evaluation, None if imagined is None else imagined[0])
+    say(f"results: {options.out}")
+    return results
+
+
+def protocol(options: Options, agent: Any) -> dict[str, Any]:
+    """How it was measured, for whoever reads the numbers later."""
+    import franka_wm
+
+    return {
+        "checkpoint": options.checkpoint,
+        "model": str(agent.cfg.model.name),
+        "environment": "franka" if arm_of(agent.env) is not None else str(agent.cfg.env.name),
+        "episodes": options.episodes,
+        "worlds": agent.env.num_envs,
+        "intervals": INTERVALS,
+        "device": str(agent.env.device),
+        "franka_wm": franka_wm.__version__,
+        "torch": torch.__version__,
+        **{
+            f"trained {name}": agent.counters[name]
+            for name in ("updates", "env_steps")
+            if name in agent.counters
+        },
+    }
+
+
+def _look_ahead(
+    agent: Any, held: diagnose.Held, evaluation: Evaluation, results: dict[str, Any], say: Say
+) -> tuple[Imagined, Any, Any] | None:
+    say("predictions without looking …")
+    results["open_loop"] = diagnose.open_loop(agent, held)
+    say("values against true returns …")
+    results["calibration"] = diagnose.calibration(agent)
+    results["health"] = diagnose.health(agent, evaluation)
+    imagined = diagnose.imagine(agent, held, say=say)
+    if imagined is not None:
+        results["open_loop"]["decoder"] = imagined[2]
+    return imagined
+
+
+def _look_inside(agent: Any, held: diagnose.Held, results: dict[str, Any], say: Say) -> None:
+    say("what can be read off the latents …")
+    results["probes"] = diagnose.probes(held, agent.model)
+    results["spectrum"], results["latents"] = diagnose.representation(held, agent.model)
+    warning = results["spectrum"]["warning"]
+    if warning:
+        results.setdefault("health", {}).setdefault("warnings", []).append(warning)
+        say(f"warning: {warning}")
+
+
+def _shift(agent: Any, options: Options, results: dict[str, Any], say: Say) -> None:
+    say("the same in shifted worlds …")
+
+    def told(case: str, found: Mapping[str, Any]) -> None:
+        parts = (f"{p} {100 * r['final_distance']['mean']:.2f} cm {r['verdict']}" for p, r in found.items())
+        say(f"  {case}: {'   '.join(parts)}")
+
+    results["robustness"] = robustness(agent, episodes=min(options.episodes, WORLDS), report=told)
+
+
+def diagnostic_tables(results: Mapping[str, Any], config: Any) -> dict[str, Table]:
+    """Title → table, of what there is in the results beside the policies."""
+    tables = {}
+    if "curves" in results.get("open_loop", {}):
+        tables["Open loop: error of predicted latents"] = horizon_table(results["open_loop"])
+    if results.get("probes"):
+        tables["Probes"] = probe_table(results["probes"])
+    found = findings(results)
+    if found:
+        tables["What else was found"] = Table(["quantity", "value"], [list(row) for row in found.items()])
+    if results.get("robustness"):
+        tables["Robustness"] = robustness_table(results["robustness"], config.success_distance)
+    return tables
+
+
+def findings(results: Mapping[str, Any]) -> dict[str, str]:
+    """Single numbers as text: ranks, calibration, planner, spectrum."""
+    out: dict[str, str] = {}
+    ahead, value, health = (results.get(name, {}) for name in ("open_loop", "calibration", "health"))
+    if "rank_correlation" in ahead:
+        out["rank correlation of latent cost and tool distance, within episodes"] = interval(
+            ahead["rank_correlation"]
+        )
+        out["… across episodes"] = interval(ahead["rank_correlation_across_episodes"])
+    if "decoder" in ahead:
+        errors = ahead["decoder"]
+        share = errors["error"] / max(errors["mean_picture"], 1e-12)
+        out["decoder's error / that of the mean picture"] = number(share)
+    if value:
+        line = f"return = {number(value['slope'])} · value + {number(value['intercept'])}"
+        out["value calibration (exact: 1, 0)"] = line
+        out["… bias, value − return"] = number(value["bias"])
+        out["… correlation"] = number(value["correlation"])
+    out |= {
+        name: interval(found) if isinstance(found, Mapping) else f"{found:.4g}"
+        for name, found in health.items()
+        if name != "warnings"
+    }
+    spectrum = results.get("spectrum", {})
+    for name in ("rankme", "effective_rank", "feature_std", "mean_cosine", "dimensions"):
+        if name in spectrum:
+            out[f"latents: {name.replace('_', ' ')}"] = f"{spectrum[name]:.4g}"
+    if spectrum:
+        out["latents: collapse"] = spectrum["warning"] or "no sign of it"
+    return out
+
+
+def _write(
+    folder: Path, results: dict[str, Any], text: str, evaluation: Evaluation, imagined: Imagined | None
+) -> None:
+    """Every file whole; the one that others read, last."""
+    if imagined is not None:
+        from franka_wm.report.video import write_png, write_video
+
+        write_png(imagined.strip, folder / "imagined.png")
+        write_video(
+            imagined.frames.repeat_interleave(2, 1).repeat_interleave(2, 2), folder / "imagined.mp4", fps=5
+        )
+    seconds = {
+        name: {"seconds_per_decision": s, "worlds": evaluation.worlds}
+        for name, s in evaluation.seconds.items()
+    }
+    for name, content in (
+        ("timing.json", to_json(seconds)),
+        ("evaluation.md", text),
+        ("evaluation.json", to_json(results)),
+    ):
+        with written_whole(folder / name) as path:
+            path.write_text(content)
+
+
+def to_json(value: Any) -> str:
+    """JSON; what is not a finite number becomes null, since JSON has no word for it."""
+
+    def clean(x: Any) -> Any:
+        if isinstance(x, Mapping):
+            return {str(key): clean(one) for key, one in x.items()}
+        if isinstance(x, (list, tuple)):
+            return [clean(one) for one in x]
+        return None if isinstance(x, float) and not math.isfinite(x) else x
+
+    return json.dumps(clean(value), indent=1, allow_nan=False, ensure_ascii=False) + "\n"

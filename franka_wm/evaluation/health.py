@@ -1,0 +1,135 @@
+"""Whether training goes well while it goes, and whether the planner earns its time."""
+
+from __future__ import annotations
+
+import inspect
+import math
+from typing import Any
+
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor
+
+from franka_wm.evaluation.intervals import bootstrap_mean
+from franka_wm.evaluation.open_loop import correlation
+from franka_wm.evaluation.rollouts import embedding, evaluating
+from franka_wm.evaluation.spectrum import latent_statistics
+
+SAMPLES = 512
+"""Latents that :func:`training_diagnostics` looks at, at most."""
+
+
+@torch.no_grad()
+def training_diagnostics(model: Any, batch: TensorDictBase) -> dict[str, float]:
+    """Numbers that show a collapse while it happens; cheap enough for every line of a log.
+
+    Changes nothing: neither the model's mode and statistics nor torch's random numbers. Waits for the device.
+
+    Args:
+        model: Any family.
+        batch: Windows [B, H], as ``loss`` takes them.
+
+    Returns:
+        ``latent/…``: everything of :func:`~franka_wm.evaluation.spectrum.latent_statistics`, of the first observation
+        of up to :data:`SAMPLES` windows, on ``embed`` where the family has it;
+        :func:`~franka_wm.evaluation.spectrum.collapse_warning` reads it. Of families with ``value`` and ``discount``
+        on data with rewards ``value/…``: ``mean``; ``td_bias``, mean of V(z_0) − (Σ γ^t r_t + γ^H V(z_H)) over the
+        windows; and ``td_correlation`` between the two. This is calibration against the model's own later
+        value and the behaviour in the replay; against true returns see ``franka-wm evaluate``. Empty where an
+        encoding is not finite.
+    """
+    device = batch.device if batch.device is not None else batch.get("action").device
+    keys = list(getattr(model, "observation_keys", model.observation_sizes))
+    batch = batch[:SAMPLES]
+    devices = [device] if device.type == "cuda" else []
+    with evaluating(model), torch.random.fork_rng(devices=devices):
+        first = model.encode(batch.select(*keys)[:, 0])
+        embedded = embedding(model)(first).float()
+        if embedded.shape[0] < 2 or not bool(torch.isfinite(embedded).all()):
+            return {}
+        out = {f"latent/{name}": value for name, value in latent_statistics(embedded).items()}
+        reward = batch.get(("next", "reward"), None)
+        if reward is not None and hasattr(model, "value") and hasattr(model, "discount"):
+            last = model.encode(batch.get("next").select(*keys)[:, -1])
+            out |= _value_consistency(model, first, last, reward, batch.get(("next", "terminated")))
+    return out
+
+
+def _value_consistency(
+    model: Any, first: Tensor, last: Tensor, reward: Tensor, terminated: Tensor
+) -> dict[str, float]:
+    value = model.value(first).squeeze(-1).float()
+    target = model.value(last).squeeze(-1).float()
+    for t in reversed(range(reward.shape[1])):
+        ended = terminated[:, t].squeeze(-1)
+        target = reward[:, t].squeeze(-1) + model.discount * torch.where(ended, 0.0, target)
+    together = correlation(value, target)
+    out = {"value/mean": float(value.mean()), "value/td_bias": float((value - target).mean())}
+    return out if math.isnan(together) else out | {"value/td_correlation": together}
+
+
+@torch.no_grad()
+def planner_health(policy: Any, observation: TensorDictBase) -> dict[str, Any]:
+    """How the planner searches, on held-out states.
+
+    Args:
+        policy: A :class:`~franka_wm.planning.PlannerPolicy`.
+        observation: Batch size [E], with what the policy reads; E ≥ 2.
+
+    Returns:
+        ``effective_samples`` (planners that weigh their samples): 1 / Σ w², near 1 when one sample decides all, near
+        the number of elites when the scores tell them apart no better than chance. ``gain``: by how much the plan
+        found scores above what it started from in the planner's own objective and model; ``better``: share
+        of states where it does. Started from means the policy's plan, or doing nothing for families without
+        one. ``prior``, ``plan``: the mean scores of both. Means with 95 % bootstrap intervals over the states.
+    """
+    bind = getattr(policy.objective, "bind", None)
+    objective = policy.objective if bind is None else bind(observation)
+    z = policy.encode(observation)
+    found = policy.planner.plan(z, policy.next, objective, prior=policy.prior, explore=False)
+    plan = found.get("plan")
+    if policy.prior is None:
+        before = torch.zeros_like(plan)
+    else:
+        latent, actions = z, []
+        for _ in range(plan.shape[1]):
+            actions.append(_deterministic(policy.prior, latent))
+            latent = policy.next(latent, actions[-1])
+        before = torch.stack(actions, 1)
+
+    def score(plans: Tensor) -> Tensor:
+        latents = [z.unsqueeze(1)]
+        for t in range(plans.shape[1]):
+            latents.append(policy.next(latents[-1], plans[:, t].unsqueeze(1)))
+        return objective(torch.stack(latents, 2), plans.unsqueeze(1)).squeeze(1).cpu()
+
+    after, prior = score(plan), score(before)
+    out = {
+        "gain": bootstrap_mean(after - prior).as_dict(),
+        "better": float((after > prior).float().mean()),
+        "plan": float(after.mean()),
+        "prior": float(prior.mean()),
+        "states": z.shape[0],
+    }
+    if "effective_samples" in found.keys():  # noqa: SIM118
+        out["effective_samples"] = bootstrap_mean(found.get("effective_samples").squeeze(-1).cpu()).as_dict()
+    return out
+
+
+def _deterministic(prior: Any, z: Tensor) -> Tensor:
+    takes = "deterministic" in inspect.signature(prior).parameters  # a prior need only take the latent
+    return prior(z, deterministic=True) if takes else prior(z)
+
+
+def paired_gain(planner: TensorDictBase, prior: TensorDictBase) -> dict[str, Any]:
+    """What planning really gains: the difference of returns over the same episodes.
+
+    Args:
+        planner, prior: Of :func:`~franka_wm.evaluation.closed_loop.play_episodes` with the same seeds.
+
+    Returns:
+        ``return``: mean difference with its 95 % bootstrap interval over pairs; for the arm also
+        ``final_distance`` [m].
+    """
+    names = [name for name in ("return", "final_distance") if name in planner.keys()]  # noqa: SIM118
+    return {name: bootstrap_mean((planner.get(name) - prior.get(name)).cpu()).as_dict() for name in names}

@@ -1,0 +1,211 @@
+"""What a model predicts without looking: latent error by horizon, ranks of distances, calibration of values."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from franka_wm.evaluation.intervals import Interval, bootstrap_ratio
+from franka_wm.evaluation.rollouts import embedding
+from franka_wm.report.calibration import calibration_bins
+
+PAIRS = 2000
+"""Random pairs of states that a rank correlation is measured over."""
+
+
+@torch.no_grad()
+def horizon_error(
+    model: Any, latents: Tensor, actions: Tensor, *, horizon: int = 10, valid: Tensor | None = None
+) -> dict[str, Any]:
+    """Error of predicted latents by horizon, against the encoded truth and against "nothing changes".
+
+    From every step of every episode the model is unrolled with the actions that were really taken. The error at h
+    is ‖ẑ_{t+h} − z_{t+h}‖², that of no change ‖z_t − z_{t+h}‖², both on ``model.embed`` where the family has it.
+    Their ratio is 0 for a perfect model, 1 for one that says that nothing changes, and above 1 for one
+    that would better say so.
+
+    Args:
+        model: With ``next``.
+        latents: (E, T + 1, Z), the encoded truth.
+        actions: (E, T, A), or (E, T) of numbered moves.
+        horizon: Largest h; at most T.
+        valid: (E, T + 1) bool, which latents are of the first episode; all if not given.
+
+    Returns:
+        ``steps`` [1 … H]; ``curves``: under ``model`` the ratio, ``mean``, ``low`` and ``high`` (H values each, 95 %
+        intervals by a bootstrap that draws whole episodes, since the windows of one are alike), and under
+        ``no_change`` that baseline, 1; ``unit``, in words; ``error`` and ``no_change_error``, means of
+        the squared distances; ``windows`` behind the longest horizon and ``episodes``.
+
+    Raises:
+        ValueError: Less than one step, shapes that do not fit, or latents that never change.
+    """
+    envs, steps = actions.shape[:2]
+    if latents.shape[:2] != (envs, steps + 1):
+        raise ValueError(f"latents {tuple(latents.shape)} do not fit to actions {tuple(actions.shape)}")
+    if horizon < 1 or steps < 1:
+        raise ValueError(f"horizon={horizon} over {steps} steps: both must be at least 1")
+    horizon = min(horizon, steps)
+    embed = embedding(model)
+    valid = torch.ones(envs, steps + 1, dtype=torch.bool, device=latents.device) if valid is None else valid
+    truth = embed(latents)
+    predicted = latents[:, :-1]
+    errors, ratios, no_change = [], [], []
+    windows = 0
+    for h in range(1, horizon + 1):
+        starts = steps + 1 - h
+        predicted = model.next(predicted[:, :starts], actions[:, h - 1 :])
+        # An episode that ended early is valid to a point: then a window is if its last step is.
+        use = valid[:, h:].double()
+        error = (embed(predicted) - truth[:, h:]).double().square().sum(-1)
+        still = (truth[:, :starts] - truth[:, h:]).double().square().sum(-1)
+        top, bottom = (torch.where(use > 0, x, 0.0).sum(1).cpu() for x in (error, still))
+        windows = int(use.sum())
+        if not windows or float(bottom.sum()) <= 0:
+            raise ValueError(f"no latent changes within {h} steps: there is nothing to predict")
+        errors.append(float(top.sum()) / windows)
+        no_change.append(float(bottom.sum()) / windows)
+        ratios.append(bootstrap_ratio(top, bottom).as_dict())
+    curve = {name: [ratio[name] for ratio in ratios] for name in ("mean", "low", "high")}
+    return {
+        "steps": list(range(1, horizon + 1)),
+        "curves": {"model": curve, "no_change": {"mean": [1.0] * horizon}},
+        "unit": "error relative to no change",
+        "error": errors,
+        "no_change_error": no_change,
+        "windows": windows,
+        "episodes": envs,
+    }
+
+
+def ranks(x: Tensor) -> Tensor:
+    """Ranks from 1 (n,), equal values sharing their mean rank."""
+    _, inverse, counts = torch.unique(x, sorted=True, return_inverse=True, return_counts=True)
+    last = counts.cumsum(0).double()
+    return (last - (counts.double() - 1) / 2)[inverse]
+
+
+def spearman(x: Tensor, y: Tensor) -> Interval:
+    """Spearman's rank correlation with its 95 % interval.
+
+    The interval is Fisher's z with the variance (1 + ρ² / 2) / (n − 3) of Bonett & Wright, "Sample size
+    requirements for estimating Pearson, Kendall and Spearman correlations", Psychometrika 65 (2000).
+
+    Args:
+        x, y: (n,), n ≥ 4.
+
+    Returns:
+        In [−1, 1]; NaN where one of them never varies.
+
+    Raises:
+        ValueError: Other shapes.
+    """
+    if x.dim() != 1 or x.shape != y.shape or x.numel() < 4:
+        raise ValueError(
+            f"give two vectors of the same length, at least 4, not {tuple(x.shape)}, {tuple(y.shape)}"
+        )
+    rho = correlation(ranks(x), ranks(y))
+    if math.isnan(rho) or abs(rho) >= 1:
+        return Interval(rho, rho, rho)
+    half = 1.959964 * math.sqrt((1 + rho * rho / 2) / (x.numel() - 3))
+    z = math.atanh(rho)
+    return Interval(rho, math.tanh(z - half), math.tanh(z + half))
+
+
+def correlation(x: Tensor, y: Tensor) -> float:
+    """Pearson's correlation of two vectors; NaN where one of them never varies."""
+    a, b = (v.double() - v.double().mean() for v in (x, y))
+    size = math.sqrt(float(a.square().sum()) * float(b.square().sum()))
+    return max(-1.0, min(1.0, float((a * b).sum()) / size)) if size > 0 else math.nan
+
+
+def cost_ranks(
+    latents: Tensor,
+    positions: Tensor,
+    *,
+    embed: Callable[[Tensor], Tensor] = lambda z: z,
+    valid: Tensor | None = None,
+    pairs: int = PAIRS,
+    seed: int = 0,
+) -> dict[str, dict[str, float]]:
+    """Whether latents that are further apart belong to tools that are further apart.
+
+    Spearman's correlation over random pairs of states, of the latent cost ‖embed(z) − embed(z')‖² with the true
+    distance between the tool positions.
+
+    Args:
+        latents: (E, T, Z).
+        positions: (E, T, 3), the tool [m].
+        embed: What costs are measured on.
+        valid: (E, T) bool, which states to use.
+        pairs: Of each kind.
+        seed: Of the draw.
+
+    Returns:
+        ``across``: pairs from anywhere; ``within``: pairs of one episode, which share its goal, as the states that
+        a planner compares do. Each an interval.
+    """
+    generator = torch.Generator().manual_seed(seed)
+    envs, steps = latents.shape[:2]
+    embedded, positions = embed(latents).cpu(), positions.cpu()
+    valid = torch.ones(envs, steps, dtype=torch.bool) if valid is None else valid.cpu()
+
+    def measured(e1: Tensor, t1: Tensor, e2: Tensor, t2: Tensor) -> dict[str, float]:
+        use = valid[e1, t1] & valid[e2, t2] & ((e1 != e2) | (t1 != t2))
+        e1, t1, e2, t2 = e1[use], t1[use], e2[use], t2[use]
+        cost = (embedded[e1, t1] - embedded[e2, t2]).square().sum(-1)
+        return spearman(cost, (positions[e1, t1] - positions[e2, t2]).norm(dim=-1)).as_dict()
+
+    def draw(size: int) -> Tensor:
+        return torch.randint(size, (pairs,), generator=generator)
+
+    one, two, three, four = draw(envs), draw(steps), draw(envs), draw(steps)
+    return {"across": measured(one, two, three, four), "within": measured(one, two, one, four)}
+
+
+def value_calibration(predicted: Tensor, returns: Tensor, *, bins: int = 10) -> dict[str, Any]:
+    """Predicted values against true discounted returns.
+
+    Args:
+        predicted: (n,).
+        returns: (n,), true.
+        bins: Of equal count along the prediction, for the curve.
+
+    Returns:
+        ``slope`` and ``intercept`` of the line return = slope · value + intercept: 1 and 0 for an exact value;
+        ``bias``: mean of value − return, above 0 for an optimist; ``error``: root mean square of that;
+        ``correlation`` (Pearson); ``samples``; and of each bin the means ``predicted`` and ``true``, the middle
+        half of the returns ``low`` and ``high``, and the ``count``. Slope, intercept and correlation are NaN
+        where the value never varies.
+
+    Raises:
+        ValueError: Other shapes or no values.
+    """
+    if predicted.dim() != 1 or predicted.shape != returns.shape or not predicted.numel():
+        raise ValueError(
+            f"give two vectors of the same length, not {tuple(predicted.shape)}, {tuple(returns.shape)}"
+        )
+    p, r = predicted.double().cpu(), returns.double().cpu()
+    centred = p - p.mean()
+    spread = float(centred.square().sum())
+    slope = float((centred * (r - r.mean())).sum()) / spread if spread > 0 else math.nan
+    return {
+        "slope": slope,
+        "intercept": float(r.mean()) - slope * float(p.mean()),
+        "bias": float((p - r).mean()),
+        "error": float((p - r).square().mean().sqrt()),
+        "correlation": correlation(p, r),
+        "samples": p.numel(),
+        **calibration_bins(p.numpy(), r.numpy(), bins=bins),
+    }
+
+
+def steps_until_forgotten(discount: float, *, rest: float = 0.02, most: int = 400) -> int:
+    """Steps after which rewards weigh less than ``rest`` in a discounted return; at most ``most``."""
+    if discount <= 0:
+        return 1
+    return most if discount >= 1 else min(most, math.ceil(math.log(rest) / math.log(discount)))

@@ -1,0 +1,176 @@
+"""Held-out experience for the diagnostics: whole episodes as (E, T) batches, and what a model makes of them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from typing import Any
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+from tensordict.nn import TensorDictModuleBase
+from torch import Tensor, nn
+from torchrl.envs.utils import ExplorationType, set_exploration_type
+
+from franka_wm.evaluation.closed_loop import EVALUATION_SEED, arm_of, begin, seeded
+
+ROLLOUT_SEED = EVALUATION_SEED + 500_000
+"""Episodes of the diagnostics: neither those of training nor those of the closed loop."""
+
+
+class Alternating(TensorDictModuleBase):
+    """World k follows policy k mod P: one rollout with the behaviour of several policies.
+
+    Args:
+        policies: P of them; each acts for all worlds and keeps what it carries along to itself.
+    """
+
+    def __init__(self, policies: Sequence[TensorDictModuleBase]):
+        super().__init__()
+        self.policies = nn.ModuleList(policies)
+        self.in_keys = sorted({key for policy in policies for key in policy.in_keys})  # pyright: ignore
+        self.out_keys = ["action"]
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        number = torch.arange(tensordict.batch_size[0], device=tensordict.device) % len(self.policies)
+        chosen = None
+        for k, policy in enumerate(self.policies):
+            action = policy(tensordict).get("action")
+            if chosen is None:
+                chosen = action.clone()
+            mine = (number == k).view(-1, *[1] * (action.dim() - 1))
+            chosen = torch.where(mine, action, chosen)
+        assert chosen is not None
+        if "context_action" in tensordict:  # a model with memory must remember what was really done
+            tensordict.set("context_action", chosen)
+        return tensordict.set("action", chosen)
+
+
+def mixture(policies: dict[str, Any]) -> TensorDictModuleBase:
+    """Half of the worlds move at random, half as the model wants: its policy, or its planner where it has none."""
+    names = ["random", *[name for name in ("policy", "planner") if name in policies][:1]]
+    return Alternating([policies[name] for name in names])
+
+
+@torch.no_grad()
+def gather_episodes(
+    env: Any,
+    policy: Any,
+    *,
+    seed: int = ROLLOUT_SEED,
+    steps: int | None = None,
+    keys: Sequence[str] = (),
+    picture_size: int | None = None,
+    pictures: int = 0,
+) -> tuple[TensorDict, Tensor | None]:
+    """Plays the first episode of every world and keeps what the diagnostics need.
+
+    Args:
+        env: E worlds.
+        policy: Run without exploration.
+        seed: Of the episodes and of all random numbers: the same call gives the same numbers on a CPU.
+        steps: T, at most an episode's length; that if not given.
+        keys: Observations to keep.
+        picture_size: Side of the pictures to render [px].
+        pictures: Of how many worlds, the first ones; the arm only.
+
+    Returns:
+        Batch size (E, T). Root: ``keys``, ``action``, ``is_init``, ``valid`` (E, T) bool (step of the first
+        episode), for the arm ``physical`` (E, T, 20): the true state without noise, as under the key ``state``;
+        under ``next``: ``keys``, ``reward``, ``terminated``, ``done``, ``physical``. And pictures of the roots,
+        (pictures, T, S, S, 3) uint8 on the CPU, or ``None``.
+    """
+    arm = arm_of(env)
+    steps = env.config.episode_length if steps is None else min(steps, env.config.episode_length)
+    rows, seen = [], []
+    running = torch.ones(env.num_envs, dtype=torch.bool, device=env.device)
+    with seeded(seed, policy), set_exploration_type(ExplorationType.DETERMINISTIC):
+        tensordict = begin(env, seed)
+        for _ in range(steps):
+            row: dict[Any, Tensor] = {"valid": running.clone()}
+            if arm is not None:
+                row["physical"] = arm.simulation.true_state.clone()
+                if picture_size and pictures:
+                    seen.append(arm.render(picture_size, num_views=pictures).cpu())
+            tensordict, following = env.step_and_maybe_reset(policy(tensordict))
+            row |= {key: tensordict.get(key) for key in (*keys, "action", "is_init")}
+            row |= {
+                ("next", key): tensordict.get(("next", key))
+                for key in (*keys, "reward", "terminated", "done")
+            }
+            if arm is not None:
+                row["next", "physical"] = arm.simulation.next_true_state.clone()
+            running &= ~tensordict.get(("next", "done")).squeeze(-1)
+            rows.append(TensorDict(row, batch_size=[env.num_envs], device=env.device))
+            tensordict = following
+    return torch.stack(rows, 1), (torch.stack(seen, 1) if seen else None)
+
+
+@contextmanager
+def evaluating(model: Any) -> Iterator[None]:
+    """The model in evaluation mode; afterwards every part is in the mode that it was in before."""
+    modes = [(module, module.training) for module in model.modules()]
+    model.eval()
+    try:
+        yield
+    finally:
+        for module, training in modes:
+            module.training = training
+
+
+@torch.no_grad()
+def encode_episodes(model: Any, episodes: TensorDictBase, *, chunk: int = 1024) -> Tensor:
+    """Latents of all observations of the episodes, what ended them included.
+
+    A model with memory (``observe``) sees each episode from its beginning, as when it acts.
+
+    Args:
+        episodes: Batch size (E, T), of :func:`gather_episodes`.
+        chunk: Observations encoded at a time: bounds the memory that pictures take.
+
+    Returns:
+        (E, T + 1, Z).
+    """
+    keys = list(getattr(model, "observation_keys", model.observation_sizes))
+    last = episodes.get("next").select(*keys)[:, -1:]
+    observations = torch.cat([episodes.select(*keys), last], 1)  # (E, T + 1)
+    if not hasattr(model, "observe"):
+        flat = observations.flatten(0, 1)
+        latents = torch.cat([model.encode(part) for part in flat.split(chunk)])
+        return latents.unflatten(0, observations.batch_size)
+    z = model.encode(observations[:, 0])
+    steps = [z]
+    never = torch.zeros(observations.batch_size[0], 1, dtype=torch.bool, device=z.device)
+    for t in range(1, observations.batch_size[1]):
+        steps.append(model.observe(observations[:, t], steps[-1], episodes.get("action")[:, t - 1], never))
+    return torch.stack(steps, 1)
+
+
+def encoded_validly(episodes: TensorDictBase) -> Tensor:
+    """Which latents of :func:`encode_episodes` are of the first episode: (E, T + 1) bool."""
+    valid = episodes.get("valid")
+    return torch.cat([valid, valid[:, -1:]], 1)
+
+
+def embedding(model: Any) -> Callable[[Tensor], Tensor]:
+    """What distances between latents are measured on: ``model.embed``, or the latent itself."""
+    return getattr(model, "embed", lambda z: z)
+
+
+def discounted_returns(reward: Tensor, terminated: Tensor, discount: float) -> Tensor:
+    """Σ γ^k r_{t+k} to the end of what was recorded, or to a termination.
+
+    Args:
+        reward: (E, T, 1).
+        terminated: (E, T, 1) bool, after that step.
+        discount: γ.
+
+    Returns:
+        (E, T, 1).
+    """
+    out = torch.zeros_like(reward)
+    following = torch.zeros_like(reward[:, 0])
+    for t in reversed(range(reward.shape[1])):
+        following = reward[:, t] + discount * torch.where(terminated[:, t], 0.0, following)
+        out[:, t] = following
+    return out
