@@ -20,7 +20,7 @@ def main(cfg: DictConfig) -> None:
     from franka_wm.envs import resolve_device
     from franka_wm.evaluation.report import evaluate_and_report
     from franka_wm.training import build
-    from franka_wm.training.entry import finish, start
+    from franka_wm.training.entry import export_experience, finish, start
     from franka_wm.training.learner import Learner
     from franka_wm.training.trainer import Trainer
 
@@ -46,6 +46,8 @@ def main(cfg: DictConfig) -> None:
     trainer.fit()
     if not trainer.interrupted and policies:
         evaluate_and_report(run.cfg, run.folder, judge, policies, rows=trainer.rows)
+    if not trainer.interrupted:
+        export_experience(run, trainer)
     finish(run, interrupted=trainer.interrupted)
 
 

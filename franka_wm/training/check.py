@@ -12,9 +12,8 @@ from franka_wm.envs.franka import check_robot
 from franka_wm.errors import UserError
 from franka_wm.training import build
 from franka_wm.training.learner import PRECISIONS, SCHEDULES
+from franka_wm.training.loggers import check_loggers
 from franka_wm.training.spaces import Spaces
-
-LOGGERS = ("csv", "tensorboard")
 
 
 def check(cfg: DictConfig) -> None:
@@ -77,7 +76,9 @@ def check(cfg: DictConfig) -> None:
     for name, known in (("precision", PRECISIONS), ("schedule", SCHEDULES)):
         if cfg.trainer[name] not in known:
             raise UserError(f"trainer.{name}={cfg.trainer[name]!r}: must be one of {', '.join(known)}")
-    _check_names("logger.names", cfg.logger.names, LOGGERS)
+    options = build.plain(cfg.logger)
+    check_loggers(options.pop("names"), **options)
+    _check_export(cfg)
     if build.is_offline(cfg):
         _check_dataset(cfg)
     elif cfg.env.kind == "none":
@@ -112,6 +113,16 @@ def _spaces(cfg: DictConfig) -> Spaces | None:
     config = FrankaConfig.from_mapping(values)
     check_robot(config, urdf_path)
     return None if build.is_offline(cfg) else Spaces.of_config(config, discrete=build.is_discrete(cfg))
+
+
+def _check_export(cfg: DictConfig) -> None:
+    if cfg.export.kind == "none":
+        return
+    from franka_wm.data.lerobot.export import check_export
+
+    if not build.is_arm(cfg) or build.is_offline(cfg):
+        raise UserError("export: only what a run gathers with the arm can be exported")
+    check_export(build.plain(cfg))
 
 
 def _check_dataset(cfg: DictConfig) -> None:

@@ -261,7 +261,7 @@ def start(cfg: DictConfig) -> Run:
         torch.set_float32_matmul_precision("high")
     OmegaConf.save(cfg, folder / "config.yaml", resolve=True)
     say(f"device {device}   seed {cfg.seed}   results in {folder}")
-    return Run(cfg=cfg, folder=folder, checkpoint=checkpoint, loggers=make_loggers(cfg, folder))
+    return Run(cfg=cfg, folder=folder, checkpoint=checkpoint, loggers=open_loggers(cfg, folder))
 
 
 def resumed(cfg: DictConfig, overrides: list[str]) -> tuple[Any, DictConfig]:
@@ -290,15 +290,36 @@ def resumed(cfg: DictConfig, overrides: list[str]) -> tuple[Any, DictConfig]:
     return checkpoint, merged
 
 
-def make_loggers(cfg: DictConfig, folder: Path) -> list[Any]:
-    """TorchRL's loggers that ``cfg.logger.names`` lists, writing into ``folder``."""
-    from torchrl.record.loggers import get_logger
+def open_loggers(cfg: DictConfig, folder: Path) -> list[Any]:
+    """The loggers that ``cfg.logger`` names; each is told the configuration."""
+    from franka_wm.training.build import plain
+    from franka_wm.training.loggers import log_config, make_loggers
 
-    return [get_logger(n, logger_name=str(folder), experiment_name=n) for n in cfg.logger.names]
+    options = plain(cfg.logger)
+    loggers = make_loggers(options.pop("names"), folder, **options)
+    log_config(loggers, plain(cfg))
+    return loggers
+
+
+def export_experience(run: Run, trainer: Any) -> None:
+    """What ``export`` in the configuration asks for: the replay's whole episodes as a LeRobot dataset."""
+    if run.cfg.export.kind == "none":
+        return
+    from franka_wm.data.lerobot.export import export_run
+    from franka_wm.training.build import plain
+
+    export_run(plain(run.cfg), trainer.experience(), folder=run.folder)
 
 
 def finish(run: Run, *, interrupted: bool) -> None:
-    """The last line; exits with 130 after Ctrl-C."""
+    """Closes the loggers, writes the run's page, says the last line; exits with 130 after Ctrl-C."""
+    from franka_wm.training.loggers import close_loggers
+
+    close_loggers(run.loggers)
+    if not interrupted:
+        from franka_wm.report.page import write_page
+
+        say(f"page:    {write_page(run.folder)}")
     if interrupted:
         say(f"stopped; go on with: python train.py resume={run.folder}")
         sys.exit(INTERRUPTED)

@@ -17,6 +17,7 @@ from torchrl.collectors import Collector
 
 from franka_wm.training.checkpoint import Checkpoint, save_checkpoint
 from franka_wm.training.learner import Learner
+from franka_wm.training.loggers import log_numbers
 from franka_wm.training.progress import Progress, say
 from franka_wm.training.spaces import Spaces
 
@@ -102,6 +103,8 @@ class Trainer:
         self.spaces = Spaces.of_env(env) if spaces is None else spaces
         self._vectors = list(self.model.observation_sizes)
         self._keys = list(getattr(self.model, "observation_keys", self._vectors))
+        if cfg.export.kind != "none":  # a dataset is for other models, too
+            self._keys = [*self.spaces.observation_sizes, *self.spaces.image_sizes]
         self._extra = list(getattr(self.model, "replay_keys", ()))
         # What the acting policy writes for the loss, a random one does not: then the actor fills the replay, too.
         self._acting = ActingPolicy(policies, actor if self._extra else "random") if policies else None
@@ -215,9 +218,7 @@ class Trainer:
         row = dict(numbers)
         row |= {"env_steps": self.env_steps, "updates": self.learner.updates, "time_s": self.seconds}
         self.rows.append(row)
-        for logger in self.loggers:
-            for name, value in numbers.items():
-                logger.log_scalar(name, value, step=self.learner.updates)
+        log_numbers(self.loggers, numbers, step=self.learner.updates)
         if say_it:
             say("  " + "   ".join(f"{name} {value:.3f}" for name, value in numbers.items()))
         return time.perf_counter()
@@ -226,7 +227,7 @@ class Trainer:
         """Writes ``checkpoints/latest``."""
         replay = None
         if self.env is not None and self.cfg.trainer.checkpoint_replay and len(self.replay):
-            replay = self._oldest_first()
+            replay = self.experience()
         return save_checkpoint(
             self.folder / "checkpoints" / "latest",
             model=self.model,
@@ -257,8 +258,10 @@ class Trainer:
         # Otherwise the worlds would repeat the episodes that the first run has already seen.
         self.env.set_seed(self.cfg.seed + self.env_steps)
 
-    def _oldest_first(self) -> TensorDictBase:
+    def experience(self) -> TensorDictBase | None:
         """The filled part of the replay, (worlds, time), in the order in which it was gathered."""
+        if self.env is None or not len(self.replay):
+            return None
         data = self.replay[:]
         cursor = self.replay.writer._cursor  # type: ignore[union-attr]
         full = self.replay.storage._len_along_dim0 == self.replay.storage._storage.shape[0]  # type: ignore[union-attr]
