@@ -186,7 +186,12 @@ def find_dataset(repo_id: str, revision: str | None = None) -> Path:
     if revision is None and (here / "meta" / "info.json").is_file():
         return here
     from huggingface_hub import snapshot_download
-    from huggingface_hub.errors import HfHubHTTPError, HFValidationError, LocalEntryNotFoundError
+    from huggingface_hub.errors import (
+        HfHubHTTPError,
+        HFValidationError,
+        LocalEntryNotFoundError,
+        RevisionNotFoundError,
+    )
 
     try:
         folder = snapshot_download(
@@ -198,6 +203,11 @@ def find_dataset(repo_id: str, revision: str | None = None) -> Path:
         how = "HF_HUB_OFFLINE is set" if os.environ.get("HF_HUB_OFFLINE") else "the Hub cannot be reached"
         raise UserError(
             f"dataset.repo_id={repo_id}: not on this machine, and {how}; give dataset.root=FOLDER instead"
+        ) from error
+    except RevisionNotFoundError as error:
+        raise UserError(
+            f"dataset.repo_id={repo_id}: has no tag {revision or 'v3.0'} on the Hub; it is in an older format, or was "
+            "published without its tag"
         ) from error
     except (HfHubHTTPError, OSError) as error:
         reason = str(error).strip().splitlines()[0] if str(error).strip() else ""

@@ -114,9 +114,10 @@ class RecordedWindows:
                 raise UserError(f"{name}={value!r}: must be a whole number of at least 1")
         if split not in SPLITS:
             raise UserError(f"split={split!r}: must be one of {', '.join(SPLITS)}")
-        if not 0 <= validation_fraction < 1:
+        number = isinstance(validation_fraction, (int, float)) and not isinstance(validation_fraction, bool)
+        if not number or not 0 <= validation_fraction < 1:
             raise UserError(
-                f"dataset.validation_fraction={validation_fraction}: must be at least 0 and below 1"
+                f"dataset.validation_fraction={validation_fraction!r}: must be at least 0 and below 1"
             )
         self.recording, self.split_name, self.seed = recording, split, seed
         self.window, self.batch_size = window, batch_size

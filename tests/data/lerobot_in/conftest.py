@@ -74,7 +74,7 @@ ARM: dict[str, Any] = {
     "gravity_compensation": True,
     "goal_sampling": "reachable",
     "observations": ("pixels", "state", "joint_target"),
-    "image_size": 32,
+    "image_size": 64,  # the least that LeRobot's TD-MPC can see
     "episode_length": EPISODE_LENGTH,
 }
 """Settings of the arm that the exported datasets were recorded with."""

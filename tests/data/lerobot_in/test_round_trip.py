@@ -38,7 +38,7 @@ def test_bit_for_bit(exact: Any, opened: Callable) -> None:
     windows = opened(exact.root, window=WINDOW)
     assert len(windows) == len(theirs) == 9 * 4
     assert windows.action_low is None and windows.episode_length == 6 and windows.fps == 30
-    assert windows.image_sizes == {"pixels": (32, 32, 3)}
+    assert windows.image_sizes == {"pixels": (64, 64, 3)}
     assert windows.observation_sizes == {"state": 20, "goal": 3, "joint_target": 7}
     for batch in windows.batches(1):
         mine = batch[0]
@@ -70,6 +70,7 @@ def test_without_the_terminal_observations(exact: Any, opened: Callable, tmp_pat
         assert not batch["next", "done"].any()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("format", ["video", "video_near_lossless"])
 def test_video(format: str, export: Callable, opened: Callable) -> None:
     """Numbers bit for bit; pictures near; the last observation exact, for it is a PNG in every format."""

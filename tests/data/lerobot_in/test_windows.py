@@ -19,7 +19,7 @@ LENGTHS = (5, 4, 7)
 @pytest.mark.parametrize("in_memory", [True, False])
 @pytest.mark.parametrize("window", [1, 3])
 def test_within_episodes_and_uniform(pictures: Path, opened: Callable, window: int, in_memory: bool) -> None:
-    windows = opened(pictures, window=window, in_memory=in_memory)
+    windows = opened(pictures, window=window, in_memory=in_memory, keys=["joints"])
     # The observation after the last action is not recorded: L rows are L − 1 transitions.
     expected = {(e, t) for e, length in enumerate(LENGTHS) for t in range(length - window)}
     assert len(windows) == len(expected)
@@ -87,6 +87,14 @@ def test_actions_of_others_are_scaled(pictures: Path, foreign, opened: Callable)
     assert action.min() >= -1 and action.max() <= 1 and (action[..., 2] == 0).all()
     with pytest.raises(UserError, match="normalize_actions=true"):
         opened(pictures, normalize_actions=False)
+
+
+def test_discrete_actions(foreign, tmp_path: Path, opened: Callable) -> None:
+    moves = {"action": {"dtype": "int64", "shape": (1,), "names": None}}
+    windows = opened(foreign.make_foreign(tmp_path / "moves", pictures=False, **moves))
+    action = windows.sample(4)["action"]
+    assert action.shape == (4, 2) and action.dtype == torch.int64
+    assert windows.action_dim == 0 and windows.num_actions == 1 and windows.action_low is None
 
 
 def test_splits(pictures: Path, foreign, tmp_path: Path, opened: Callable) -> None:
