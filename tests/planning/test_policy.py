@@ -11,7 +11,7 @@ from torchrl.envs import EnvBase, InitTracker, TransformedEnv
 from torchrl.envs.utils import ExplorationType, check_env_specs, set_exploration_type
 
 from franka_wm.models import make
-from franka_wm.planning import MPPI, GoalDistance, ModelPolicy, PlannerPolicy
+from franka_wm.planning import CEM, ICEM, MPPI, GoalDistance, GradientPlanner, ModelPolicy, PlannerPolicy
 
 HORIZON, GOAL = 3, 2.0
 
@@ -160,6 +160,28 @@ def test_closed_loop_reaches_the_goal():
     with set_exploration_type(ExplorationType.DETERMINISTIC):
         rollout = env.rollout(3, policy(MPPI(action_dim=2, horizon=HORIZON, num_samples=256, num_elites=16)))
     assert (rollout["next", "state"][:, -1] - GOAL).norm(dim=-1).max() < 0.4
+
+
+@pytest.mark.parametrize(
+    "planner",
+    [
+        CEM(action_dim=2, horizon=HORIZON, num_samples=64, num_elites=8, iterations=3),
+        ICEM(action_dim=2, horizon=HORIZON),
+        GradientPlanner(action_dim=2, horizon=HORIZON, iterations=5),
+    ],
+    ids=lambda planner: type(planner).__name__,
+)
+def test_every_planner_acts_inside_a_collector_and_its_plan_is_carried(planner):
+    env = TransformedEnv(Points(), InitTracker())
+    collector = Collector(env, policy(planner), frames_per_batch=3 * 9, total_frames=3 * 18)
+    data = torch.cat([batch.clone() for batch in collector], dim=1)
+    collector.shutdown()
+    shape = planner.plan(torch.zeros(3, 2), Exact().next, GoalDistance(torch.zeros(2)))["plan"].shape
+    assert data["plan"].shape == (3, 18, *shape[1:])
+    assert data["action"].abs().max() <= 1 and not data["action"].requires_grad
+    # towards the goal in every episode, which no action and random actions are not
+    assert (data["next", "state"] - data["state"]).mean() > 0.3
+    assert data["next", "done"].sum(1).flatten().tolist() == [6, 4, 3]
 
 
 def test_exploration_follows_torchrl_unless_told():
