@@ -40,6 +40,7 @@ def main(cfg: DictConfig) -> None:
         loggers=run.loggers,
         evaluate=run.evaluation_during_training(judge, policies),
         spaces=spaces,
+        validation=run.validation,
     )
     if run.checkpoint is not None:
         trainer.restore(run.checkpoint)

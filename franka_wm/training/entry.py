@@ -161,6 +161,8 @@ class Run:
     folder: Path
     checkpoint: Any = None
     loggers: list[Any] = field(default_factory=list)
+    validation: Any = None
+    """Windows of recorded episodes that training never sees."""
 
     def build_environments(self) -> tuple[Any, Any]:
         """The training worlds and the evaluation worlds, compiled and ready; ``None`` where there are none.
@@ -194,7 +196,7 @@ class Run:
 
         if not build.is_offline(self.cfg):
             return build.make_replay_buffer(self.cfg, env.device), Spaces.of_env(env)
-        windows, _ = build.open_recorded(self.cfg, resolve_device(self.cfg.device))
+        windows, self.validation = build.open_recorded(self.cfg, resolve_device(self.cfg.device))
         spaces = Spaces(
             observation_sizes=dict(windows.observation_sizes),
             image_sizes=dict(windows.image_sizes),

@@ -66,15 +66,17 @@ class Trainer:
     """Gathers experience and learns from it, in turns.
 
     Args:
-        env: The training worlds.
+        env: The training worlds; ``None`` on recorded data.
         learner: Updates the model.
-        replay: Receives (worlds, time) batches, gives windows.
+        replay: Receives (worlds, time) batches, gives windows; or recorded windows.
         policies: By name; ``random`` gathers the first steps, ``actor`` the rest.
         actor: Which of them acts.
         cfg: The whole configuration; saved with every checkpoint.
         folder: Of the run.
         loggers: TorchRL loggers.
         evaluate: Called now and then with nothing, returns numbers to log.
+        spaces: What the model was built for; the environment's if not given.
+        validation: Recorded windows that training never sees; their losses are logged.
     """
 
     def __init__(
@@ -90,6 +92,7 @@ class Trainer:
         loggers: list[Any],
         evaluate: Any,
         spaces: Spaces | None = None,
+        validation: Any = None,
     ):
         self.env, self.learner, self.replay, self.cfg, self.folder = env, learner, replay, cfg, folder
         self.model = learner.model
@@ -100,6 +103,7 @@ class Trainer:
         self.seconds = 0.0
         self.rows: list[dict[str, float]] = []
         self.interrupted = False
+        self.validation = validation
         self.spaces = Spaces.of_env(env) if spaces is None else spaces
         self._vectors = list(self.model.observation_sizes)
         self._keys = list(getattr(self.model, "observation_keys", self._vectors))
@@ -209,9 +213,21 @@ class Trainer:
         metrics = self.learner.metrics()
         if not text and "loss" in metrics:
             text = f"loss {metrics['loss']:.4g}"
-        row |= metrics
+        row |= metrics | self.validate()
         row |= progress.line(self.learner.updates, self.env_steps, text)
         self.record(row)
+
+    @torch.no_grad()
+    def validate(self, batches: int = 4) -> dict[str, float]:
+        """Mean losses over some recorded windows that training never sees; one host sync."""
+        if self.validation is None:
+            return {}
+        training = self.model.training
+        self.model.eval()
+        losses = [self.model.loss(self.validation.sample()) for _ in range(batches)]
+        self.model.train(training)
+        means = {name: torch.stack([one.get(name) for one in losses]).mean() for name in losses[0].keys()}  # noqa: SIM118
+        return {f"validation/{name}": float(value) for name, value in means.items()}
 
     def record(self, numbers: Mapping[str, float], *, say_it: bool = False) -> float:
         """Adds a row to the history and the loggers; returns the time."""
