@@ -1,0 +1,100 @@
+"""Synthetic episodes, quick to make, and what reads them back: LeRobot's own code, offline."""
+
+from __future__ import annotations
+
+import os
+
+os.environ.setdefault("HF_HUB_OFFLINE", "1")  # before anything imports LeRobot
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from franka_wm.data.lerobot.episodes import Episode, complete
+from franka_wm.data.lerobot.provenance import describe
+from franka_wm.data.lerobot.schema import DONE, EPISODE_KEY, SEED, TRUNCATED, Schema, schema_for
+from franka_wm.data.lerobot.writer import DatasetWriter
+from franka_wm.envs import FrankaConfig
+
+
+@pytest.fixture(scope="session")
+def make_schema() -> Callable[..., Schema]:
+    """A schema with one camera, state, goal and targets; pictures of 16 × 16."""
+
+    def make(format: str = "exact", size: int = 16, **changes: Any) -> Schema:
+        values = {"observations": ("pixels", "state", "joint_target"), "image_size": size} | changes
+        return schema_for(FrankaConfig(**values), format=format)
+
+    return make
+
+
+@pytest.fixture(scope="session")
+def make_episode() -> Callable[..., Episode]:
+    """An episode of noise; its pictures show a square that moves by a pixel per step over a gradient."""
+
+    def make(schema: Schema, number: int, length: int = 7) -> Episode:
+        rng = np.random.default_rng(number)
+        rows, terminal = {}, {}
+        for name, feature in schema.features.items():
+            if name in (SEED, EPISODE_KEY):
+                continue
+            shape = (length + 1, *feature["shape"])
+            if name in schema.images:
+                array = moving_square(length + 1, feature["shape"][0], rng)
+            elif feature["dtype"] == "bool":
+                array = np.zeros(shape, bool)
+            else:
+                array = rng.normal(size=shape).astype(schema.numpy_dtype(name))
+            rows[name] = array[:length].copy()
+            if name in schema.observed:
+                terminal[name] = array[length]
+        rows[DONE][-1] = rows[TRUNCATED][-1] = True
+        return complete(rows, terminal, seed=(0, number, 0))
+
+    return make
+
+
+def moving_square(length: int, size: int, rng: np.random.Generator) -> np.ndarray:
+    """(length, size, size, 3) uint8."""
+    ramp = np.linspace(30, 200, size)
+    picture = np.stack(
+        [np.broadcast_to(ramp, (size, size)), np.broadcast_to(ramp[:, None], (size, size))], -1
+    )
+    picture = np.concatenate([picture, np.full((size, size, 1), 90.0)], -1).astype(np.uint8)
+    out = np.repeat(picture[None], length, 0)
+    side, start = size // 4, rng.integers(0, size, 2)
+    for t in range(length):
+        rows = (start[0] + np.arange(side)) % size
+        columns = (start[1] + t + np.arange(side)) % size
+        out[t][np.ix_(rows, columns)] = (
+            rng.integers(0, 255, 3) if t == 0 else out[t - 1, rows[0], (start[1] + t - 1) % size]
+        )
+    return out
+
+
+@pytest.fixture(scope="session")
+def write() -> Callable[..., Path]:
+    """Writes episodes as a dataset, in this process unless ``workers`` says otherwise."""
+
+    def run(out: Path, schema: Schema, episodes: list[Episode], **options: Any) -> Path:
+        options = {"workers": 0, "provenance": describe(policy="test", seed=0, config={})} | options
+        with DatasetWriter(out, schema, **options) as writer:
+            writer.add(episodes)
+            return writer.finish()
+
+    return run
+
+
+@pytest.fixture
+def load(monkeypatch: pytest.MonkeyPatch) -> Callable[..., Any]:
+    """LeRobot's own reader."""
+
+    def run(root: Path, **options: Any) -> Any:
+        from lerobot.datasets.lerobot_dataset import LeRobotDataset
+
+        return LeRobotDataset("test/set", root=root, video_backend="pyav", **options)
+
+    return run

@@ -1,0 +1,262 @@
+"""From the real environment to a dataset: collect, export, and what the command line refuses."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import threading
+
+import numpy as np
+import pytest
+import torch
+from torchrl.collectors import Collector
+
+from franka_wm.cli import main
+from franka_wm.data.lerobot.collect import OPTIONS, gather, open_source
+from franka_wm.data.lerobot.export import export_replay
+from franka_wm.data.lerobot.provenance import read_provenance
+from franka_wm.data.lerobot.schema import (
+    ACTION,
+    DONE,
+    EPISODE_KEY,
+    GOAL,
+    IMAGE_PREFIX,
+    REWARD,
+    SEED,
+    STATE,
+    SUCCESS,
+    TARGET,
+    schema_for,
+)
+from franka_wm.data.lerobot.terminal import read_terminals
+from franka_wm.data.policies import SmoothRandomPolicy
+from franka_wm.errors import UserError
+
+SMALL = [
+    "env=reach_fixed_pixels",
+    "env.image_size=16",
+    "env.substeps=2",
+    "env.episode_length=6",
+    "device=cpu",
+]
+FRONT = IMAGE_PREFIX + "front"
+
+
+def column(dataset, name: str) -> np.ndarray:
+    return np.asarray(dataset.hf_dataset.with_format("numpy")[name][:])
+
+
+@pytest.fixture(scope="module")
+def collected(tmp_path_factory):
+    """12 episodes of 8 worlds, twice: in two sessions."""
+    out = tmp_path_factory.mktemp("collected") / "set"
+    arguments = ["collect", f"out={out}", "num_envs=8", "workers=1", "seed=5", *SMALL]
+    assert main([*arguments, "episodes=12"]) == 0
+    assert main([*arguments, "episodes=20", "resume=true", "policy=ik"]) == 0
+    return out
+
+
+def test_worlds_can_be_played_again(collected, load, small_env) -> None:
+    """The first state follows from the feature ``seed``, the others from the actions, the end from the side file."""
+    dataset = load(collected)
+    assert (dataset.num_episodes, dataset.num_frames) == (20, 120)
+    seeds = column(dataset, SEED).reshape(20, 6, 3)[:, 0]
+    assert len({tuple(seed) for seed in seeds}) == 20
+    assert sorted(seeds[:12, 1].tolist()) == [0, 0, 1, 1, 2, 2, 3, 3, 4, 5, 6, 7]
+    assert set(seeds[:12, 0]) == {5}
+    assert set(seeds[12:, 0]) == {5 + 12}
+    config = {"observations": ("pixels", "state", "joint_target"), "image_size": 16, "episode_length": 6}
+    settings = read_provenance(collected)["sessions"][0]["config"]["env"]  # pyright: ignore[reportOptionalSubscript]
+    config |= {key: settings[key] for key in ("action_scale", "limit_velocity", "substeps")}
+    env = small_env(8, seed=5, **config)
+    state, action = (column(dataset, name).reshape(20, 6, -1) for name in (STATE, ACTION))
+    reward, target = column(dataset, REWARD).reshape(20, 6), column(dataset, TARGET).reshape(20, 6, 7)
+    keys = column(dataset, EPISODE_KEY).reshape(20, 6)[:, 0].tolist()
+    features = dataset.meta.features
+    terminal = read_terminals(
+        collected,
+        keys=keys,
+        lengths=[6] * 20,
+        features={name: features[name] for name in (STATE, FRONT, GOAL)},
+    )
+    assert terminal.problem is None
+    first = {int(world): i for i, (_, world, number) in enumerate(seeds[:12]) if number == 0}
+    order = [first[world] for world in range(8)]
+    step = env.reset()
+    for t in range(6):
+        assert np.array_equal(step["state"].numpy(), state[order, t])
+        assert np.array_equal(step["joint_target"].numpy(), target[order, t])
+        for world, i in enumerate(order):
+            shown = dataset[6 * i + t]
+            picture = (shown[FRONT].numpy() * 255).round().astype(np.uint8).transpose(1, 2, 0)
+            assert np.array_equal(picture, step["pixels"][world].numpy())
+        step["action"] = torch.as_tensor(action[order, t])
+        after = env.step(step)["next"]
+        assert np.array_equal(after["reward"][:, 0].numpy(), reward[order, t])
+        step = after.select("state", "joint_target", "goal", "pixels")
+    assert np.array_equal(after["state"].numpy(), terminal.values[STATE][order])
+    assert np.array_equal(after["pixels"].numpy(), terminal.values[FRONT][order])
+    assert np.array_equal(after["goal"].numpy(), terminal.values[GOAL][order])
+    done = column(dataset, DONE).reshape(20, 6)
+    assert done[:, -1].all()
+    assert not done[:, :-1].any()
+
+
+def test_provenance_says_how(collected) -> None:
+    provenance = read_provenance(collected)
+    assert provenance is not None
+    assert [(s["policy"], s["episodes"], s["seed"]) for s in provenance["sessions"]] == [
+        ("smooth", 12, 5),
+        ("ik", 8, 5),
+    ]
+    assert provenance["sessions"][0]["config"]["env"]["image_size"] == 16
+    assert provenance["sessions"][0]["versions"]["newton"]
+
+
+def test_the_same_seed_gives_the_same_dataset(collected, tmp_path, load) -> None:
+    out = tmp_path / "again"
+    assert main(["collect", f"out={out}", "num_envs=8", "workers=0", "seed=5", "episodes=12", *SMALL]) == 0
+    again, before = load(out), load(collected)
+    assert np.array_equal(column(again, EPISODE_KEY), column(before, EPISODE_KEY)[: 12 * 6])
+
+
+def test_ctrl_c_leaves_a_dataset(tmp_path, load) -> None:
+    options = OPTIONS | {"out": str(tmp_path / "set"), "num_envs": 4, "episodes": 100_000}
+    source = open_source(options, SMALL)
+    timer = threading.Timer(1.0, os.kill, (os.getpid(), signal.SIGINT))
+    timer.start()
+    out, whole = gather(source, out=options["out"], episodes=options["episodes"], workers=0)
+    timer.join()
+    assert not whole
+    dataset = load(out)
+    assert 0 < dataset.num_episodes < 100_000
+    assert dataset.num_frames == 6 * dataset.num_episodes
+
+
+@pytest.mark.parametrize(
+    ("arguments", "says"),
+    [
+        (["episodes=3"], "give out="),
+        (["out=x", "episodes=none"], "must be a whole number"),
+        (["out=x", "episodes=0"], "at least 1"),
+        (["out=x", "format=gif"], "must be one of exact, video"),
+        (["out=x", "policy=planner"], "give checkpoint="),
+        (["out=x", "policy=nonsense"], "smooth, noop, ik, or the folder of a run"),
+        (["out=x", "env=nonsense"], "nonsense"),
+        (["out=x", "env.fps=29.97"], "whole frames"),
+        (["out=x", "env.observations=[depth]"], "depth has no place"),
+        (["out=x", "rubbish"], "is not one of"),
+    ],
+)
+def test_bad_arguments_are_one_line(arguments, says, capsys, tmp_path, monkeypatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert main(["collect", *arguments]) == 1
+    error = capsys.readouterr().err.strip()
+    assert says in error
+    assert error.count("\n") == 0
+    assert list(tmp_path.iterdir()) == []
+
+
+# -- a replay ----------------------------------------------------------------------------------------------------
+
+
+def replay_of(env, steps: int):
+    """(worlds, time) with what a trainer keeps."""
+    policy = SmoothRandomPolicy(7, generator=torch.Generator().manual_seed(0))
+    options = {"frames_per_batch": env.num_envs * steps, "total_frames": -1, "track_traj_ids": False}
+    batch = next(iter(Collector(env, policy, **options)))
+    keys = [key for key in ("state", "joint_target", "pixels") if key in batch.keys()]  # noqa: SIM118
+    return batch.select(*keys, "action", "is_init", *(("next", k) for k in (*keys, "reward", "terminated")))
+
+
+def test_a_replay_comes_back_bit_for_bit(tmp_path, load, small_env) -> None:
+    env = small_env(3, observations=("pixels", "state", "joint_target"), image_size=16, episode_length=7)
+    data = replay_of(env, 25)
+    done = export_replay(
+        data[:, 3:], config=env.config, out=tmp_path / "set", seed=9, policy="p", settings={}, workers=0
+    )
+    assert (done.episodes, done.frames, done.partial) == (6, 42, 6)
+    dataset = load(done.out)
+    terminal = read_terminals(
+        done.out,
+        keys=column(dataset, EPISODE_KEY).reshape(6, 7)[:, 0].tolist(),
+        lengths=[7] * 6,
+        features={name: dataset.meta.features[name] for name in (STATE, FRONT)},
+    )
+    seeds = column(dataset, SEED).reshape(6, 7, 3)[:, 0]
+    for i, (world, begin) in enumerate(((0, 7), (1, 7), (2, 7), (0, 14), (1, 14), (2, 14))):
+        part = data[world, begin : begin + 7]
+        assert list(seeds[i]) == [9, world, -1]
+        rows = slice(7 * i, 7 * i + 7)
+        for name, key in ((STATE, "state"), (ACTION, "action"), (TARGET, "joint_target")):
+            assert np.array_equal(column(dataset, name)[rows], part[key].numpy())
+        assert np.array_equal(column(dataset, REWARD)[rows], part["next", "reward"][:, 0].numpy())
+        pictures = [(dataset[j][FRONT].numpy() * 255).round() for j in range(7 * i, 7 * i + 7)]
+        assert np.array_equal(np.stack(pictures).transpose(0, 2, 3, 1), part["pixels"].numpy())
+        assert np.array_equal(terminal.values[STATE][i], part["next", "state"][-1].numpy())
+        assert np.array_equal(terminal.values[FRONT][i], part["next", "pixels"][-1].numpy())
+    np.testing.assert_allclose(column(dataset, GOAL), np.tile(env.config.goal, (42, 1)), atol=1e-6)
+    assert column(dataset, SUCCESS).dtype == bool
+
+
+def test_a_replay_without_whole_episodes_is_refused(tmp_path, small_env) -> None:
+    env = small_env(2, episode_length=50)
+    with pytest.raises(UserError, match="no whole episode of 50 steps, only 2 partial"):
+        export_replay(
+            replay_of(env, 5),
+            config=env.config,
+            out=tmp_path / "set",
+            seed=0,
+            policy="p",
+            settings={},
+            workers=0,
+        )
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_export_of_a_run_without_replay_is_one_line(tmp_path, capsys) -> None:
+    from omegaconf import OmegaConf
+
+    from franka_wm.training.checkpoint import save_checkpoint
+
+    save_checkpoint(
+        tmp_path / "run", model=torch.nn.Linear(2, 2), config=OmegaConf.create({"seed": 0}), counters={}
+    )
+    assert main(["export", f"source={tmp_path / 'run'}", f"out={tmp_path / 'set'}"]) == 1
+    assert "without its replay" in capsys.readouterr().err
+
+
+def test_a_saved_replay_is_exported(tmp_path, load, small_env) -> None:
+    from omegaconf import OmegaConf
+
+    from franka_wm.training.checkpoint import save_checkpoint
+
+    env = small_env(2, episode_length=5)
+    config = {
+        "seed": 3,
+        "env": {"kind": "franka", "urdf_path": None, "episode_length": 5, "observations": ["state"]},
+    }
+    save_checkpoint(
+        tmp_path / "run" / "checkpoints" / "latest",
+        model=torch.nn.Linear(2, 2),
+        config=OmegaConf.create(config),
+        counters={},
+        replay=replay_of(env, 12),
+    )
+    out = tmp_path / "set"
+    assert main(["export", f"source={tmp_path / 'run'}", f"out={out}", "workers=0"]) == 0
+    assert load(out).num_episodes == 4
+    assert json.loads((out / "meta/franka_wm/provenance.json").read_text())["sessions"][0]["seed"] == 3
+
+
+def test_schemas_of_several_cameras() -> None:
+    from franka_wm.envs import FrankaConfig
+
+    config = FrankaConfig(observations=("pixels", "goal_pixels", "state"), cameras=("wrist", "front"))
+    schema = schema_for(config)
+    assert {name: schema.sources[name] for name in schema.images} == {
+        IMAGE_PREFIX + "wrist": "pixels",
+        IMAGE_PREFIX + "front": "pixels_front",
+        IMAGE_PREFIX + "goal": "goal_pixels",
+    }

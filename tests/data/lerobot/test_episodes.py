@@ -1,0 +1,146 @@
+"""Whole episodes out of batches, whatever the batches' sizes."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from tensordict import TensorDict
+
+from franka_wm.data.lerobot.episodes import EpisodeCutter, cut_replay
+from franka_wm.data.lerobot.schema import (
+    ACTION,
+    DONE,
+    JOINTS,
+    REWARD,
+    SEED,
+    STATE,
+    SUCCESS,
+    TERMINATED,
+    TOOL,
+    TRUNCATED,
+    episode_key,
+)
+from franka_wm.errors import UserError
+
+WORLDS, STEPS, LENGTH = 5, 60, 8
+
+
+def stream(ends: np.ndarray, seed: int = 0) -> TensorDict:
+    """(worlds, time) as a collector gives it, with an end wherever ``ends`` says so; values are all different."""
+    rng = torch.Generator().manual_seed(seed)
+    done = torch.as_tensor(ends).unsqueeze(-1)
+    first = torch.ones_like(done)
+    first[:, 1:] = done[:, :-1]
+
+    def noise(*shape: int) -> torch.Tensor:
+        return torch.randn(*ends.shape, *shape, generator=rng)
+
+    state, after = noise(20), noise(20)
+    inside = ~done[:, :-1]  # o of the next step is what this one led to, except across an end
+    state[:, 1:] = torch.where(inside, after[:, :-1], state[:, 1:])
+    pixels = torch.randint(0, 255, (*ends.shape, 16, 16, 3), generator=rng, dtype=torch.uint8)
+    late = torch.as_tensor(rng_bool(ends.shape, seed)).unsqueeze(-1)
+    root = {"state": state, "joint_target": noise(7), "goal": noise(3), "pixels": pixels, "action": noise(7)}
+    following = {
+        "state": after,
+        "joint_target": noise(7),
+        "goal": noise(3),
+        "pixels": pixels.flip(-1),
+        "reward": noise(1),
+        "done": done,
+        "terminated": done & ~late,
+        "truncated": done & late,
+        "success": done & ~late,
+    }
+    return TensorDict(root | {"is_init": first, "next": following}, batch_size=ends.shape)
+
+
+def rng_bool(shape, seed: int, share: float = 0.5) -> np.ndarray:
+    return np.random.default_rng(seed).random(shape) < share
+
+
+@pytest.mark.parametrize("sizes", [[60], [1] * 60, [7] * 8 + [4], [3, 40, 17]])
+def test_cutting_does_not_depend_on_the_batches(sizes, make_schema) -> None:
+    data = stream(rng_bool((WORLDS, STEPS), 3, 0.15))
+    cutter = EpisodeCutter(make_schema(), seed=11)
+    episodes, begin = [], 0
+    for size in sizes:
+        episodes += cutter.push(data[:, begin : begin + size])
+        begin += size
+    done = data["next", "done"][..., 0].numpy()
+    expected = {}  # by a plain loop
+    for world in range(WORLDS):
+        start = number = 0
+        for t in range(STEPS):
+            if done[world, t]:
+                expected[world, number] = (start, t + 1)
+                start, number = t + 1, number + 1
+    assert len(episodes) == len(expected)
+    for episode in episodes:
+        run, world, number = episode.rows[SEED][0]
+        assert run == 11
+        begin, end = expected.pop((int(world), int(number)))
+        part = data[int(world), begin:end]
+        for feature, key in ((STATE, "state"), (ACTION, "action"), ("observation.images.front", "pixels")):
+            assert np.array_equal(episode.rows[feature], part[key].numpy())
+        for feature in (REWARD, DONE, TERMINATED, TRUNCATED, SUCCESS):
+            assert np.array_equal(episode.rows[feature], part["next", feature.removeprefix("next.")].numpy())
+        assert np.array_equal(episode.terminal[STATE], part["next", "state"][-1].numpy())
+        assert np.array_equal(
+            episode.terminal["observation.images.front"], part["next", "pixels"][-1].numpy()
+        )
+        assert np.array_equal(episode.rows[JOINTS], episode.rows[STATE][:, :7])
+        assert np.array_equal(episode.terminal[TOOL], episode.terminal[STATE][14:17])
+        assert episode.key == episode_key(episode.rows)
+    open_steps = sum(STEPS - 1 - max(np.flatnonzero(row), default=-1) for row in done)
+    assert cutter.waiting == open_steps
+
+
+def test_keys_differ_even_where_numbers_agree(make_schema) -> None:
+    data = stream(rng_bool((1, STEPS), 3, 0.2)).expand(3, STEPS)
+    episodes = EpisodeCutter(make_schema(), seed=0).push(data.contiguous())
+    assert len({episode.key for episode in episodes}) == len(episodes)
+
+
+def test_moves_become_the_actions_they_stand_for(make_schema) -> None:
+    from franka_wm.envs.discretize import discrete_action_table
+
+    table = discrete_action_table(7)
+    data = stream(rng_bool((2, STEPS), 3, 0.2))
+    data["action"] = torch.randint(0, 15, (2, STEPS))
+    episode = EpisodeCutter(make_schema(), seed=0, discrete=table).push(data)[0]
+    world = int(episode.rows[SEED][0, 1])
+    assert np.array_equal(episode.rows[ACTION], table[data["action"][world, : episode.length]].numpy())
+
+
+def test_missing_observations_are_named(make_schema) -> None:
+    data = stream(rng_bool((2, 9), 3, 0.2)).exclude("joint_target")
+    with pytest.raises(UserError, match="no 'joint_target'"):
+        EpisodeCutter(make_schema(), seed=0).push(data)
+
+
+def test_a_replay_gives_whole_episodes_only(make_schema) -> None:
+    ends = np.zeros((2, STEPS), bool)
+    ends[0, LENGTH - 1 :: LENGTH] = True  # all by time
+    ends[1, [2, 10, 14, 22, 30, 38, 46, 54]] = True  # 3 (cut short), 8, 4 (terminated), 8, 8, …
+    data = stream(ends)
+    data["next", "terminated"] = torch.zeros_like(data["next", "terminated"])
+    data["next", "terminated"][1, 14] = True
+    data["is_init"][0, 0] = False  # the oldest has lost its start
+    kept = data.clone()
+    for key in ("done", "truncated"):
+        del data["next", key]
+    episodes, partial = cut_replay(data, make_schema(), seed=4, episode_length=LENGTH)
+    lengths = {world: [e.length for e in episodes if e.rows[SEED][0, 1] == world] for world in (0, 1)}
+    assert lengths == {0: [8] * 6, 1: [8, 4, 8, 8, 8, 8, 8]}
+    assert partial == 4  # the first of each world, and the steps after the last end of each
+    ended = next(e for e in episodes if e.length == 4)
+    assert ended.rows[TERMINATED][-1, 0]
+    assert not ended.rows[TRUNCATED][-1, 0]
+    assert np.array_equal(ended.rows[STATE], kept["state"][1, 11:15].numpy())
+    assert np.array_equal(ended.terminal[STATE], kept["next", "state"][1, 14].numpy())
+    by_time = next(e for e in episodes if e.length == 8)
+    assert by_time.rows[TRUNCATED][-1, 0]
+    assert not by_time.rows[TRUNCATED][:-1].any()
+    assert list(by_time.rows[SEED][0, [0, 2]]) == [4, -1]
