@@ -21,6 +21,21 @@ _FAMILIES: dict[str, tuple[str, str, str]] = {
         "MuZero",
         "MuZero: a latent model for tree search over a few discrete moves",
     ),
+    "jepa": (
+        "franka_wm.models.jepa",
+        "JEPA",
+        "JEPA: pretrains a vision encoder from pictures alone (I-JEPA, V-JEPA, LeJEPA)",
+    ),
+    "lewm": (
+        "franka_wm.models.lewm",
+        "LeWorldModel",
+        "LeWorldModel: action-conditioned JEPA trained end to end with SIGReg",
+    ),
+    "action_world_model": (
+        "franka_wm.models.action_world_model",
+        "ActionWorldModel",
+        "V-JEPA 2-AC: transformer dynamics over the tokens of a pretrained encoder",
+    ),
 }
 _REGISTERED: dict[str, tuple[type, str]] = {}
 

@@ -1,6 +1,7 @@
 """TD-MPC2: a latent world model without decoder (Hansen, Su & Wang, ICLR 2024, arXiv:2310.16828)."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Any, Literal
 
 import torch
@@ -9,13 +10,16 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from franka_wm.models.parts import Ensemble, GaussianPolicy, RunningScale, SimNorm, TwoHotSymlog, mlp
+from franka_wm.models.pixel_encoder import PixelEncoder
+from franka_wm.models.vision import RandomShift, check_image_sizes, check_pictures
 
 
 class TDMPC2(nn.Module):
     """Encoder, dynamics, reward, Q-ensemble and policy over one latent space, trained together.
 
     z = h(s);  z' = d(z, a);  r = R(z, a);  q = Q(z, a);  a = π(z). The defaults are the published
-    5 M-parameter model for state observations. Latents (..., `latent_dim`) are simplices of `simnorm_dim`
+    5 M-parameter model for state observations, for pictures with `image_sizes` (shifted at random in `loss`
+    in training mode, never while planning), or for both. Latents (..., `latent_dim`) are simplices of `simnorm_dim`
     features, both from the encoder and from the dynamics. Rewards and values are in the units of the
     environment's reward.
 
@@ -27,9 +31,12 @@ class TDMPC2(nn.Module):
       * One backward pass serves model and policy, so the policy learns from the critic before this update
         instead of after it. Their gradients stay apart.
       * The entropy bonus is the plain entropy of the squashed Gaussian.
+      * All frames of a window are shifted alike, so that motion between them is kept; the paper shifts each.
 
     Args:
-        observation_sizes: observation key -> size of its last dimension; encoded in this order.
+        observation_sizes: observation key -> size of its last dimension; encoded in this order. May be empty
+            where there are pictures.
+        image_sizes: picture key -> (height, width, channels), uint8.
         action_dim: size of an action; each component lies in [-1, 1].
         episode_length: steps of an episode, from which the discount follows if it is not given:
             clamp((T/5 - 1) / (T/5), 0.95, 0.995).
@@ -49,6 +56,13 @@ class TDMPC2(nn.Module):
         consistency_coef, reward_coef, value_coef, entropy_coef: weights of the losses.
         tau: how far target Q-functions, and the policy loss's scale, move at each update.
         encoder_lr_scale: learning rate of the encoder relative to the rest.
+        channels: of each convolution over pictures.
+        random_shift: pixels by which pictures are shifted at most, in each direction; the paper pads by 3 to 4.
+        encoder_from: start from the vision transformer of this checkpoint instead of convolutions, see
+            `franka_wm.models.backbone.read_encoder`.
+        encoder_architecture: the transformer's numbers; only to rebuild from a checkpoint.
+        encoder_grid: average its tokens to so many rows and columns.
+        freeze_encoder: keep it as it is; what joins its features into z is still trained.
 
     Raises:
         ValueError: a size or coefficient that cannot work, or neither `episode_length` nor `discount`.
@@ -60,7 +74,8 @@ class TDMPC2(nn.Module):
     def __init__(
         self,
         *,
-        observation_sizes: Mapping[str, int],
+        observation_sizes: Mapping[str, int] | None = None,
+        image_sizes: Mapping[str, tuple[int, int, int]] | None = None,
         action_dim: int,
         episode_length: int | None = None,
         discount: float | None = None,
@@ -84,10 +99,17 @@ class TDMPC2(nn.Module):
         entropy_coef: float = 1e-4,
         tau: float = 0.01,
         encoder_lr_scale: float = 0.3,
+        channels: int = 32,
+        random_shift: int = 3,
+        encoder_from: str | Path | None = None,
+        encoder_architecture: Sequence[int] | None = None,
+        encoder_grid: int | None = 4,
+        freeze_encoder: bool = False,
     ) -> None:
         super().__init__()
-        sizes = {str(key): int(size) for key, size in observation_sizes.items()}
-        if not sizes or min(sizes.values()) < 1:
+        sizes = {str(key): int(size) for key, size in (observation_sizes or {}).items()}
+        self.image_sizes = check_image_sizes(image_sizes or {})
+        if (not sizes and not self.image_sizes) or min(sizes.values(), default=1) < 1:
             raise ValueError(f"observation_sizes needs at least one key, each of size 1 or more, got {sizes}")
         if action_dim < 1:
             raise ValueError(f"action_dim must be at least 1, got {action_dim}")
@@ -110,15 +132,37 @@ class TDMPC2(nn.Module):
             latent_dim,
             num_q,
         )
+        self.observation_keys = [*sizes, *self.image_sizes]
         self.discount = _discount(discount, episode_length)
         self.rho, self.tau, self.encoder_lr_scale = rho, tau, encoder_lr_scale
         self.consistency_coef, self.reward_coef = consistency_coef, reward_coef
         self.value_coef, self.entropy_coef = value_coef, entropy_coef
 
         observation_dim, hidden = sum(sizes.values()), (hidden_dim, hidden_dim)
-        self.encoder = mlp(
-            observation_dim, (encoder_dim,) * (encoder_layers - 1), latent_dim, output=SimNorm(simnorm_dim)
-        )
+        pretrained = encoder_from is not None or encoder_architecture is not None
+        if (pretrained and not self.image_sizes) or (freeze_encoder and not pretrained):
+            raise ValueError("encoder_from needs pictures, and freeze_encoder needs encoder_from")
+        if self.image_sizes:
+            self.encoder: nn.Module = PixelEncoder(
+                image_sizes=self.image_sizes,
+                observation_dim=observation_dim,
+                hidden=(encoder_dim,) * max(1, encoder_layers - 1),
+                latent_dim=latent_dim,
+                simnorm_dim=simnorm_dim,
+                channels=channels,
+                encoder_from=encoder_from,
+                architecture=encoder_architecture,
+                grid=encoder_grid,
+                freeze=freeze_encoder,
+            )
+        else:
+            self.encoder = mlp(
+                observation_dim,
+                (encoder_dim,) * (encoder_layers - 1),
+                latent_dim,
+                output=SimNorm(simnorm_dim),
+            )
+        self.random_shift = RandomShift(random_shift)
         self.dynamics = mlp(latent_dim + action_dim, hidden, latent_dim, output=SimNorm(simnorm_dim))
         self.reward_head = mlp(latent_dim + action_dim, hidden, bins)
         nn.init.zeros_(self.reward_head[-1].weight)  # type: ignore[arg-type]  # first prediction: exactly 0
@@ -171,9 +215,19 @@ class TDMPC2(nn.Module):
         self.observation_std.copy_(torch.where(std > 1e-6, std, torch.ones_like(std)))
 
     def encode(self, observation: TensorDictBase) -> Tensor:
-        """Observations with keys `observation_sizes`, each (..., size) -> latents (..., latent_dim)."""
-        x = torch.cat([observation.get(key) for key in self.observation_sizes], dim=-1)
-        return self.encoder(self._standardise(x))
+        """Observations with keys `observation_sizes`, each (..., size), and `image_sizes`, each
+        (..., height, width, C) uint8 -> latents (..., latent_dim)."""
+        pictures = {key: check_pictures(observation.get(key)) for key in self.image_sizes}
+        vectors = None
+        if self.observation_sizes:
+            x = torch.cat([observation.get(key) for key in self.observation_sizes], dim=-1)
+            vectors = self._standardise(x)
+        return self._encode(vectors, pictures)
+
+    def rebuild_overrides(self) -> dict[str, Any]:
+        """Constructor arguments that replace those which read other files, so that the model's own weights
+        rebuild it: JSON-able."""
+        return self.encoder.rebuild() if isinstance(self.encoder, PixelEncoder) else {}
 
     def next(self, z: Tensor, action: Tensor) -> Tensor:
         """Latents (..., latent_dim) and actions (..., action_dim) -> next latents (..., latent_dim)."""
@@ -268,7 +322,7 @@ class TDMPC2(nn.Module):
             -1, 1, 1
         )
 
-        encoded = self.encoder(self._standardise(self._window(batch)))  # (H+1, B, D), one call
+        encoded = self._encode_window(batch)  # (H+1, B, D), one call
         after = encoded[1:].detach()
         with torch.no_grad():
             target = self._td_target(after, reward, terminated)
@@ -309,13 +363,14 @@ class TDMPC2(nn.Module):
         return TensorDict({"loss": total, **metrics}, batch_size=[])
 
     def parameter_groups(self, lr: float) -> list[dict[str, Any]]:
-        """Parameter groups for Adam; every parameter is in exactly one.
+        """Parameter groups for Adam; every parameter that is trained is in exactly one.
 
         Besides Adam's own options each group has a `name`, and a `clip`: gradient norms are clipped (at 20,
         as published) over all groups with the same `clip` together.
         """
         encoder, policy = list(self.encoder.parameters()), list(self.policy_head.parameters())
         apart = {id(parameter) for parameter in (*encoder, *policy)}
+        encoder = [parameter for parameter in encoder if parameter.requires_grad]
         rest = [parameter for parameter in self.parameters() if id(parameter) not in apart]
         return [
             {"name": "encoder", "clip": "model", "params": encoder, "lr": lr * self.encoder_lr_scale},
@@ -331,6 +386,21 @@ class TDMPC2(nn.Module):
 
     def _standardise(self, x: Tensor) -> Tensor:
         return (x.to(self.observation_mean.dtype) - self.observation_mean) / self.observation_std
+
+    def _encode(self, vectors: Tensor | None, pictures: Mapping[str, Tensor]) -> Tensor:
+        if not self.image_sizes:
+            return self.encoder(vectors)
+        return self.encoder(pictures, vectors)
+
+    def _encode_window(self, batch: TensorDictBase) -> Tensor:
+        """Latents (H+1, B, D) of the H+1 observations of windows [B, H]; pictures are shifted in training."""
+        vectors = self._standardise(self._window(batch)) if self.observation_sizes else None
+        after = batch.get("next")
+        pictures = {}
+        for key in self.image_sizes:
+            window = torch.cat((batch.get(key), after.get(key)[:, -1:]), dim=1)
+            pictures[key] = self.random_shift(check_pictures(window)).transpose(0, 1)
+        return self._encode(vectors, pictures)
 
     def _window(self, batch: TensorDictBase) -> Tensor:
         """The H+1 observations of windows [B, H], time first: (H+1, B, observation_dim)."""

@@ -1,0 +1,334 @@
+"""LeWorldModel: an action-conditioned JEPA trained end to end, kept from collapsing by SIGReg alone."""
+
+from collections.abc import Mapping
+from typing import Any
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+from franka_wm.models.groups import decay_groups
+from franka_wm.models.jepa import one_size, stack_views
+from franka_wm.models.memory import Memory
+from franka_wm.models.parts import TwoHotSymlog, initialize, mlp
+from franka_wm.models.regularizers import (
+    ProjectionMLP,
+    SIGReg,
+    feature_std,
+    info_nce,
+    participation_ratio,
+)
+from franka_wm.models.transformer import CausalTransformer, block_causal_mask, hide_invalid
+from franka_wm.models.vectors import Vectors
+from franka_wm.models.vision import ViT, vit_size
+
+
+class LeWorldModel(nn.Module):
+    """Encoder and action-conditioned predictor of embeddings, one loss for both (LeWorldModel, after LeJEPA,
+    Balestriero & LeCun 2025, arXiv:2511.08544).
+
+    loss = mean squared error of the next embedding + `sigreg_coef` · SIGReg of the embeddings, for each time
+    step over the batch. No stop-gradient, no teacher, no decoder, no reward. An embedding is a vision
+    transformer's class token through an MLP with BatchNorm; the predictor is a causal transformer over the
+    last `history` embeddings with the actions through AdaLN-zero.
+
+    z holds the last `history` frames' embeddings, the actions between them and who is real (see
+    `franka_wm.models.memory`), so `next(z, action)` needs nothing else. Distances to a goal are measured on
+    `embed(z)`, the newest embedding. BatchNorm uses the batch's statistics in `loss` alone, and there in
+    training mode alone: planning never depends on what else is in the batch.
+
+    With `observation_sizes` a frame's embedding is joined by that of the state vector; without pictures it is
+    that of the state alone. With pictures, goals are compared by the picture's part.
+
+    Deliberate differences: rotary positions in the predictor instead of learned ones, so that a history which
+    is still short predicts as in training; `rollout`, InfoNCE and the reward probe, off by default.
+
+    Args:
+        image_sizes: picture key -> (height, width, channels); several of one size share the encoder.
+        observation_sizes: vector key -> size; may be empty if there are pictures.
+        action_dim: size of an action.
+        episode_length: unused but for the discount's default.
+        embed_dim: of a frame's picture.
+        state_embed_dim: of a frame's state vector, next to pictures; without, it is `embed_dim`.
+        state_hidden_dim: width of the state encoder's two hidden layers.
+        history: frames that the predictor sees.
+        encoder_size, encoder_width, encoder_depth, encoder_heads, patch_size: the vision transformer.
+        projector_hidden: of the MLPs after encoder and predictor.
+        predictor_depth, predictor_heads, predictor_head_dim, predictor_mlp, dropout: the predictor.
+        sigreg_coef, sigreg_directions: of the regulariser.
+        rollout: 1, as published: predict from true embeddings. More: feed predictions back for so many steps
+            at the end of each window as well.
+        infonce_coef: weight of an InfoNCE loss between predicted and true next embeddings.
+        reward_head: learn the reward as a probe of z whose gradient stops there, for planners that need it;
+            the batch must then hold rewards.
+        discount: of the rewards, for objectives that ask.
+        weight_decay: of matrices.
+
+    Raises:
+        ValueError: a setting that cannot work.
+    """
+
+    def __init__(
+        self,
+        *,
+        image_sizes: Mapping[str, tuple[int, int, int]] | None = None,
+        observation_sizes: Mapping[str, int] | None = None,
+        action_dim: int,
+        episode_length: int | None = None,
+        embed_dim: int = 192,
+        state_embed_dim: int = 64,
+        state_hidden_dim: int = 256,
+        history: int = 3,
+        encoder_size: str = "tiny",
+        encoder_width: int | None = None,
+        encoder_depth: int | None = None,
+        encoder_heads: int | None = None,
+        patch_size: int = 8,
+        projector_hidden: int = 2048,
+        predictor_depth: int = 6,
+        predictor_heads: int = 16,
+        predictor_head_dim: int = 64,
+        predictor_mlp: int = 2048,
+        dropout: float = 0.1,
+        sigreg_coef: float = 0.09,
+        sigreg_directions: int = 1024,
+        rollout: int = 1,
+        infonce_coef: float = 0.0,
+        reward_head: bool = False,
+        discount: float = 0.99,
+        weight_decay: float = 1e-3,
+    ) -> None:
+        super().__init__()
+        if not image_sizes and not observation_sizes:
+            raise ValueError("give observation_sizes or image_sizes: there is nothing to read")
+        if rollout < 1:
+            raise ValueError(f"rollout must be at least 1, got {rollout}")
+        if min(sigreg_coef, infonce_coef) < 0.0:
+            raise ValueError("sigreg_coef and infonce_coef must not be negative")
+        if not 0.0 <= discount <= 1.0:
+            raise ValueError(f"discount must be in [0, 1], got {discount}")
+        self.vectors = Vectors(observation_sizes or {})
+        self.observation_sizes, self.action_dim = self.vectors.sizes, action_dim
+        self.sigreg_coef, self.infonce_coef, self.rollout = sigreg_coef, infonce_coef, rollout
+        self.weight_decay, self.discount = weight_decay, discount
+        self.image_sizes: dict[str, tuple[int, int, int]] = {}
+        self.encoder = self.projector = self.state_encoder = None
+        self.image_part = self.state_part = 0
+        if image_sizes:
+            self.image_sizes, size = one_size(image_sizes)
+            shape = vit_size(encoder_size, width=encoder_width, depth=encoder_depth, heads=encoder_heads)
+            self.encoder = ViT(
+                image_size=size,
+                patch_size=patch_size,
+                width=shape.width,
+                depth=shape.depth,
+                heads=shape.heads,
+                cls=True,
+            )
+            self.image_part = embed_dim
+            self.projector = ProjectionMLP(
+                shape.width * len(self.image_sizes), embed_dim, hidden=projector_hidden
+            )
+        if self.observation_sizes:
+            self.state_part = state_embed_dim if image_sizes else embed_dim
+            self.state_encoder = mlp(self.vectors.size, (state_hidden_dim, state_hidden_dim), self.state_part)
+            _spread(self.state_encoder)
+        self.observation_keys = [*self.observation_sizes, *self.image_sizes]
+        frame = self.image_part + self.state_part
+        self.memory = Memory(history=history, frame_dim=frame, action_dim=action_dim)
+        self.latent_dim = self.memory.size
+        self.action_encoder = nn.Sequential(nn.Linear(action_dim, frame), nn.SiLU(), nn.Linear(frame, frame))
+        initialize(self.action_encoder)
+        _spread(self.action_encoder)
+        self.predictor = CausalTransformer(
+            width=frame,
+            depth=predictor_depth,
+            heads=predictor_heads,
+            head_dim=predictor_head_dim,
+            hidden=predictor_mlp,
+            condition=frame,
+            dropout=dropout,
+        )
+        self.head = ProjectionMLP(frame, frame, hidden=projector_hidden)
+        self.sigreg = SIGReg(directions=sigreg_directions)
+        self.reward_probe = None
+        if reward_head:
+            self.two_hot = TwoHotSymlog()
+            self.reward_probe = mlp(self.latent_dim + action_dim, (256, 256), self.two_hot.bins)
+            nn.init.zeros_(self.reward_probe[-1].weight)  # type: ignore[arg-type]
+            self.reward = self._reward  # there only where it can be asked
+
+    # ------------------------------------------------------------------ what a planner uses
+
+    def set_observation_statistics(self, mean: Tensor, std: Tensor) -> None:
+        """Standardise state vectors from now on, see `Vectors.set_statistics`."""
+        self.vectors.set_statistics(mean, std)
+
+    def encode(self, observation: TensorDictBase) -> Tensor:
+        """The z (..., latent_dim) of an episode's first observation: a history of one frame."""
+        return self.memory.start(self._frame(observation))
+
+    def observe(
+        self, observation: TensorDictBase, previous_z: Tensor, action: Tensor, is_init: Tensor
+    ) -> Tensor:
+        """The z after `action` led to `observation`.
+
+        Args:
+            observation: batch size [E].
+            previous_z: (E, latent_dim), before the action.
+            action: (E, action_dim).
+            is_init: (E, 1) bool; where True the observation is an episode's first, and z that of `encode`.
+        """
+        frame = self._frame(observation)
+        pushed = self.memory.push(previous_z, action, frame)
+        return torch.where(is_init, self.memory.start(frame), pushed)
+
+    def next(self, z: Tensor, action: Tensor) -> Tensor:
+        """z (..., latent_dim) and actions (..., action_dim) -> next z (..., latent_dim)."""
+        frames, actions, valid = (x.reshape(-1, *x.shape[z.dim() - 1 :]) for x in self.memory.split(z))
+        flat = action.reshape(-1, self.action_dim)
+        actions = torch.cat((actions, flat.unsqueeze(1).to(actions.dtype)), dim=1)
+        mask = block_causal_mask(self.memory.history, device=z.device)
+        predicted = self._predict(frames, actions, hide_invalid(mask, valid), training=False)[:, -1]
+        return self.memory.push(z, action, predicted.view(*z.shape[:-1], -1))
+
+    def embed(self, z: Tensor) -> Tensor:
+        """What goals are compared on: the newest frame's embedding (..., embed_dim)."""
+        return self._comparable(self.memory.last(z))
+
+    def encode_goal(self, observation: TensorDictBase) -> Tensor:
+        """The embedding (..., embed_dim) of a goal: of its pictures where the model reads any (state vectors
+        are not needed then), else of its state vectors."""
+        if self.image_sizes:
+            return self._picture(observation, batch_statistics=False)
+        return self._comparable(self._frame(observation))
+
+    def _reward(self, z: Tensor, action: Tensor) -> Tensor:
+        """Expected reward (..., 1) of an action in z; the attribute `reward` with `reward_head` only."""
+        assert self.reward_probe is not None
+        return self.two_hot.decode(self.reward_probe(torch.cat((z, action), dim=-1)))
+
+    # ------------------------------------------------------------------ training
+
+    def forward(self, batch: TensorDictBase) -> TensorDict:
+        """Same as `loss`, for wrappers that call the module."""
+        return self.loss(batch)
+
+    def loss(self, batch: TensorDictBase) -> TensorDict:
+        """Loss of a batch of windows; call `backward` once on the entry `loss`.
+
+        Args:
+            batch: batch size [B, H]: H contiguous transitions of one episode, with the observation keys,
+                `action` (B, H, A), in `next` the observation keys and, with `reward_head` only, `reward`
+                (B, H, 1). Of `next` only the last observation is read.
+
+        Returns:
+            batch size []: `loss`, and detached `loss_prediction`, `loss_sigreg`, `relative_error` (squared
+            error of the prediction over that of predicting no change), `feature_std` and `feature_rank`
+            (participation ratio) of the embeddings; `loss_infonce`, `loss_reward` where asked for.
+
+        Raises:
+            ValueError: the batch size is not [B, H].
+        """
+        if len(batch.batch_size) != 2:
+            raise ValueError(f"a batch of windows has batch size [B, H], got {list(batch.batch_size)}")
+        action = batch.get("action")
+        frames = self._frame(window_of(batch, self.observation_keys), batch_statistics=self.training)
+        frames = frames.float()  # (B, H+1, F)
+
+        cut = self.memory.windows
+        before, after, actions = cut(frames[:, :-1]), cut(frames[:, 1:]), cut(action)
+        mask = block_causal_mask(before.shape[1], device=before.device)
+        predicted = self._predict(before, actions, mask, training=self.training).float()
+        prediction = F.mse_loss(predicted, after)
+        total = prediction
+        sigreg = self._sigreg(frames.transpose(0, 1))
+        total = total + self.sigreg_coef * sigreg
+        extra: dict[str, Tensor] = {}
+        if self.rollout > 1:
+            extra["loss_rollout"] = self._rollout_loss(frames, action)
+        if self.infonce_coef:
+            extra["loss_infonce"] = self.infonce_coef * info_nce(predicted[:, -1], after[:, -1])
+        if self.reward_probe is not None:
+            z = self.memory.gather(frames[:, :-1].detach(), action)
+            logits = self.reward_probe(torch.cat((z, action.to(z.dtype)), dim=-1))
+            extra["loss_reward"] = self.two_hot.loss(logits.float(), batch.get(("next", "reward"))).mean()
+        for value in extra.values():
+            total = total + value
+        with torch.no_grad():
+            metrics = {
+                "loss_prediction": prediction.detach(),
+                "loss_sigreg": sigreg.detach(),
+                "relative_error": prediction.detach() / F.mse_loss(before, after).clamp_min(1e-12),
+                "feature_std": feature_std(frames),
+                "feature_rank": participation_ratio(frames),
+                **{name: value.detach() for name, value in extra.items()},
+            }
+        return TensorDict({"loss": total, **metrics}, batch_size=[])
+
+    def parameter_groups(self, lr: float) -> list[dict[str, Any]]:
+        """Parameter groups for AdamW."""
+        return decay_groups(self.parameters(), lr, weight_decay=self.weight_decay)
+
+    def after_update(self) -> None:
+        """Nothing: there is no teacher."""
+
+    # ------------------------------------------------------------------ pieces
+
+    def _picture(self, observation: TensorDictBase, *, batch_statistics: bool) -> Tensor:
+        assert self.encoder is not None and self.projector is not None
+        pictures = stack_views(observation, self.image_sizes)  # (..., V, height, width, C)
+        tokens = self.encoder(pictures.flatten(0, -4))[:, 0]
+        x = tokens.reshape(*pictures.shape[:-4], -1)
+        return self.projector(x, batch_statistics=batch_statistics)
+
+    def _frame(self, observation: TensorDictBase, *, batch_statistics: bool = False) -> Tensor:
+        """Observations (...) -> a frame's embedding (..., F): the picture's, then the state's."""
+        parts = []
+        if self.encoder is not None:
+            parts.append(self._picture(observation, batch_statistics=batch_statistics))
+        if self.state_encoder is not None:
+            parts.append(self.state_encoder(self.vectors(observation)))
+        return parts[0] if len(parts) == 1 else torch.cat(parts, dim=-1)
+
+    def _comparable(self, frame: Tensor) -> Tensor:
+        return frame[..., : self.image_part] if self.image_part else frame
+
+    def _predict(self, frames: Tensor, actions: Tensor, mask: Tensor, *, training: bool) -> Tensor:
+        """Frames (N, K, F), the action taken at each (N, K, A) -> the frame after each (N, K, F)."""
+        positions = torch.arange(frames.shape[1], device=frames.device)
+        condition = self.action_encoder(actions.to(frames.dtype))
+        x = self.predictor(frames, positions, mask, condition, dropout=training)
+        return self.head(x, batch_statistics=training)
+
+    def _sigreg(self, frames: Tensor) -> Tensor:
+        """Of pictures and states apart: they tell of the same thing, so they cannot be independent."""
+        parts = [part for part in (self.image_part, self.state_part) if part]
+        values = [self.sigreg(x) for x in frames.split(parts, dim=-1)]
+        return torch.stack(values).mean()
+
+    def _rollout_loss(self, frames: Tensor, action: Tensor) -> Tensor:
+        """Squared error of predictions fed back, from the second step on, at the end of the windows."""
+        horizon = action.shape[1]
+        start = max(0, horizon - self.rollout)
+        z = self.memory.gather(frames[:, : start + 1], action)[:, -1]
+        predicted = []
+        for t in range(start, horizon):
+            z = self.next(z, action[:, t])
+            predicted.append(self.memory.last(z))
+        return F.mse_loss(torch.stack(predicted, 1)[:, 1:], frames[:, start + 2 :])
+
+
+def window_of(batch: TensorDictBase, keys: list[str]) -> TensorDict:
+    """The H+1 observations of windows [B, H]: the roots, and the last of `next`."""
+    after, (count, horizon) = batch.get("next"), batch.batch_size
+    window = {key: torch.cat((batch.get(key), after.get(key)[:, -1:]), dim=1) for key in keys}
+    return TensorDict(window, batch_size=[count, horizon + 1])
+
+
+def _spread(network: nn.Sequential) -> None:
+    """Weights of unit gain: where no normalisation follows, those of std 0.02 would start with no signal."""
+    last = network[-1]
+    assert isinstance(last, nn.Linear)
+    nn.init.xavier_uniform_(last.weight)

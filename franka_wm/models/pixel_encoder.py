@@ -1,0 +1,107 @@
+"""TD-MPC2's encoder of pictures, and of pictures with vectors."""
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from franka_wm.models.backbone import Backbone
+from franka_wm.models.parts import NormedLinear, SimNorm, initialize
+from franka_wm.models.vision import ConvEncoder
+
+
+class PixelEncoder(nn.Module):
+    """Pictures, and vectors if there are any -> z (..., latent_dim), simplices of `simnorm_dim`.
+
+    Each picture goes through convolutions of its own (or all through one pretrained vision transformer),
+    vectors through `NormedLinear` layers; the features side by side go through one more, with SimNorm. One
+    picture whose features are as many as the latent's go to SimNorm directly, as published.
+
+    Args:
+        image_sizes: picture key -> (height, width, channels).
+        observation_dim: size of the vectors together; 0: none.
+        hidden: widths of the layers over vectors.
+        channels: of the convolutions.
+        encoder_from, architecture, grid: see `Backbone`.
+        freeze: do not train the pretrained transformer.
+    """
+
+    def __init__(
+        self,
+        *,
+        image_sizes: Mapping[str, tuple[int, int, int]],
+        observation_dim: int,
+        hidden: Sequence[int],
+        latent_dim: int,
+        simnorm_dim: int,
+        channels: int = 32,
+        encoder_from: str | Path | None = None,
+        architecture: Sequence[int] | None = None,
+        grid: int | None = 4,
+        freeze: bool = False,
+    ) -> None:
+        super().__init__()
+        self.keys, self.frozen = list(image_sizes), freeze
+        self.backbone = self.convolutions = None
+        if encoder_from is not None or architecture is not None:
+            sizes = set(image_sizes.values())
+            if len(sizes) > 1:
+                raise ValueError(
+                    f"all pictures must have one size to share an encoder, got {dict(image_sizes)}"
+                )
+            self.backbone = Backbone(
+                sizes.pop(), grid=grid, encoder_from=encoder_from, architecture=architecture
+            )
+            features = len(self.keys) * self.backbone.tokens * self.backbone.width
+            if freeze:
+                self.backbone.requires_grad_(False).eval()
+        else:
+            self.convolutions = nn.ModuleList(
+                ConvEncoder(size, channels=channels) for size in image_sizes.values()
+            )
+            features = sum(conv.features for conv in self.convolutions)  # type: ignore[misc]
+        layers = []
+        for width in hidden if observation_dim else ():
+            layers.append(NormedLinear(observation_dim, width))
+            observation_dim = width
+        self.vectors = nn.Sequential(*layers)
+        initialize(self.vectors)
+        self.direct = self.backbone is None and not layers and features == latent_dim
+        simnorm = SimNorm(simnorm_dim)
+        self.join: nn.Module = simnorm
+        if not self.direct:
+            self.join = NormedLinear(
+                features + (observation_dim if layers else 0), latent_dim, activation=simnorm
+            )
+            initialize(self.join)
+
+    def train(self, mode: bool = True) -> "PixelEncoder":
+        """As usual, but a frozen backbone stays in evaluation mode."""
+        super().train(mode)
+        if self.frozen and self.backbone is not None:
+            self.backbone.eval()
+        return self
+
+    def forward(self, pictures: Mapping[str, Tensor], vectors: Tensor | None = None) -> Tensor:
+        """Pictures (..., height, width, C) uint8 by key, vectors (..., observation_dim) -> (..., latent_dim)."""
+        if self.backbone is None:
+            assert self.convolutions is not None
+            parts = [conv(pictures[key]) for key, conv in zip(self.keys, self.convolutions, strict=True)]
+        else:
+            stacked = torch.stack([pictures[key] for key in self.keys], dim=-4)
+            with torch.set_grad_enabled(torch.is_grad_enabled() and not self.frozen):
+                tokens = self.backbone(stacked.flatten(0, -4))
+            parts = [tokens.reshape(*stacked.shape[:-4], -1)]
+        if len(self.vectors):
+            assert vectors is not None
+            parts.append(self.vectors(vectors))
+        return self.join(parts[0] if len(parts) == 1 else torch.cat(parts, dim=-1))
+
+    def rebuild(self) -> dict[str, Any]:
+        """Arguments of TD-MPC2 that rebuild this without the pretrained checkpoint."""
+        if self.backbone is None:
+            return {}
+        own = self.backbone.rebuild()
+        return {"encoder_from": None, "encoder_architecture": own["architecture"]}

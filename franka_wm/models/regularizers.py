@@ -1,0 +1,258 @@
+"""What keeps embeddings apart when no decoder does, and how to see that they collapse.
+
+All of it is computed in float32, on the device, with static shapes.
+"""
+
+from typing import Literal
+
+import torch
+from torch import Tensor, distributed, nn
+from torch.nn import functional as F
+
+from franka_wm.models.parts import initialize
+
+COLLAPSE = ("ema", "sigreg", "vicreg", "none")
+"""Names of the guards against collapse that a family may offer."""
+
+CollapseName = Literal["ema", "sigreg", "vicreg", "none"]
+
+
+def _processes() -> int:
+    ready = distributed.is_available() and distributed.is_initialized()
+    return distributed.get_world_size() if ready else 1
+
+
+def mean_over_processes(x: Tensor) -> Tensor:
+    """Mean of `x` over all processes where torch.distributed is initialised; `x` itself otherwise.
+
+    The gradient is that of the own part, as if it were the whole mean: averaged over processes, as data
+    parallel training does, this is the gradient of the global statistic.
+    """
+    if _processes() == 1:
+        return x
+    total = x.detach().clone()
+    distributed.all_reduce(total)
+    return x + (total / _processes() - x.detach())
+
+
+class SIGReg(nn.Module):
+    """Sketched isotropic Gaussian regularisation (LeJEPA: Balestriero & LeCun 2025, arXiv:2511.08544).
+
+    Embeddings are projected on random unit directions, drawn afresh at each call; along each, the
+    Epps-Pulley statistic compares the empirical characteristic function with that of N(0, 1):
+
+        n ∫ |mean exp(i t x) - exp(-t² / 2)|² exp(-t² / 2) dt,
+
+    by the trapezoid rule on `knots` points of [0, `limit`], doubled for the negative half. By Cramér and Wold
+    it is at its least for all directions only if the embeddings are N(0, I). Under several processes the
+    means of sine and cosine are averaged over all of them, and the directions are those of the first.
+
+    Args:
+        directions: number of random directions.
+        knots: points of the integral.
+        limit: its end.
+
+    Raises:
+        ValueError: fewer than one direction or two knots, or an empty interval.
+    """
+
+    knot: Tensor
+    weight: Tensor
+    gaussian: Tensor
+
+    def __init__(self, *, directions: int = 1024, knots: int = 17, limit: float = 3.0) -> None:
+        super().__init__()
+        if directions < 1 or knots < 2 or not limit > 0.0:
+            raise ValueError(
+                f"need directions >= 1, knots >= 2 and limit > 0, got {directions}, {knots} and {limit}"
+            )
+        self.directions = directions
+        t = torch.linspace(0.0, limit, knots)
+        gaussian = torch.exp(-0.5 * t.square())
+        step = torch.full((knots,), 2.0 * limit / (knots - 1))
+        step[0] *= 0.5
+        step[-1] *= 0.5
+        self.register_buffer("knot", t, persistent=False)
+        self.register_buffer("gaussian", gaussian, persistent=False)
+        self.register_buffer("weight", step * gaussian, persistent=False)
+
+    def forward(self, x: Tensor) -> Tensor:
+        """Embeddings (..., n, D) -> the statistic of each set of n, averaged over directions and sets: ()."""
+        with torch.autocast(x.device.type, enabled=False):
+            x = x.float()
+            directions = torch.randn(x.shape[-1], self.directions, device=x.device)
+            if _processes() > 1:
+                distributed.broadcast(directions, 0)
+            angle = (x @ F.normalize(directions, dim=0)).unsqueeze(-1) * self.knot  # (..., n, M, knots)
+            cos = mean_over_processes(angle.cos().mean(-3))
+            sin = mean_over_processes(angle.sin().mean(-3))
+            error = (cos - self.gaussian).square() + sin.square()
+            return (error @ self.weight).mean() * (x.shape[-2] * _processes())
+
+
+def variance_loss(x: Tensor, *, target: float = 1.0, eps: float = 1e-4) -> Tensor:
+    """VICReg's hinge on the standard deviation of each feature over n samples (..., n, D) -> ()."""
+    std = (x.float().var(dim=-2) + eps).sqrt()
+    return F.relu(target - std).mean()
+
+
+def covariance_loss(x: Tensor) -> Tensor:
+    """VICReg's squared covariances off the diagonal, summed and divided by D: (..., n, D) -> ()."""
+    x = x.float()
+    x = x - x.mean(dim=-2, keepdim=True)
+    covariance = x.mT @ x / (x.shape[-2] - 1)
+    off = covariance.square().sum((-2, -1)) - covariance.diagonal(dim1=-2, dim2=-1).square().sum(-1)
+    return (off / x.shape[-1]).mean()
+
+
+def vicreg(
+    a: Tensor,
+    b: Tensor,
+    *,
+    invariance_coef: float = 25.0,
+    variance_coef: float = 25.0,
+    covariance_coef: float = 1.0,
+) -> Tensor:
+    """Variance-invariance-covariance loss of two views (..., n, D) -> () (arXiv:2105.04906)."""
+    a, b = a.float(), b.float()
+    variance = 0.5 * (variance_loss(a) + variance_loss(b))
+    covariance = covariance_loss(a) + covariance_loss(b)
+    return invariance_coef * F.mse_loss(a, b) + variance_coef * variance + covariance_coef * covariance
+
+
+def info_nce(queries: Tensor, keys: Tensor, *, temperature: float = 0.1) -> Tensor:
+    """InfoNCE of matching rows (n, D) against all others, both ways, on cosines -> () (arXiv:1807.03748).
+
+    Raises:
+        ValueError: `temperature` is not positive.
+    """
+    if not temperature > 0.0:
+        raise ValueError(f"temperature must be positive, got {temperature}")
+    with torch.autocast(queries.device.type, enabled=False):
+        logits = F.normalize(queries.float(), dim=-1) @ F.normalize(keys.float(), dim=-1).mT / temperature
+        own = torch.arange(logits.shape[0], device=logits.device)
+        return 0.5 * (F.cross_entropy(logits, own) + F.cross_entropy(logits.mT, own))
+
+
+class CollapseGuard(nn.Module):
+    """The loss that keeps embeddings from collapsing to a point: SIGReg or VICReg.
+
+    For `ema` and `none` it is zero: `ema` guards through its slow teacher instead, `none` not at all.
+
+    Args:
+        kind: one of `COLLAPSE`.
+        coef: weight of the guard; None: 0.05 for sigreg (LeJEPA's); for vicreg 1, which with a prediction
+            loss of weight 1 gives the published ratio 25 : 25 : 1.
+        directions: of SIGReg.
+
+    Raises:
+        ValueError: an unknown `kind`, or a negative `coef`.
+    """
+
+    def __init__(self, kind: str, *, coef: float | None = None, directions: int = 1024) -> None:
+        super().__init__()
+        if kind not in COLLAPSE:
+            raise ValueError(f"unknown collapse guard {kind!r}; available: {', '.join(COLLAPSE)}")
+        if coef is not None and coef < 0.0:
+            raise ValueError(f"the coefficient of the collapse guard must not be negative, got {coef}")
+        self.kind, self.acts = kind, kind in ("sigreg", "vicreg")
+        self.coef = {"sigreg": 0.05, "vicreg": 1.0}.get(kind, 0.0) if coef is None else coef
+        self.sigreg = SIGReg(directions=directions) if kind == "sigreg" else None
+
+    def forward(self, x: Tensor) -> Tensor:
+        """Embeddings (..., n, D), n samples of each of any number of sets -> (), weighted by `coef`."""
+        if not self.acts:
+            return torch.zeros((), device=x.device)
+        if self.sigreg is not None:
+            return self.coef * self.sigreg(x)
+        return self.coef * (variance_loss(x) + covariance_loss(x) / 25.0)
+
+
+class ProjectionMLP(nn.Module):
+    """Linear, BatchNorm, GELU, Linear: (..., inputs) -> (..., outputs).
+
+    Which statistics the BatchNorm uses is asked for at each call instead of read from the module's mode, so
+    that planning never depends on what else is in the batch, whatever the mode.
+
+    Args:
+        hidden: width of the hidden layer; 4 × `outputs` when None.
+        normalized: end with a BatchNorm as well.
+    """
+
+    def __init__(
+        self, inputs: int, outputs: int, *, hidden: int | None = None, normalized: bool = False
+    ) -> None:
+        super().__init__()
+        hidden = 4 * outputs if hidden is None else hidden
+        self.up, self.norm = nn.Linear(inputs, hidden), BatchNorm(hidden)
+        self.down = nn.Linear(hidden, outputs)
+        self.last = BatchNorm(outputs) if normalized else None
+        initialize(self)
+
+    def forward(self, x: Tensor, *, batch_statistics: bool) -> Tensor:
+        h = F.gelu(self.norm(self.up(x), batch_statistics=batch_statistics))
+        h = self.down(h)
+        return h if self.last is None else self.last(h, batch_statistics=batch_statistics)
+
+
+class BatchNorm(nn.Module):
+    """Batch normalisation of the last dimension, whose statistics are chosen at each call.
+
+    Over all leading dimensions; with `batch_statistics` those of the batch, which also move the running ones
+    by `momentum`; otherwise the running ones.
+    """
+
+    running_mean: Tensor
+    running_var: Tensor
+
+    def __init__(self, features: int, *, momentum: float = 0.1, eps: float = 1e-5) -> None:
+        super().__init__()
+        self.momentum, self.eps = momentum, eps
+        self.weight, self.bias = nn.Parameter(torch.ones(features)), nn.Parameter(torch.zeros(features))
+        self.register_buffer("running_mean", torch.zeros(features))
+        self.register_buffer("running_var", torch.ones(features))
+
+    def forward(self, x: Tensor, *, batch_statistics: bool) -> Tensor:
+        flat = x.reshape(-1, x.shape[-1])
+        y = F.batch_norm(
+            flat,
+            self.running_mean,
+            self.running_var,
+            self.weight,
+            self.bias,
+            training=batch_statistics,
+            momentum=self.momentum,
+            eps=self.eps,
+        )
+        return y.reshape(x.shape)
+
+
+# -- seeing a collapse -----------------------------------------------------------------------------------
+
+
+def feature_std(x: Tensor) -> Tensor:
+    """Mean over features of their standard deviation over samples: (..., D) -> (). Zero: collapsed."""
+    return x.detach().float().reshape(-1, x.shape[-1]).std(0, correction=0).mean()
+
+
+def participation_ratio(x: Tensor) -> Tensor:
+    """How many directions the samples (..., D) spread over: tr(C)² / tr(C²) of their covariance -> ().
+
+    From 1 (a line) to D (a ball); 0 where all samples agree. Unlike `effective_rank` it needs no
+    decomposition, which would wait for the host, so that losses can report it.
+    """
+    x = x.detach().float().reshape(-1, x.shape[-1])
+    x = x - x.mean(0)
+    covariance = x.mT @ x / x.shape[0]
+    return covariance.trace().square() / covariance.square().sum().clamp_min(1e-30)
+
+
+def effective_rank(x: Tensor) -> Tensor:
+    """exp of the entropy of the normalised singular values of samples (..., D) -> () (arXiv:2210.02885).
+
+    For evaluation: the decomposition waits for the host.
+    """
+    x = x.detach().float().reshape(-1, x.shape[-1])
+    values = torch.linalg.svdvals(x - x.mean(0))
+    p = values / values.sum().clamp_min(1e-30)
+    return torch.exp(-(p * (p + 1e-30).log()).sum())

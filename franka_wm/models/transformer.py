@@ -1,0 +1,210 @@
+"""Predictors over time: an action-conditioned transformer, block-causal masks, and an MLP.
+
+Positions in time enter through rotary codes (RoPE, arXiv:2104.09864), which depend on differences alone: a
+history that is still short predicts the same wherever it stands in the sequence.
+"""
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+from franka_wm.models.parts import initialize, mlp
+
+
+def block_causal_mask(frames: int, tokens: int = 1, device: torch.device | None = None) -> Tensor:
+    """Who may attend to whom: all tokens of a frame to all of this and earlier frames.
+
+    Args:
+        frames: number of frames.
+        tokens: of each frame.
+
+    Returns:
+        (frames · tokens, frames · tokens) bool, True where the row may attend to the column.
+    """
+    time = torch.arange(frames, device=device).repeat_interleave(tokens)
+    return time.unsqueeze(1) >= time.unsqueeze(0)
+
+
+def hide_invalid(mask: Tensor, valid: Tensor, tokens: int = 1) -> Tensor:
+    """A block-causal mask that also hides frames which never were.
+
+    Args:
+        mask: (L, L) bool, L = frames · tokens.
+        valid: (N, frames), 1 (or True) where the frame is real.
+        tokens: of each frame.
+
+    Returns:
+        (N, 1, L, L) bool. Every token keeps itself, so that no row is empty (its softmax would be nan).
+    """
+    seen = (valid > 0.5).repeat_interleave(tokens, dim=1)[:, None, None, :]
+    itself = torch.eye(mask.shape[0], dtype=torch.bool, device=mask.device)
+    return (mask & seen) | itself
+
+
+def rotary(x: Tensor, positions: Tensor) -> Tensor:
+    """Rotate pairs of features of queries or keys (N, heads, L, D) by their positions (L,); D even."""
+    half = x.shape[-1] // 2
+    frequencies = 100.0 ** (-torch.arange(half, device=x.device, dtype=torch.float32) / half)
+    angles = positions.to(torch.float32).unsqueeze(-1) * frequencies
+    cos, sin = angles.cos().to(x.dtype), angles.sin().to(x.dtype)
+    a, b = x[..., :half], x[..., half:]
+    return torch.cat((a * cos - b * sin, a * sin + b * cos), dim=-1)
+
+
+class CausalBlock(nn.Module):
+    """Transformer block with masked attention; conditioned through AdaLN-zero if `condition` is given.
+
+    AdaLN-zero (DiT, arXiv:2212.09748): the condition gives scale, shift and gate of both halves, and starts
+    at zero, so that the block starts as the identity.
+
+    Args:
+        width: of the tokens.
+        heads, head_dim: of the attention; `head_dim` even.
+        hidden: width of the MLP.
+        condition: size of the condition; without, a plain pre-norm block.
+        dropout: after attention and inside the MLP, where `forward` is asked for it.
+    """
+
+    def __init__(
+        self,
+        *,
+        width: int,
+        heads: int,
+        head_dim: int,
+        hidden: int,
+        condition: int | None = None,
+        dropout: float = 0.0,
+    ) -> None:
+        super().__init__()
+        self.heads, self.dropout = heads, dropout
+        affine = condition is None
+        self.norm1 = nn.LayerNorm(width, eps=1e-6, elementwise_affine=affine)
+        self.norm2 = nn.LayerNorm(width, eps=1e-6, elementwise_affine=affine)
+        self.qkv, self.out = nn.Linear(width, 3 * heads * head_dim), nn.Linear(heads * head_dim, width)
+        self.up, self.down = nn.Linear(width, hidden), nn.Linear(hidden, width)
+        self.modulation = None if condition is None else nn.Linear(condition, 6 * width)
+
+    def zero(self) -> None:
+        """Start as the identity where conditioned."""
+        if self.modulation is not None:
+            nn.init.zeros_(self.modulation.weight)
+            nn.init.zeros_(self.modulation.bias)
+
+    def forward(
+        self,
+        x: Tensor,
+        positions: Tensor,
+        mask: Tensor,
+        condition: Tensor | None = None,
+        *,
+        dropout: bool = False,
+    ) -> Tensor:
+        """(N, L, width), positions (L,), mask (L, L) or (N, 1, L, L), condition (N, L, C) -> (N, L, width)."""
+        if self.modulation is None:
+            x = x + self._drop(self._attend(self.norm1(x), positions, mask), dropout)
+            return x + self._drop(self._mlp(self.norm2(x), dropout), dropout)
+        assert condition is not None
+        shift1, scale1, gate1, shift2, scale2, gate2 = self.modulation(F.silu(condition)).chunk(6, dim=-1)
+        attended = self._attend(torch.addcmul(shift1, self.norm1(x), 1 + scale1), positions, mask)
+        x = x + gate1 * self._drop(attended, dropout)
+        fed = self._mlp(torch.addcmul(shift2, self.norm2(x), 1 + scale2), dropout)
+        return x + gate2 * self._drop(fed, dropout)
+
+    def _attend(self, x: Tensor, positions: Tensor, mask: Tensor) -> Tensor:
+        q, k, v = self.qkv(x).unflatten(-1, (3, self.heads, -1)).permute(2, 0, 3, 1, 4)
+        attended = F.scaled_dot_product_attention(
+            rotary(q, positions), rotary(k, positions), v, attn_mask=mask
+        )
+        return self.out(attended.transpose(1, 2).flatten(-2))
+
+    def _mlp(self, x: Tensor, dropout: bool) -> Tensor:
+        return self.down(self._drop(F.gelu(self.up(x)), dropout))
+
+    def _drop(self, x: Tensor, dropout: bool) -> Tensor:
+        return F.dropout(x, self.dropout) if dropout and self.dropout else x
+
+
+class CausalTransformer(nn.Module):
+    """A stack of `CausalBlock`s and a last LayerNorm: (N, L, width) -> (N, L, width).
+
+    Args: as for `CausalBlock`, and
+        depth: number of blocks.
+
+    Raises:
+        ValueError: a size below 1, an odd `head_dim`, or a dropout outside [0, 1).
+    """
+
+    def __init__(
+        self,
+        *,
+        width: int,
+        depth: int,
+        heads: int,
+        head_dim: int,
+        hidden: int,
+        condition: int | None = None,
+        dropout: float = 0.0,
+    ) -> None:
+        super().__init__()
+        for name, value in (
+            ("width", width),
+            ("depth", depth),
+            ("heads", heads),
+            ("head_dim", head_dim),
+            ("hidden", hidden),
+        ):
+            if value < 1:
+                raise ValueError(f"{name} of a transformer must be at least 1, got {value}")
+        if head_dim % 2:
+            raise ValueError(f"head_dim must be even (rotary codes turn pairs of features), got {head_dim}")
+        if not 0.0 <= dropout < 1.0:
+            raise ValueError(f"dropout must be in [0, 1), got {dropout}")
+        self.blocks = nn.ModuleList(
+            CausalBlock(
+                width=width,
+                heads=heads,
+                head_dim=head_dim,
+                hidden=hidden,
+                condition=condition,
+                dropout=dropout,
+            )
+            for _ in range(depth)
+        )
+        self.norm = nn.LayerNorm(width, eps=1e-6)
+        initialize(self)
+        for block in self.blocks:
+            block.zero()  # type: ignore[operator]
+
+    def forward(
+        self,
+        x: Tensor,
+        positions: Tensor,
+        mask: Tensor,
+        condition: Tensor | None = None,
+        *,
+        dropout: bool = False,
+    ) -> Tensor:
+        """See `CausalBlock.forward`."""
+        for block in self.blocks:
+            x = block(x, positions, mask, condition, dropout=dropout)
+        return self.norm(x)
+
+
+class MLPDynamics(nn.Module):
+    """The next frame from a memory and an action, by an MLP that predicts the change.
+
+    (z (..., memory_dim), last frame (..., frame_dim), action (..., action_dim)) -> (..., frame_dim).
+    Starts as "nothing changes".
+
+    Args:
+        memory_dim: size of z, see `franka_wm.models.memory`.
+        hidden: width of each hidden layer.
+    """
+
+    def __init__(self, *, memory_dim: int, frame_dim: int, action_dim: int, hidden: tuple[int, ...]) -> None:
+        super().__init__()
+        self.network = mlp(memory_dim + action_dim, hidden, frame_dim)
+        nn.init.zeros_(self.network[-1].weight)  # type: ignore[arg-type]
+
+    def forward(self, z: Tensor, frame: Tensor, action: Tensor) -> Tensor:
+        return frame + self.network(torch.cat((z, action), dim=-1))

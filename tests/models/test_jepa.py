@@ -1,0 +1,203 @@
+import copy
+
+import pytest
+import torch
+from tensordict import TensorDict
+
+from franka_wm.models import make
+from franka_wm.models.jepa import JEPA, random_crops
+from franka_wm.models.regularizers import feature_std
+from franka_wm.models.vision import ViT
+
+SIZE = dict(encoder_width=32, encoder_depth=1, encoder_heads=2, predictor_width=32, predictor_depth=1)
+
+
+@pytest.fixture(autouse=True)
+def _seed():
+    torch.manual_seed(0)
+
+
+def small(**overrides) -> JEPA:
+    settings = dict(image_sizes={"pixels": (16, 16, 3)}, patch_size=4, predictor_heads=2, guard_directions=32)
+    return make("jepa", **{**settings, **SIZE, "local_views": 2, "ema_steps": 100, **overrides})
+
+
+def train(model: JEPA, windows, *, steps: int, batch: int = 32, horizon: int = 2, lr: float = 3e-3) -> list:
+    optimiser = torch.optim.AdamW(model.parameter_groups(lr))
+    history = []
+    for _ in range(steps):
+        losses = model.loss(windows(batch, horizon))
+        optimiser.zero_grad()
+        losses["loss"].backward()
+        optimiser.step()
+        model.after_update()
+        history.append(losses.detach())
+    return history
+
+
+@pytest.mark.parametrize("recipe", ["ijepa", "vjepa", "lejepa"])
+@pytest.mark.parametrize("collapse", ["ema", "sigreg", "vicreg", "none"])
+def test_every_recipe_trains_with_every_guard_from_pixels_alone(recipe, collapse, dots):
+    model = small(recipe=recipe, collapse=collapse)
+    batch = dots.windows(6, 2).select("pixels")  # no actions, no next
+    losses = model.loss(batch)
+    losses["loss"].backward()
+    assert losses.isfinite().all()
+    for name, parameter in model.named_parameters():
+        if name.startswith("target_"):
+            assert parameter.grad is None
+        else:
+            assert parameter.grad is not None and parameter.grad.isfinite().all(), name
+    z = model.encode(batch)
+    assert z.shape == (6, 2, model.latent_dim) and not z.requires_grad
+    assert not hasattr(model, "next")
+
+
+def test_the_context_is_blind_to_what_is_masked(dots):
+    """Perturb the pixels of everything that was not seen: the context's features do not change by a bit."""
+    model = small()
+    clips = dots.windows(4, 1)["pixels"]
+    seen: list[torch.Tensor] = []
+    model.encoder.register_forward_hook(lambda module, inputs, output: seen.append(inputs[1]))
+    model.loss(TensorDict({"pixels": clips}, [4, 1]))
+    keep = seen[0]
+    before = model.encoder(clips, keep)
+    changed = clips.clone()
+    for k in range(4):
+        for token in set(range(16)) - set(keep[k].tolist()):
+            y, x = 4 * (token // 4), 4 * (token % 4)
+            changed[k, :, y : y + 4, x : x + 4] = torch.randint(0, 256, (1, 4, 4, 3), dtype=torch.uint8)
+    assert not torch.equal(changed, clips)
+    assert torch.equal(model.encoder(changed, keep), before)
+
+
+def test_context_and_targets_come_from_the_right_encoders(dots):
+    model = small()
+    calls: list[tuple[str, int]] = []
+    for name in ("encoder", "target_encoder"):
+        getattr(model, name).register_forward_hook(
+            lambda module, inputs, output, name=name: calls.append((name, output.shape[1]))
+        )
+    model.loss(dots.windows(4, 1))
+    visible = 16 - 4 * round(0.175 * 16)
+    assert calls == [("encoder", visible), ("target_encoder", 16)]
+
+
+def test_the_teacher_follows_its_schedule(dots):
+    model = small(ema_start=0.9, ema_end=1.0, ema_steps=4)
+    assert isinstance(model.target_encoder, ViT)
+    with torch.no_grad():
+        for p in model.encoder.parameters():
+            p.add_(1.0)
+    live = model.encoder.patch_embedding.weight.detach()
+    for expected in (0.9, 0.925, 0.95, 0.975, 1.0, 1.0):
+        old = model.target_encoder.patch_embedding.weight.clone()
+        assert model.ema() == pytest.approx(expected)
+        model.after_update()
+        moved = model.target_encoder.patch_embedding.weight
+        torch.testing.assert_close(moved, expected * old + (1 - expected) * live)
+    assert model.updates == 6
+
+
+def test_the_teacher_is_in_no_parameter_group_and_gets_no_gradient(dots):
+    model = small(recipe="lejepa", collapse="ema")
+    held = {id(p) for group in model.parameter_groups(1e-3) for p in group["params"]}
+    own = {id(p) for name, p in model.named_parameters() if not name.startswith("target_")}
+    assert held == own
+    before = copy.deepcopy(model.target_encoder.state_dict())
+    model.loss(dots.windows(4, 1))["loss"].backward()
+    assert all(torch.equal(v, before[k]) for k, v in model.target_encoder.state_dict().items())
+
+
+@pytest.mark.parametrize("collapse", ["none", "ema", "sigreg", "vicreg"])
+@pytest.mark.parametrize("recipe", ["ijepa", pytest.param("lejepa", marks=pytest.mark.slow)])
+def test_without_a_guard_it_collapses_and_with_any_it_does_not(recipe, collapse, dots):
+    model = small(recipe=recipe, collapse=collapse, projection=16, ema_steps=1000)
+
+    def spread() -> float:
+        """Deviation over pictures of the pooled tokens, which are layer-normed, so that 1 is the most."""
+        torch.manual_seed(7)
+        x = model.encoder(dots.windows(128, 1)["pixels"].flatten(0, 1))
+        return feature_std(torch.nn.functional.layer_norm(x.mean(1), x.shape[-1:])).item()
+
+    before = spread()
+    history = train(model, dots.windows, steps=80 if recipe == "ijepa" else 100)
+    after = spread()
+    if collapse == "none":
+        # BatchNorm in lejepa's projector, which looks at differences, puts off the end, but does not avert it.
+        assert after < (0.2 if recipe == "ijepa" else 0.6) * before
+        assert history[-1]["loss_prediction"] < 0.02 * history[0]["loss_prediction"]
+    else:
+        assert after > (0.5 if recipe == "ijepa" else 2.0) * before
+        assert history[-1]["loss_prediction"] > 0.02 * history[0]["loss_prediction"]
+
+
+def test_features_pooled_or_flat(dots):
+    pictures = dots.windows(3, 2)
+    assert small(features="mean").encode(pictures).shape == (3, 2, 32)
+    flat = small(features="flat")
+    assert flat.latent_dim == 16 * 32 and flat.encode(pictures).shape == (3, 2, 16 * 32)
+    two = small(image_sizes={"pixels": (16, 16, 3), "wrist": (16, 16, 3)})
+    pictures["wrist"] = pictures["pixels"].flip(2)
+    assert two.latent_dim == 64
+    torch.testing.assert_close(
+        two.encode(pictures)[..., 32:],
+        two.encode(TensorDict({"pixels": pictures["wrist"], "wrist": pictures["pixels"]}, [3, 2]))[..., :32],
+    )
+    assert two.loss(pictures)["loss"].isfinite()
+
+
+def test_crops_are_parts_of_the_picture():
+    ramp = torch.arange(16, dtype=torch.float32).mul(15).to(torch.uint8)
+    picture = ramp.view(1, 1, 1, 16, 1).expand(2, 3, 16, 16, 3)  # brightness is the column
+    crops = random_crops(picture, 5, (0.25, 0.25), (8, 8))
+    assert crops.shape == (5, 2, 3, 8, 8, 3) and crops.dtype == torch.uint8
+    assert (crops == crops[:, :, :1]).all()  # all frames alike
+    span = (crops[..., -1, 0].int() - crops[..., 0, 0].int()).float()[:, :, 0, 0]
+    # A quarter of the area spans 7 columns from first to last pixel, times the root of the aspect ratio.
+    assert span.min() > 15 * 7 * (3 / 4) ** 0.5 - 2 and span.max() < 15 * 7 * (4 / 3) ** 0.5 + 2
+    assert len(set(crops[:, :, 0, 0, 0, 0].flatten().tolist())) > 3
+    whole = random_crops(picture, 1, (1.0, 1.0), (16, 16))
+    assert (whole[0].int() - picture.int()).abs().max() < 45  # only the aspect ratio cuts a little
+
+
+def test_a_saved_model_is_the_same_model(dots):
+    model, other = small(), small()
+    train(model, dots.windows, steps=2, batch=4)
+    other.load_state_dict(model.state_dict())
+    pictures = dots.windows(2, 2)
+    assert torch.equal(model.encode(pictures), other.encode(pictures))
+    assert other.updates == 2
+
+
+@pytest.mark.parametrize("recipe", ["ijepa", "vjepa", "lejepa"])
+def test_the_loss_traces_without_graph_breaks_or_host_reads(recipe, dots):
+    model = small(recipe=recipe, collapse="sigreg")
+    compiled = torch.compile(
+        lambda pixels: model.loss(TensorDict({"pixels": pixels}, [4, 2]))["loss"],
+        backend="eager",
+        fullgraph=True,
+    )
+    assert compiled(dots.windows(4, 2)["pixels"]).isfinite()
+
+
+def test_settings_that_cannot_work_are_refused(dots):
+    for wrong, message in [
+        (dict(recipe="mae"), "ijepa"),
+        (dict(collapse="hope"), "vicreg"),
+        (dict(masks="stripes"), "multiblock"),
+        (dict(image_sizes={}), "pixels"),
+        (dict(observation_sizes={"state": 3}), "pictures only"),
+        (dict(tubelet=2), "clips"),
+        (dict(patch_size=5), "patch_size"),
+        (dict(patch_size=8), "no context"),
+        (dict(recipe="lejepa", masks="random"), "crops"),
+        (dict(features="cls"), "flat"),
+        (dict(ema_start=1.1), "ema_start"),
+    ]:
+        with pytest.raises(ValueError, match=message):
+            small(**wrong)
+    with pytest.raises(ValueError, match=r"\[B, H\]"):
+        small().loss(dots.windows(3, 2)[0])
+    with pytest.raises(ValueError, match="frames"):
+        small(recipe="vjepa").loss(dots.windows(3, 1))
