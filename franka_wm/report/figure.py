@@ -137,13 +137,14 @@ def inline_svg(figure: "Figure", label: str) -> str:
     svg = svg[svg.index("<svg") :]
     svg = re.sub(r"<metadata>.*?</metadata>\s*", "", svg, flags=re.DOTALL)
     # Names of groups ("axes_1") repeat in every picture and nothing refers to them.
-    svg = re.sub(r' id="[a-zA-Z0-9]+_\d+"', "", svg)
+    svg = re.sub(r' id="[\w.]+_\d+"', "", svg)
     svg = re.sub(
         r"(fill|stroke): (#[0-9a-f]{6})\b",
         lambda found: f"{found[1]}: {_VARIABLES.get(found[2], found[2])}",
         svg,
     )
-    svg = re.sub(r"(font: [^;\"]*?px) [^;\"]+", r"\1 var(--font)", svg)
+    # Older versions of matplotlib write the short form.
+    svg = re.sub(r"(font-family:|font: [^;\"]*?px) [^;\"]+", r"\1 var(--font)", svg)
     size = re.search(r'viewBox="0 0 ([\d.]+) ([\d.]+)"', svg)
     assert size is not None  # matplotlib always writes one
     head = (
