@@ -72,10 +72,10 @@ def publish_dataset(
     update: bool = False,
     dry_run: bool = False,
 ) -> None:
-    """Sends a dataset with LeRobot's ``push_to_hub``, then our card, then the tag that LeRobot loads.
+    """Sends a dataset with our card, and sets the tag that LeRobot loads.
 
-    ``push_to_hub`` writes a card of its own over the one that is there, and tags before; so it is told not to tag,
-    the card is sent after it, and the tag is set and checked last.
+    What arrives is what LeRobot's ``push_to_hub`` would send, except for the card: it writes a generated one over
+    the one that is there. It also leaves files of an earlier version, which are removed here.
 
     Args:
         root: A LeRobot dataset on disk. Gets a README.md and a picture.
@@ -112,19 +112,7 @@ def publish_dataset(
     with explained(repo_id):
         _check_name(api, repo_id, "dataset", update)
         with announced(f"sending {len(files)} files"):
-            from lerobot.datasets.lerobot_dataset import LeRobotDataset
-
-            LeRobotDataset(repo_id, root=root).push_to_hub(
-                private=private, license=license, tag_version=False
-            )
-            _remove_stale(api, repo_id, "dataset", files)
-            api.upload_file(
-                path_or_fileobj=card.encode(),
-                path_in_repo=README,
-                repo_id=repo_id,
-                repo_type="dataset",
-                commit_message="Card of franka_wm",
-            )
+            _send(api, root, repo_id, "dataset", private, update)
             _tag(api, repo_id)
     say(f"published: {api.endpoint}/datasets/{repo_id} ({'private' if private else 'public'})")
 
@@ -161,9 +149,7 @@ def publish_model(
         with explained(repo_id):
             _check_name(api, repo_id, "model", update)
             with announced(f"sending {len(files)} files"):
-                api.create_repo(repo_id=repo_id, private=private, repo_type="model", exist_ok=update)
-                api.upload_folder(repo_id=repo_id, folder_path=staged, repo_type="model")
-                _remove_stale(api, repo_id, "model", files)
+                _send(api, staged, repo_id, "model", private, update)
         say(f"published: {api.endpoint}/{repo_id} ({'private' if private else 'public'})")
 
 
@@ -245,17 +231,17 @@ def _check_name(api: Any, repo_id: str, kind: str, update: bool) -> None:
         )
 
 
-def _remove_stale(api: Any, repo_id: str, kind: str, files: Sequence[str]) -> None:
-    """What an earlier version left there: readers would take it for part of this one."""
-    there = api.list_repo_files(repo_id=repo_id, repo_type=kind)
-    stale = [name for name in there if name not in {*files, README, ".gitattributes"}]
-    if stale:
-        api.delete_files(
-            repo_id=repo_id,
-            delete_patterns=stale,
-            repo_type=kind,
-            commit_message="Remove an earlier version's files",
-        )
+def _send(api: Any, folder: Path, repo_id: str, kind: str, private: bool, update: bool) -> None:
+    """Everything in one commit. What an earlier version left there goes in it: readers would take it for ours."""
+    api.create_repo(repo_id=repo_id, private=private, repo_type=kind, exist_ok=update)
+    api.upload_folder(
+        repo_id=repo_id,
+        folder_path=folder,
+        repo_type=kind,
+        ignore_patterns=["images/", ".*"],
+        delete_patterns="*",
+        commit_message="Upload with franka-wm",
+    )
 
 
 def _tag(api: Any, repo_id: str) -> None:

@@ -1,0 +1,247 @@
+"""Publishing, by LeRobot's and the Hub's own clients, to a Hub on loopback."""
+
+from __future__ import annotations
+
+import importlib.util
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+from omegaconf import OmegaConf
+
+from franka_wm.data.lerobot.hub import check_repo_id, explained
+from franka_wm.data.lerobot.publish import stage_model
+from franka_wm.errors import UserError
+from franka_wm.training.checkpoint import load_checkpoint, save_checkpoint
+
+
+def _fake_hub():
+    spec = importlib.util.spec_from_file_location("fake_hub", Path(__file__).with_name("fake_hub.py"))
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+fake_hub = _fake_hub()
+
+
+@pytest.fixture
+def hub():
+    hub = fake_hub.Hub()
+    yield hub
+    hub.close()
+
+
+@pytest.fixture
+def publish(hub, tmp_path):
+    """Runs the verb in a process of its own: the Hub's address is read when its client is imported."""
+
+    def run(
+        *arguments: str, token: str | None = fake_hub.TOKEN, url: str | None = None, offline: bool = False
+    ):
+        env = {k: v for k, v in os.environ.items() if not k.startswith(("HF_", "HUGGING"))}
+        env |= {"HF_ENDPOINT": url or hub.url, "HF_HOME": str(tmp_path / "home"), "HF_HUB_DISABLE_XET": "1"}
+        env |= {"HF_TOKEN": token} if token else {}
+        env |= {"HF_HUB_OFFLINE": "1"} if offline else {}
+        return subprocess.run(
+            [sys.executable, "-m", "franka_wm.cli", "publish", *arguments],
+            capture_output=True,
+            text=True,
+            env=env,
+            check=False,
+        )
+
+    return run
+
+
+@pytest.fixture(scope="module")
+def dataset(tmp_path_factory, make_schema, make_episode, write):
+    schema = make_schema()
+    return write(tmp_path_factory.mktemp("data") / "set", schema, [make_episode(schema, i) for i in range(2)])
+
+
+def one_line(result, *says: str) -> None:
+    error = [line for line in result.stderr.splitlines() if line.startswith("error: ")]
+    assert result.returncode == 1, result.stderr
+    assert len(error) == 1, result.stderr
+    assert "Traceback" not in result.stderr
+    assert fake_hub.TOKEN not in result.stderr + result.stdout
+    for text in says:
+        assert text in error[0]
+
+
+def test_a_dataset_goes_with_our_card_and_tag(hub, publish, dataset) -> None:
+    done = publish(f"root={dataset}", "repo_id=user/arm", "license=cc-by-4.0")
+    assert done.returncode == 0, done.stderr
+    assert fake_hub.TOKEN not in done.stderr + done.stdout
+    repo = hub.repos["datasets/user/arm"]
+    assert repo["private"] is True
+    local = {p.relative_to(dataset).as_posix(): p.read_bytes() for p in dataset.rglob("*") if p.is_file()}
+    assert {name: repo["files"][name] for name in local} == local
+    card = repo["files"]["README.md"].decode()
+    for text in (
+        "license: cc-by-4.0",
+        "observation.images.front",
+        "picture.png",
+        "@software",
+        "terminal",
+        "LeRobot",
+    ):
+        assert text in card
+    assert "More Information Needed" not in card  # what push_to_hub's own card says
+    assert repo["tags"] == {"v3.0": f"{repo['commits']:040x}"}  # the newest commit, the one with the card
+
+    again = publish(f"root={dataset}", "repo_id=user/arm")
+    one_line(again, "exists already", "update=true")
+    repo["files"]["data/chunk-000/file-007.parquet"] = b"of an earlier version"
+    before = repo["commits"]
+    done = publish(f"root={dataset}", "repo_id=user/arm", "update=true", "private=false")
+    assert done.returncode == 0, done.stderr
+    assert "data/chunk-000/file-007.parquet" not in repo["files"]
+    assert repo["files"]["README.md"].decode() != card  # another license
+    assert repo["commits"] > before
+    assert repo["tags"] == {"v3.0": f"{repo['commits']:040x}"}
+
+
+def test_a_dry_run_sends_nothing(hub, publish, dataset) -> None:
+    done = publish(f"root={dataset}", "repo_id=user/arm", "--dry-run", token=None)
+    assert done.returncode == 0, done.stderr
+    assert hub.requests == []
+    for text in ("user/arm (private)", "data/chunk-000/file-000.parquet", "README.md", "nothing was sent"):
+        assert text in done.stdout
+
+
+def test_what_is_missing_is_one_line(hub, publish, dataset, tmp_path) -> None:
+    root = f"root={dataset}"
+    one_line(publish(root, "repo_id=user/arm", token=None), "no token", "hf auth login")
+    one_line(publish(root, "repo_id=user/arm", token="hf_wrong"), "refuses the token (status 401)")
+    one_line(publish(root, "repo_id=user/arm", url="http://127.0.0.1:9"), "cannot be reached")
+    one_line(publish(root, "repo_id=user/arm", offline=True), "HF_HUB_OFFLINE is set")
+    assert hub.repos == {}
+
+
+@pytest.mark.parametrize(
+    ("arguments", "says"),
+    [
+        (["repo_id=user/arm"], "root=DATASET or checkpoint=RUN"),
+        (["root=x"], "give repo_id="),
+        (["root=x", "repo_id=arm"], "must be user/name"),
+        (["root=x", "repo_id=../arm"], "must be user/name"),
+        (["root=x", "repo_id=user/arm"], "not a LeRobot dataset"),
+        (["root=x", "repo_id=user/arm", "private=perhaps"], "must be true or false"),
+        (["checkpoint=x", "repo_id=user/arm"], "no checkpoint"),
+    ],
+)
+def test_bad_arguments_are_one_line(arguments, says, capsys, tmp_path, monkeypatch) -> None:
+    from franka_wm.cli import main
+
+    monkeypatch.chdir(tmp_path)
+    assert main(["publish", *arguments]) == 1
+    error = capsys.readouterr().err
+    assert says in error
+    assert error.count("\n") == 1
+
+
+# -- models --------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def run_folder(tmp_path):
+    config = {
+        "seed": 4,
+        "resume": "/home/someone/run",
+        "model": {"name": "tdmpc2"},
+        "env": {"kind": "franka"},
+    }
+    model = torch.nn.Linear(3, 2)
+    save_checkpoint(
+        tmp_path / "run" / "checkpoints" / "latest",
+        model=model,
+        optimizer=torch.optim.AdamW(model.parameters()),
+        config=OmegaConf.create(config),
+        counters={"updates": 7, "env_steps": 70},
+        extra={"spaces": {"action_dim": 2}},
+    )
+    (tmp_path / "run" / "evaluation.md").write_text("| policy | distance |\n|---|---|\n| planner | 1 cm |\n")
+    return tmp_path / "run", model
+
+
+def test_a_model_goes_without_what_only_training_needs(hub, publish, run_folder, tmp_path) -> None:
+    folder, model = run_folder
+    done = publish(f"checkpoint={folder}", "repo_id=user/model")
+    assert done.returncode == 0, done.stderr
+    repo = hub.repos["models/user/model"]
+    assert repo["private"] is True
+    assert set(repo["files"]) == {
+        ".gitattributes",
+        "README.md",
+        "config.yaml",
+        "counters.json",
+        "evaluation.md",
+        "extra.json",
+        "extra.safetensors",
+        "manifest.json",
+        "model.safetensors",
+    }
+    assert "planner | 1 cm" in repo["files"]["README.md"].decode()
+    assert b"/home/someone" not in b"".join(repo["files"].values())
+    there = tmp_path / "there"
+    there.mkdir()
+    for name, content in repo["files"].items():
+        (there / name).write_bytes(content)
+    opened = load_checkpoint(there)  # its manifest fits
+    copy = torch.nn.Linear(3, 2)
+    opened.load_model(copy)
+    assert torch.equal(copy.weight, model.weight)
+    assert opened.extra() == {"spaces": {"action_dim": 2}}
+    assert opened.counters == {"updates": 7, "env_steps": 70}
+
+
+def test_a_staged_model_is_damaged_if_changed(run_folder, tmp_path) -> None:
+    place = tmp_path / "place"
+    place.mkdir()
+    stage_model(run_folder[0], place, repo_id="user/model", license="mit")
+    manifest = json.loads((place / "manifest.json").read_text())
+    assert set(manifest["files"]) >= {"model.safetensors", "config.yaml"}
+    weights = bytearray((place / "model.safetensors").read_bytes())
+    weights[-1] ^= 1
+    (place / "model.safetensors").write_bytes(weights)
+    with pytest.raises(UserError, match="damaged"):
+        load_checkpoint(place)
+
+
+def test_downloads_take_tensors_and_plain_values_only(monkeypatch, tmp_path) -> None:
+    import huggingface_hub
+
+    from franka_wm.data.lerobot.hub import download
+
+    asked = {}
+
+    def snapshot(repo_id, **options):
+        asked.update(options, repo_id=repo_id)
+        return str(tmp_path)
+
+    monkeypatch.setattr(huggingface_hub, "snapshot_download", snapshot)
+    with pytest.raises(UserError, match="holds no model"):
+        download("user/model")
+    (tmp_path / "manifest.json").write_text("{}")
+    assert download("user/model@v1") == tmp_path
+    assert asked["repo_id"] == "user/model"
+    assert asked["revision"] == "v1"
+    assert sorted(asked["allow_patterns"]) == ["*.json", "*.safetensors", "*.yaml"]
+    for name in ("model", "../model", "user/../x", "https://x/y", ""):
+        with pytest.raises(UserError, match="must be user/name"):
+            check_repo_id(name)
+
+
+def test_a_missing_repository_is_one_line() -> None:
+    import httpx
+
+    with pytest.raises(UserError, match="cannot be reached"), explained("user/name"):
+        raise httpx.ConnectError("no route")
