@@ -21,6 +21,11 @@ from franka_wm.errors import FrankaError, UserError
 # verb -> (module:function, arguments, what it does in one line)
 VERBS: dict[str, tuple[str, str, str]] = {
     "list": ("franka_wm.cli:show_list", "", "environments, robots, tasks, models and planners"),
+    "evaluate": (
+        "franka_wm.evaluation.evaluate:main",
+        "checkpoint=… [key=value …]",
+        "judge a checkpoint on held-out episodes: success, predictions, latents, robustness",
+    ),
     "summary": ("franka_wm.report.seeds:summary", "RUN …", "runs of several seeds in one table"),
     "report": (
         "franka_wm.report.page:report",

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, cast
 
 import torch
 from tensordict import TensorDict
@@ -44,7 +44,7 @@ from franka_wm.report.spectra import principal_components
 EPISODES = 48
 """Held-out episodes of the diagnostics, at most; half of them random, half the model's own."""
 
-PICTURED = 16
+PICTURED = 48
 """Of how many of them pictures are taken."""
 
 HORIZON = 10
@@ -81,7 +81,7 @@ def hold_out(agent: Any, *, pictures: bool = True, seed: int = ROLLOUT_SEED) -> 
         picture_size=picture_size(model),
         pictures=shown,
     )
-    episodes = episodes[:EPISODES]
+    episodes = cast(TensorDict, episodes[:EPISODES])
     with torch.no_grad():
         latents = encode_episodes(model, episodes)
     return Held(episodes, latents, encoded_validly(episodes), seen)
@@ -215,12 +215,14 @@ def imagine(
     count, length = pictures.shape[:2]
     device = held.latents.device
     seen = embedding(agent.model)(held.latents[:count, :length]).float()
-    fit = count - max(2, count // 4)
+    fit = count - max(2, count // 6)
     valid = held.valid[:count, :length].cpu()
     known, unknown = valid.clone(), valid.clone()
     known[fit:], unknown[:fit] = False, False
-    say(f"training a decoder on {int(known.sum())} pictures, for looking only …")
-    decoder = train_decoder(seen[known.to(device)], pictures[known])
+    latents, drawn = _starts(agent, decoder_size=pictures.shape[2])
+    latents, drawn = torch.cat([seen[known.to(device)], latents]), torch.cat([pictures[known], drawn])
+    say(f"training a decoder on {len(drawn)} pictures, for looking only …")
+    decoder = train_decoder(latents, drawn)
     errors = decoder_error(decoder, seen[unknown.to(device)], pictures[unknown])
     world = (
         count - 1 if count % 2 == 0 else count - 2
@@ -231,3 +233,27 @@ def imagine(
         agent.model, decoder, held.latents[world, 0], actions, pictures[world, : steps + 1]
     )
     return shown, decoder, errors
+
+
+def _starts(agent: Any, *, decoder_size: int, rounds: int = 6, steps: int = 8) -> tuple[Tensor, Tensor]:
+    """Latents (n, D) and pictures of the first steps of many more episodes: more poses than a few long ones show."""
+    keys = list(getattr(agent.model, "observation_keys", agent.model.observation_sizes))
+    latents, pictures = [], []
+    for k in range(rounds):
+        episodes, seen = gather_episodes(
+            agent.env,
+            mixture(agent.policies),
+            seed=ROLLOUT_SEED + 1 + k,
+            steps=steps,
+            keys=keys,
+            picture_size=decoder_size,
+            pictures=min(64, agent.env.num_envs),
+        )
+        assert seen is not None
+        episodes = cast(TensorDict, episodes[: len(seen)])
+        with torch.no_grad():
+            embedded = embedding(agent.model)(encode_episodes(agent.model, episodes)[:, :-1]).float()
+        use = episodes.get("valid")
+        latents.append(embedded[use])
+        pictures.append(seen[use.cpu()])
+    return torch.cat(latents), torch.cat(pictures)

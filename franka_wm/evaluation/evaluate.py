@@ -238,7 +238,9 @@ def diagnostic_tables(results: Mapping[str, Any], config: Any) -> dict[str, Tabl
         tables["Probes"] = probe_table(results["probes"])
     found = findings(results)
     if found:
-        tables["What else was found"] = Table(["quantity", "value"], [list(row) for row in found.items()])
+        tables["What else was found"] = Table(
+            ["quantity", "value"], [[name, text] for name, text in found.items()]
+        )
     if results.get("robustness"):
         tables["Robustness"] = robustness_table(results["robustness"], config.success_distance)
     return tables

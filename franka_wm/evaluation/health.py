@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import inspect
 import math
-from typing import Any
+from typing import Any, cast
 
 import torch
 from tensordict import TensorDictBase
@@ -40,7 +40,7 @@ def training_diagnostics(model: Any, batch: TensorDictBase) -> dict[str, float]:
     """
     device = batch.device if batch.device is not None else batch.get("action").device
     keys = list(getattr(model, "observation_keys", model.observation_sizes))
-    batch = batch[:SAMPLES]
+    batch = cast(TensorDictBase, batch[:SAMPLES])
     devices = [device] if device.type == "cuda" else []
     with evaluating(model), torch.random.fork_rng(devices=devices):
         first = model.encode(batch.select(*keys)[:, 0])

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, cast
 
 import torch
 from tensordict import TensorDict
@@ -110,8 +110,8 @@ def evaluate_agent(
         for seed in seeds:
             with seeded(seed, policy):
                 played.append(play_episodes(env, policy, seed=seed).cpu())
-        rows = torch.cat(played)[:episodes]
-        evaluation.episodes[name] = rows  # pyright: ignore[reportArgumentType]
+        rows = cast(TensorDict, torch.cat(played)[:episodes])
+        evaluation.episodes[name] = rows
         evaluation.policies[name] = summarize(rows)
         if timing:
             with seeded(seeds[0], policy):

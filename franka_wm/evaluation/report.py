@@ -10,19 +10,19 @@ from typing import Any
 import torch
 from omegaconf import DictConfig
 
-from franka_wm.envs import FrankaEnv
 from franka_wm.envs.camera import project
-from franka_wm.evaluation.closed_loop import EVALUATION_SEED, evaluate_policies, play_episodes
+from franka_wm.evaluation.closed_loop import EVALUATION_SEED, arm_of, evaluate_policies, play_episodes
+from franka_wm.evaluation.tables import motion_table, outcome_table, terminal
 from franka_wm.report import written_whole
 from franka_wm.report.curves import plot_learning_curves
-from franka_wm.report.table import markdown_table, terminal_table
+from franka_wm.report.table import markdown
 from franka_wm.report.video import draw_marker, tile_frames, write_png, write_video
 
 
 def evaluate_and_report(
     cfg: DictConfig,
     folder: Path,
-    env: FrankaEnv,
+    env: Any,
     policies: Mapping[str, Any],
     *,
     rows: Sequence[Mapping[str, float]],
@@ -30,8 +30,8 @@ def evaluate_and_report(
 ) -> dict[str, dict[str, Any]]:
     """Evaluates every policy on the same unseen episodes and writes what a run leaves behind.
 
-    Writes ``evaluation.json``, ``evaluation.md``, ``curves.png``, ``video.mp4`` and ``last_frame.png`` into
-    ``folder``, and prints the table.
+    Writes ``evaluation.json``, ``evaluation.md``, ``curves.png`` and, of the arm, ``video.mp4`` and ``last_frame.png``
+    into ``folder``, and prints the table. Policies may be any; the table shows what there is.
     """
     from rich.console import Console
 
@@ -40,18 +40,35 @@ def evaluate_and_report(
         env,
         policies,
         seed=cfg.seed,
-        report=lambda name, r: say(f"  {name}: final distance {r['final_distance']['mean']:.4f} m"),
+        thorough=bool(cfg.evaluation.get("thorough", False)),
+        report=lambda name, r: say(_line(name, r)),
     )
+    tables = [table for table in (outcome_table(results), motion_table(results)) if table.rows]
     with written_whole(folder / "evaluation.json") as path:
         path.write_text(json.dumps(results, indent=2) + "\n")
     with written_whole(folder / "evaluation.md") as path:
-        path.write_text(markdown_table(results))
+        path.write_text("\n".join(map(markdown, tables)))
+    arm = arm_of(env)
     if rows:
-        plot_learning_curves(rows, folder / "curves.png", success_distance=env.config.success_distance)
-    if cfg.evaluation.video_episodes:
-        film(cfg, folder, policies["planner"])
-    Console(width=120).print(terminal_table(results))
+        mark = None if arm is None else arm.config.success_distance
+        plot_learning_curves(rows, folder / "curves.png", success_distance=mark)
+    if cfg.evaluation.video_episodes and arm is not None:
+        film(cfg, folder, policies[acting(policies)])
+    console = Console(width=120)
+    for table in tables:
+        console.print(terminal(table))
     return results
+
+
+def acting(policies: Mapping[str, Any]) -> str:
+    """The policy that a run is about: the planner, the policy where there is none, else whatever comes first."""
+    return next((name for name in ("planner", "policy") if name in policies), next(iter(policies)))
+
+
+def _line(name: str, result: Mapping[str, Any]) -> str:
+    if "final_distance" in result:
+        return f"  {name}: final distance {result['final_distance']['mean']:.4f} m"
+    return f"  {name}: return {result['return']['mean']:.2f}"
 
 
 def film(cfg: DictConfig, folder: Path, policy: Any) -> None:
@@ -59,15 +76,17 @@ def film(cfg: DictConfig, folder: Path, policy: Any) -> None:
     from franka_wm.training.build import make_evaluation_env
 
     env = make_evaluation_env(cfg, num_envs=cfg.evaluation.video_episodes)
+    arm = arm_of(env)
+    assert arm is not None
     size = cfg.evaluation.video_size
     frames: list[torch.Tensor] = []
 
     def picture() -> None:
-        view = env.render(size, samples=2)
-        marks = project(env.goal, env.config, size)
+        view = arm.render(size, samples=2)
+        marks = project(arm.goal, arm.config, size)
         frames.append(draw_marker(view.cpu(), marks.cpu(), radius=size / 32))
 
     play_episodes(env, policy, seed=cfg.seed + EVALUATION_SEED, video=picture)
     film = tile_frames(torch.stack(frames))
-    write_video(film, folder / "video.mp4", fps=round(env.config.fps))
+    write_video(film, folder / "video.mp4", fps=round(arm.config.fps))
     write_png(film[-1], folder / "last_frame.png")

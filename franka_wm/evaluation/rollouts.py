@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from typing import Any
+from typing import Any, cast
 
 import torch
 from tensordict import TensorDict, TensorDictBase
@@ -81,12 +81,13 @@ def gather_episodes(
         (pictures, T, S, S, 3) uint8 on the CPU, or ``None``.
     """
     arm = arm_of(env)
-    steps = env.config.episode_length if steps is None else min(steps, env.config.episode_length)
+    longest = int(env.config.episode_length)
+    length = longest if steps is None else min(steps, longest)
     rows, seen = [], []
     running = torch.ones(env.num_envs, dtype=torch.bool, device=env.device)
     with seeded(seed, policy), set_exploration_type(ExplorationType.DETERMINISTIC):
         tensordict = begin(env, seed)
-        for _ in range(steps):
+        for _ in range(length):
             row: dict[Any, Tensor] = {"valid": running.clone()}
             if arm is not None:
                 row["physical"] = arm.simulation.true_state.clone()
@@ -103,7 +104,7 @@ def gather_episodes(
             running &= ~tensordict.get(("next", "done")).squeeze(-1)
             rows.append(TensorDict(row, batch_size=[env.num_envs], device=env.device))
             tensordict = following
-    return torch.stack(rows, 1), (torch.stack(seen, 1) if seen else None)
+    return cast(TensorDict, torch.stack(rows, 1)), (torch.stack(seen, 1) if seen else None)
 
 
 @contextmanager
@@ -133,9 +134,9 @@ def encode_episodes(model: Any, episodes: TensorDictBase, *, chunk: int = 1024) 
     """
     keys = list(getattr(model, "observation_keys", model.observation_sizes))
     last = episodes.get("next").select(*keys)[:, -1:]
-    observations = torch.cat([episodes.select(*keys), last], 1)  # (E, T + 1)
+    observations = cast(TensorDict, torch.cat([episodes.select(*keys), last], 1))  # pyright: ignore  # (E, T + 1)
     if not hasattr(model, "observe"):
-        flat = observations.flatten(0, 1)
+        flat = cast(TensorDict, observations.flatten(0, 1))
         latents = torch.cat([model.encode(part) for part in flat.split(chunk)])
         return latents.unflatten(0, observations.batch_size)
     z = model.encode(observations[:, 0])
