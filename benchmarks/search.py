@@ -1,0 +1,93 @@
+"""Time of a tree search: encode, search with the model, act, for 1, 64, 1024 environments.
+
+python benchmarks/search.py                  50 simulations of PUCT and of Gumbel over 15 moves
+python benchmarks/search.py --envs 1 --variants puct
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Callable
+from functools import partial
+from typing import Any
+
+import torch
+from common import publish, rate
+from tensordict import TensorDict
+
+from franka_wm import models
+from franka_wm.envs import resolve_device
+from franka_wm.planning import MCTS, SearchPolicy
+
+MOVES = 15
+REFERENCE_MILLISECONDS = 4.3
+"""One move of 50 simulations for one environment of the reference library, compiled, on 2 CPU cores."""
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--device", default="auto")
+    parser.add_argument("--envs", type=int, nargs="+", default=[1, 64, 1024])
+    parser.add_argument("--variants", nargs="+", default=["puct", "gumbel"], choices=["puct", "gumbel"])
+    parser.add_argument("--simulations", type=int, default=50)
+    parser.add_argument("--seconds", type=float, default=3.0)
+    parser.add_argument("--out")
+    arguments = parser.parse_args()
+    device = resolve_device(arguments.device)
+    if device.type == "cuda":
+        torch.set_float32_matmul_precision("high")
+    model = models.make("muzero", observation_sizes={"state": 20, "joint_target": 7}, num_actions=MOVES).to(
+        device
+    )
+    model.eval()
+    rows = []
+    for variant in arguments.variants:
+        search = MCTS(num_actions=MOVES, num_simulations=arguments.simulations, variant=variant)
+        policy = SearchPolicy.for_model(model, search, explore=True)
+        for envs in arguments.envs:
+            observation = TensorDict(
+                {
+                    "state": torch.randn(envs, 20, device=device),
+                    "joint_target": torch.randn(envs, 7, device=device),
+                },
+                batch_size=[envs],
+            )
+            eager = partial(policy, observation)
+            ways: dict[str, Callable[[], Any]] = {"eager": eager}
+            if device.type == "cuda":
+                ways["CUDA graph"] = captured(eager)
+            for way, decide in ways.items():
+                decisions = rate(decide, seconds=arguments.seconds, warmup=1)
+                rows.append(
+                    {
+                        "variant": variant,
+                        "launched": way,
+                        "environments": envs,
+                        "ms/decision": 1e3 / decisions,
+                        "ms/move": 1e3 / decisions / envs,
+                        "moves [1/s]": decisions * envs,
+                        "reference / ours": REFERENCE_MILLISECONDS * decisions * envs / 1e3,
+                    }
+                )
+                print(rows[-1], flush=True)
+    publish(f"tree search: {arguments.simulations} simulations, {MOVES} moves", rows, arguments.out)
+
+
+def captured(work: Callable[[], Any]) -> Callable[[], Any]:
+    """`work` as one CUDA graph."""
+    stream = torch.cuda.Stream()
+    stream.wait_stream(torch.cuda.current_stream())
+    with torch.cuda.stream(stream):
+        for _ in range(3):
+            work()
+    torch.cuda.current_stream().wait_stream(stream)
+    graph = torch.cuda.CUDAGraph()
+    with torch.cuda.graph(graph):
+        work()
+    return graph.replay
+
+
+if __name__ == "__main__":
+    main()
