@@ -17,17 +17,18 @@ from franka_wm.training.entry import one_line_errors, run_command
 @one_line_errors
 def main(cfg: DictConfig) -> None:
     """One run: build, train, evaluate, report."""
-    from franka_wm.envs import resolve_device
     from franka_wm.evaluation.report import evaluate_and_report
     from franka_wm.training import build
     from franka_wm.training.entry import export_experience, finish, start
     from franka_wm.training.learner import Learner
+    from franka_wm.training.stages import pretrain
     from franka_wm.training.trainer import Trainer
 
     run = start(cfg)
     env, judge = run.build_environments()
     replay, spaces = run.build_experience(env)
-    model = build.make_model(run.cfg, spaces, resolve_device(run.cfg.device))
+    pretrain(run, env, replay, spaces)
+    model = build.make_model(run.cfg, spaces, run.device)
     policies = build.make_agent_policies(run.cfg, model, judge, spaces)
     trainer = Trainer(
         env=env,

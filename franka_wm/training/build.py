@@ -226,7 +226,6 @@ def make_policies(
     ``planner`` and ``policy`` where the model has what they need; ``noop`` and ``random`` (smooth random:
     first-order autoregressive); for the arm ``oracle``, inverse kinematics with true geometry.
     """
-    generator = torch.Generator(device=env.device).manual_seed(seed)
     policies: dict[str, Any] = {}
     discrete = not env.action_spec.dtype.is_floating_point
     if discrete:
@@ -235,21 +234,27 @@ def make_policies(
         policies["planner"] = PlannerPolicy.for_model(model, planner, objective=objective)
     if hasattr(model, "policy"):
         policies["policy"] = ModelPolicy.for_model(model)
+    return policies | make_scripted_policies(env, seed=seed, smoothness=smoothness)
+
+
+def make_scripted_policies(env: Any, *, seed: int = 0, smoothness: float = 0.7) -> dict[str, Any]:
+    """Policies that need no model: ``noop``, ``random`` and, for the arm, ``oracle``."""
+    generator = torch.Generator(device=env.device).manual_seed(seed)
+    discrete = not env.action_spec.dtype.is_floating_point
     arm = isinstance(env, (FrankaEnv, TransformedFrankaEnv))
     if discrete and not arm:
-        policies["random"] = RandomMovesPolicy(env.action_dim, generator=generator)
-        return policies
+        return {"random": RandomMovesPolicy(env.action_dim, generator=generator)}
     size = env.config.action_dim if arm else env.action_dim
-    others: dict[str, Any] = {
+    scripted: dict[str, Any] = {
         "noop": NoopPolicy(size),
         "random": SmoothRandomPolicy(size, smoothness=smoothness, generator=generator),
     }
     if arm:
-        others["oracle"] = OraclePolicy(env.kinematics, env.config)
+        scripted["oracle"] = OraclePolicy(env.kinematics, env.config)
     if discrete:
         moves: Any = env.transform
-        others = {name: DiscretePolicy(policy, moves.table) for name, policy in others.items()}
-    return policies | others
+        scripted = {name: DiscretePolicy(policy, moves.table) for name, policy in scripted.items()}
+    return scripted
 
 
 def make_agent_policies(cfg: DictConfig, model: Any, env: Any, spaces: Spaces) -> dict[str, Any]:

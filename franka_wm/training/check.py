@@ -14,6 +14,7 @@ from franka_wm.training import build
 from franka_wm.training.learner import PRECISIONS, SCHEDULES
 from franka_wm.training.loggers import check_loggers
 from franka_wm.training.spaces import Spaces
+from franka_wm.training.stages import check_pretrain
 
 
 def check(cfg: DictConfig) -> None:
@@ -85,6 +86,7 @@ def check(cfg: DictConfig) -> None:
         raise UserError(
             "env=none: without an environment there must be data; use dataset=lerobot dataset.root=…"
         )
+    check_pretrain(cfg)
     spaces = _spaces(cfg)
     if spaces is not None:
         model = build.make_model(cfg, spaces, "cpu")

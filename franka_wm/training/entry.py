@@ -190,13 +190,12 @@ class Run:
 
     def build_experience(self, env: Any) -> tuple[Any, Any]:
         """Where batches come from, and what a model must know of it: ``sample()`` and its :class:`Spaces`."""
-        from franka_wm.envs import resolve_device
         from franka_wm.training import build
         from franka_wm.training.spaces import Spaces
 
         if not build.is_offline(self.cfg):
             return build.make_replay_buffer(self.cfg, env.device), Spaces.of_env(env)
-        windows, self.validation = build.open_recorded(self.cfg, resolve_device(self.cfg.device))
+        windows, self.validation = build.open_recorded(self.cfg, self.device)
         spaces = Spaces(
             observation_sizes=dict(windows.observation_sizes),
             image_sizes=dict(windows.image_sizes),
@@ -205,13 +204,22 @@ class Run:
         )
         return windows, spaces
 
-    def learner_options(self) -> dict[str, Any]:
-        trainer = self.cfg.trainer
+    @property
+    def device(self) -> Any:
+        """Where the run computes."""
+        from franka_wm.envs import resolve_device
+
+        return resolve_device(self.cfg.device)
+
+    def learner_options(self, cfg: DictConfig | None = None) -> dict[str, Any]:
+        """Arguments of the learner; ``cfg`` is another than the run's for a first stage."""
+        cfg = self.cfg if cfg is None else cfg
+        trainer = cfg.trainer
         from franka_wm.training.build import learning_rate
 
         names = ("grad_clip", "capture", "compile", "precision", "schedule", "warmup")
         return {name: trainer[name] for name in names} | {
-            "lr": learning_rate(self.cfg),
+            "lr": learning_rate(cfg),
             "total_updates": trainer.updates,
         }
 

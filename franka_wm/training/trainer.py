@@ -7,10 +7,10 @@ import time
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import torch
-from omegaconf import DictConfig
+from omegaconf import DictConfig, OmegaConf
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torchrl.collectors import Collector
@@ -248,11 +248,20 @@ class Trainer:
             self.folder / "checkpoints" / "latest",
             model=self.model,
             optimizer=self.learner.optimizer,
-            config=self.cfg,
+            config=self._config(),
             counters={"env_steps": self.env_steps, "updates": self.learner.updates, "seconds": self.seconds},
             replay=replay,
             extra={"rows": self.rows, "spaces": self.spaces.as_dict()},
         )
+
+    def _config(self) -> DictConfig:
+        """The configuration, so that the checkpoint alone rebuilds the model, without what it was started from."""
+        own = getattr(self.model, "rebuild_overrides", dict)()
+        if not own:
+            return self.cfg
+        cfg = cast(DictConfig, OmegaConf.create(OmegaConf.to_container(self.cfg, resolve=True)))
+        cfg.model.update(own)
+        return cfg
 
     def restore(self, checkpoint: Checkpoint) -> None:
         """Continues from a checkpoint: weights, optimiser, counters, history, experience, random numbers.

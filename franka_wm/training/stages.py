@@ -1,0 +1,82 @@
+"""Two stages: an encoder from pictures alone, then a model whose dynamics are learned on top of it, frozen.
+
+V-JEPA 2-AC's recipe (arXiv:2506.09985): with the encoder fixed, the targets of the dynamics are fixed, too, and nothing
+can be gained by making them easier.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+from franka_wm.errors import UserError
+from franka_wm.training import build
+from franka_wm.training.learner import Learner
+from franka_wm.training.progress import say
+from franka_wm.training.spaces import Spaces
+from franka_wm.training.trainer import Trainer
+
+if TYPE_CHECKING:
+    from franka_wm.training.entry import Run
+
+FOLDER = "pretrained"
+
+
+def pretrain(run: Run, env: Any, experience: Any, spaces: Spaces) -> None:
+    """The first stage, if ``cfg.pretrain`` asks for one; ``cfg.model.encoder_from`` then names its checkpoint.
+
+    Experience comes from smooth random motion, or from the recorded data. A run that resumes has its encoder already.
+
+    Args:
+        run: Its configuration is changed: the second stage starts from what was learned here.
+        env: The training worlds; ``None`` on recorded data.
+        experience: Recorded windows; not used where there are worlds.
+        spaces: Of observations and actions.
+
+    Raises:
+        UserError: The model takes no pretrained encoder.
+    """
+    cfg = run.cfg
+    if cfg.pretrain.kind == "none" or run.checkpoint is not None:
+        return
+    first = cfg.copy()
+    first.model = cfg.pretrain.model
+    first.trainer.updates = cfg.pretrain.updates
+    first.trainer.checkpoint_replay = False
+    first.export.kind = "none"
+    model = build.make_model(first, spaces, run.device)
+    say(f"first stage: {cfg.pretrain.model.name}, {cfg.pretrain.updates} updates on pictures alone")
+    policies = {} if env is None else build.make_scripted_policies(env, seed=cfg.seed)
+    trainer = Trainer(
+        env=env,
+        learner=Learner(model, **run.learner_options(first)),
+        replay=experience if env is None else build.make_replay_buffer(first, env.device),
+        policies=policies,
+        actor="random",
+        cfg=first,
+        folder=run.folder / FOLDER,
+        loggers=[],
+        evaluate=dict,
+        spaces=spaces,
+        validation=run.validation,
+    )
+    trainer.fit()
+    if trainer.interrupted:
+        raise KeyboardInterrupt
+    cfg.model.encoder_from = str(run.folder.absolute() / FOLDER / "checkpoints" / "latest")
+    say("second stage: dynamics on the frozen encoder")
+
+
+def check_pretrain(cfg: Any) -> None:
+    """What can be refused before a run.
+
+    Raises:
+        UserError: The model takes no pretrained encoder.
+    """
+    if cfg.pretrain.kind == "none":
+        return
+    if cfg.pretrain.kind != "encoder":
+        raise UserError(f"pretrain.kind={cfg.pretrain.kind!r}: must be none or encoder")
+    if "encoder_from" not in cfg.model:
+        raise UserError(
+            f"pretrain: model={cfg.model.name} takes no pretrained encoder; use action_world_model or tdmpc2_pixels"
+        )
