@@ -23,10 +23,12 @@ from franka_wm.report.style import BLUE, VERMILION, policy_name
 HOST = "127.0.0.1"
 """The page takes orders from whoever reaches it, so only this machine does."""
 
-HISTORY = 300
-"""Steps in the plots."""
+HISTORY = 10.0
+"""How far back the plots look, in simulated time [s]."""
 REDRAW = 0.2
 """Least time between two pictures of the plots and the status [s]; the arm moves in every step."""
+
+KINDS = "video: an .mp4 of the environment's camera; dataset: a LeRobot dataset of what is observed and done"
 
 LABELS = {
     "horizon": "horizon [steps]",
@@ -82,7 +84,8 @@ class Page:
             on_goal=session.ask_goal,
         )
         self._times: deque[float] = deque(maxlen=30)
-        self._history: deque[tuple[float, float, float]] = deque(maxlen=HISTORY)
+        most = max(2, round(HISTORY * arm.config.fps))
+        self._history: deque[tuple[float, float, float]] = deque(maxlen=most)
         self._drawn = 0.0
         self._sliders: dict[str, Any] = {}
         self._build(title)
@@ -137,7 +140,8 @@ class Page:
                 for setting in session.settings:
                     self._add_slider(setting)
         with gui.add_folder("Record", expand_by_default=False):
-            self._record = gui.add_button("Record a video", icon="video", color="gray")
+            self._kind = gui.add_dropdown("as", ("video", "dataset"), initial_value="video", hint=KINDS)
+            self._record = gui.add_button("Record", icon="player-record", color="gray")
             self._record.on_click(lambda _: self._try(self.toggle_recording))
 
     def _add_slider(self, setting: Setting) -> None:
@@ -184,13 +188,14 @@ class Page:
         self.show(self.session.frame())
 
     def toggle_recording(self) -> None:
-        """Starts to film, or writes ``live-DATE-TIME.mp4`` into the folder and says where."""
+        """Starts to record, or writes ``live-DATE-TIME…`` into the folder and says where."""
+        kind = str(self._kind.value)
         if not self.session.recording:
-            self.session.start_recording()
-            self._record.label = "Stop and save"
+            self.session.start_recording(kind)
+            self._record.label, self._kind.disabled = "Stop and save", True
             return
-        self._record.label = "Record a video"
-        name = f"live-{datetime.now():%Y-%m-%d-%H-%M-%S}.mp4"
+        self._record.label, self._kind.disabled = "Record", False
+        name = f"live-{datetime.now():%Y-%m-%d-%H-%M-%S}{'.mp4' if kind == 'video' else ''}"
         path = self.session.stop_recording(self.folder / name)
         self._notify("Saved", str(path.resolve()))
 
@@ -224,8 +229,8 @@ class Page:
         self._status.content = self._describe(frame)
         if len(self._history) > 1:
             seconds, distance, reward = np.array(self._history).T
-            draw(self._distance, seconds, distance, steps=10.0)
-            draw(self._reward, seconds, reward, steps=0.1)
+            draw(self._distance, seconds - seconds[-1], distance, steps=10.0)
+            draw(self._reward, seconds - seconds[-1], reward, steps=0.1)
 
     def _describe(self, frame: Frame) -> str:
         fps = self.session.arm.config.fps
@@ -242,19 +247,22 @@ class Page:
 
 
 def draw(plot: Any, seconds: np.ndarray, values: np.ndarray, *, steps: float) -> None:
-    """Puts a curve into a plot, whose axis holds 0 and all values and grows and shrinks in whole ``steps``."""
+    """Puts a curve into a plot, whose axis holds 0 and all values and grows and shrinks in whole ``steps``.
+
+    Time counts back from now: axes that stay as they are need not be built anew.
+    """
     low = steps * np.floor(min(0.0, float(values.min())) / steps)
     high = steps * np.ceil(max(0.0, float(values.max())) / steps)
     scales = axes(low, high if high > low else low + steps)
-    if plot.scales != scales:  # a browser builds the plot anew for other axes
+    if plot.scales != scales:
         plot.scales = scales
     plot.data = (seconds, values)
 
 
 def axes(low: float, high: float) -> dict[str, Any]:
-    """Time as it comes, values from ``low`` to ``high`` with a margin."""
+    """The last seconds, and values from ``low`` to ``high`` with a margin."""
     margin = 0.06 * (high - low)
     return {
-        "x": {"time": False, "auto": True},
-        "y": {"range": (float(low - margin), float(high + margin)), "auto": True},
+        "x": {"time": False, "range": (-HISTORY, 0.0)},
+        "y": {"range": (float(low - margin), float(high + margin))},
     }

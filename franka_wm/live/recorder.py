@@ -1,10 +1,14 @@
-"""What happens on the live page, as a video."""
+"""What happens on the live page, as a video or as a LeRobot dataset."""
 
 from __future__ import annotations
 
+from dataclasses import asdict
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 import torch
+from tensordict import TensorDictBase
 
 from franka_wm.envs import FrankaEnv
 from franka_wm.envs.camera import project
@@ -25,14 +29,13 @@ class VideoRecorder:
         self.env, self.size, self.most = env, size, most
         self.frames: list[torch.Tensor] = []
 
-    @property
-    def full(self) -> bool:
-        """Whether no further picture is taken."""
-        return len(self.frames) >= self.most
+    def __len__(self) -> int:
+        """Steps recorded."""
+        return len(self.frames)
 
-    def take(self) -> None:
-        """One picture of the present; nothing where it is full."""
-        if self.full:
+    def take(self, step: TensorDictBase) -> None:
+        """One picture of the present; nothing where it is full. ``step`` is not looked at."""
+        if len(self) >= self.most:
             return
         picture = self.env.render(self.size, num_views=1).cpu()
         centre = project(self.env.goal[:1], self.env.config, self.size).cpu()
@@ -49,3 +52,91 @@ class VideoRecorder:
                 f"nothing was recorded for {path}: play for a moment before stopping the recording"
             )
         return write_video(torch.stack(self.frames), path, fps=max(1, round(self.env.config.fps)))
+
+
+class DatasetRecorder:
+    """Collects steps for a LeRobot dataset; what :func:`~franka_wm.data.lerobot.schema.schema_for` lists is kept.
+
+    An episode of the dataset begins with the recording or with an episode of the environment, and ends with either;
+    one that the recording cut off counts as truncated. Where a goal was dragged, the next row simply has another one.
+
+    Args:
+        env: The world, with its transforms.
+        seed: Of the session.
+        policy: Who acts at the start, for the dataset's provenance.
+        format: How pictures are stored; see :data:`~franka_wm.data.lerobot.schema.FORMATS`.
+        most: Steps after which it is full.
+
+    Raises:
+        UserError: The environment observes something that has no place in a dataset.
+    """
+
+    def __init__(
+        self, env: Any, *, seed: int = 0, policy: str = "", format: str = "exact", most: int = 20_000
+    ):
+        from franka_wm.data.lerobot.schema import schema_for
+
+        self.env, self.seed, self.policy, self.most = env, seed, policy, most
+        self.arm: FrankaEnv = env if isinstance(env, FrankaEnv) else env.base_env
+        self.schema = schema_for(self.arm.config, format=format)
+        self.steps: list[TensorDictBase] = []
+
+    def __len__(self) -> int:
+        """Steps recorded."""
+        return len(self.steps)
+
+    def take(self, step: TensorDictBase) -> None:
+        """One step: observation, ``action`` and, under ``next``, what followed; nothing where it is full."""
+        if len(self) >= self.most:
+            return
+        keys = {*self.schema.sources.values(), *(key for key, _, _ in self.schema.derived.values())}
+        flags = ("reward", "done", "terminated", "truncated", "success")
+        after = step.get("next").select(*keys, *flags)
+        self.steps.append(step.select(*keys, "action", "is_init").set("next", after).cpu().clone())
+
+    def write(self, path: str | Path) -> Path:
+        """Writes the dataset's folder, which appears whole.
+
+        Raises:
+            UserError: No step was taken, or the folder cannot be written.
+        """
+        from franka_wm.data.lerobot.episodes import UNKNOWN_EPISODE, EpisodeCutter, complete
+        from franka_wm.data.lerobot.provenance import describe
+        from franka_wm.data.lerobot.schema import EPISODE_KEY, SEED
+        from franka_wm.data.lerobot.writer import DatasetWriter
+
+        if not self.steps:
+            raise UserError(
+                f"nothing was recorded for {path}: play for a moment before stopping the recording"
+            )
+        batch: Any = torch.stack(self.steps, 1)  # type: ignore[arg-type, call-overload]
+        first, ended = batch["is_init"], batch["next", "done"]
+        first[:, 0] = True
+        cut = torch.ones_like(ended)  # before a beginning there is an end, also where a button was the reason
+        cut[:, :-1] = first[:, 1:]
+        batch["next", "truncated"] |= cut & ~ended
+        ended |= cut
+        table = None if self.env.action_spec.dtype.is_floating_point else self.env.transform.table
+        cutter = EpisodeCutter(self.schema, seed=self.seed, discrete=table)
+        provenance = describe(
+            policy=f"live session, began with {self.policy}",
+            seed=self.seed,
+            config={"env": _plain(asdict(self.arm.config))},
+        )
+        with DatasetWriter(path, self.schema, provenance=provenance, workers=0) as writer:
+            for episode in cutter.push(batch):
+                world = int(episode.rows.pop(SEED)[0, 1])
+                del episode.rows[EPISODE_KEY]
+                # Which of its world's episodes it was is not said: it was played by hand and cannot be repeated.
+                seed = (self.seed, world, UNKNOWN_EPISODE)
+                writer.add([complete(episode.rows, episode.terminal, seed=seed)])
+            return writer.finish()
+
+
+def _plain(value: Any) -> Any:
+    """For JSON: tuples as lists, numpy's numbers as Python's."""
+    if isinstance(value, dict):
+        return {key: _plain(v) for key, v in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(v) for v in value]
+    return value.item() if isinstance(value, np.generic) else value

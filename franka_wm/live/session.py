@@ -21,7 +21,7 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 from franka_wm.envs import FrankaEnv
 from franka_wm.errors import UserError
 from franka_wm.live.commanded import commanded_path
-from franka_wm.live.recorder import VideoRecorder
+from franka_wm.live.recorder import DatasetRecorder, VideoRecorder
 from franka_wm.live.settings import Setting, planner_settings, rebuilt
 
 PREFERRED = ("planner", "oracle", "noop")
@@ -44,7 +44,7 @@ class Frame:
         distance: From tool to goal, at the last step's end, before any reset [m].
         success: Of the last step.
         decision: Time that the policy took for the last step [s].
-        recording: Pictures taken so far; None where nothing is recorded.
+        recording: Steps recorded so far; None where nothing is recorded.
     """
 
     steps: int
@@ -93,14 +93,14 @@ class Session:
         if self.arm.num_envs != 1:
             raise UserError(f"a live session simulates one world, the environment has {self.arm.num_envs}")
         self.policies = dict(policies)
-        self.keep_goal = keep_goal
+        self.keep_goal, self.seed = keep_goal, seed
         self.speed = 1.0
         self.error: Exception | None = None
         self._lock = threading.RLock()
         self._playing, self._stopping = threading.Event(), threading.Event()
         self._thread: threading.Thread | None = None
         self._listeners: list[Callable[[Frame], None]] = []
-        self._recorder: VideoRecorder | None = None
+        self._recorder: VideoRecorder | DatasetRecorder | None = None
         self._steps = self._episode = 0
         self._reward = self._decision = 0.0
         self._success = False
@@ -134,7 +134,7 @@ class Session:
             if bool(after["done"]):
                 self._begin_episode()
             if self._recorder is not None:
-                self._recorder.take()
+                self._recorder.take(done)
             frame = self._frame(stepped=True)
         return self._tell(frame)
 
@@ -238,13 +238,24 @@ class Session:
     def recording(self) -> bool:
         return self._recorder is not None
 
-    def start_recording(self, **options: Any) -> None:
-        """Films every step from now on; ``options`` are those of :class:`VideoRecorder`."""
+    def start_recording(self, kind: str = "video", **options: Any) -> None:
+        """Records every step from now on; what was recorded before and not written is dropped.
+
+        Args:
+            kind: ``video`` or ``dataset``.
+            options: Those of :class:`VideoRecorder` or :class:`DatasetRecorder`.
+
+        Raises:
+            UserError: The environment observes something that has no place in a dataset.
+        """
         with self._lock:
-            self._recorder = VideoRecorder(self.arm, **options)
+            if kind == "dataset":
+                self._recorder = DatasetRecorder(self.env, seed=self.seed, policy=self._policy, **options)
+            else:
+                self._recorder = VideoRecorder(self.arm, **options)
 
     def stop_recording(self, path: str | Path) -> Path:
-        """Writes what was filmed since :meth:`start_recording`.
+        """Writes what was recorded since :meth:`start_recording`: an .mp4, or a dataset's folder.
 
         Raises:
             UserError: Nothing was recorded, or the file cannot be written.
@@ -350,7 +361,7 @@ class Session:
             distance=self._distance,
             success=self._success,
             decision=self._decision,
-            recording=None if self._recorder is None else len(self._recorder.frames),
+            recording=None if self._recorder is None else len(self._recorder),
         )
 
     def _tell(self, frame: Frame) -> Frame:

@@ -22,7 +22,7 @@ An arm in the browser, on this machine only: drag its goal, switch policies, mov
                       a planner that knows its geometry, inverse kinematics, random actions, or not at all
   policy=NAME         who acts first: planner, policy, oracle, random, noop
   port=8080           of http://127.0.0.1; 0 takes a free one
-  out=FOLDER          where videos go (the present folder)
+  out=FOLDER          where recordings go: videos and LeRobot datasets (the present folder)
   seconds=S           ends after so long; without it, Ctrl-C ends it
   seed=0  device=auto
   env.KEY=VALUE       a field of the environment's configuration; episodes have no end unless
@@ -104,6 +104,9 @@ def view(arguments: Sequence[str]) -> None:
     if any(argument in ("--help", "-h") for argument in arguments):
         print(USAGE)
         return
+    import warp as wp
+
+    wp.config.log_level = wp.LOG_WARNING  # its list of compiled modules drowns what there is to say
     options = parse(arguments)
     if options.rerun is not None:
         record(options)

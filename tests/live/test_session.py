@@ -235,3 +235,38 @@ def test_a_recording_stops_growing_and_an_empty_one_is_not_written(make_session,
 def test_one_world_only(small_env) -> None:
     with pytest.raises(UserError, match="one world, the environment has 2"):
         Session(small_env(2), {"noop": lambda t: t})
+
+
+@pytest.mark.slow
+def test_a_recording_can_be_a_dataset_of_what_happened(make_session, tmp_path: Path) -> None:
+    from lerobot.datasets.lerobot_dataset import LeRobotDataset
+
+    session = make_session(policy="oracle", observations=("pixels", "state", "joint_target"), image_size=16)
+    session.step()
+    session.start_recording("dataset")
+    seen = [session.step() for _ in range(3)]
+    session.set_goal(RIGHT)
+    seen += [session.step() for _ in range(2)]
+    session.reset()  # in the middle: what follows is another episode
+    seen += [session.step() for _ in range(4)]
+    assert seen[-1].recording == 9
+    path = session.stop_recording(tmp_path / "live")
+    data = LeRobotDataset("local/live", root=path)
+    assert (data.num_episodes, data.num_frames, data.fps) == (2, 9, 30)
+    rows = [data[i] for i in range(9)]
+    assert [int(row["episode_index"]) for row in rows] == [0] * 5 + [1] * 4
+    assert [bool(row["next.truncated"]) for row in rows] == [False] * 4 + [True] + [False] * 3 + [True]
+    assert [bool(row["next.done"]) for row in rows] == [bool(row["next.truncated"]) for row in rows]
+    rewards = [float(row["next.reward"]) for row in rows]
+    np.testing.assert_allclose(rewards, [frame.reward for frame in seen], atol=1e-6)
+    goals = np.stack([row["observation.environment_state"].numpy() for row in rows])
+    np.testing.assert_allclose(goals[3:5], [RIGHT, RIGHT], atol=1e-6)
+    assert not np.allclose(goals[2], RIGHT)
+    np.testing.assert_allclose(rows[1]["tool_position"].numpy(), seen[0].tool, atol=1e-6)
+
+
+def test_what_has_no_place_in_a_dataset_is_said_at_the_start(make_session) -> None:
+    session = make_session(policy="noop", observations=("depth", "state", "joint_target"), image_size=16)
+    with pytest.raises(UserError, match="depth has no place in a LeRobot dataset"):
+        session.start_recording("dataset")
+    assert not session.recording

@@ -5,6 +5,7 @@ from __future__ import annotations
 import builtins
 import re
 import socket
+import subprocess
 import sys
 from pathlib import Path
 
@@ -153,6 +154,34 @@ def test_a_port_in_use_is_said(capsys: pytest.CaptureFixture[str]) -> None:
         taken = other.getsockname()[1]
         assert cli.main(["view", *CHEAP, f"port={taken}", "policy=noop", "seconds=0.1"]) == 0
     assert f"(port {taken} is taken)" in capsys.readouterr().out
+
+
+@pytest.mark.slow
+def test_a_checkpoint_brings_its_own_planner_and_policy(root: Path, tmp_path: Path) -> None:
+    from franka_wm.live.session import Session
+
+    train = [sys.executable, "train.py", "scale=smoke", "device=cpu", f"hydra.run.dir={tmp_path / 'run'}"]
+    done = subprocess.run(train, cwd=root, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    stage = view.build(view.parse([f"checkpoint={tmp_path / 'run'}", "device=cpu"]))
+    assert stage.title.startswith("tdmpc2, ")
+    assert stage.steps == 50
+    assert stage.env.config.episode_length > 1000, "nobody asked for the episode to end"
+    session = Session(stage.env, stage.policies)
+    assert session.policy == "planner"
+    frame = session.step()
+    assert frame.path is not None
+    assert frame.path.shape == (session.planner.horizon + 1, 3)
+    session.set_planner(horizon=2, iterations=1)
+    assert session.step().path.shape == (3, 3)
+    session.set_policy("policy")
+    assert session.step().path is None
+    session.set_policy("oracle")
+    goal = (0.4, 0.2, 0.5)
+    session.set_goal(goal)
+    for _ in range(50):
+        frame = session.step()
+    assert max(abs(a - b) for a, b in zip(frame.tool, goal, strict=True)) < 0.01
 
 
 def test_an_exception_while_it_plays_ends_it(monkeypatch: pytest.MonkeyPatch) -> None:
