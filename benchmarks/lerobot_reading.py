@@ -11,12 +11,14 @@ from __future__ import annotations
 import argparse
 import os
 import random
+import sys
 import tempfile
 import time
 from pathlib import Path
 from typing import Any
 
 os.environ["HF_HUB_OFFLINE"] = "1"
+sys.path.append(sys.path.pop(0))  # this folder last: `lerobot` is the package, not the script beside this one
 
 import torch
 from common import publish, rate
@@ -28,6 +30,7 @@ from franka_wm.envs import FrankaConfig, FrankaEnv
 
 def record(folder: Path, episodes: int, format: str, window: int, batch_size: int) -> tuple[Path, Any]:
     """A dataset of episodes of 50 steps, and a replay buffer with the same steps."""
+    import warp as wp
     from torchrl.collectors import Collector
 
     from franka_wm.data.lerobot.episodes import EpisodeCutter
@@ -35,6 +38,7 @@ def record(folder: Path, episodes: int, format: str, window: int, batch_size: in
     from franka_wm.data.lerobot.schema import schema_for
     from franka_wm.data.lerobot.writer import DatasetWriter
 
+    wp.config.log_level = wp.LOG_WARNING  # its list of compiled modules drowns the table
     config = FrankaConfig(
         observations=("pixels", "state"), goal_sampling="reachable", substeps=4, episode_length=50
     )
