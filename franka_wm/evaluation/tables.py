@@ -94,30 +94,19 @@ def probe_table(results: Mapping[str, Mapping[str, Any]]) -> Table:
     return Table(["R² of what is read off the latent", "ridge", "nearest neighbours"], rows)
 
 
-def robustness_table(results: Mapping[str, Mapping[str, Mapping[str, Any]]]) -> Table:
+def robustness_table(
+    results: Mapping[str, Mapping[str, Mapping[str, Any]]], success_distance: float
+) -> Table:
     """What breaks under which shift, of :func:`franka_wm.evaluation.robustness.robustness`."""
-    first = next(iter(next(iter(results.values())).values()))
-    distance = first.get("success_distance")
-    header = ["shift", "policy", "return", "change of return"]
-    if distance is not None:
-        header = [
-            "shift",
-            "policy",
-            "final distance [cm]",
-            "change [cm]",
-            f"success at {centimetres(distance)} [%]",
-        ]
+    success = f"success at {centimetres(success_distance)} [%]"
+    header = ["shift", "policy", "final distance [cm]", "change [cm]", success, "verdict"]
     rows = []
     for shift, policies in results.items():
         for policy, r in policies.items():
-            change = r.get("change")
-            if distance is None:
-                cells = [interval(r["return"]), "" if change is None else interval(change)]
-            else:
-                moved = "" if change is None else interval(change, 100)
-                cells = [interval(r["final_distance"], 100), moved, interval(r["success"], 100, 0)]
+            change = "" if r["change"] is None else interval(r["change"], 100)
+            cells = [interval(r["final_distance"], 100), change, interval(r["success"], 100, 0)]
             rows.append([shift, policy_name(policy), *cells, r["verdict"]])
-    return Table([*header, "verdict"], rows)
+    return Table(header, rows)
 
 
 def _distances(policies: Policies, name: str) -> list[str]:

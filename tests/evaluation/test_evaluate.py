@@ -1,0 +1,147 @@
+"""``franka-wm evaluate``: files, tables, repeatability, and one line for what cannot be."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+import torch
+
+from franka_wm import cli
+from franka_wm.errors import UserError
+from franka_wm.evaluation import diagnose
+from franka_wm.evaluation.evaluate import default_folder, parse, to_json
+
+POLICIES = {"planner", "policy", "noop", "random", "oracle"}
+
+
+@pytest.mark.slow
+def test_everything_twice(run_folder: Path, tmp_path: Path, capsys, monkeypatch) -> None:
+    """All files, and evaluation.json and evaluation.md the same to the byte."""
+    train = diagnose.train_decoder
+    monkeypatch.setattr(diagnose, "train_decoder", lambda z, p: train(z, p, steps=20))
+    for out in ("one", "two"):
+        arguments = [f"checkpoint={run_folder}", f"out={tmp_path / out}", "episodes=8", "device=cpu"]
+        assert cli.main(["evaluate", *arguments]) == 0
+    said = capsys.readouterr().out
+    one, two = tmp_path / "one", tmp_path / "two"
+    names = {"evaluation.json", "evaluation.md", "timing.json", "imagined.png", "imagined.mp4"}
+    assert {path.name for path in one.iterdir()} == names
+    for name in ("evaluation.json", "evaluation.md", "imagined.png"):
+        assert (one / name).read_bytes() == (two / name).read_bytes(), name
+
+    results = json.loads((one / "evaluation.json").read_text())
+    assert set(results["policies"]) == POLICIES
+    for policy in results["policies"].values():
+        assert policy["episodes"] == 8
+        assert {"final_distance", "success", "success_once", "return", "path_length", "jerk"} <= set(policy)
+    assert results["policies"]["oracle"]["final_distance"]["mean"] < 0.1
+    assert len(results["open_loop"]["curves"]["model"]["mean"]) == 10
+    assert set(results["probes"]) == {"joints", "velocities", "tool", "goal", "tool to goal"}
+    assert results["spectrum"]["effective_rank"] > 1 and results["calibration"]["samples"] == 8 * 12
+    assert results["health"]["planner states"] == 8
+    assert len(results["latents"]["points"]) == len(results["latents"]["quantity"]) == 8 * 12
+    assert results["protocol"]["episodes"] == 8 and results["protocol"]["model"] == "tdmpc2"
+    timing = json.loads((one / "timing.json").read_text())
+    assert set(timing) == POLICIES and timing["planner"]["seconds_per_decision"] > 0
+
+    text = (one / "evaluation.md").read_text()
+    for title in ("Open loop", "Probes", "What else was found", "inverse kinematics"):
+        assert title in text
+    assert "inverse kinematics" in said and "Robustness" not in text
+
+
+@pytest.mark.slow
+def test_the_closed_loop_alone(run_folder: Path, tmp_path: Path, capsys) -> None:
+    arguments = ["episodes=4", "device=cpu", "open_loop=false", "probes=false"]
+    assert cli.main(["evaluate", f"checkpoint={run_folder}", f"out={tmp_path}", *arguments]) == 0
+    results = json.loads((tmp_path / "evaluation.json").read_text())
+    assert set(results) == {"protocol", "policies"}
+    assert str(tmp_path) in capsys.readouterr().out.splitlines()[-1]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "says"),
+    [
+        (["episodes=5"], "give checkpoint="),
+        (["checkpoint=a", "episodes=1"], "episodes=1"),
+        (["checkpoint=a", "episodes=many"], "episodes=many"),
+        (["checkpoint=a", "probes=yes"], "true or false"),
+        (["checkpoint=a", "fast=true"], "unknown key 'fast'"),
+        (["checkpoint=a", "checkpoint=b"], "given twice"),
+        (["outputs/run"], "not key=value"),
+        (["checkpoint="], "not key=value"),
+    ],
+)
+def test_bad_arguments(arguments: list[str], says: str, capsys) -> None:
+    assert cli.main(["evaluate", *arguments]) == 1
+    lines = capsys.readouterr().err.strip().splitlines()
+    assert len(lines) == 1 and lines[0].startswith("error: ") and says in lines[0]
+
+
+def test_a_checkpoint_that_is_not_there(tmp_path: Path, capsys) -> None:
+    arguments = [f"checkpoint={tmp_path}/nowhere", f"out={tmp_path}/out", "device=cpu"]
+    assert cli.main(["evaluate", *arguments]) == 1
+    assert "nowhere" in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
+
+
+def test_help(capsys) -> None:
+    assert cli.main(["evaluate", "--help"]) == 0
+    assert "robustness=false" in capsys.readouterr().out
+    assert cli.main(["evaluate"]) == 2
+
+
+def test_options(tmp_path: Path) -> None:
+    options = parse(["checkpoint=a", "out=b", "episodes=7", "device=cpu", "robustness=true", "probes=false"])
+    assert (options.episodes, options.robustness, options.probes, options.open_loop) == (7, True, False, True)
+    with pytest.raises(UserError):
+        parse([])
+    checkpoint = tmp_path / "run" / "checkpoints" / "latest"
+    checkpoint.mkdir(parents=True)
+    assert (
+        default_folder(str(checkpoint))
+        == default_folder(str(tmp_path / "run"))
+        == tmp_path / "run" / "evaluation"
+    )
+    assert default_folder("hf:me/arm") == Path("outputs/evaluation/me--arm")
+
+
+def test_json_has_no_nan() -> None:
+    text = to_json({"a": float("nan"), "b": [1.0, float("inf")], "c": {"d": 2}})
+    assert json.loads(text) == {"a": None, "b": [1.0, None], "c": {"d": 2}}
+
+
+# -- models that lack parts --------------------------------------------------------------------------------
+
+
+class Blind(torch.nn.Module):
+    """A representation alone: no dynamics, no value, no policy."""
+
+    observation_sizes = {"state": 20}
+
+    def encode(self, observation):
+        return observation.get("state")
+
+
+@pytest.fixture
+def representation_alone(agent):
+    from dataclasses import replace
+
+    policies = {name: agent.policies[name] for name in ("noop", "random")}
+    return replace(agent, model=Blind(), planner=None, policies=policies)
+
+
+def test_a_representation_alone(representation_alone) -> None:
+    held = diagnose.hold_out(representation_alone, pictures=False)
+    assert held.pictures is None
+    assert "curves" not in diagnose.open_loop(representation_alone, held)
+    assert diagnose.calibration(representation_alone) == {}
+    assert diagnose.health(representation_alone, None) == {}
+    assert diagnose.imagine(representation_alone, held) is None
+    found = diagnose.probes(held, representation_alone.model)
+    assert found["joints"]["ridge"] > 0.999 and found["tool"]["ridge"] > 0.999  # it hands the state over
+    assert found["goal"]["ridge"] is None  # one test episode has one goal
+    spectrum, latents = diagnose.representation(held, representation_alone.model)
+    assert spectrum["dimensions"] == 20 and len(latents["explained"]) == 2

@@ -1,0 +1,146 @@
+"""Training health: what is logged is right, cheap to ask for, and changes nothing."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from tensordict import TensorDict
+
+from franka_wm.evaluation.health import paired_gain, planner_health, training_diagnostics
+from franka_wm.evaluation.spectrum import collapse_warning, latent_statistics
+from franka_wm.models.tdmpc2 import TDMPC2
+from franka_wm.planning import MPPI, PlannerPolicy
+
+
+@pytest.fixture
+def model() -> TDMPC2:
+    torch.manual_seed(0)
+    sizes = {"state": 6}
+    return TDMPC2(
+        observation_sizes=sizes, action_dim=2, episode_length=20, latent_dim=16, encoder_dim=32, hidden_dim=32
+    )
+
+
+@pytest.fixture
+def batch() -> TensorDict:
+    generator = torch.Generator().manual_seed(1)
+    states = torch.randn(64, 4, 6, generator=generator)
+    return TensorDict(
+        {
+            "state": states[:, :3],
+            "action": torch.rand(64, 3, 2, generator=generator) * 2 - 1,
+            "is_init": torch.zeros(64, 3, 1, dtype=torch.bool),
+            "next": {
+                "state": states[:, 1:],
+                "reward": torch.randn(64, 3, 1, generator=generator),
+                "terminated": torch.zeros(64, 3, 1, dtype=torch.bool),
+            },
+        },
+        batch_size=[64, 3],
+    )
+
+
+def test_diagnostics_are_those_of_the_encoded_batch(model: TDMPC2, batch: TensorDict) -> None:
+    model.value = lambda z: z[..., :1]  # its own says 0 everywhere before training
+    found = training_diagnostics(model, batch)
+    expected = latent_statistics(model.encode(batch[:, 0]))
+    assert {name.removeprefix("latent/"): v for name, v in found.items() if "latent/" in name} == expected
+    assert all(isinstance(value, float) for value in found.values())
+    assert {"value/mean", "value/td_bias", "value/td_correlation"} <= set(found)
+
+
+def test_looking_changes_nothing(model: TDMPC2, batch: TensorDict) -> None:
+    model.train()
+    model.q_ensemble.eval()  # a part that is kept in another mode
+    before = {name: value.clone() for name, value in model.state_dict().items()}
+    torch.manual_seed(5)
+    expected = torch.rand(4)
+    torch.manual_seed(5)
+    training_diagnostics(model, batch)
+    assert torch.equal(torch.rand(4), expected)
+    assert model.training and model.encoder.training and not model.q_ensemble.training
+    assert all(torch.equal(value, before[name]) for name, value in model.state_dict().items())
+
+
+def test_a_collapsed_encoder_is_told(model: TDMPC2, batch: TensorDict) -> None:
+    assert collapse_warning(training_diagnostics(model, batch)) is None
+    with torch.no_grad():
+        for parameter in model.encoder.parameters():
+            parameter.zero_()
+    assert "to a point" in str(collapse_warning(training_diagnostics(model, batch)))
+
+
+def test_an_exact_value_has_no_bias(model: TDMPC2, batch: TensorDict) -> None:
+    """Reward 1 for ever is worth 1 / (1 − γ); a value of that is consistent with itself. One too high by c is too
+    high by c − γ³ c over three steps."""
+    batch["next", "reward"] = torch.ones(64, 3, 1)
+    exact = 1 / (1 - model.discount)
+    for offset in (0.0, 5.0):
+        model.value = lambda z, offset=offset: torch.full((*z.shape[:-1], 1), exact + offset)
+        found = training_diagnostics(model, batch)
+        assert found["value/td_bias"] == pytest.approx(offset * (1 - model.discount**3), abs=1e-4)
+        assert "value/td_correlation" not in found  # of constants there is none
+
+
+def test_a_termination_ends_the_return(model: TDMPC2, batch: TensorDict) -> None:
+    batch["next", "reward"] = torch.ones(64, 3, 1)
+    batch["next", "terminated"] = torch.tensor([False, True, False]).view(1, 3, 1).expand(64, 3, 1).clone()
+    model.value = lambda z: torch.full((*z.shape[:-1], 1), 100.0)
+    expected = 100 - (1 + model.discount)
+    assert training_diagnostics(model, batch)["value/td_bias"] == pytest.approx(expected, rel=1e-5)
+
+
+def test_without_rewards_or_finite_latents(model: TDMPC2, batch: TensorDict) -> None:
+    del batch["next", "reward"], batch["next", "terminated"]
+    found = training_diagnostics(model, batch)
+    assert found and not any(name.startswith("value/") for name in found)
+    batch["state"].fill_(torch.nan)
+    assert training_diagnostics(model, batch) == {}
+
+
+# -- planners ----------------------------------------------------------------------------------------------
+
+
+def nearest_to_origin(trajectory: torch.Tensor, actions: torch.Tensor) -> torch.Tensor:
+    return -trajectory[:, :, -1].square().sum(-1)
+
+
+@pytest.fixture
+def states() -> TensorDict:
+    position = torch.randn(40, 2, generator=torch.Generator().manual_seed(2))
+    return TensorDict({"position": position, "is_init": torch.ones(40, 1, dtype=torch.bool)}, batch_size=[40])
+
+
+def test_planning_gains_over_doing_nothing(point_model, states: TensorDict) -> None:
+    planner = MPPI(action_dim=2, horizon=2, num_samples=256, num_elites=32, num_policy_samples=0)
+    policy = PlannerPolicy.for_model(point_model, planner, objective=nearest_to_origin)
+    torch.manual_seed(0)
+    found = planner_health(policy, states)
+    stays = float(-states["position"].square().sum(-1).mean())
+    assert found["prior"] == pytest.approx(stays)
+    assert found["gain"]["mean"] == pytest.approx(found["plan"] - found["prior"], rel=1e-5)
+    assert found["gain"]["low"] > 0.5 * -stays
+    assert found["better"] > 0.9 and found["states"] == 40
+    assert 1 <= found["effective_samples"]["mean"] <= 32
+
+
+def test_a_perfect_prior_leaves_nothing_to_gain(point_model, states: TensorDict) -> None:
+    point_model.policy = lambda z, deterministic=False: (
+        (-z).clamp(-1, 1) if deterministic else torch.ones_like(z)
+    )
+    planner = MPPI(action_dim=2, horizon=3, num_samples=64, num_elites=8, num_policy_samples=4)
+    policy = PlannerPolicy.for_model(point_model, planner, objective=nearest_to_origin)
+    torch.manual_seed(0)
+    found = planner_health(policy, states)
+    assert found["gain"]["mean"] <= 1e-6
+    assert found["better"] < 0.1
+
+
+def test_pairs_are_narrower_than_their_parts() -> None:
+    """Episodes differ much more than the two policies do on the same one."""
+    base = torch.linspace(-50, 0, 60)
+    noise = 0.1 * torch.randn(60, generator=torch.Generator().manual_seed(3))
+    one, two = ({"return": values} for values in (base + 1 + noise, base))
+    gain = paired_gain(*(TensorDict(part, batch_size=[60]) for part in (one, two)))
+    assert set(gain) == {"return"}
+    assert 0.9 < gain["return"]["low"] < 1 + float(noise.mean()) < gain["return"]["high"] < 1.1

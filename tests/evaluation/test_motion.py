@@ -1,0 +1,124 @@
+"""How the arm moved on the way, against the same quantities computed from recorded states."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from tensordict import TensorDict
+from tensordict.nn import TensorDictModule
+
+from franka_wm.data.policies import NoopPolicy, OraclePolicy, SmoothRandomPolicy
+from franka_wm.envs import TransformedFrankaEnv
+from franka_wm.envs.discretize import DiscreteActions
+from franka_wm.envs.external import ExternalConfig, ExternalEnv
+from franka_wm.evaluation.closed_loop import (
+    arm_of,
+    decision_times,
+    evaluate_policies,
+    play_episodes,
+    summarize,
+)
+
+LENGTH = 8
+
+
+@pytest.fixture(scope="module")
+def env(small_env):
+    return small_env(4, episode_length=LENGTH, goal_sampling="reachable")
+
+
+def test_motion_by_hand(env) -> None:
+    policy = SmoothRandomPolicy(generator=torch.Generator().manual_seed(0))
+    episodes = play_episodes(env, policy, seed=5)
+    policy = SmoothRandomPolicy(generator=torch.Generator().manual_seed(0))
+    observation = env.reset(seed=5)
+    tools, actions, distances = [observation["state"][:, 14:17]], [], []
+    for _ in range(LENGTH):
+        step = env.step(policy(observation))
+        actions.append(step["action"])
+        observation = step["next"].exclude("reward", "done", "terminated", "truncated")
+        observation["is_init"] = torch.zeros(4, 1, dtype=torch.bool)
+        tools.append(observation["state"][:, 14:17])
+        distances.append(observation["state"][:, 17:].norm(dim=-1))
+    path, action = torch.stack(tools, 1), torch.stack(actions, 1)
+    torch.testing.assert_close(episodes["path_length"], path.diff(dim=1).norm(dim=-1).sum(1))
+    torch.testing.assert_close(episodes["action_change"], action.diff(dim=1).square().mean((1, 2)))
+    jerk = (path.diff(n=3, dim=1) * env.config.fps**3).square().sum(-1).mean(1).sqrt()
+    torch.testing.assert_close(episodes["jerk"], jerk, rtol=1e-3, atol=1e-2)
+    torch.testing.assert_close(episodes["closest_distance"], torch.stack(distances).amin(0))
+    assert (episodes["closest_distance"] < episodes["final_distance"]).any()
+
+
+def test_worlds_that_ended_move_no_further(small_env) -> None:
+    """Of episodes that end at success, what comes after in the same world counts for nothing."""
+    env = small_env(6, episode_length=12, success_distance=0.25, terminate_on_success=True)
+    episodes = play_episodes(env, OraclePolicy(env.kinematics, env.config), seed=0)
+    assert episodes["length"].min() < 12
+    at_rest = episodes["length"] == 1
+    assert at_rest.any() and (episodes["path_length"][at_rest] < 0.1).all()
+    assert (episodes["action_change"][at_rest] == 0).all() and (episodes["jerk"][at_rest] == 0).all()
+
+
+def test_the_thorough_summary() -> None:
+    episodes = TensorDict(
+        {
+            "final_distance": torch.tensor([0.04, 0.2]),
+            "closest_distance": torch.tensor([0.02, 0.005]),
+            "return": torch.tensor([-1.0, -2.0]),
+            "path_length": torch.tensor([0.5, 0.7]),
+        },
+        batch_size=[2],
+    )
+    summary = summarize(episodes)
+    assert {k: v["mean"] for k, v in summary["success"].items()} == {"0.05": 0.5, "0.025": 0.0, "0.01": 0.0}
+    assert {k: v["mean"] for k, v in summary["success_once"].items()} == {"0.05": 1, "0.025": 1, "0.01": 0.5}
+    assert summary["path_length"]["mean"] == pytest.approx(0.6)
+    assert "jerk" not in summary
+
+
+def test_a_run_s_end_says_the_outcome_alone_unless_asked(env) -> None:
+    short = evaluate_policies(env, {"noop": NoopPolicy()}, seed=0)["noop"]
+    assert set(short) == {"final_distance", "success", "return", "episodes"}
+    long = evaluate_policies(env, {"noop": NoopPolicy()}, seed=0, thorough=True)["noop"]
+    assert {"success_once", "path_length", "action_change", "jerk", "length"} <= set(long)
+    assert all(long[name] == short[name] for name in short)
+
+
+def test_numbered_moves_are_measured_as_the_servo_gets_them(small_env) -> None:
+    arm = small_env(2, episode_length=4)
+    env = TransformedFrankaEnv(arm, DiscreteActions())
+    assert arm_of(env) is arm
+    count = iter(range(100))
+
+    def alternate(is_init: torch.Tensor) -> torch.Tensor:  # +1 and −1 on the first axis, in turns
+        return torch.full(is_init.shape[:1], next(count) % 2)
+
+    episodes = play_episodes(env, TensorDictModule(alternate, ["is_init"], ["action"]), seed=0)
+    assert torch.allclose(episodes["action_change"], torch.tensor(4 / 7))
+
+
+def test_time_of_a_decision(env) -> None:
+    slow = TensorDictModule(
+        lambda is_init: torch.linalg.svd(torch.randn(300, 300)).U[:4, :7].contiguous(),
+        ["is_init"],
+        ["action"],
+    )
+    fast, slower = decision_times(env, NoopPolicy(), decisions=5), decision_times(env, slow, decisions=5)
+    assert fast.shape == (5,) and (fast > 0).all()
+    assert slower.median() > 5 * fast.median()
+
+
+def test_another_library_s_environment() -> None:
+    """CartPole: return and length, no distances; the same twice."""
+    env = ExternalEnv(ExternalConfig(kind="gym", name="CartPole-v1", episode_length=60), num_envs=3)
+    assert arm_of(env) is None
+    push = TensorDictModule(
+        lambda is_init: torch.ones(is_init.shape[:1], dtype=torch.int64), ["is_init"], ["action"]
+    )
+    episodes = play_episodes(env, push, seed=1)
+    assert set(episodes.keys()) == {"return", "length"}
+    assert (episodes["return"] == episodes["length"]).all()  # CartPole pays 1 for every step
+    assert (episodes["length"] < 15).all()  # pushed over
+    assert torch.equal(play_episodes(env, push, seed=1)["return"], episodes["return"])
+    assert set(evaluate_policies(env, {"push": push}, seed=0)["push"]) == {"return", "length", "episodes"}
+    env.close()

@@ -1,0 +1,170 @@
+"""The protocol on a trained agent: held out, the same twice, everything from the checkpoint alone."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from types import SimpleNamespace
+
+import pytest
+import torch
+
+from franka_wm.data.policies import NoopPolicy, SmoothRandomPolicy
+from franka_wm.errors import UserError
+from franka_wm.evaluation.closed_loop import seeded, summarize
+from franka_wm.evaluation.protocol import evaluate_agent, held_out_seeds
+from franka_wm.evaluation.robustness import SHIFTS, UNSHIFTED, Shift, robustness
+from franka_wm.evaluation.rollouts import (
+    discounted_returns,
+    encode_episodes,
+    encoded_validly,
+    gather_episodes,
+    mixture,
+)
+from franka_wm.training.load import load_agent
+
+
+def test_twice_gives_the_same_numbers(agent) -> None:
+    """Planner and random policies draw random numbers; whatever was drawn in between does not matter."""
+    first = evaluate_agent(agent, episodes=6)
+    torch.rand(17)
+    second = evaluate_agent(agent, episodes=6, timing=False)
+    assert set(first.policies) == {"planner", "policy", "noop", "random", "oracle"}
+    assert first.policies == second.policies
+    assert first.markdown() == second.markdown()
+    for name, episodes in first.episodes.items():
+        assert (episodes == second.episodes[name]).all(), name
+    assert first.policies["random"] != first.policies["noop"]
+    assert set(first.seconds) == set(first.policies) and second.seconds == {}
+
+
+def test_an_agent_loaded_anew_gives_the_same_numbers(agent, run_folder: Path) -> None:
+    again = load_agent(run_folder, num_envs=6, device="cpu", seed=0)
+    expected = evaluate_agent(agent, episodes=6, timing=False)
+    assert evaluate_agent(again, episodes=6, timing=False).policies == expected.policies
+
+
+def test_torch_s_own_random_numbers_are_left_alone(agent) -> None:
+    torch.manual_seed(1)
+    expected = torch.rand(3)
+    torch.manual_seed(1)
+    evaluate_agent(agent, episodes=2, policies={"random": agent.policies["random"]}, timing=False)
+    assert torch.equal(torch.rand(3), expected)
+
+
+def test_more_episodes_than_worlds_are_played_in_rounds(agent) -> None:
+    noop = {"noop": agent.policies["noop"]}
+    evaluation = evaluate_agent(agent, episodes=15, policies=noop, timing=False)
+    rows = evaluation.episodes["noop"]
+    assert evaluation.policies["noop"]["episodes"] == len(rows) == 15
+    assert evaluation.seeds == held_out_seeds(3) and len(set(evaluation.seeds)) == 3
+    assert rows["final_distance"].unique().numel() == 15  # no episode twice
+    one = evaluate_agent(agent, episodes=6, seeds=[held_out_seeds(2)[1]], policies=noop, timing=False)
+    assert torch.equal(one.episodes["noop"]["final_distance"], rows["final_distance"][6:12])
+    assert summarize(rows) == evaluation.policies["noop"]
+
+
+def test_what_cannot_be_evaluated(agent) -> None:
+    with pytest.raises(UserError, match="episodes=1"):
+        evaluate_agent(agent, episodes=1)
+    with pytest.raises(UserError, match="3 rounds"):
+        evaluate_agent(agent, episodes=13, seeds=[1, 2])
+
+
+def test_the_table_names_its_intervals(agent) -> None:
+    noop = {"noop": agent.policies["noop"]}
+    text = evaluate_agent(agent, episodes=6, policies=noop, timing=False).markdown()
+    for word in ("doing nothing", "6 episodes", "bootstrap", "Wilson", str(held_out_seeds(1)[0])):
+        assert word in text, word
+
+
+def test_every_generator_inside_a_policy_is_seeded() -> None:
+    hidden = SmoothRandomPolicy(generator=torch.Generator().manual_seed(9))
+    outer = torch.nn.ModuleList([NoopPolicy(), hidden])
+    draws = []
+    for _ in range(2):
+        with seeded(4, outer):
+            draws.append(torch.randn(3, generator=hidden.generator))
+    assert torch.equal(*draws)
+
+
+# -- held-out episodes -------------------------------------------------------------------------------------
+
+
+def test_half_at_random_half_by_the_model(agent) -> None:
+    episodes, pictures = gather_episodes(
+        agent.env, mixture(agent.policies), keys=["state", "joint_target"], picture_size=32, pictures=3
+    )
+    assert episodes.batch_size == (6, 12) and pictures is not None
+    assert pictures.shape == (3, 12, 32, 32, 3) and pictures.float().std() > 10
+    again, _ = gather_episodes(agent.env, mixture(agent.policies), keys=["state"])
+    assert torch.equal(episodes["action"], again["action"])
+    # Odd worlds do what the model's policy does, even ones do not.
+    with torch.no_grad():
+        wanted = agent.model.policy(agent.model.encode(episodes), deterministic=True)
+    torch.testing.assert_close(episodes["action"][1::2], wanted[1::2])
+    assert (episodes["action"][::2] - wanted[::2]).abs().mean() > 0.1
+    assert episodes["valid"].all()
+    torch.testing.assert_close(episodes["physical"][:, 1:], episodes["next", "physical"][:, :-1])
+
+
+def test_latents_of_whole_episodes(agent) -> None:
+    keys = list(agent.model.observation_sizes)
+    episodes, _ = gather_episodes(agent.env, agent.policies["random"], keys=keys)
+    latents = encode_episodes(agent.model, episodes, chunk=7)
+    assert latents.shape == (6, 13, agent.model.latent_dim)
+    with torch.no_grad():
+        torch.testing.assert_close(latents[:, :-1], agent.model.encode(episodes))
+        torch.testing.assert_close(latents[:, 1:], agent.model.encode(episodes["next"]))
+    assert encoded_validly(episodes).shape == (6, 13)
+
+
+def test_a_model_with_memory_sees_its_episode_from_the_beginning(agent) -> None:
+    """Its latent counts the steps: 0 where it encodes afresh, one more at every observation."""
+    model = SimpleNamespace(
+        observation_sizes={"state": 20},
+        encode=lambda o: torch.zeros(*o.batch_size, 1),
+        observe=lambda o, z, action, is_init: z + 1,
+    )
+    episodes, _ = gather_episodes(agent.env, agent.policies["noop"], keys=["state"])
+    latents = encode_episodes(model, episodes)
+    assert torch.equal(latents[..., 0], torch.arange(13.0).expand(6, 13))
+
+
+def test_discounted_returns_by_hand() -> None:
+    reward = torch.tensor([1.0, 2.0, 4.0, 8.0]).view(1, 4, 1)
+    ended = torch.tensor([False, True, False, False]).view(1, 4, 1)
+    never = torch.zeros_like(ended)
+    assert discounted_returns(reward, never, 0.5).flatten().tolist() == [4.0, 6.0, 8.0, 8.0]
+    assert discounted_returns(reward, ended, 0.5).flatten().tolist() == [2.0, 2.0, 8.0, 8.0]
+
+
+# -- robustness --------------------------------------------------------------------------------------------
+
+
+@pytest.mark.slow
+def test_what_a_shift_does(agent) -> None:
+    """The oracle aims with the servo's own targets: joint noise does not touch it, delay does."""
+    shifts = {
+        "late": Shift({"action_latency": 10}),
+        "unseen": Shift({"observation_noise": 0.05}),
+        "looks": SHIFTS["colours ± 0.3"],
+    }
+    told = []
+    results = robustness(
+        agent, episodes=8, shifts=shifts, policies=["oracle"], report=lambda case, r: told.append(case)
+    )
+    assert told == list(results) == [UNSHIFTED, "late", "unseen"]  # the model reads no pictures
+    plain, late, unseen = (results[case]["oracle"] for case in results)
+    assert plain["change"] is None and plain["verdict"] == ""
+    assert late["change"]["low"] > 0.01 and late["verdict"] in ("worse", "breaks")
+    assert unseen["final_distance"] == plain["final_distance"] and unseen["verdict"] == "holds"
+    assert unseen["change"] == {"mean": 0.0, "low": 0.0, "high": 0.0}  # the very same episodes
+
+
+def test_what_cannot_be_shifted(agent) -> None:
+    with pytest.raises(UserError, match="no policy 'nobody'"):
+        robustness(agent, policies=["nobody"])
+    with pytest.raises(UserError, match="only the arm"):
+        robustness(SimpleNamespace(env=object()))
+    with pytest.raises(UserError, match="episodes=1"):
+        robustness(agent, episodes=1)
