@@ -35,7 +35,7 @@ def main(cfg: DictConfig) -> None:
         learner=Learner(model, **run.learner_options()),
         replay=replay,
         policies=policies,
-        actor=build.ACTORS[run.cfg.collector.acts],
+        actor=build.actor(run.cfg),
         cfg=run.cfg,
         folder=run.folder,
         loggers=run.loggers,

@@ -24,9 +24,30 @@ from franka_wm.planning import ModelPolicy, PlannerPolicy, registry
 from franka_wm.training.spaces import Spaces
 
 ACTORS = {"policy": "policy", "planner": "planner", "smooth": "random", "noop": "noop", "ik": "oracle"}
-"""What ``collector.acts`` may be, and the policy that it names."""
+"""What ``collector.acts`` may be beside ``auto``, and the policy that it names."""
 
 POLICIES = ("planner", "policy", "noop", "random", "oracle")
+
+
+def actor(cfg: DictConfig) -> str:
+    """The name of the policy that gathers experience, by ``collector.acts``.
+
+    Raises:
+        UserError: No such policy, or one that the model's family does not have.
+    """
+    acts = cfg.collector.acts
+    if acts != "auto" and acts not in ACTORS:
+        raise UserError(f"collector.acts={acts!r}: must be one of auto, {', '.join(ACTORS)}")
+    family = models.family(cfg.model.name)
+    there = {"planner": hasattr(family, "next"), "policy": hasattr(family, "policy")}
+    searched = bool(getattr(family, "replay_keys", ()))  # the loss needs what the search found
+    if acts == "auto":
+        usable = [name for name in ("policy", "planner") if there[name]]
+        return "planner" if searched else (usable or ["random"])[0]
+    if not there.get(acts, True) or (searched and acts != "planner"):
+        fitting = "planner" if there["planner"] else "smooth"
+        raise UserError(f"collector.acts={acts}: model={cfg.model.name} cannot; use collector.acts={fitting}")
+    return ACTORS[acts]
 
 
 def plain(node: Any) -> dict[str, Any]:

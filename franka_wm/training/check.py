@@ -42,8 +42,8 @@ def check(cfg: DictConfig) -> None:
         raise UserError(
             f"evaluation.video_size={cfg.evaluation.video_size}: must be even, video codecs want it"
         )
-    if cfg.collector.acts not in build.ACTORS:
-        raise UserError(f"collector.acts={cfg.collector.acts!r}: must be one of {', '.join(build.ACTORS)}")
+    if not build.is_offline(cfg):
+        build.actor(cfg)
     if cfg.env.kind != "none" and cfg.env.episode_length < window:
         raise UserError(
             f"env.episode_length={cfg.env.episode_length} is shorter than replay.window={window}; "

@@ -133,3 +133,45 @@ def test_every_part_of_the_world_model_moves(composed, small_env) -> None:
         if p.requires_grad and torch.equal(p.detach(), before[name])
     ]
     assert not still
+
+
+def test_schedule() -> None:
+    """Up over the warm-up, down to zero along a cosine; the optimiser is given these rates."""
+    learner = Learner(Line(), lr=0.1, schedule="cosine", warmup=10, total_updates=110)
+    assert learner.rate(0) == pytest.approx(0.1)
+    assert learner.rate(9) == pytest.approx(1.0)
+    assert learner.rate(60) == pytest.approx(0.5)
+    assert learner.rate(110) == pytest.approx(0.0)
+    for _ in range(5):
+        learner.update(batch(1.0))
+    assert learner.optimizer.param_groups[0]["lr"] == pytest.approx(0.1 * 0.5)
+
+
+def test_bfloat16_is_close_to_float32(composed, small_env) -> None:
+    cfg = composed("scale=smoke", "device=cpu")
+
+    def losses(precision: str) -> dict[str, float]:
+        torch.manual_seed(0)
+        learner = Learner(build.make_model(cfg, small_env(2)), precision=precision)
+        generator = torch.Generator().manual_seed(0)
+
+        def draw(*shape: int) -> torch.Tensor:
+            return torch.randn(8, 3, *shape, generator=generator)
+
+        after = {"state": draw(20), "joint_target": draw(7), "reward": -draw(1).abs()}
+        after["terminated"] = torch.zeros(8, 3, 1, dtype=torch.bool)
+        root = {"state": draw(20), "joint_target": draw(7), "action": draw(7).tanh()}
+        data = TensorDict(root | {"next": TensorDict(after, batch_size=[8, 3])}, batch_size=[8, 3])
+        learner.update(data)
+        return learner.metrics()
+
+    exact, low = losses("float32"), losses("bfloat16")
+    for name in ("loss_consistency", "loss_reward"):
+        assert low[name] == pytest.approx(exact[name], rel=0.05, abs=1e-3)
+    assert all(torch.tensor(value).isfinite() for value in low.values())
+
+
+@pytest.mark.parametrize("options", [{"precision": "int3"}, {"schedule": "up"}, {"schedule": "cosine"}])
+def test_options_that_do_not_exist(options: dict[str, str]) -> None:
+    with pytest.raises(UserError):
+        Learner(Line(), **options)

@@ -1,0 +1,155 @@
+"""Agents and models from a checkpoint alone; two stages in one run; every family through the one loop."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from omegaconf import DictConfig
+
+from franka_wm import models
+from franka_wm.errors import UserError
+from franka_wm.training import build
+from franka_wm.training.check import check
+from franka_wm.training.entry import Run
+from franka_wm.training.learner import Learner
+from franka_wm.training.load import load_agent
+from franka_wm.training.stages import pretrain
+from franka_wm.training.trainer import Trainer
+
+SMALL = (
+    "scale=smoke",
+    "device=cpu",
+    "logger=none",
+    "env.substeps=1",
+    "env.episode_length=8",
+    "env.image_size=32",
+    "collector.num_envs=4",
+    "replay.capacity=400",
+    "replay.batch_size=4",
+    "evaluation.episodes=2",
+    "trainer.updates=6",
+    "trainer.updates_per_batch=3",
+)
+FAMILIES = {
+    "tdmpc2": ["env=reach"],
+    "tdmpc2_pixels": ["env=reach_pixels", "model.encoder_grid=2"],
+    "muzero": ["env=reach", "planner=gumbel"],
+    "lewm": ["env=reach_goal_image", "planner=cem"],
+    "action_world_model": ["env=reach_goal_image", "planner=cem"],
+    "jepa": ["env=reach_pixels"],
+}
+
+
+@pytest.fixture(scope="module")
+def train(composed, tmp_path_factory) -> Callable[..., tuple[Path, DictConfig, Any]]:
+    """What train.py does, without Hydra's folders: the run's folder, configuration and trainer."""
+
+    def make(*overrides: str) -> tuple[Path, DictConfig, Any]:
+        cfg = composed(*SMALL, *overrides)
+        check(cfg)
+        torch.manual_seed(0)
+        run = Run(cfg=cfg, folder=tmp_path_factory.mktemp("run"))
+        env = build.make_env(cfg)
+        replay, spaces = run.build_experience(env)
+        pretrain(run, env, replay, spaces)
+        model = build.make_model(cfg, spaces, run.device)
+        trainer = Trainer(
+            env=env,
+            learner=Learner(model, **run.learner_options()),
+            replay=replay,
+            policies=build.make_agent_policies(cfg, model, env, spaces),
+            actor=build.actor(cfg),
+            cfg=cfg,
+            folder=run.folder,
+            loggers=[],
+            evaluate=dict,
+            spaces=spaces,
+        )
+        trainer.fit()
+        return run.folder, cfg, trainer
+
+    return make
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("family", FAMILIES)
+def test_every_family_trains_and_comes_back(family: str, train) -> None:
+    folder, _, trainer = train(f"model={family}", *FAMILIES[family])
+    metrics = [row for row in trainer.rows if "loss" in row]
+    assert metrics and all(torch.tensor(row["loss"]).isfinite() for row in metrics)
+    model = models.load(str(folder))
+    assert not model.training
+    batch = trainer.replay.sample()
+    trainer.model.eval()
+    with torch.no_grad():
+        torch.testing.assert_close(model.encode(batch), trainer.model.encode(batch))
+    agent = load_agent(folder, num_envs=2, device="cpu")
+    assert ("planner" in agent.policies) == (family != "jepa")
+    for policy in agent.policies.values():
+        tensordict = agent.env.reset(seed=3)
+        for _ in range(2):
+            _, tensordict = agent.env.step_and_maybe_reset(policy(tensordict))
+            assert tensordict["action"].float().isfinite().all()
+
+
+@pytest.mark.slow
+def test_two_stages(train) -> None:
+    """The encoder of the first stage does not move in the second, and the checkpoint does not need it."""
+    folder, _, trainer = train(
+        "model=action_world_model", "pretrain=jepa", "pretrain.updates=4", *FAMILIES["action_world_model"]
+    )
+    first = models.load(str(folder / "pretrained"))
+    learned = trainer.model.encoder.network.state_dict()
+    assert learned
+    for name, value in first.encoder.state_dict().items():
+        if name in learned:
+            assert torch.equal(value, learned[name]), name
+    frozen = [p for p in trainer.model.encoder.parameters() if p.requires_grad]
+    assert frozen == []
+    shutil.rmtree(folder / "pretrained")
+    again = models.load(str(folder))
+    batch = trainer.replay.sample()
+    trainer.model.eval()
+    with torch.no_grad():
+        torch.testing.assert_close(again.encode(batch), trainer.model.encode(batch))
+
+
+def test_a_family_without_an_encoder_to_replace(composed) -> None:
+    with pytest.raises(UserError, match="pretrain"):
+        check(composed(*SMALL, "pretrain=jepa"))
+
+
+def test_no_world_and_no_data(composed) -> None:
+    with pytest.raises(UserError, match="dataset"):
+        check(composed("env=none"))
+
+
+def test_no_checkpoint(tmp_path: Path) -> None:
+    with pytest.raises(UserError, match="checkpoint"):
+        load_agent(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("overrides", "named"),
+    [
+        (["planner=mcts"], "continuous"),
+        (["model=muzero"], "moves"),
+        (["objective=goal_image"], "goal_pixels"),
+        (["model=lewm"], "pixels"),
+        (["model=muzero", "planner=mcts", "collector.acts=smooth"], "planner"),
+        (["model=jepa", "env=reach_pixels", "collector.acts=planner"], "smooth"),
+        (["model=lewm", "env=reach_pixels"], "goal_pixels"),
+        (["export=lerobot", "export.format=gif"], "gif"),
+        (["trainer.precision=int3"], "precision"),
+        (["trainer.schedule=up"], "schedule"),
+    ],
+)
+def test_what_does_not_go_together(overrides: list[str], named: str, composed) -> None:
+    with pytest.raises(UserError) as caught:
+        check(composed(*SMALL, *overrides))
+    assert named in str(caught.value) and "\n" not in str(caught.value)
