@@ -20,9 +20,12 @@ import os
 import re
 import shutil
 import signal
+import subprocess
+import sys
 import time
 import traceback
 from collections.abc import Iterable, Mapping
+from importlib import import_module
 from multiprocessing.connection import Connection, wait
 from pathlib import Path
 from typing import Any
@@ -172,11 +175,20 @@ class DatasetWriter:
 
     # -- during ------------------------------------------------------------------------------------------------
 
-    def start(self) -> None:
-        """Starts the writing processes; otherwise done when there is something to write."""
+    def start(self, *, wait: bool = False) -> None:
+        """Starts the writing processes; otherwise done when there is something to write.
+
+        Args:
+            wait: Until they are ready to write.
+        """
         if not self._workers:
             numbers = range(self._number_of_workers)
             self._workers = [_Worker(self.working, number) for number in numbers] or [_Here()]
+        if wait:
+            for worker in self._workers:
+                worker.send(("nothing",))
+            while any(worker.busy for worker in self._workers):
+                self._receive()
 
     def add(self, episodes: Iterable[Episode]) -> None:
         """Takes episodes over; returns when they are in memory or on their way to a process.
@@ -341,14 +353,25 @@ def _wait_for_orphans(path: Path) -> None:
 
 
 class _Worker:
-    """A process that writes shards, and the connection to it. It ends when this process does, however that ends."""
+    """A process that writes shards, and the connection to it. It ends when this process does, however that ends.
+
+    A plain subprocess and not one of ``multiprocessing``, which would import the program's main module there, and
+    with it, as a rule, torch and the simulator.
+    """
 
     def __init__(self, working: Path, number: int):
-        context = multiprocessing.get_context("spawn")
-        self.connection, theirs = context.Pipe()
+        self.connection, theirs = multiprocessing.Pipe()
         self.log = working / f"worker-{number}.log"
-        self._process = context.Process(target=_work, args=(theirs, working, self.log), daemon=True)
-        self._process.start()
+        code = f"from {__name__} import work; work()"
+        path = os.pathsep.join(entry for entry in sys.path if entry)
+        with self.log.open("w") as log:
+            self._process = subprocess.Popen(
+                [sys.executable, "-c", code, str(theirs.fileno()), str(working)],
+                pass_fds=[theirs.fileno()],
+                stdin=subprocess.DEVNULL,
+                stderr=log,  # encoders and progress bars talk there
+                env=os.environ | {"PYTHONPATH": path, "SVT_LOG": "1", "OMP_NUM_THREADS": "1"},
+            )
         theirs.close()
         self.busy = False
 
@@ -369,18 +392,19 @@ class _Worker:
 
     def _died(self) -> UserError:
         self.busy = False
-        self._process.join(5)
+        self._process.wait()
         return UserError(
-            f"a writing process ended (exit code {self._process.exitcode}; {self.log} may say why); what is finished "
-            "is kept, go on with resume=true"
+            f"a writing process ended (exit code {self._process.returncode}; {self.log} may say why); what is "
+            "finished is kept, go on with resume=true"
         )
 
     def stop(self) -> None:
         self.connection.close()  # it reads the end of the connection, and ends
-        self._process.join(30)
-        if self._process.is_alive():
+        try:
+            self._process.wait(30)
+        except subprocess.TimeoutExpired:
             self._process.kill()
-            self._process.join()
+            self._process.wait()
 
 
 class _Here:
@@ -402,22 +426,21 @@ def _raise(problem: str | None) -> None:
 def _do(kind: str, *job: Any) -> str | None:
     """Does a job; what went wrong, in one line."""
     try:
-        {"shard": _write_shard, "merge": merge}[kind](*job)
+        {"shard": _write_shard, "merge": merge, "nothing": lambda: None}[kind](*job)
     except Exception as error:  # every reason goes to the one who asked
         traceback.print_exc()
         return str(error) if isinstance(error, UserError) else f"{type(error).__name__}: {error}"
     return None
 
 
-def _work(connection: Connection, working: Path, log: Path) -> None:
-    """The process: does jobs until the connection ends."""
+def work() -> None:
+    """A writing process: does jobs until the connection, whose number is its first argument, ends."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the process that sends the jobs
+    connection, working = Connection(int(sys.argv[1])), Path(sys.argv[2])
     descriptor = os.open(working / "lock.workers", os.O_RDWR | os.O_CREAT, 0o644)
     fcntl.flock(descriptor, fcntl.LOCK_SH)
-    # Encoders and progress bars talk to standard error.
-    errors = os.open(log, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o644)
-    os.dup2(errors, 2)
-    os.environ["SVT_LOG"] = "1"
+    for module in ("pandas", "pyarrow.parquet", "PIL.Image", "av"):  # now, while episodes are still gathered
+        import_module(module)
     while True:
         try:
             connection.send(_do(*connection.recv()))

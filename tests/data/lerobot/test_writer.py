@@ -472,13 +472,13 @@ def test_a_writing_process_that_dies_is_one_line(tmp_path, make_schema, make_epi
 KILLED = """
 import os, pickle, sys
 from franka_wm.data.lerobot.writer import DatasetWriter
-if __name__ == "__main__":
-    schema, episodes = pickle.load(open(sys.argv[1], "rb"))
-    options = dict(provenance={"policy": "p"}, workers=2, shard_frames=21, resume=True)
-    with DatasetWriter(sys.argv[2], schema, **options) as writer:
-        print("ready", flush=True)
-        writer.add(episodes[writer.resumed:])
-        writer.finish()
+schema, episodes = pickle.load(open(sys.argv[1], "rb"))
+options = dict(provenance={"policy": "p"}, workers=2, shard_frames=21, resume=True)
+with DatasetWriter(sys.argv[2], schema, **options) as writer:
+    writer.start(wait=True)
+    print("ready", flush=True)
+    writer.add(episodes[writer.resumed:])
+    writer.finish()
 """
 
 
