@@ -140,13 +140,13 @@ def show_list(arguments: list[str]) -> None:
         "environments (env=)": options("env"),
         "robots (env.robot=)": ROBOTS | options("env/robot"),
         "tasks (env.task=)": tasks(),
-        "models (model=)": available(),
+        "models (model=)": options("model") or available(),
         "planners (planner=)": options("planner"),
     }
     for title, entries in sections.items():
         print(title)
         for name, line in entries.items():
-            print(f"  {name:20s} {line}".rstrip())
+            print(f"  {name:24s} {line}".rstrip())
         if not entries:
             print("  in conf/ of a checkout of the repository, which this installation is not")
 
