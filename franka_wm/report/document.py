@@ -266,7 +266,7 @@ td{white-space:nowrap}
 td small{display:block;opacity:.65;font-size:12px}
 table.texts td{text-align:left;white-space:normal;overflow-wrap:anywhere}
 table.texts th{text-align:left}
-.facts{display:grid;grid-template-columns:minmax(120px,max-content) 1fr;gap:4px 20px;margin:0 0 12px;font-size:15px}
+.facts{display:grid;grid-template-columns:fit-content(58%) minmax(0,1fr);gap:4px 20px;margin:0 0 12px;font-size:15px}
 .facts dt{opacity:.7}
 .facts dd{margin:0;overflow-wrap:anywhere}
 .warning{background:var(--alert);border-left:4px solid var(--vermilion);border-radius:6px;padding:10px 14px;
@@ -287,7 +287,7 @@ h1{font-size:24px}
 .tiles{grid-template-columns:1fr 1fr;gap:8px}
 .tiles dd{font-size:20px}
 th,td{padding:7px 9px}
-.facts{grid-template-columns:minmax(90px,max-content) 1fr;gap:4px 14px;font-size:14px}
+.facts{gap:4px 14px;font-size:14px}
 .card{padding:8px}
 }
 @media print{nav{display:none}.card,.scroll{break-inside:avoid}}

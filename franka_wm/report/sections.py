@@ -129,7 +129,7 @@ def result(run: RunFiles) -> str:
         ]
         header = ["policy", "one decision for all worlds [ms]", "worlds"]
         tables += folded("Time per decision", scrolling(html(Table(header, rows))))
-    return tables + described
+    return tables + (folded("How it was evaluated", described) if described else "")
 
 
 def curves(run: RunFiles) -> str:

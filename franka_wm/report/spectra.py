@@ -109,7 +109,8 @@ def latent_figure(
 
     Args:
         points: (N, 2).
-        quantity: (N,) colour, on the map cividis, which colour-blind readers see the same.
+        quantity: (N,) colour, on the map cividis, which colour-blind readers see the same; without its ends, which
+            vanish on a dark and on a light ground.
         label: the quantity's name and unit.
         explained: (2,) share of the variance of both directions, for the labels.
 
@@ -123,7 +124,7 @@ def latent_figure(
         )
     figure, (axes,) = new_figure(theme=theme)
     # As a picture: thousands of vector points would make a page slow.
-    drawn: Any = axes.scatter(*places.T, c=colours, cmap="cividis", s=7, linewidths=0, rasterized=True)
+    drawn: Any = axes.scatter(*places.T, c=colours, cmap=_colour_map(), s=7, linewidths=0, rasterized=True)
     bar = figure.colorbar(drawn, ax=axes)
     bar.set_label(label, color=theme.colour(INK), fontsize=9)
     bar.ax.tick_params(colors=theme.colour(INK), labelsize=8)
@@ -133,3 +134,10 @@ def latent_figure(
     axes.set_xticks([])
     axes.set_yticks([])
     return figure
+
+
+def _colour_map() -> Any:
+    from matplotlib import colormaps
+    from matplotlib.colors import ListedColormap
+
+    return ListedColormap(colormaps["cividis"](np.linspace(0.2, 0.95, 256)))
