@@ -265,7 +265,7 @@ def findings(results: Mapping[str, Any]) -> dict[str, str]:
         out["… bias, value − return"] = number(value["bias"])
         out["… correlation"] = number(value["correlation"])
     out |= {
-        name: interval(found) if isinstance(found, Mapping) else f"{found:.4g}"
+        name: interval(found, 1, 3) if isinstance(found, Mapping) else f"{found:.4g}"
         for name, found in health.items()
         if name != "warnings"
     }
