@@ -256,6 +256,7 @@ def start(cfg: DictConfig) -> Run:
     from hydra.core.hydra_config import HydraConfig
 
     from franka_wm.envs import resolve_device
+    from franka_wm.report.versions import write_versions
     from franka_wm.training.check import check
 
     folder = Path(HydraConfig.get().runtime.output_dir)
@@ -270,6 +271,7 @@ def start(cfg: DictConfig) -> Run:
     if device.type == "cuda":
         torch.set_float32_matmul_precision("high")
     OmegaConf.save(cfg, folder / "config.yaml", resolve=True)
+    write_versions(folder, device)
     say(f"device {device}   seed {cfg.seed}   results in {folder}")
     return Run(cfg=cfg, folder=folder, checkpoint=checkpoint, loggers=open_loggers(cfg, folder))
 
