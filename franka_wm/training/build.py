@@ -18,6 +18,7 @@ from franka_wm.data.policies import (
 )
 from franka_wm.data.replay import make_replay
 from franka_wm.envs import FrankaConfig, FrankaEnv, TransformedFrankaEnv, resolve_device
+from franka_wm.envs.config import ACTION_MODES
 from franka_wm.envs.discretize import DiscreteActions
 from franka_wm.errors import UserError
 from franka_wm.planning import ModelPolicy, PlannerPolicy, registry
@@ -313,12 +314,23 @@ def is_offline(cfg: DictConfig) -> bool:
 
 
 def open_recorded(cfg: DictConfig, device: torch.device) -> tuple[Any, Any]:
-    """Training and validation windows of the datasets that ``cfg.dataset`` names."""
+    """Training and validation windows of the datasets that ``cfg.dataset`` names.
+
+    The second is ``None`` where no episode is long enough for validation.
+    """
     from franka_wm.data.lerobot import open_dataset
 
     values = plain(cfg.dataset)
     kind = values.pop("kind")
     if kind != "lerobot":
         raise UserError(f"dataset.kind={kind!r}: must be none or lerobot")
-    common = values | {"window": window(cfg), "batch_size": cfg.replay.batch_size, "device": device}
-    return tuple(open_dataset(**common, split=split) for split in ("train", "validation"))  # type: ignore[return-value]
+    train = open_dataset(
+        **values,
+        window=window(cfg),
+        batch_size=cfg.replay.batch_size,
+        device=device,
+        keys=model_keys(cfg),
+    )
+    if is_arm(cfg):  # what is learned will act there
+        train.check(fps=cfg.env.fps, action_dim=ACTION_MODES[cfg.env.action_mode])
+    return train, train.validation()

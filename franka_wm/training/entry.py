@@ -200,6 +200,7 @@ class Run:
             observation_sizes=dict(windows.observation_sizes),
             image_sizes=dict(windows.image_sizes),
             action_dim=windows.action_dim,
+            num_actions=windows.num_actions,
             episode_length=windows.episode_length,
         )
         return windows, spaces
