@@ -385,7 +385,7 @@ def test_goes_on_with_what_is_finished(tmp_path, make_schema, make_episode, load
     ) as writer:
         writer.add(episodes[:3])
     assert not out.exists()
-    (tmp_path / "set.writing/shards/shard-00099.partial").mkdir()
+    (tmp_path / "set.writing/shards/shard-00003.partial").mkdir()  # the number of the next
     with pytest.raises(UserError, match="unfinished"):
         DatasetWriter(out, schema, provenance={})
     with pytest.raises(UserError, match="other features"):
