@@ -27,6 +27,16 @@ def test_use_the_environment(root: Path) -> None:
     assert "(64, 32, 32, 3)" in out
 
 
+def test_train_from_a_dataset(root: Path, tmp_path: Path) -> None:
+    from franka_wm.cli import main
+
+    made = ["collect", f"out={tmp_path}/set", "episodes=12", "policy=smooth", "env=reach", "num_envs=4"]
+    assert main([*made, "env.episode_length=10", "env.substeps=1"]) == 0
+    out = run(root, "examples/train_from_a_dataset.py", f"{tmp_path}/set", "20")
+    losses = [float(line.split("loss ")[1].split()[0]) for line in out.splitlines() if "loss" in line]
+    assert len(losses) == 10 and losses[-1] < losses[0]
+
+
 CONF = "hydra.searchpath=[file://examples/conf]"
 RUN = ("scale=smoke", "logger=none", "evaluation.video_episodes=0", "device=cpu")
 
