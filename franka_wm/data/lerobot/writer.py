@@ -37,6 +37,7 @@ from franka_wm.data.lerobot.merge import merge
 from franka_wm.data.lerobot.provenance import read_provenance
 from franka_wm.data.lerobot.schema import Schema
 from franka_wm.data.lerobot.shard import check_episode, write_shard
+from franka_wm.data.lerobot.terminal import TERMINAL_FOLDER
 from franka_wm.errors import UserError
 
 SHARD_BYTES = 64_000_000
@@ -172,6 +173,14 @@ class DatasetWriter:
         return sorted(
             folder for folder in (self.working / "shards").glob("shard-*") if folder.suffix != _PARTIAL
         )
+
+    def keys(self) -> set[int]:
+        """Keys of the episodes that are on disk: shards are finished out of order, so a kill may leave a gap."""
+        import pyarrow.parquet as pq
+
+        roots = ([self.out] if self.out.exists() else []) + self._shards()
+        files = [file for root in roots for file in (root / TERMINAL_FOLDER).glob("*.parquet")]
+        return {key for file in files for key in pq.read_table(file)["episode_key"].to_pylist()}
 
     # -- during ------------------------------------------------------------------------------------------------
 

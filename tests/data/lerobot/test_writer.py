@@ -477,7 +477,8 @@ options = dict(provenance={"policy": "p"}, workers=2, shard_frames=21, resume=Tr
 with DatasetWriter(sys.argv[2], schema, **options) as writer:
     writer.start(wait=True)
     print("ready", flush=True)
-    writer.add(episodes[writer.resumed:])
+    there = writer.keys()
+    writer.add(episode for episode in episodes if episode.key not in there)
     writer.finish()
 """
 
@@ -489,6 +490,7 @@ def _kill_and_go_on(tmp_path, schema, episodes, load, moments: list[float]) -> N
     code.write_text(KILLED)
     given.write_bytes(pickle.dumps((schema, episodes)))
     out, finished = tmp_path / "set", 0
+    by_key = {episode.key: episode for episode in episodes}
     for moment in moments:
         with subprocess.Popen(
             [sys.executable, str(code), str(given), str(out)], stdout=subprocess.PIPE, start_new_session=True
@@ -498,23 +500,19 @@ def _kill_and_go_on(tmp_path, schema, episodes, load, moments: list[float]) -> N
             time.sleep(moment)
             os.killpg(process.pid, signal.SIGKILL) if moment < 0.5 else process.kill()
         shards = sorted((tmp_path / "set.writing/shards").glob("shard-*[0-9]"))
-        if shards:  # what is there is a dataset of whole episodes, without going on
-            kept = load(shards[0])
-            compare(kept, schema, episodes[: kept.num_episodes])
+        for shard in shards[:2]:  # what is there is a dataset of whole episodes, without going on
+            keys = [key for key in by_key if key in set(_keys(shard))]
+            compare(load(shard), schema, [by_key[key] for key in keys])
         finished = max(finished, len(shards))
     with DatasetWriter(out, schema, provenance={}, workers=0, resume=True) as writer:
         assert writer.resumed >= finished  # at least an episode in each of the shards that were there
-        # Shards are finished out of order: those that were lost are added again, by their keys.
-        there = {int(k) for folder in writer._shards() for k in _keys(folder)} | (
-            {int(k) for k in _keys(out)} if out.exists() else set()
-        )
+        there = writer.keys()
         writer.add(episode for episode in episodes if episode.key not in there)
         writer.finish()
     dataset = load(out)
     keys = list(dict.fromkeys(dataset.hf_dataset.with_format("numpy")[EPISODE_KEY][:].tolist()))
     assert len(keys) == dataset.num_episodes
     assert set(keys) == {episode.key for episode in episodes}
-    by_key = {episode.key: episode for episode in episodes}
     compare(dataset, schema, [by_key[key] for key in keys])
 
 
