@@ -42,12 +42,13 @@ def main(cfg: DictConfig) -> None:
         evaluate=run.evaluation_during_training(judge, policies),
         spaces=spaces,
         validation=run.validation,
+        diagnose=run.diagnose,
     )
     if run.checkpoint is not None:
         trainer.restore(run.checkpoint)
     trainer.fit()
     if not trainer.interrupted and policies:
-        evaluate_and_report(run.cfg, run.folder, judge, policies, rows=trainer.rows)
+        evaluate_and_report(run.cfg, run.folder, judge, policies, rows=trainer.rows, log_video=run.log_video)
     if not trainer.interrupted:
         export_experience(run, trainer)
     finish(run, interrupted=trainer.interrupted)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -27,11 +27,13 @@ def evaluate_and_report(
     *,
     rows: Sequence[Mapping[str, float]],
     say: Any = print,
+    log_video: Callable[[str, torch.Tensor, int], None] | None = None,
 ) -> dict[str, dict[str, Any]]:
     """Evaluates every policy on the same unseen episodes and writes what a run leaves behind.
 
     Writes ``evaluation.json``, ``evaluation.md``, ``curves.png`` and, of the arm, ``video.mp4`` and ``last_frame.png``
-    into ``folder``, and prints the table. Policies may be any; the table shows what there is.
+    into ``folder``, and prints the table; ``log_video`` is given the film, too. Policies may be any; the table shows what
+    there is.
     """
     from rich.console import Console
 
@@ -53,7 +55,10 @@ def evaluate_and_report(
         mark = None if arm is None else arm.config.success_distance
         plot_learning_curves(rows, folder / "curves.png", success_distance=mark)
     if cfg.evaluation.video_episodes and arm is not None:
-        film(cfg, folder, policies[acting(policies)])
+        name = acting(policies)
+        frames = film(cfg, folder, policies[name])
+        if log_video is not None:
+            log_video(f"eval/{name}", frames, round(arm.config.fps))
     console = Console(width=120)
     for table in tables:
         console.print(terminal(table))
@@ -71,7 +76,7 @@ def _line(name: str, result: Mapping[str, Any]) -> str:
     return f"  {name}: return {result['return']['mean']:.2f}"
 
 
-def film(cfg: DictConfig, folder: Path, policy: Any) -> None:
+def film(cfg: DictConfig, folder: Path, policy: Any) -> torch.Tensor:
     """``video.mp4`` and ``last_frame.png``: episodes of one policy, the goal drawn as a ring."""
     from franka_wm.training.build import make_evaluation_env
 
@@ -90,3 +95,4 @@ def film(cfg: DictConfig, folder: Path, policy: Any) -> None:
     film = tile_frames(torch.stack(frames))
     write_video(film, folder / "video.mp4", fps=round(arm.config.fps))
     write_png(film[-1], folder / "last_frame.png")
+    return film

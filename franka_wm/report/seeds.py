@@ -8,6 +8,7 @@ from typing import Any
 from franka_wm.errors import UserError
 
 COLUMNS = (
+    ("return", lambda r: r["return"]["mean"], 2),
     ("final distance [cm]", lambda r: 100 * r["final_distance"]["mean"], 2),
     ("within 5 cm [%]", lambda r: 100 * r["success"]["0.05"]["mean"], 0),
     ("within 2.5 cm [%]", lambda r: 100 * r["success"]["0.025"]["mean"], 0),
@@ -23,7 +24,8 @@ def read_evaluation(run: str | Path) -> dict[str, Any]:
     """
     path = Path(run) / "evaluation.json"
     try:
-        return json.loads(path.read_text())
+        found = json.loads(path.read_text())
+        return found.get("policies", found)  # as training leaves it, or as `franka-wm evaluate` does
     except FileNotFoundError as error:
         raise UserError(f"{run}: no evaluation.json; give folders of runs that were finished") from error
     except (OSError, json.JSONDecodeError) as error:
@@ -35,13 +37,16 @@ def read_evaluation(run: str | Path) -> dict[str, Any]:
 def seeds_table(evaluations: Sequence[Mapping[str, Any]]) -> str:
     """Markdown: one row per policy, `mean over runs (lowest – highest)` in every cell."""
     policies = [p for p in evaluations[0] if all(p in e for e in evaluations)]
+    # Other environments than the arm have returns alone; of the arm, distances say more.
+    reaches = all("final_distance" in e[p] for e in evaluations for p in policies)
+    columns = COLUMNS[1:] if reaches else COLUMNS[:1]
     lines = [
-        "| policy | " + " | ".join(name for name, _, _ in COLUMNS) + " |",
-        "|---|" + "---:|" * len(COLUMNS),
+        "| policy | " + " | ".join(name for name, _, _ in columns) + " |",
+        "|---|" + "---:|" * len(columns),
     ]
     for policy in policies:
         cells = []
-        for _, value, digits in COLUMNS:
+        for _, value, digits in columns:
             values = [value(e[policy]) for e in evaluations]
             low, high = min(values), max(values)
             mean = f"{sum(values) / len(values):.{digits}f}"

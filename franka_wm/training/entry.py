@@ -224,6 +224,20 @@ class Run:
             "total_updates": trainer.updates,
         }
 
+    def log_video(self, name: str, frames: Any, fps: int) -> None:
+        """A film (T, H, W, 3) uint8 to every logger that takes films."""
+        from franka_wm.training.loggers import log_video
+
+        log_video(self.loggers, name, frames, fps=fps, step=self.cfg.trainer.updates)
+
+    def diagnose(self, model: Any, batch: Any) -> tuple[dict[str, float], str | None]:
+        """Whether latents collapse and values drift: numbers to log, and a warning."""
+        from franka_wm.evaluation.health import training_diagnostics
+        from franka_wm.evaluation.spectrum import collapse_warning
+
+        numbers = training_diagnostics(model, batch)
+        return numbers, collapse_warning(numbers)
+
     def evaluation_during_training(
         self, env: Any, policies: Mapping[str, Any]
     ) -> Callable[[], dict[str, float]]:

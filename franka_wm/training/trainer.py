@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import signal
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, cast
@@ -77,6 +77,7 @@ class Trainer:
         evaluate: Called now and then with nothing, returns numbers to log.
         spaces: What the model was built for; the environment's if not given.
         validation: Recorded windows that training never sees; their losses are logged.
+        diagnose: From model and batch to numbers to log and, if something is going wrong, a warning.
     """
 
     def __init__(
@@ -93,6 +94,7 @@ class Trainer:
         evaluate: Any,
         spaces: Spaces | None = None,
         validation: Any = None,
+        diagnose: Callable[[Any, TensorDictBase], tuple[dict[str, float], str | None]] | None = None,
     ):
         self.env, self.learner, self.replay, self.cfg, self.folder = env, learner, replay, cfg, folder
         self.model = learner.model
@@ -104,6 +106,8 @@ class Trainer:
         self.rows: list[dict[str, float]] = []
         self.interrupted = False
         self.validation = validation
+        self.diagnose = diagnose
+        self._batch: TensorDictBase | None = None
         self.spaces = Spaces.of_env(env) if spaces is None else spaces
         self._vectors = list(self.model.observation_sizes)
         self._keys = list(getattr(self.model, "observation_keys", self._vectors))
@@ -138,7 +142,8 @@ class Trainer:
                 if self.env is not None:
                     self.gather()
                 for _ in range(min(trainer.updates_per_batch, total - self.learner.updates)):
-                    self.learner.update(self.replay.sample())
+                    self._batch = self.replay.sample()
+                    self.learner.update(self._batch)
                 self.seconds = time.perf_counter() - started
                 now = time.perf_counter()
                 last = self.learner.updates >= total
@@ -214,7 +219,13 @@ class Trainer:
         if not text and "loss" in metrics:
             text = f"loss {metrics['loss']:.4g}"
         row |= metrics | self.validate()
+        warning = None
+        if self.diagnose is not None and self._batch is not None:
+            numbers, warning = self.diagnose(self.model, self._batch)
+            row |= numbers
         row |= progress.line(self.learner.updates, self.env_steps, text)
+        if warning:
+            say(f"  warning: {warning}")
         self.record(row)
 
     @torch.no_grad()
