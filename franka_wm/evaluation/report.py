@@ -32,8 +32,8 @@ def evaluate_and_report(
     """Evaluates every policy on the same unseen episodes and writes what a run leaves behind.
 
     Writes ``evaluation.json``, ``evaluation.md``, ``curves.png`` and, of the arm, ``video.mp4`` and ``last_frame.png``
-    into ``folder``, and prints the table; ``log_video`` is given the film, too. Policies may be any; the table shows what
-    there is.
+    into ``folder``, and prints the table; ``log_video`` is given the film, too. Policies may be any; the
+    table shows what there is.
     """
     from rich.console import Console
 
