@@ -30,8 +30,9 @@ setup: $(STAMP) ## make .venv and install the locked packages
 train: $(STAMP) ## train, plan and evaluate; Hydra overrides in ARGS="..."
 	@$(BIN)/python train.py $(ARGS)
 
+# Two processes with a thread each: tests are small, and torch's threads would wait for each other.
 test: $(STAMP) ## run the tests; pytest options in ARGS="..."
-	@$(BIN)/python -m pytest $(ARGS)
+	@OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 2 --dist loadfile $(ARGS)
 
 lint: $(STAMP) ## ruff check, ruff format --check, pyright
 	@$(BIN)/ruff check .
