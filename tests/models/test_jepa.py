@@ -115,21 +115,25 @@ def test_without_a_guard_it_collapses_and_with_any_it_does_not(recipe, collapse,
     model = small(recipe=recipe, collapse=collapse, projection=16, ema_steps=1000)
 
     def spread() -> float:
-        """Deviation over pictures of the pooled tokens, which are layer-normed, so that 1 is the most."""
+        """Deviation over pictures of what agrees with its prediction: pooled tokens, or lejepa's embeddings.
+
+        Tokens are layer-normed, so that 1 is the most; embeddings are 1 if SIGReg had its way."""
         torch.manual_seed(7)
-        x = model.encoder(dots.windows(128, 1)["pixels"].flatten(0, 1))
-        return feature_std(torch.nn.functional.layer_norm(x.mean(1), x.shape[-1:])).item()
+        x = model.encoder(dots.windows(128, 1)["pixels"].flatten(0, 1)).mean(1)
+        if recipe == "lejepa":
+            return feature_std(model.projector(x, batch_statistics=False)).item()
+        return feature_std(torch.nn.functional.layer_norm(x, x.shape[-1:])).item()
 
     before = spread()
     history = train(model, dots.windows, steps=80 if recipe == "ijepa" else 100)
     after = spread()
+    first, last = history[0]["loss_prediction"], history[-1]["loss_prediction"]
     if collapse == "none":
-        # BatchNorm in lejepa's projector, which looks at differences, puts off the end, but does not avert it.
-        assert after < (0.2 if recipe == "ijepa" else 0.6) * before
-        assert history[-1]["loss_prediction"] < 0.02 * history[0]["loss_prediction"]
+        assert after < (0.2 * before if recipe == "ijepa" else 0.02)
+        assert last < 0.02 * first  # all too easy
     else:
-        assert after > (0.5 if recipe == "ijepa" else 2.0) * before
-        assert history[-1]["loss_prediction"] > 0.02 * history[0]["loss_prediction"]
+        assert after > (0.5 * before if recipe == "ijepa" else 0.1)
+        assert last > 0.02 * first
 
 
 def test_features_pooled_or_flat(dots):

@@ -1,0 +1,39 @@
+"""Each picture family's file in conf/model mirrors its constructor."""
+
+import inspect
+from importlib import import_module
+
+import pytest
+from omegaconf import OmegaConf
+
+from franka_wm.models import _FAMILIES
+
+# Known at run time only, or there to rebuild a model from its own checkpoint.
+NOT_IN_FILES = {
+    "self",
+    "image_sizes",
+    "observation_sizes",
+    "action_dim",
+    "episode_length",
+    "encoder_architecture",
+    "huggingface_config",
+}
+
+
+@pytest.mark.parametrize("file", ["jepa", "vjepa", "lejepa", "lewm", "action_world_model", "tdmpc2_pixels"])
+def test_the_file_names_every_hyper_parameter_with_its_default(root, file):
+    path = root / "conf" / "model" / f"{file}.yaml"
+    assert path.read_text(encoding="utf-8").startswith("# ")
+    values = dict(OmegaConf.to_container(OmegaConf.load(path)))
+    module, cls, _ = _FAMILIES[values.pop("name")]
+    for known in ("observations", "window", "lr"):
+        values.pop(known)
+    signature = inspect.signature(getattr(import_module(module), cls).__init__)
+    defaults = {k: p.default for k, p in signature.parameters.items() if k not in NOT_IN_FILES}
+    assert set(values) == set(defaults)
+    if "recipe" in values:
+        assert values.pop("recipe") == ("ijepa" if file == "jepa" else file)
+        defaults.pop("recipe")
+    for name, default in defaults.items():
+        value = tuple(values[name]) if isinstance(values[name], list) else values[name]
+        assert value == default, name
