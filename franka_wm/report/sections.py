@@ -362,7 +362,8 @@ def _outcome(values: Mapping[str, Any], who: str) -> list[tuple[str, str, str]]:
     out = []
     distance = values.get("final_distance") or {}
     if is_interval(distance) and None not in distance.values():
-        mean, low, high = (f"{100 * distance[k]:.2g}" for k in ("mean", "low", "high"))
+        digits = 0 if distance["mean"] >= 0.1 else 2  # [m]; shown in cm
+        mean, low, high = (f"{100 * distance[k]:.{digits}f}" for k in ("mean", "low", "high"))
         out.append(("final distance", f"{mean} cm", f"{low} – {high}, {who}"))
     rates = _success({who: values}).get(who, {})
     if rates:
