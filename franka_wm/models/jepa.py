@@ -92,7 +92,7 @@ class JEPA(nn.Module):
     def __init__(
         self,
         *,
-        image_sizes: Mapping[str, tuple[int, int, int]],
+        image_sizes: Mapping[str, tuple[int, int, int]] | None = None,
         observation_sizes: Mapping[str, int] | None = None,
         action_dim: int | None = None,
         episode_length: int | None = None,
@@ -136,7 +136,7 @@ class JEPA(nn.Module):
             raise ValueError(
                 f"need 0 <= ema_start <= ema_end <= 1 and ema_steps >= 1, got {ema_start}, {ema_end}, {ema_steps}"
             )
-        self.image_sizes, size = one_size(image_sizes)
+        self.image_sizes, size = one_size(image_sizes or {})
         self.observation_sizes: dict[str, int] = {}
         self.observation_keys = list(self.image_sizes)
         self.action_dim = action_dim
