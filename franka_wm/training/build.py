@@ -100,7 +100,7 @@ def make_evaluation_env(cfg: DictConfig, *, num_envs: int | None = None, **chang
 # -- models -------------------------------------------------------------------------------------------------
 
 
-NOT_FOR_MODELS = ("name", "observations", "window", "lr")
+NOT_FOR_MODELS = ("name", "observations", "window", "lr", "schedule", "warmup")
 """Entries of ``conf/model`` that are about a family's training, not for its constructor."""
 
 
@@ -112,6 +112,15 @@ def window(cfg: DictConfig) -> int:
 def learning_rate(cfg: DictConfig) -> float:
     """``trainer.lr``, or the model's own."""
     return cfg.model.lr if cfg.trainer.lr is None else cfg.trainer.lr
+
+
+def schedule(cfg: DictConfig) -> tuple[str, int]:
+    """``trainer.schedule`` and ``trainer.warmup`` [updates], or the model's own; constant where neither says."""
+    kind = cfg.model.get("schedule", "constant") if cfg.trainer.schedule is None else cfg.trainer.schedule
+    warmup = cfg.model.get("warmup", 0.0)
+    if cfg.trainer.warmup is not None:
+        return kind, cfg.trainer.warmup
+    return kind, round(warmup * cfg.trainer.updates)
 
 
 def model_keys(cfg: DictConfig) -> list[str] | None:
@@ -158,7 +167,7 @@ def make_model(cfg: DictConfig, surroundings: Any, device: torch.device | str | 
         sizes["image_sizes"] = spaces.image_sizes
     try:
         model = models.make(name, **sizes, **actions, episode_length=spaces.episode_length, **values)
-    except (TypeError, ValueError) as error:
+    except (TypeError, ValueError, ModuleNotFoundError) as error:
         raise UserError(f"model={name}: {error}") from error
     return model.to(device)
 

@@ -30,7 +30,7 @@ def check(cfg: DictConfig) -> None:
         "replay.window": (window, 1),
         "trainer.updates": (cfg.trainer.updates, 0),
         "trainer.updates_per_batch": (cfg.trainer.updates_per_batch, 1),
-        "trainer.warmup": (cfg.trainer.warmup, 0),
+        "trainer.warmup": (build.schedule(cfg)[1], 0),
         "evaluation.episodes": (cfg.evaluation.episodes, 2),
         "evaluation.video_episodes": (cfg.evaluation.video_episodes, 0),
         "evaluation.video_size": (cfg.evaluation.video_size, 16),
@@ -74,9 +74,13 @@ def check(cfg: DictConfig) -> None:
     if cfg.replay.capacity < cfg.collector.num_envs * cfg.collector.steps_per_batch:
         raise UserError(f"replay.capacity={cfg.replay.capacity}: smaller than one batch of the collector")
     _check_names("evaluation.during", cfg.evaluation.during, build.POLICIES)
-    for name, known in (("precision", PRECISIONS), ("schedule", SCHEDULES)):
-        if cfg.trainer[name] not in known:
-            raise UserError(f"trainer.{name}={cfg.trainer[name]!r}: must be one of {', '.join(known)}")
+    chosen = {
+        "precision": (cfg.trainer.precision, PRECISIONS),
+        "schedule": (build.schedule(cfg)[0], SCHEDULES),
+    }
+    for name, (value, known) in chosen.items():
+        if value not in known:
+            raise UserError(f"trainer.{name}={value!r}: must be one of {', '.join(known)}")
     options = build.plain(cfg.logger)
     check_loggers(options.pop("names"), **options)
     _check_export(cfg)

@@ -216,12 +216,15 @@ class Run:
         """Arguments of the learner; ``cfg`` is another than the run's for a first stage."""
         cfg = self.cfg if cfg is None else cfg
         trainer = cfg.trainer
-        from franka_wm.training.build import learning_rate
+        from franka_wm.training.build import learning_rate, schedule
 
-        names = ("grad_clip", "capture", "compile", "precision", "schedule", "warmup")
+        names = ("grad_clip", "capture", "compile", "precision")
+        kind, warmup = schedule(cfg)
         return {name: trainer[name] for name in names} | {
             "lr": learning_rate(cfg),
             "total_updates": trainer.updates,
+            "schedule": kind,
+            "warmup": warmup,
         }
 
     def log_video(self, name: str, frames: Any, fps: int) -> None:
