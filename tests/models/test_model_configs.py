@@ -28,6 +28,8 @@ def test_the_file_names_every_hyper_parameter_with_its_default(root, file):
     module, cls, _ = _FAMILIES[values.pop("name")]
     for known in ("observations", "window", "lr"):
         values.pop(known)
+    for known in ("schedule", "warmup"):
+        values.pop(known, None)
     signature = inspect.signature(getattr(import_module(module), cls).__init__)
     defaults = {k: p.default for k, p in signature.parameters.items() if k not in NOT_IN_FILES}
     assert set(values) == set(defaults)
