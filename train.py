@@ -19,7 +19,7 @@ def main(cfg: DictConfig) -> None:
     """One run: build, train, evaluate, report."""
     from franka_wm.evaluation.report import evaluate_and_report
     from franka_wm.training import build
-    from franka_wm.training.entry import export_experience, finish, start
+    from franka_wm.training.entry import finish, start
     from franka_wm.training.learner import Learner
     from franka_wm.training.stages import pretrain
     from franka_wm.training.trainer import Trainer
@@ -49,9 +49,7 @@ def main(cfg: DictConfig) -> None:
     trainer.fit()
     if not trainer.interrupted and policies:
         evaluate_and_report(run.cfg, run.folder, judge, policies, rows=trainer.rows, log_video=run.log_video)
-    if not trainer.interrupted:
-        export_experience(run, trainer)
-    finish(run, interrupted=trainer.interrupted)
+    finish(run, trainer)
 
 
 if __name__ == "__main__":

@@ -124,6 +124,19 @@ class ExternalEnv(TransformedEnv):
         return {"return": total / count_or_one, "length": length / count_or_one, "episodes": count}
 
 
+def check_external(config: ExternalConfig) -> None:
+    """Makes one copy and closes it again.
+
+    Raises:
+        UserError: The extra is not installed, or there is no such environment or observation.
+    """
+    env = _make_one(config)
+    try:
+        _groups(config, env)
+    finally:
+        env.close()
+
+
 def _make_one(config: ExternalConfig) -> EnvBase:
     try:
         if config.kind == "gym":

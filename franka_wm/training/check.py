@@ -16,6 +16,8 @@ from franka_wm.training.loggers import check_loggers
 from franka_wm.training.spaces import Spaces
 from franka_wm.training.stages import check_pretrain
 
+METRICS = ("l2", "l1", "cosine")
+
 
 def check(cfg: DictConfig) -> None:
     """What can be refused before anything is built."""
@@ -91,6 +93,8 @@ def check(cfg: DictConfig) -> None:
             "env=none: without an environment there must be data; use dataset=lerobot dataset.root=…"
         )
     check_pretrain(cfg)
+    if cfg.objective.metric not in METRICS:
+        raise UserError(f"objective.metric={cfg.objective.metric!r}: must be one of {', '.join(METRICS)}")
     spaces = _spaces(cfg)
     if spaces is not None:
         model = build.make_model(cfg, spaces, "cpu")
@@ -109,9 +113,9 @@ def _spaces(cfg: DictConfig) -> Spaces | None:
     if not build.is_arm(cfg):
         values = build.plain(cfg.env)
         if values["kind"] != "none":
-            from franka_wm.envs.external import external_config
+            from franka_wm.envs.external import check_external, external_config
 
-            external_config(values)
+            check_external(external_config(values))
         return None
     values = build.plain(cfg.env)
     del values["kind"]
@@ -129,6 +133,14 @@ def _check_export(cfg: DictConfig) -> None:
     if not build.is_arm(cfg) or build.is_offline(cfg):
         raise UserError("export: only what a run gathers with the arm can be exported")
     check_export(build.plain(cfg))
+    c, t = cfg.collector, cfg.trainer
+    steps = max(c.seed_steps, 1) + -(-t.updates // t.updates_per_batch) * c.steps_per_batch
+    steps = min(steps, cfg.replay.capacity // c.num_envs)
+    if steps < cfg.env.episode_length and not cfg.env.terminate_on_success:
+        raise UserError(
+            f"export: each world will have gathered {steps} steps, no whole episode of {cfg.env.episode_length}; "
+            "raise collector.seed_steps or trainer.updates, or lower env.episode_length"
+        )
 
 
 def _check_dataset(cfg: DictConfig) -> None:
@@ -136,6 +148,16 @@ def _check_dataset(cfg: DictConfig) -> None:
         raise UserError(
             f"dataset={cfg.dataset.kind}: model={cfg.model.name} learns from its own search, not from recordings"
         )
+    if cfg.dataset.kind != "lerobot":
+        raise UserError(f"dataset.kind={cfg.dataset.kind!r}: must be none or lerobot")
+    if (cfg.dataset.root is None) == (cfg.dataset.repo_id is None):
+        raise UserError("dataset=lerobot: give dataset.root=FOLDER or dataset.repo_id=USER/NAME, one of them")
+    if cfg.dataset.root is not None:
+        from franka_wm.data.lerobot.source import read_source
+
+        roots = [cfg.dataset.root] if isinstance(cfg.dataset.root, str) else list(cfg.dataset.root)
+        for root in roots:
+            read_source(root)
 
 
 def _check_names(option: str, names: Any, known: Sequence[str]) -> None:

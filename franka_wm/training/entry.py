@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import fcntl
 import functools
 import logging
 import sys
@@ -105,9 +106,8 @@ def check_command(arguments: list[str]) -> str | None:
         lines = [
             line.strip() for line in str(error).splitlines() if line.strip() and "object_type" not in line
         ]
-        lines = [
-            line for line in lines if not line.startswith(("full_key:", "Config search path", "Set the env"))
-        ]
+        noise = ("full_key:", "Config search path", "Set the env", "provider=")
+        lines = [line for line in lines if not line.startswith(noise)]
         return "; ".join(lines) + "; python train.py --help lists every option"
     finally:
         GlobalHydra.instance().clear()
@@ -239,6 +239,8 @@ class Run:
         from franka_wm.evaluation.spectrum import collapse_warning
 
         numbers = training_diagnostics(model, batch)
+        if not numbers:
+            return {}, "the model's latents are no longer finite; lower trainer.lr"
         return numbers, collapse_warning(numbers)
 
     def evaluation_during_training(
@@ -288,10 +290,31 @@ def start(cfg: DictConfig) -> Run:
     torch.manual_seed(cfg.seed)
     if device.type == "cuda":
         torch.set_float32_matmul_precision("high")
+    claim(folder)
     OmegaConf.save(cfg, folder / "config.yaml", resolve=True)
     write_versions(folder, device)
     say(f"device {device}   seed {cfg.seed}   results in {folder}")
     return Run(cfg=cfg, folder=folder, checkpoint=checkpoint, loggers=open_loggers(cfg, folder))
+
+
+_CLAIMED: list[Any] = []  # open files: their locks last as long as the process
+
+
+def claim(folder: Path) -> None:
+    """Locks a run's folder for as long as this process lives, so that no two runs write into one.
+
+    Raises:
+        UserError: Another run is writing there.
+    """
+    file = (folder / ".lock").open("w")
+    try:
+        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError as error:
+        file.close()
+        raise UserError(
+            f"another run is writing into {folder}; choose a folder with hydra.run.dir=…"
+        ) from error
+    _CLAIMED.append(file)
 
 
 def resumed(cfg: DictConfig, overrides: list[str]) -> tuple[Any, DictConfig]:
@@ -341,15 +364,17 @@ def export_experience(run: Run, trainer: Any) -> None:
     export_run(plain(run.cfg), trainer.experience(), folder=run.folder)
 
 
-def finish(run: Run, *, interrupted: bool) -> None:
-    """Closes the loggers, writes the run's page, says the last line; exits with 130 after Ctrl-C."""
+def finish(run: Run, trainer: Any) -> None:
+    """Closes the loggers, writes the run's page, exports, says the last line; exits with 130 after Ctrl-C."""
     from franka_wm.training.loggers import close_loggers
 
+    interrupted = trainer.interrupted
     close_loggers(run.loggers)
     if not interrupted:
         from franka_wm.report.page import write_page
 
         say(f"page:    {write_page(run.folder)}")
+        export_experience(run, trainer)
     if interrupted:
         say(f"stopped; go on with: python train.py resume={run.folder}")
         sys.exit(INTERRUPTED)
