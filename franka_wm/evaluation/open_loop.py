@@ -16,6 +16,15 @@ from franka_wm.report.calibration import calibration_bins
 PAIRS = 2000
 """Random pairs of states that a rank correlation is measured over."""
 
+RESAMPLES = 2000
+"""Draws of whole episodes behind the interval of such a correlation."""
+
+_DRAWN_AT_ONCE = 250
+
+
+class NothingToPredictError(ValueError):
+    """Latents that never change, or episodes that are shorter than the horizon: a ratio of errors is not defined."""
+
 
 @torch.no_grad()
 def horizon_error(
@@ -42,7 +51,8 @@ def horizon_error(
         the squared distances; ``windows`` behind the longest horizon and ``episodes``.
 
     Raises:
-        ValueError: Less than one step, shapes that do not fit, or latents that never change.
+        NothingToPredictError: Latents that never change, or no episode of that length.
+        ValueError: Less than one step, or shapes that do not fit.
     """
     envs, steps = actions.shape[:2]
     if latents.shape[:2] != (envs, steps + 1):
@@ -65,8 +75,10 @@ def horizon_error(
         still = (truth[:, :starts] - truth[:, h:]).double().square().sum(-1)
         top, bottom = (torch.where(use > 0, x, 0.0).sum(1).cpu() for x in (error, still))
         windows = int(use.sum())
-        if not windows or float(bottom.sum()) <= 0:
-            raise ValueError(f"no latent changes within {h} steps: there is nothing to predict")
+        if not windows:
+            raise NothingToPredictError(f"no episode lasts {h} steps: there is nothing to predict")
+        if float(bottom.sum()) <= 0:
+            raise NothingToPredictError(f"no latent changes within {h} steps: there is nothing to predict")
         errors.append(float(top.sum()) / windows)
         no_change.append(float(bottom.sum()) / windows)
         ratios.append(bootstrap_ratio(top, bottom).as_dict())
@@ -123,6 +135,68 @@ def correlation(x: Tensor, y: Tensor) -> float:
     return max(-1.0, min(1.0, float((a * b).sum()) / size)) if size > 0 else math.nan
 
 
+def grouped_spearman(
+    x: Tensor, y: Tensor, groups: Tensor, *, resamples: int = RESAMPLES, seed: int = 0
+) -> Interval:
+    """Spearman's rank correlation of pairs of states, with a 95 % interval that draws whole episodes.
+
+    Many pairs from few episodes are not independent: each resample draws as many episodes as there are, with
+    repetition (a cluster bootstrap: Field & Welsh, "Bootstrapping clustered data", JRSS B 69, 2007). A pair of two
+    episodes counts as often as their copies can be paired, a pair within one as often as that one was drawn, and
+    the ranks are those of the resample.
+
+    Args:
+        x, y: (n,), n ≥ 4.
+        groups: (n, 2) the episodes, from 0, that the two states of each pair are from.
+        resamples: How many.
+        seed: Of the draw.
+
+    Returns:
+        In [−1, 1]; NaN where one of them never varies. Pairs of a single episode have no spread: low = mean = high.
+
+    Raises:
+        ValueError: Other shapes.
+    """
+    n = x.numel()
+    if x.dim() != 1 or x.shape != y.shape or groups.shape != (n, 2) or n < 4:
+        raise ValueError(
+            f"give two vectors of the same length, at least 4, and (n, 2) groups, not {tuple(x.shape)}, "
+            f"{tuple(y.shape)}, {tuple(groups.shape)}"
+        )
+    rho = correlation(ranks(x), ranks(y))
+    # Episodes that no pair is from cannot be told from those that do not exist.
+    names, groups = torch.unique(groups, return_inverse=True)
+    if math.isnan(rho) or names.numel() < 2:
+        return Interval(rho, rho, rho)
+    one, two = groups.unbind(1)
+    within = one == two
+    places = [torch.unique(v, return_inverse=True) for v in (x, y)]
+    generator = torch.Generator().manual_seed(seed)
+    found = []
+    for start in range(0, resamples, _DRAWN_AT_ONCE):
+        count = min(_DRAWN_AT_ONCE, resamples - start)
+        drawn = torch.randint(names.numel(), (count, names.numel()), generator=generator)
+        copies = torch.zeros(count, names.numel(), dtype=torch.double)
+        copies.scatter_add_(1, drawn, torch.ones_like(drawn, dtype=torch.double))
+        weights = torch.where(within, copies[:, one], copies[:, one] * copies[:, two])
+        total = weights.sum(1, keepdim=True)
+        a, b = (_centred_ranks(place, values.numel(), weights, total) for values, place in places)
+        size = ((weights * a * a).sum(1) * (weights * b * b).sum(1)).sqrt()
+        found.append((weights * a * b).sum(1)[size > 0] / size[size > 0])
+    draws = torch.cat(found)
+    if not draws.numel():
+        return Interval(rho, rho, rho)
+    low, high = torch.quantile(draws, torch.tensor([0.025, 0.975], dtype=torch.double)).tolist()
+    return Interval(rho, max(-1.0, min(low, rho)), min(1.0, max(high, rho)))
+
+
+def _centred_ranks(place: Tensor, values: int, weights: Tensor, total: Tensor) -> Tensor:
+    """Ranks (B, n) minus their mean, where pair i is there ``weights[:, i]`` times; ``place`` sorts the values."""
+    here = torch.zeros(len(weights), values, dtype=torch.double).index_add_(1, place, weights)
+    rank = (here.cumsum(1) - here / 2)[:, place]
+    return rank - (weights * rank).sum(1, keepdim=True) / total.clamp_min(1.0)
+
+
 def cost_ranks(
     latents: Tensor,
     positions: Tensor,
@@ -147,7 +221,7 @@ def cost_ranks(
 
     Returns:
         ``across``: pairs from anywhere; ``within``: pairs of one episode, which share its goal, as the states that
-        a planner compares do. Each an interval.
+        a planner compares do. Each an interval, by :func:`grouped_spearman`: whole episodes are drawn.
     """
     generator = torch.Generator().manual_seed(seed)
     envs, steps = latents.shape[:2]
@@ -158,7 +232,8 @@ def cost_ranks(
         use = valid[e1, t1] & valid[e2, t2] & ((e1 != e2) | (t1 != t2))
         e1, t1, e2, t2 = e1[use], t1[use], e2[use], t2[use]
         cost = (embedded[e1, t1] - embedded[e2, t2]).square().sum(-1)
-        return spearman(cost, (positions[e1, t1] - positions[e2, t2]).norm(dim=-1)).as_dict()
+        distance = (positions[e1, t1] - positions[e2, t2]).norm(dim=-1)
+        return grouped_spearman(cost, distance, torch.stack((e1, e2), 1), seed=seed).as_dict()
 
     def draw(size: int) -> Tensor:
         return torch.randint(size, (pairs,), generator=generator)

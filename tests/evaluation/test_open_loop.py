@@ -13,6 +13,7 @@ from franka_wm.evaluation.intervals import bootstrap_ratio
 from franka_wm.evaluation.open_loop import (
     correlation,
     cost_ranks,
+    grouped_spearman,
     horizon_error,
     ranks,
     spearman,
@@ -156,6 +157,41 @@ def test_pairs_within_episodes_do_not_mix_goals() -> None:
     result = cost_ranks(torch.cat((tool, goal), -1), tool)
     assert result["within"]["mean"] == pytest.approx(1.0)
     assert result["across"]["mean"] < 0.5
+
+
+def test_intervals_of_ranks_draw_whole_episodes() -> None:
+    """Each episode's latents are right or wrong as a whole: 600 pairs know no more than 12 episodes do."""
+    truth = []
+    widths, covered = [], 0
+    for trial in range(40):
+        generator = torch.Generator().manual_seed(trial)
+        tool = torch.randn(12, 40, 3, generator=generator)
+        noise = torch.randn(12, 40, 3, generator=generator)
+        good = (torch.rand(12, 1, 1, generator=generator) < 0.5).float()
+        result = cost_ranks(good * tool + (1 - good) * noise, tool, pairs=600, seed=trial)["within"]
+        assert result["low"] <= result["mean"] <= result["high"]
+        truth.append(result["mean"])
+        widths.append(result["high"] - result["low"])
+        covered += result["low"] <= 0.5 <= result["high"]
+    spread = float(torch.tensor(truth).std())
+    assert covered / 40 >= 0.8
+    assert (
+        2 * spread < sum(widths) / 40 < 8 * spread
+    )  # 1.96 · 2 is right; independent pairs would give about 0.5
+
+
+def test_grouped_ranks_of_equal_weights_are_spearmans() -> None:
+    generator = torch.Generator().manual_seed(9)
+    x = torch.randint(20, (300,), generator=generator).double()
+    y = x + 8 * torch.randn(300, generator=generator)
+    own = torch.arange(300)[:, None].expand(
+        300, 2
+    )  # every pair an episode of its own: as good as independent
+    grouped, plain = grouped_spearman(x, y, own), spearman(x, y)
+    assert grouped.mean == pytest.approx(plain.mean, abs=1e-12)
+    assert grouped.high - grouped.low == pytest.approx(plain.high - plain.low, rel=0.15)
+    with pytest.raises(ValueError, match="groups"):
+        grouped_spearman(x, y, own[1:])
 
 
 # -- values ------------------------------------------------------------------------------------------------
