@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from franka_wm.data.lerobot.command import compose, required, split
+from franka_wm.data.lerobot.command import compose, number, required, split
 from franka_wm.data.lerobot.episodes import Episode, EpisodeCutter
 from franka_wm.data.lerobot.provenance import describe
 from franka_wm.data.lerobot.schema import FORMATS, SEED, schema_for
@@ -138,7 +138,9 @@ def _simple(name: str, options: dict[str, Any], overrides: list[str]) -> Source:
     from franka_wm.training.entry import with_scale
     from franka_wm.training.progress import announced, say
 
-    cfg = compose(with_scale(overrides))
+    cfg = compose(with_scale(overrides), tuple(OPTIONS))
+    seed, smoothness = number(cfg, "seed"), number(cfg, "collector.smoothness", float)
+    worlds = options["num_envs"] or min(number(cfg, "collector.num_envs"), options["episodes"])
     if not build.is_arm(cfg):
         raise UserError(
             f"collect: env.kind={cfg.env.kind!r}: datasets are gathered from the arm (env=reach, …)"
@@ -152,31 +154,31 @@ def _simple(name: str, options: dict[str, Any], overrides: list[str]) -> Source:
     urdf_path = values.pop("urdf_path")
     config = FrankaConfig.from_mapping(values)
     schema_for(config, format=options["format"])  # refuses what cannot be stored before anything is built
-    worlds = options["num_envs"] or min(int(cfg.collector.num_envs), options["episodes"])
     with announced(f"building {worlds} worlds; a machine's first start compiles kernels for a minute or two"):
-        env = FrankaEnv(config, num_envs=worlds, device=cfg.device, seed=int(cfg.seed), urdf_path=urdf_path)
+        env = FrankaEnv(config, num_envs=worlds, device=cfg.device, seed=seed, urdf_path=urdf_path)
     cfg.env.observations = values["observations"]
     import torch
 
     from franka_wm.data.policies import NoopPolicy, OraclePolicy, SmoothRandomPolicy
 
-    smoothness = float(cfg.collector.smoothness)
     makers: dict[str, Callable[[], Any]] = {
         "noop": lambda: NoopPolicy(env.action_dim),
         "ik": lambda: OraclePolicy(env.kinematics, config),
         "smooth": lambda: SmoothRandomPolicy(
             env.action_dim,
             smoothness=smoothness,
-            generator=torch.Generator(device=env.device).manual_seed(int(cfg.seed)),
+            generator=torch.Generator(device=env.device).manual_seed(seed),
         ),
     }
     resolved: Any = OmegaConf.to_container(cfg, resolve=True)
     kept = {key: resolved[key] for key in ("env", "collector", "seed", "device")}
-    return Source(env, makers[name](), kept, name, int(cfg.seed))
+    return Source(env, makers[name](), kept, name, seed)
 
 
 def _agent(part: str, checkpoint: str, options: dict[str, Any], overrides: list[str]) -> Source:
     from omegaconf import OmegaConf
+    from omegaconf.errors import OmegaConfBaseException
+    from yaml import YAMLError
 
     from franka_wm.training.load import load_agent
     from franka_wm.training.progress import announced
@@ -185,9 +187,12 @@ def _agent(part: str, checkpoint: str, options: dict[str, Any], overrides: list[
     seed, device = None, "auto"
     for override in overrides:
         key, _, text = override.partition("=")
-        value: Any = OmegaConf.from_dotlist([f"value={text}"]).value
+        try:
+            value: Any = OmegaConf.from_dotlist([f"value={text}"]).value
+        except (YAMLError, OmegaConfBaseException) as error:
+            raise UserError(f"collect: {override}: {text!r} is not a value as in YAML") from error
         if key == "seed":
-            seed = int(value)
+            seed = number(OmegaConf.create({"seed": value}), "seed")
         elif key == "device":
             device = text
         elif key.startswith("env."):

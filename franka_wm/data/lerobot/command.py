@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -60,7 +61,7 @@ def required(verb: str, values: Mapping[str, Any], *names: str) -> None:
             raise UserError(f"{verb}: give {name}=…; franka-wm {verb} --help")
 
 
-def compose(overrides: Sequence[str]) -> Any:
+def compose(overrides: Sequence[str], options: Sequence[str] = ()) -> Any:
     """The configuration of ``conf/`` with Hydra's overrides, as ``train.py`` would see it.
 
     Raises:
@@ -81,7 +82,61 @@ def compose(overrides: Sequence[str]) -> Any:
         with initialize_config_dir(str(folder), version_base="1.3"):
             return compose("config", overrides=list(overrides))
     except (HydraException, OmegaConfBaseException) as error:
-        lines = [line.strip() for line in str(error).splitlines()]
-        raise UserError("; ".join(line for line in lines if line and "object_type" not in line)) from error
+        raise UserError(explain(str(error), allowed=_allowed(folder, str(error), options))) from error
     finally:
         GlobalHydra.instance().clear()
+
+
+_MISSING = re.compile(r"Could not find '([^']+)/([^'/]+)'")
+_UNKNOWN = re.compile(r"Could not override '([^']+)'")
+
+
+def explain(message: str, *, allowed: Sequence[str] = ()) -> str:
+    """What Hydra and OmegaConf say of an override, in one line.
+
+    Args:
+        message: Theirs, of many lines: with the choices of a group, how to append, where configurations are.
+        allowed: Keys that there are in the place of an unknown one.
+    """
+    lines = [line.strip() for line in message.splitlines() if line.strip()]
+    missing, unknown = _MISSING.search(message), _UNKNOWN.search(message)
+    if missing is not None:
+        choices = [line for line in message.splitlines() if line.startswith("\t") and "provider=" not in line]
+        return f"{missing[1]}={missing[2]}: must be one of {', '.join(line.strip() for line in choices)}"
+    if unknown is not None:
+        return f"{unknown[1]}: no such option; there are {', '.join(allowed)}"
+    noise = ("full_key:", "object_type", "Config search path", "provider=", "See https://", "Set the env")
+    return "; ".join(line for line in lines if not line.startswith(noise))
+
+
+def _allowed(folder: Any, message: str, options: Sequence[str]) -> list[str]:
+    """The keys beside the one that an override names in vain; at the top, the verb's own, too."""
+    from hydra import compose, initialize_config_dir
+    from hydra.core.global_hydra import GlobalHydra
+    from omegaconf import DictConfig, OmegaConf
+
+    unknown = _UNKNOWN.search(message)
+    if unknown is None:
+        return []
+    GlobalHydra.instance().clear()
+    with initialize_config_dir(str(folder), version_base="1.3"):
+        node: Any = compose("config", overrides=["scale=laptop"])
+    place = unknown[1].rpartition(".")[0] if "/" not in unknown[1] and "@" not in unknown[1] else ""
+    found = OmegaConf.select(node, place) if place else node
+    if isinstance(found, DictConfig):
+        return [f"{place}.{key}" if place else str(key) for key in [*([] if place else options), *found]]
+    return [*options, *(str(key) for key in node)]
+
+
+def number(cfg: Any, key: str, kind: type[int] | type[float] = int) -> Any:
+    """The number at ``key`` of a configuration.
+
+    Raises:
+        UserError: There is something else.
+    """
+    from omegaconf import OmegaConf
+
+    value = OmegaConf.select(cfg, key)
+    if isinstance(value, bool) or not isinstance(value, int if kind is int else int | float):
+        raise UserError(f"{key}={value}: must be a {'whole ' if kind is int else ''}number")
+    return kind(value)

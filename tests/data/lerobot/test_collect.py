@@ -143,7 +143,19 @@ def test_ctrl_c_leaves_a_dataset(tmp_path, load) -> None:
         (["out=x", "format=gif"], "must be one of exact, video"),
         (["out=x", "policy=planner"], "give checkpoint="),
         (["out=x", "policy=nonsense"], "smooth, noop, ik, or the folder of a run"),
-        (["out=x", "env=nonsense"], "nonsense"),
+        (["out=x", "env=nonsense"], "env=nonsense: must be one of dm_control, franka, gym, none, reach"),
+        (["out=x", "fmt=exact"], "fmt: no such option; there are out, episodes, policy, checkpoint, format"),
+        (
+            ["out=x", "env.imag_size=3"],
+            "env.imag_size: no such option; there are env.kind, env.urdf_path, env.im",
+        ),
+        (["out=x", "seed=abc"], "seed=abc: must be a whole number"),
+        (["out=x", "seed=null"], "seed=None: must be a whole number"),
+        (["out=x", "seed=[1"], "no viable alternative"),
+        (["out=x", "collector.num_envs=many"], "collector.num_envs=many: must be a whole number"),
+        (["out=x", "collector.smoothness=very"], "collector.smoothness=very: must be a number"),
+        (["out=x", "policy=.", "seed=abc"], "seed=abc: must be a whole number"),
+        (["out=x", "policy=.", "env.goal=[1"], "is not a value as in YAML"),
         (["out=x", "env.fps=29.97"], "whole frames"),
         (["out=x", "env.observations=[depth]"], "depth has no place"),
         (["out=x", "rubbish"], "is not one of"),
@@ -155,6 +167,8 @@ def test_bad_arguments_are_one_line(arguments, says, capsys, tmp_path, monkeypat
     error = capsys.readouterr().err.strip()
     assert says in error
     assert error.count("\n") == 0
+    for noise in ("provider=", "search path", "append", "hydra.cc"):
+        assert noise not in error
     assert list(tmp_path.iterdir()) == []
 
 
