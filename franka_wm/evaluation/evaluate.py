@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import os
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,8 +16,9 @@ from franka_wm.errors import UserError
 from franka_wm.evaluation import diagnose
 from franka_wm.evaluation.closed_loop import arm_of
 from franka_wm.evaluation.decoder import Imagined
+from franka_wm.evaluation.open_loop import NothingToPredictError
 from franka_wm.evaluation.protocol import EPISODES, INTERVALS, Evaluation, describe, evaluate_agent
-from franka_wm.evaluation.robustness import robustness
+from franka_wm.evaluation.robustness import check_shiftable, note, robustness
 from franka_wm.evaluation.tables import (
     horizon_table,
     interval,
@@ -135,11 +137,14 @@ def run(options: Options) -> dict[str, Any]:
     from franka_wm.training.load import load_agent
     from franka_wm.training.progress import announced, say
 
+    check_folder(options.out)
     console = Console(width=120)
     with announced(f"loading {options.checkpoint} and building {min(options.episodes, WORLDS)} worlds"):
         agent = load_agent(
             options.checkpoint, num_envs=min(options.episodes, WORLDS), device=options.device, seed=0
         )
+    if options.robustness:
+        check_shiftable(agent)
     results: dict[str, Any] = {"protocol": protocol(options, agent)}
     say(f"{options.episodes} held-out episodes for each of {', '.join(agent.policies)} …")
     evaluation = evaluate_agent(
@@ -173,6 +178,19 @@ def run(options: Options) -> dict[str, Any]:
     return results
 
 
+def check_folder(folder: Path) -> None:
+    """Whether results can go there; asked before anything is played.
+
+    Raises:
+        UserError: It or what it lies in is a file, or may not be written to.
+    """
+    there = next((f for f in (folder, *folder.absolute().parents) if f.exists()), Path("/"))
+    if not there.is_dir():
+        raise UserError(f"evaluate: out={folder}: {there} is a file; give a folder for the results")
+    if not os.access(there, os.W_OK | os.X_OK):
+        raise UserError(f"evaluate: out={folder}: {there} may not be written to; give another folder")
+
+
 def protocol(options: Options, agent: Any) -> dict[str, Any]:
     """How it was measured, for whoever reads the numbers later."""
     import franka_wm
@@ -199,7 +217,11 @@ def _look_ahead(
     agent: Any, held: diagnose.Held, evaluation: Evaluation, results: dict[str, Any], say: Say
 ) -> tuple[Imagined, Any, Any] | None:
     say("predictions without looking …")
-    results["open_loop"] = diagnose.open_loop(agent, held)
+    try:
+        results["open_loop"] = diagnose.open_loop(agent, held)
+    except NothingToPredictError as error:
+        results["open_loop"] = {"not_measured": str(error)}
+        say(f"warning: open loop not measured: {error}")
     say("values against true returns …")
     results["calibration"] = diagnose.calibration(agent)
     results["health"] = diagnose.health(agent, evaluation)
@@ -226,7 +248,12 @@ def _shift(agent: Any, options: Options, results: dict[str, Any], say: Say) -> N
         parts = (f"{p} {100 * r['final_distance']['mean']:.2f} cm {r['verdict']}" for p, r in found.items())
         say(f"  {case}: {'   '.join(parts)}")
 
-    results["robustness"] = robustness(agent, episodes=min(options.episodes, WORLDS), report=told)
+    episodes = min(options.episodes, WORLDS)
+    results["robustness"] = robustness(agent, episodes=episodes, report=told)
+    results["protocol"]["robustness episodes"] = episodes
+    if note(episodes):
+        results["protocol"]["robustness note"] = note(episodes)
+        say(f"note: {note(episodes)}")
 
 
 def diagnostic_tables(results: Mapping[str, Any], config: Any) -> dict[str, Table]:
@@ -242,7 +269,10 @@ def diagnostic_tables(results: Mapping[str, Any], config: Any) -> dict[str, Tabl
             ["quantity", "value"], [[name, text] for name, text in found.items()]
         )
     if results.get("robustness"):
-        tables["Robustness"] = robustness_table(results["robustness"], config.success_distance)
+        few = results.get("protocol", {}).get("robustness note")
+        tables["Robustness" + (f" ({few})" if few else "")] = robustness_table(
+            results["robustness"], config.success_distance
+        )
     return tables
 
 
@@ -250,6 +280,8 @@ def findings(results: Mapping[str, Any]) -> dict[str, str]:
     """Single numbers as text: ranks, calibration, planner, spectrum."""
     out: dict[str, str] = {}
     ahead, value, health = (results.get(name, {}) for name in ("open_loop", "calibration", "health"))
+    if "not_measured" in ahead:
+        out["open loop, not measured"] = ahead["not_measured"]
     if "rank_correlation" in ahead:
         out["rank correlation of latent cost and tool distance, within episodes"] = interval(
             ahead["rank_correlation"]

@@ -8,6 +8,7 @@ from typing import Any
 
 import torch
 from tensordict import TensorDictBase
+from torch import Tensor
 
 from franka_wm.errors import UserError
 from franka_wm.evaluation.closed_loop import arm_of, play_episodes, seeded
@@ -15,6 +16,21 @@ from franka_wm.evaluation.intervals import bootstrap_mean, wilson
 from franka_wm.evaluation.protocol import held_out_seeds
 
 UNSHIFTED = "as trained"
+
+WORKS_AT = 0.05
+"""Distance [m] within which episodes must end, unshifted, for a policy to count as working at all …"""
+
+WORKS_SHARE = 0.1
+"""… and in what share of them at least."""
+
+LEAST_DISTANCE = 0.005
+"""By how much the final distance must grow on average [m] for a shift to make anything *worse* …"""
+
+LEAST_SUCCESS = 0.02
+"""… or by how much the rate of success must fall."""
+
+ENOUGH_EPISODES = 20
+"""With fewer, :func:`note` warns."""
 
 
 @dataclass(frozen=True)
@@ -73,16 +89,14 @@ def robustness(
     Returns:
         Shift → policy → ``final_distance`` [m] and ``success`` (at the task's distance), with 95 % intervals
         (bootstrap, Wilson); ``change`` of the final distance [m], paired by episode, with its bootstrap interval
-        (``None`` for :data:`UNSHIFTED`); ``verdict``: ``holds``, ``worse`` where the change's interval lies above 0,
-        ``breaks`` where also less than half of the unshifted successes are left.
+        (``None`` for :data:`UNSHIFTED`); ``verdict``, of :func:`verdict` (empty for :data:`UNSHIFTED`).
 
     Raises:
         UserError: Not the arm, fewer than 2 episodes, or no such policy.
     """
     from franka_wm.training import build
 
-    if arm_of(agent.env) is None:
-        raise UserError("robustness=true: only the arm can be shifted; this run's environment is another's")
+    check_shiftable(agent)
     if episodes < 2:
         raise UserError(f"episodes={episodes}: must be at least 2")
     names = _chosen(agent.policies) if policies is None else list(policies)
@@ -111,6 +125,53 @@ def robustness(
     return results
 
 
+def check_shiftable(agent: Any) -> None:
+    """Whether the agent's worlds can be shifted.
+
+    Raises:
+        UserError: Not the arm.
+    """
+    if arm_of(agent.env) is None:
+        raise UserError("robustness=true: only the arm can be shifted; this run's environment is another's")
+
+
+def note(episodes: int) -> str:
+    """What to say about verdicts from so few episodes; empty where there are enough."""
+    if episodes >= ENOUGH_EPISODES:
+        return ""
+    return (
+        f"only {episodes} episodes in each shifted world: verdicts need at least {ENOUGH_EPISODES}, "
+        f"better 100; a real change may go unseen"
+    )
+
+
+def verdict(distance: Tensor, unshifted: Tensor, *, success_distance: float) -> str:
+    """What a shift does to a policy, in a word or two.
+
+    Args:
+        distance: (E,) final distances in the shifted world [m].
+        unshifted: (E,) of the same episodes in the world of training [m].
+        success_distance: Below which an episode is a success [m].
+
+    Returns:
+        ``never worked``: unshifted, less than :data:`WORKS_SHARE` of the episodes end within :data:`WORKS_AT`, so
+        there is nothing that a shift could break. ``worse``: the mean final distance grows by more than
+        :data:`LEAST_DISTANCE`, or the rate of success falls by more than :data:`LEAST_SUCCESS`, and the 95 %
+        interval of that change, paired by episode, leaves out 0. ``breaks``: worse, and less than half of the
+        unshifted successes are left. ``holds``: none of these was seen.
+    """
+    if float((unshifted < WORKS_AT).double().mean()) < WORKS_SHARE:
+        return "never worked"
+    now, before = distance < success_distance, unshifted < success_distance
+    grown = bootstrap_mean(distance - unshifted)
+    lost = bootstrap_mean(before.double() - now.double())
+    further = grown.low > 0 and grown.mean > LEAST_DISTANCE
+    rarer = lost.low > 0 and lost.mean > LEAST_SUCCESS
+    if not (further or rarer):
+        return "holds"
+    return "breaks" if 2 * int(now.sum()) < int(before.sum()) else "worse"
+
+
 def _chosen(policies: Mapping[str, Any]) -> list[str]:
     own = [name for name in ("planner", "policy") if name in policies][:1]
     return own + [name for name in ("oracle",) if name in policies]
@@ -118,17 +179,11 @@ def _chosen(policies: Mapping[str, Any]) -> list[str]:
 
 def _compared(played: TensorDictBase, before: TensorDictBase, success_distance: float) -> dict[str, Any]:
     distance, unshifted = played.get("final_distance"), before.get("final_distance")
-    hits, hits_before = (int((d < success_distance).sum()) for d in (distance, unshifted))
+    hits = int((distance < success_distance).sum())
     same = played is before
-    change = None if same else bootstrap_mean(distance - unshifted)
-    verdict = ""
-    if change is not None:
-        verdict = "worse" if change.low > 0 else "holds"
-        if verdict == "worse" and 2 * hits < hits_before:
-            verdict = "breaks"
     return {
         "final_distance": bootstrap_mean(distance).as_dict(),
         "success": wilson(hits, torch.numel(distance)).as_dict(),
-        "change": None if change is None else change.as_dict(),
-        "verdict": verdict,
+        "change": None if same else bootstrap_mean(distance - unshifted).as_dict(),
+        "verdict": "" if same else verdict(distance, unshifted, success_distance=success_distance),
     }

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 import torch
 
 from franka_wm import cli
 from franka_wm.errors import UserError
-from franka_wm.evaluation import diagnose
+from franka_wm.evaluation import diagnose, evaluate
 from franka_wm.evaluation.evaluate import default_folder, parse, to_json
 
 POLICIES = {"planner", "policy", "noop", "random", "oracle"}
@@ -85,6 +86,40 @@ def test_a_checkpoint_that_is_not_there(tmp_path: Path, capsys) -> None:
     assert cli.main(["evaluate", *arguments]) == 1
     assert "nowhere" in capsys.readouterr().err
     assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize("out", ["taken", "taken/below"])
+def test_results_that_cannot_be_written_are_refused_before_playing(out: str, tmp_path: Path, capsys) -> None:
+    (tmp_path / "taken").write_text("mine")
+    arguments = [f"checkpoint={tmp_path}/nowhere", f"out={tmp_path / out}", "device=cpu"]
+    assert cli.main(["evaluate", *arguments]) == 1  # before it even looks for the checkpoint
+    captured = capsys.readouterr()
+    assert captured.err.count("\n") == 1 and "taken is a file; give a folder" in captured.err
+    assert captured.out == ""
+    assert (tmp_path / "taken").read_text() == "mine"
+
+
+def test_shifting_what_is_no_arm_is_refused_before_playing(tmp_path: Path, monkeypatch, capsys) -> None:
+    monkeypatch.setattr("franka_wm.training.load.load_agent", lambda *a, **k: SimpleNamespace(env=object()))
+    monkeypatch.setattr(evaluate, "evaluate_agent", lambda *a, **k: pytest.fail("played"))
+    arguments = ["checkpoint=gym", f"out={tmp_path}/out", "robustness=true"]
+    monkeypatch.setattr(evaluate, "protocol", lambda *a: pytest.fail("went on"))
+    assert cli.main(["evaluate", *arguments]) == 1
+    captured = capsys.readouterr()
+    assert captured.err.count("\n") == 1 and "only the arm can be shifted" in captured.err
+
+
+def test_latents_that_never_change_are_said(agent, monkeypatch) -> None:
+    """The rest is measured; the reason is in the results and in the table."""
+    held = diagnose.hold_out(agent, pictures=False)
+    held.latents = torch.zeros_like(held.latents)
+    for other in ("calibration", "health"):
+        monkeypatch.setattr(diagnose, other, lambda *a: {})
+    results, said = {}, []
+    assert evaluate._look_ahead(agent, held, None, results, said.append) is None  # type: ignore[arg-type]
+    assert "no latent changes within 1 steps" in results["open_loop"]["not_measured"]
+    assert sum("warning: open loop not measured" in line for line in said) == 1
+    assert "no latent changes" in evaluate.findings(results)["open loop, not measured"]
 
 
 def test_help(capsys) -> None:

@@ -12,7 +12,7 @@ from franka_wm.data.policies import NoopPolicy, SmoothRandomPolicy
 from franka_wm.errors import UserError
 from franka_wm.evaluation.closed_loop import seeded, summarize
 from franka_wm.evaluation.protocol import evaluate_agent, held_out_seeds
-from franka_wm.evaluation.robustness import SHIFTS, UNSHIFTED, Shift, robustness
+from franka_wm.evaluation.robustness import SHIFTS, UNSHIFTED, Shift, note, robustness, verdict
 from franka_wm.evaluation.rollouts import (
     discounted_returns,
     encode_episodes,
@@ -159,6 +159,45 @@ def test_what_a_shift_does(agent) -> None:
     assert late["change"]["low"] > 0.01 and late["verdict"] in ("worse", "breaks")
     assert unseen["final_distance"] == plain["final_distance"] and unseen["verdict"] == "holds"
     assert unseen["change"] == {"mean": 0.0, "low": 0.0, "high": 0.0}  # the very same episodes
+
+
+@pytest.mark.parametrize(
+    ("unshifted", "grown", "says"),
+    [
+        (1.06, 0.0, "never worked"),  # an untrained planner, a metre away
+        (1.06, 0.2, "never worked"),
+        (0.0, 2e-5, "holds"),  # surely further away, by 0.02 mm
+        (0.02, 0.004, "holds"),
+        (0.02, 0.006, "worse"),
+        (0.049, 0.002, "breaks"),  # hardly further away, but all successes are gone
+        (0.02, 0.2, "breaks"),
+        (0.02, -0.01, "holds"),
+    ],
+)
+def test_verdicts(unshifted: float, grown: float, says: str) -> None:
+    before = torch.full((40,), unshifted)
+    assert verdict(before + grown, before, success_distance=0.05) == says
+
+
+def test_a_few_lost_successes_are_worse_only_if_they_are_more_than_luck_and_2_percent() -> None:
+    before = torch.full((400,), 0.0499)
+    for lost, says in ((6, "holds"), (40, "worse"), (300, "breaks")):
+        after = before.clone()
+        after[:lost] = 0.0501
+        assert verdict(after, before, success_distance=0.05) == says
+
+
+def test_a_policy_that_works_in_a_tenth_of_the_episodes_works() -> None:
+    before = torch.full((40,), 0.5)
+    before[:4] = 0.01
+    assert verdict(before, before, success_distance=0.05) == "holds"
+    before[0] = 0.5
+    assert verdict(before, before, success_distance=0.05) == "never worked"
+
+
+def test_few_episodes_are_noted() -> None:
+    assert "only 8 episodes" in note(8) and "only 19" in note(19)
+    assert note(20) == ""
 
 
 def test_what_cannot_be_shifted(agent) -> None:
