@@ -9,8 +9,10 @@ from typing import Any
 
 import numpy as np
 
+from franka_wm.data.lerobot.paths import without_paths
 from franka_wm.data.lerobot.provenance import read_provenance
-from franka_wm.data.lerobot.schema import OWN_FOLDER
+from franka_wm.data.lerobot.schema import OWN_FOLDER, PROVENANCE
+from franka_wm.data.lerobot.terminal import TERMINAL_FOLDER
 from franka_wm.errors import UserError
 
 PICTURE = f"{OWN_FOLDER}/picture.png"
@@ -40,12 +42,34 @@ def dataset_card(root: Path, *, repo_id: str, license: str) -> str:
     """
     info = json.loads((root / "meta" / "info.json").read_text(encoding="utf-8"))
     provenance = read_provenance(root)
-    sessions = [] if provenance is None else provenance["sessions"]
-    task = "" if provenance is None else provenance["schema"]["task"]
+    try:
+        task, gathered = (
+            ("", "") if provenance is None else (provenance["schema"]["task"], _gathered(provenance))
+        )
+    except (KeyError, TypeError, AttributeError) as error:
+        raise UserError(
+            f"{root / PROVENANCE} is not a provenance of franka_wm ({error!r}); copy the dataset again"
+        ) from error
+    robot = f"of `{info['robot_type']}`" if info.get("robot_type") else "of a robot"
+    own = "A [LeRobot](https://github.com/huggingface/lerobot) dataset (v3.0)"
+    settings = cite = ""
+    tags = ["LeRobot"]
+    if provenance is not None:
+        robot = f"of a simulated {info['robot_type']} arm"
+        own += ", gathered with franka_wm in NVIDIA Newton"
+        settings = f"\n\nSettings in full: [{PROVENANCE}]({PROVENANCE})."
+        cite = f"\n## Citation\n\n{_CITATION}\n"
+        tags += ["franka", "simulation", "world-model"]
+    rows = "Row t is (o_t, a_t, and what followed a_t)."
+    if (root / TERMINAL_FOLDER).is_dir():
+        rows += (
+            " The observation after the last action of each episode is in\n"
+            f"`{TERMINAL_FOLDER}`, found by `episode_key`."
+        )
     head = front_matter(
         license=license,
         task_categories=["robotics"],
-        tags=["LeRobot", "franka", "simulation", "world-model"],
+        tags=tags,
         configs=[{"config_name": "default", "data_files": "data/*/*.parquet"}],
     )
     picture = f"\n![Frames of one episode]({PICTURE})\n" if (root / PICTURE).is_file() else ""
@@ -53,23 +77,15 @@ def dataset_card(root: Path, *, repo_id: str, license: str) -> str:
         f"| `{name}` | {feature['dtype']} | {tuple(feature['shape'])} | {_names(feature.get('names'))} |"
         for name, feature in info["features"].items()
     )
-    gathered = "\n".join(
-        f"- {one['episodes']} episodes by `{one['policy']}`, seed {one['seed']}, {one['date']}, "
-        f"franka-wm {one['versions'].get('franka-wm')}:\n\n  ```bash\n  {one['command']}\n  ```"
-        for one in sessions
-    )
     return f"""{head}
 # {repo_id.split("/")[-1]}
 
-{info["total_episodes"]} episodes, {info["total_frames"]} steps at {info["fps"]} Hz of a simulated {info["robot_type"]}
-arm. {task} A [LeRobot](https://github.com/huggingface/lerobot) dataset (v3.0), gathered with franka_wm in NVIDIA
-Newton.
+{info["total_episodes"]} episodes, {info["total_frames"]} steps at {info["fps"]} Hz {robot}.
+{f"{task} " if task else ""}{own}.
 {picture}
 ## How it was gathered
 
-{gathered or "Not recorded."}
-
-Settings in full: [meta/franka_wm/provenance.json]({OWN_FOLDER}/provenance.json).
+{gathered or "Not recorded."}{settings}
 
 ## Use it
 
@@ -85,8 +101,7 @@ python train.py dataset=lerobot dataset.repo_id={repo_id}   # a world model, wit
 
 ## What a row holds
 
-Row t is (o_t, a_t, and what followed a_t). The observation after the last action of each episode is in
-`{OWN_FOLDER}/terminal`, found by `episode_key`.
+{rows}
 
 | feature | dtype | shape | names |
 |---|---|---|---|
@@ -95,11 +110,15 @@ Row t is (o_t, a_t, and what followed a_t). The observation after the last actio
 ## License
 
 {license}
+{cite}"""
 
-## Citation
 
-{_CITATION}
-"""
+def _gathered(provenance: Mapping[str, Any]) -> str:
+    return "\n".join(
+        f"- {one['episodes']} episodes by `{one['policy']}`, seed {one['seed']}, {one['date']}, "
+        f"franka-wm {one['versions'].get('franka-wm')}:\n\n  ```bash\n  {one['command']}\n  ```"
+        for one in without_paths(provenance["sessions"])
+    )
 
 
 def _names(names: Any) -> str:
@@ -108,11 +127,12 @@ def _names(names: Any) -> str:
     return ", ".join(names) if len(names) <= 7 else f"{names[0]}, … {names[-1]} ({len(names)})"
 
 
-def make_picture(root: Path, *, frames: int = 6) -> None:
-    """Frames of the first episode, side by side, as ``meta/franka_wm/picture.png``; nothing without pictures.
+def make_picture(root: Path, out: Path, *, frames: int = 6) -> None:
+    """Frames of the first episode, side by side, as PNG; nothing without pictures.
 
     Args:
         root: The dataset.
+        out: Where the picture goes.
         frames: How many.
     """
     from franka_wm.data.lerobot.pictures import encode_png
@@ -129,7 +149,8 @@ def make_picture(root: Path, *, frames: int = 6) -> None:
     name, kind = next(iter(kinds.items()))
     episode = _first_episode(root, info, name, kind)
     chosen = episode[np.linspace(0, len(episode) - 1, min(frames, len(episode))).round().astype(int)]
-    with written_whole(root / PICTURE) as path:
+    out.parent.mkdir(parents=True, exist_ok=True)
+    with written_whole(out) as path:
         path.write_bytes(encode_png(np.concatenate(list(chosen), axis=1)))
 
 
@@ -156,12 +177,12 @@ def _first_episode(root: Path, info: Mapping[str, Any], name: str, kind: str) ->
     return np.stack(frames)
 
 
-def model_card(folder: Path, run: Path, *, repo_id: str, license: str) -> str:
+def model_card(folder: Path, *, repo_id: str, license: str) -> str:
     """README.md of a trained model.
 
     Args:
-        folder: The files that are published; has ``config.yaml`` and ``counters.json``.
-        run: The run's folder, where ``evaluation.md`` is if it was evaluated.
+        folder: The files that are published; has ``config.yaml`` and ``counters.json``, and ``evaluation.md`` if it
+            was evaluated.
         repo_id: Where it goes.
         license: Identifier.
     """
@@ -171,17 +192,21 @@ def model_card(folder: Path, run: Path, *, repo_id: str, license: str) -> str:
     if not isinstance(cfg, DictConfig):
         raise UserError(f"{folder / 'config.yaml'} is not a configuration")
     counters = json.loads((folder / "counters.json").read_text(encoding="utf-8"))
-    evaluation = run / "evaluation.md"
+    evaluation = folder / "evaluation.md"
     table = evaluation.read_text(encoding="utf-8") if evaluation.is_file() else "Not evaluated."
     head = front_matter(
         license=license,
         library_name="franka_wm",
-        tags=["world-model", "robotics", "franka", str(cfg.model.name)],
+        tags=[
+            "world-model",
+            *(["robotics", "franka"] if cfg.env.kind == "franka" else []),
+            str(cfg.model.name),
+        ],
     )
     return f"""{head}
 # {repo_id.split("/")[-1]}
 
-A latent world model ({cfg.model.name}) of a simulated Franka arm, trained with franka_wm:
+A latent world model ({cfg.model.name}) of {_world(cfg.env)}, trained with franka_wm:
 {counters.get("updates", 0):,} updates, {counters.get("env_steps", 0):,} environment steps, seed {cfg.seed}.
 
 ## Evaluation
@@ -191,10 +216,7 @@ A latent world model ({cfg.model.name}) of a simulated Franka arm, trained with 
 ## Use it
 
 ```python
-from franka_wm.training.load import load_agent
-
-agent = load_agent("hf:{repo_id}")
-rollout = agent.env.rollout(50, agent.policies["planner"])
+{_use(cfg.env.kind, repo_id)}
 ```
 
 Weights are safetensors, everything else is JSON and YAML; nothing is unpickled or executed. The configuration is in
@@ -208,3 +230,23 @@ Weights are safetensors, everything else is JSON and YAML; nothing is unpickled 
 
 {_CITATION}
 """
+
+
+def _world(env: Any) -> str:
+    """What a model is a model of."""
+    if env.kind == "franka":
+        return "a simulated Franka arm"
+    if env.kind == "none":
+        return "recorded episodes"
+    named = [str(env[key]) for key in ("name", "task") if env.get(key)]
+    return f"`{' '.join([str(env.kind), *named])}`"
+
+
+def _use(kind: str, repo_id: str) -> str:
+    if kind == "none":  # nothing to act in
+        return f'from franka_wm.training.load import load_model\n\nmodel = load_model("hf:{repo_id}")'
+    return (
+        "from franka_wm.training.load import load_agent\n\n"
+        f'agent = load_agent("hf:{repo_id}")\n'
+        'rollout = agent.env.rollout(50, agent.policies["planner"])'
+    )

@@ -11,9 +11,12 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from franka_wm.data.lerobot.card import dataset_card, make_picture, model_card
+from franka_wm.data.lerobot.card import PICTURE, dataset_card, make_picture, model_card
 from franka_wm.data.lerobot.command import split
 from franka_wm.data.lerobot.hub import check_repo_id, explained
+from franka_wm.data.lerobot.paths import shortened, without_paths
+from franka_wm.data.lerobot.provenance import read_provenance
+from franka_wm.data.lerobot.schema import PROVENANCE
 from franka_wm.errors import UserError
 
 OPTIONS: dict[str, Any] = {
@@ -78,7 +81,8 @@ def publish_dataset(
     the one that is there. It also leaves files of an earlier version, which are removed here.
 
     Args:
-        root: A LeRobot dataset on disk. Gets a README.md and a picture.
+        root: A LeRobot dataset on disk. Nothing in it is changed: card and picture are made elsewhere, and go in the
+            place of a README.md that is there.
         repo_id: ``user/name``.
         private: Whether only you can see it.
         license: Of the data.
@@ -92,29 +96,87 @@ def publish_dataset(
 
     root = Path(root).absolute()
     check_repo_id(repo_id)
-    info_path = root / "meta" / "info.json"
-    if not info_path.is_file():
+    _check_dataset(root)
+    api = None if dry_run else _api(repo_id)
+    with tempfile.TemporaryDirectory() as place:
+        staged = stage_dataset(root, Path(place), repo_id=repo_id, license=license)
+        files = _files(staged)
+        _show(files, staged, repo_id, private, "dataset")
+        if (root / README).is_file():
+            say(f"the card above goes in the place of {root / README}, which stays as it is on this machine")
+        if api is None:
+            say("dry run: nothing was sent")
+            return
+        with explained(repo_id):
+            _check_name(api, repo_id, "dataset", update)
+            with announced(f"sending {len(files)} files"):
+                _send(api, staged, repo_id, "dataset", private, update)
+                _tag(api, repo_id)
+    say(f"published: {api.endpoint}/datasets/{repo_id} ({'private' if private else 'public'})")
+
+
+def _check_dataset(root: Path) -> None:
+    """Raises ``UserError`` unless it is a LeRobot dataset of the version that is published, with episodes."""
+    path = root / "meta" / "info.json"
+    if not path.is_file():
         raise UserError(f"publish: root={root} is not a LeRobot dataset (no meta/info.json)")
-    info = json.loads(info_path.read_text(encoding="utf-8"))
+    try:
+        info = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        raise UserError(f"publish: {path} cannot be read ({error}); copy the dataset again") from error
+    kinds = {"codebase_version": str, "total_episodes": int, "total_frames": int, "fps": int | float}
+    kinds |= {"features": dict, "data_path": str}
+    wrong = [
+        key
+        for key, kind in kinds.items()
+        if not isinstance(info, dict) or not isinstance(info.get(key), kind)
+    ]
+    features = {} if "features" in wrong else info["features"]
+    wrong += [
+        f"features.{name}"
+        for name, one in features.items()
+        if not isinstance(one, dict)
+        or not isinstance(one.get("dtype"), str)
+        or not isinstance(one.get("shape"), list)
+    ]
+    if any(one["dtype"] == "video" for name, one in features.items() if f"features.{name}" not in wrong):
+        wrong += [] if isinstance(info.get("video_path"), str) else ["video_path"]
+    if wrong:
+        raise UserError(
+            f"publish: {path} lacks {', '.join(wrong)}, or has another kind of value there; a LeRobot dataset has them"
+        )
     if not info["total_episodes"]:
         raise UserError(f"publish: root={root} has no episodes")
     if info["codebase_version"] != VERSION_TAG:
         raise UserError(f"publish: root={root} is of version {info['codebase_version']}, not {VERSION_TAG}")
-    make_picture(root)
-    card = dataset_card(root, repo_id=repo_id, license=license)
-    (root / README).write_text(card, encoding="utf-8")
-    files = _files(root)
-    _show(files, root, repo_id, private, "dataset")
-    if dry_run:
-        say("dry run: nothing was sent")
-        return
-    api = _api(repo_id)
-    with explained(repo_id):
-        _check_name(api, repo_id, "dataset", update)
-        with announced(f"sending {len(files)} files"):
-            _send(api, root, repo_id, "dataset", private, update)
-            _tag(api, repo_id)
-    say(f"published: {api.endpoint}/datasets/{repo_id} ({'private' if private else 'public'})")
+
+
+def stage_dataset(root: Path, place: Path, *, repo_id: str, license: str) -> Path:
+    """Links to the files of a dataset, with a card and a picture, and a provenance without absolute paths.
+
+    Args:
+        root: The dataset; is only read.
+        place: An empty folder.
+        repo_id, license: For the card.
+
+    Returns:
+        ``place``: what is published, file by file.
+    """
+    for name in _files(root):
+        (place / name).parent.mkdir(parents=True, exist_ok=True)
+        if name not in (README, PROVENANCE, PICTURE):
+            (place / name).symlink_to(root / name)
+    provenance = read_provenance(root)
+    if provenance is not None:
+        text = (root / PROVENANCE).read_text(encoding="utf-8")
+        cleaned = without_paths(provenance)
+        if cleaned != provenance:
+            text = json.dumps(cleaned, indent=1)
+        (place / PROVENANCE).write_text(text, encoding="utf-8")
+    make_picture(root, place / PICTURE)
+    card = dataset_card(place, repo_id=repo_id, license=license)
+    (place / README).write_text(card, encoding="utf-8")
+    return place
 
 
 def publish_model(
@@ -154,7 +216,7 @@ def publish_model(
 
 
 def stage_model(checkpoint: Path, place: Path, *, repo_id: str, license: str) -> Path:
-    """A checkpoint without what only training needs: no optimiser, no replay, no random states, no local paths.
+    """A checkpoint without what only training needs: no optimiser, no replay, no random states, no absolute paths.
 
     Args:
         checkpoint: A run's folder, or a checkpoint in it.
@@ -174,10 +236,12 @@ def stage_model(checkpoint: Path, place: Path, *, repo_id: str, license: str) ->
     for name in kept:
         if name in manifest["files"]:
             shutil.copyfile(opened.folder / name, place / name)
-    config = opened.config.copy()
+    config = without_paths(OmegaConf.to_container(opened.config), clear=True)
     if "resume" in config:
-        config.resume = None
-    OmegaConf.save(config, place / "config.yaml")
+        config["resume"] = None
+    OmegaConf.save(OmegaConf.create(config), place / "config.yaml")
+    if (place / "extra.json").is_file():
+        _copy_json(place / "extra.json", place / "extra.json")
     manifest["files"] = {
         path.name: {
             "bytes": path.stat().st_size,
@@ -187,12 +251,29 @@ def stage_model(checkpoint: Path, place: Path, *, repo_id: str, license: str) ->
     }
     (place / "manifest.json").write_text(json.dumps(manifest, indent=1), encoding="utf-8")
     run = opened.folder.parent.parent if opened.folder.parent.name == "checkpoints" else opened.folder
-    for name in ("evaluation.json", "evaluation.md"):
-        if (run / name).is_file():
-            shutil.copyfile(run / name, place / name)
-    card = model_card(place, run, repo_id=repo_id, license=license)
+    written = run / "evaluation"  # where the verb evaluate puts them; a published model has them at its top
+    written = written if (written / "evaluation.md").is_file() else run
+    if (written / "evaluation.json").is_file():
+        _copy_json(written / "evaluation.json", place / "evaluation.json")
+    if (written / "evaluation.md").is_file():
+        text = (written / "evaluation.md").read_text(encoding="utf-8")
+        (place / "evaluation.md").write_text(shortened(text), encoding="utf-8")
+    card = model_card(place, repo_id=repo_id, license=license)
     (place / README).write_text(card, encoding="utf-8")
     return place
+
+
+def _copy_json(source: Path, target: Path) -> None:
+    """Unchanged, unless there are absolute paths in it."""
+    text = source.read_text(encoding="utf-8")
+    try:
+        value = json.loads(text)
+    except ValueError as error:
+        raise UserError(
+            f"publish: {source} cannot be read ({error}); write it again, or remove it"
+        ) from error
+    cleaned = without_paths(value)
+    target.write_text(text if cleaned == value else json.dumps(cleaned, indent=1), encoding="utf-8")
 
 
 # -- the Hub -------------------------------------------------------------------------------------------------------
@@ -201,7 +282,11 @@ def stage_model(checkpoint: Path, place: Path, *, repo_id: str, license: str) ->
 def _files(root: Path) -> list[str]:
     """What goes, relative to ``root``: everything but recorders' scratch and what is hidden."""
     names = [path.relative_to(root).as_posix() for path in sorted(root.rglob("*")) if path.is_file()]
-    return [name for name in names if not name.startswith(("images/", ".")) and "/." not in name]
+    return [name for name in names if _goes(name)]
+
+
+def _goes(name: str) -> bool:
+    return not name.startswith(("images/", ".")) and "/." not in name
 
 
 def _show(files: Sequence[str], root: Path, repo_id: str, private: bool, kind: str) -> None:
@@ -232,13 +317,14 @@ def _check_name(api: Any, repo_id: str, kind: str, update: bool) -> None:
 
 
 def _send(api: Any, folder: Path, repo_id: str, kind: str, private: bool, update: bool) -> None:
-    """Everything in one commit. What an earlier version left there goes in it: readers would take it for ours."""
+    """All of a staged folder, which has what :func:`_files` lists and no more, in one commit. What an
+    earlier version left there goes in it: readers would take it for ours."""
     api.create_repo(repo_id=repo_id, private=private, repo_type=kind, exist_ok=update)
     api.upload_folder(
         repo_id=repo_id,
         folder_path=folder,
         repo_type=kind,
-        ignore_patterns=["images/", ".*"],
+        ignore_patterns=["images/", ".*", "*/.*"],
         delete_patterns="*",
         commit_message="Upload with franka-wm",
     )

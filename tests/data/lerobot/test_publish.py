@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib.util
 import json
 import os
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -14,7 +15,9 @@ import torch
 from omegaconf import OmegaConf
 
 from franka_wm.data.lerobot.hub import check_repo_id, explained
-from franka_wm.data.lerobot.publish import stage_model
+from franka_wm.data.lerobot.paths import shortened, without_paths
+from franka_wm.data.lerobot.publish import stage_dataset, stage_model
+from franka_wm.data.lerobot.schema import PROVENANCE
 from franka_wm.errors import UserError
 from franka_wm.training.checkpoint import load_checkpoint, save_checkpoint
 
@@ -66,6 +69,10 @@ def dataset(tmp_path_factory, make_schema, make_episode, write):
     return write(tmp_path_factory.mktemp("data") / "set", schema, [make_episode(schema, i) for i in range(2)])
 
 
+def contents(folder: Path) -> dict[str, bytes]:
+    return {p.relative_to(folder).as_posix(): p.read_bytes() for p in folder.rglob("*") if p.is_file()}
+
+
 def one_line(result, *says: str) -> None:
     error = [line for line in result.stderr.splitlines() if line.startswith("error: ")]
     assert result.returncode == 1, result.stderr
@@ -82,7 +89,9 @@ def test_a_dataset_goes_with_our_card_and_tag(hub, publish, dataset) -> None:
     assert fake_hub.TOKEN not in done.stderr + done.stdout
     repo = hub.repos["datasets/user/arm"]
     assert repo["private"] is True
-    local = {p.relative_to(dataset).as_posix(): p.read_bytes() for p in dataset.rglob("*") if p.is_file()}
+    local = contents(dataset)
+    assert "README.md" not in local  # the card was made elsewhere
+    del local[PROVENANCE]  # goes without this machine's paths
     assert {name: repo["files"][name] for name in local} == local
     card = repo["files"]["README.md"].decode()
     for text in (
@@ -115,6 +124,103 @@ def test_a_dry_run_sends_nothing(hub, publish, dataset) -> None:
     assert hub.requests == []
     for text in ("user/arm (private)", "data/chunk-000/file-000.parquet", "README.md", "nothing was sent"):
         assert text in done.stdout
+
+
+@pytest.fixture
+def copy(dataset, tmp_path):
+    """A dataset of the test's own."""
+    return Path(shutil.copytree(dataset, tmp_path / "copy"))
+
+
+def test_a_folder_stays_as_it_is_and_what_is_shown_is_what_goes(hub, publish, copy) -> None:
+    (copy / "README.md").write_text("mine")
+    for name in (".env", "meta/.secret", "data/.env", "data/.cache/x", "images/front/frame.png"):
+        (copy / name).parent.mkdir(parents=True, exist_ok=True)
+        (copy / name).write_text("hidden")
+    before = contents(copy)
+    root = f"root={copy}"
+    dry = publish(root, "repo_id=user/arm", "--dry-run")
+    one_line(publish(root, "repo_id=user/arm", token=None), "no token")
+    assert contents(copy) == before
+    assert "stays as it is" in dry.stdout
+    done = publish(root, "repo_id=user/arm")
+    assert done.returncode == 0, done.stderr
+    assert contents(copy) == before
+    sent = hub.repos["datasets/user/arm"]["files"]
+    shown = {line.split()[0] for line in dry.stdout.splitlines() if line.startswith("  ")}
+    assert shown == set(sent) - {".gitattributes"}
+    assert "# arm" in sent["README.md"].decode()
+    assert b"hidden" not in sent.values()
+
+
+def test_provenance_and_card_name_no_folder_of_this_machine(copy, tmp_path) -> None:
+    provenance = json.loads((copy / PROVENANCE).read_text())
+    session = provenance["sessions"][0]
+    session["command"] = "franka-wm collect out=/home/someone/sets/reach policy='/home/someone/a run' seed=1"
+    session["policy"] = "planner of /home/someone/outputs/run"
+    session["config"] = {"env": {"urdf_path": "/home/someone/arm.urdf"}, "places": ["~/x/y", 3]}
+    (copy / PROVENANCE).write_text(json.dumps(provenance))
+    (tmp_path / "place").mkdir()
+    place = stage_dataset(copy, tmp_path / "place", repo_id="user/arm", license="mit")
+    staged = json.loads((place / PROVENANCE).read_text())["sessions"][0]
+    assert staged["command"] == "franka-wm collect out=reach policy='a run' seed=1"
+    assert staged["policy"] == "planner of run"
+    assert staged["config"] == {"env": {"urdf_path": "arm.urdf"}, "places": ["y", 3]}
+    card = (place / "README.md").read_text()
+    assert "out=reach policy='a run'" in card
+    assert "NVIDIA\nNewton" in card or "NVIDIA Newton" in card
+    assert "someone" not in card + (place / PROVENANCE).read_text()
+
+
+def test_the_card_of_anothers_dataset_claims_nothing(copy, tmp_path) -> None:
+    shutil.rmtree(copy / "meta" / "franka_wm")
+    (tmp_path / "place").mkdir()
+    place = stage_dataset(copy, tmp_path / "place", repo_id="user/arm", license="mit")
+    card = (place / "README.md").read_text()
+    assert "Not recorded." in card
+    for text in ("Newton", "provenance.json", "simulated", "simulation", "terminal", "gathered with"):
+        assert text not in card
+
+
+@pytest.mark.parametrize(
+    ("text", "says"),
+    [
+        ("{}", "lacks codebase_version, total_episodes"),
+        ("[]", "lacks codebase_version"),
+        ('{"total', "cannot be read"),
+    ],
+)
+def test_a_broken_dataset_is_one_line(text, says, copy, capsys) -> None:
+    from franka_wm.cli import main
+
+    (copy / "meta" / "info.json").write_text(text)
+    assert main(["publish", f"root={copy}", "repo_id=user/arm", "--dry-run"]) == 1
+    error = capsys.readouterr().err
+    assert says in error
+    assert error.count("\n") == 1
+
+
+@pytest.mark.parametrize(
+    ("text", "becomes"),
+    [
+        ("out=/a/b/c seed=1", "out=c seed=1"),
+        ("x ~/b/c", "x c"),
+        ("a:/b/c file:///d/e", "a:c e"),
+        (
+            "https://hub/a/b hf:user/name outputs/run 3 cm/s",
+            "https://hub/a/b hf:user/name outputs/run 3 cm/s",
+        ),
+        (r"out=C:\Users\me\set", "out=set"),
+    ],
+)
+def test_absolute_paths_become_their_last_component(text, becomes) -> None:
+    assert shortened(text) == becomes
+
+
+def test_absolute_paths_of_a_configuration_are_cleared() -> None:
+    config = {"a": {"b": "/x/y", "c": "~/z", "d": "x/y"}, "e": ["/x/y", None, 1.5], "f": "hf:user/name"}
+    cleared = {"a": {"b": None, "c": None, "d": "x/y"}, "e": ["y", None, 1.5], "f": "hf:user/name"}
+    assert without_paths(config, clear=True) == cleared
 
 
 def test_what_is_missing_is_one_line(hub, publish, dataset, tmp_path) -> None:
@@ -156,8 +262,9 @@ def run_folder(tmp_path):
     config = {
         "seed": 4,
         "resume": "/home/someone/run",
-        "model": {"name": "tdmpc2"},
-        "env": {"kind": "franka"},
+        "model": {"name": "tdmpc2", "encoder_from": "/home/someone/jepa"},
+        "dataset": {"root": "/home/someone/set", "cache_dir": "~/someone/cache"},
+        "env": {"kind": "franka", "urdf_path": "/home/someone/arm.urdf", "image_size": 64},
     }
     model = torch.nn.Linear(3, 2)
     save_checkpoint(
@@ -190,7 +297,8 @@ def test_a_model_goes_without_what_only_training_needs(hub, publish, run_folder,
         "model.safetensors",
     }
     assert "planner | 1 cm" in repo["files"]["README.md"].decode()
-    assert b"/home/someone" not in b"".join(repo["files"].values())
+    assert b"someone" not in b"".join(repo["files"].values())
+    assert "a simulated Franka arm" in repo["files"]["README.md"].decode()
     there = tmp_path / "there"
     there.mkdir()
     for name, content in repo["files"].items():
@@ -201,6 +309,34 @@ def test_a_model_goes_without_what_only_training_needs(hub, publish, run_folder,
     assert torch.equal(copy.weight, model.weight)
     assert opened.extra() == {"spaces": {"action_dim": 2}}
     assert opened.counters == {"updates": 7, "env_steps": 70}
+
+
+def test_a_models_card_has_the_newest_evaluation_and_the_right_world(tmp_path) -> None:
+    worlds = [
+        ({"kind": "gym", "name": "CartPole-v1"}, "`gym CartPole-v1`", "load_agent"),
+        ({"kind": "none"}, "recorded episodes", "load_model"),
+    ]
+    for i, (env, says, use) in enumerate(worlds):
+        run, place = tmp_path / f"run{i}", tmp_path / f"place{i}"
+        config = OmegaConf.create({"seed": 4, "model": {"name": "dreamer"}, "env": env})
+        save_checkpoint(
+            run / "checkpoints" / "latest", model=torch.nn.Linear(3, 2), config=config, counters={}
+        )
+        (run / "evaluation").mkdir()
+        (run / "evaluation.md").write_text("the older numbers")
+        (run / "evaluation" / "evaluation.md").write_text("the verb's numbers of /home/someone/run")
+        (run / "evaluation" / "evaluation.json").write_text('{"checkpoint": "/home/someone/run"}')
+        place.mkdir()
+        stage_model(run, place, repo_id="user/model", license="mit")
+        card = (place / "README.md").read_text()
+        assert f"(dreamer) of {says}, trained" in card
+        assert use in card
+        assert "Franka arm, trained" not in card
+        assert "- franka\n" not in card
+        assert "the verb's numbers of run" in card
+        assert "older" not in card
+        assert json.loads((place / "evaluation.json").read_text()) == {"checkpoint": "run"}
+        load_checkpoint(place)
 
 
 def test_a_staged_model_is_damaged_if_changed(run_folder, tmp_path) -> None:
