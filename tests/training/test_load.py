@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import fcntl
 import shutil
+import subprocess
+import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -15,7 +18,7 @@ from franka_wm import models
 from franka_wm.errors import UserError
 from franka_wm.training import build
 from franka_wm.training.check import check
-from franka_wm.training.entry import Run
+from franka_wm.training.entry import _CLAIMED, Run, claim
 from franka_wm.training.learner import Learner
 from franka_wm.training.load import load_agent
 from franka_wm.training.stages import pretrain
@@ -130,6 +133,17 @@ def test_no_world_and_no_data(composed) -> None:
         check(composed("env=none"))
 
 
+def test_one_run_in_a_folder(tmp_path: Path) -> None:
+    """The second process is refused while the first one lives."""
+    code = "import sys; from pathlib import Path; from franka_wm.training.entry import claim; claim(Path(sys.argv[1]))"
+    command = [sys.executable, "-c", code, str(tmp_path)]
+    claim(tmp_path)
+    refused = subprocess.run(command, capture_output=True, text=True)
+    assert refused.returncode and "another run" in refused.stderr
+    fcntl.flock(_CLAIMED.pop(), fcntl.LOCK_UN)
+    assert subprocess.run(command, capture_output=True).returncode == 0
+
+
 def test_no_checkpoint(tmp_path: Path) -> None:
     with pytest.raises(UserError, match="checkpoint"):
         load_agent(tmp_path)
@@ -146,6 +160,10 @@ def test_no_checkpoint(tmp_path: Path) -> None:
         (["model=jepa", "env=reach_pixels", "collector.acts=planner"], "smooth"),
         (["model=lewm", "env=reach_pixels"], "goal_pixels"),
         (["export=lerobot", "export.format=gif"], "gif"),
+        (["export=lerobot", "env.episode_length=50"], "whole episode"),
+        (["dataset=lerobot", "dataset.root=no/such/folder"], "no/such/folder"),
+        (["dataset=lerobot"], "dataset.root"),
+        (["objective.metric=l7"], "l7"),
         (["trainer.precision=int3"], "precision"),
         (["trainer.schedule=up"], "schedule"),
     ],

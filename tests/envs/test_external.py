@@ -1,0 +1,78 @@
+"""Other simulators' environments under the same keys."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+from franka_wm.envs.external import ExternalConfig, ExternalEnv, external_config
+from franka_wm.errors import UserError
+from franka_wm.training.spaces import Spaces
+
+pytest.importorskip("gymnasium")
+
+
+def test_moves_and_statistics() -> None:
+    env = ExternalEnv(ExternalConfig(kind="gym", name="CartPole-v1"), num_envs=3, seed=1)
+    assert Spaces.of_env(env) == Spaces(observation_sizes={"state": 4}, num_actions=2, episode_length=500)
+    torch.manual_seed(0)
+    data = env.rollout(80, break_when_any_done=False)
+    done = data["next", "done"]
+    assert data["state"].dtype == torch.float32 and data["action"].shape == (3, 80)
+    assert done.any() and data["is_init"].sum() >= 3
+    # An episode's return is its length: one for each step.
+    numbers = env.statistics()
+    assert numbers["episodes"] == done.sum()
+    assert numbers["return"] == pytest.approx(numbers["length"])
+    # Each episode that ended began at an is_init: from there to its end are as many steps as the last count says.
+    world, last = done[..., 0].nonzero()[0].tolist()
+    assert data["next", "step_count"][world, last] == last + 1
+    assert env.statistics()["episodes"] == 0
+
+
+def test_continuous_actions_fill_their_range() -> None:
+    """Pendulum's torque is ±2 N·m; here actions are in [−1, 1]."""
+    env = ExternalEnv(ExternalConfig(kind="gym", name="Pendulum-v1", episode_length=5), num_envs=2)
+    low, high = env.action_spec.space.low, env.action_spec.space.high
+    assert (low == -1).all() and (high == 1).all()
+    tensordict = env.reset(seed=0)
+    start = tensordict["state"].clone()
+    full = env.step(tensordict.clone().set("action", torch.ones(2, 1)))["next", "state"]
+    angle = torch.atan2(start[:, 1], start[:, 0])
+    expected = (
+        start[:, 2] + (15 * torch.sin(angle) + 3 * 2.0) * 0.05
+    )  # of Gymnasium's documentation: g=10, m=l=1
+    torch.testing.assert_close(full[:, 2], expected.clamp(-8, 8), rtol=1e-4, atol=1e-4)
+    data = env.rollout(12, break_when_any_done=False)
+    assert data["next", "truncated"].any() and not data["next", "terminated"].any()
+
+
+def test_observations_by_name() -> None:
+    pytest.importorskip("dm_control")
+    config = external_config(
+        {
+            "kind": "dm_control",
+            "name": "reacher",
+            "task": "hard",
+            "frame_skip": 2,
+            "observations": {"state": ["position", "velocity"], "target": "to_target"},
+        }
+    )
+    env = ExternalEnv(config, num_envs=2)
+    assert Spaces.of_env(env).observation_sizes == {"state": 4, "target": 2}
+
+
+@pytest.mark.parametrize(
+    ("values", "named"),
+    [
+        ({"kind": "gym", "name": "Nope-v1"}, "Nope"),
+        ({"kind": "gym", "name": "CartPole-v1", "observations": {"state": ["wheel"]}}, "wheel"),
+        ({"kind": "gym", "name": "CartPole-v1", "frame_skip": 0}, "frame_skip"),
+        ({"kind": "gym", "name": "CartPole-v1", "wheels": 2}, "wheels"),
+        ({"kind": "atari", "name": "Pong"}, "atari"),
+    ],
+)
+def test_refusals(values: dict, named: str) -> None:
+    with pytest.raises(UserError) as caught:
+        ExternalEnv(external_config(values), num_envs=1)
+    assert named in str(caught.value) and "\n" not in str(caught.value)
