@@ -16,7 +16,27 @@ from franka_wm.errors import UserError
 from franka_wm.report.video import draw_marker, write_video
 
 
-class VideoRecorder:
+class Recorder:
+    """What recorders share: they end at ``most`` steps, or when closed."""
+
+    most: int
+    closed = False
+
+    def __len__(self) -> int:
+        """Steps recorded."""
+        raise NotImplementedError
+
+    @property
+    def full(self) -> bool:
+        """Whether no further step has a place."""
+        return len(self) >= self.most
+
+    def close(self) -> None:
+        """Takes no more steps; what there is can be written, and written again where that failed."""
+        self.closed = True
+
+
+class VideoRecorder(Recorder):
     """Collects one picture a step, from the environment's own camera, the goal drawn as a ring.
 
     Args:
@@ -34,8 +54,8 @@ class VideoRecorder:
         return len(self.frames)
 
     def take(self, step: TensorDictBase) -> None:
-        """One picture of the present; nothing where it is full. ``step`` is not looked at."""
-        if len(self) >= self.most:
+        """One picture of the present; nothing where it is full or closed. ``step`` is not looked at."""
+        if self.closed or self.full:
             return
         picture = self.env.render(self.size, num_views=1).cpu()
         centre = project(self.env.goal[:1], self.env.config, self.size).cpu()
@@ -54,7 +74,7 @@ class VideoRecorder:
         return write_video(torch.stack(self.frames), path, fps=max(1, round(self.env.config.fps)))
 
 
-class DatasetRecorder:
+class DatasetRecorder(Recorder):
     """Collects steps for a LeRobot dataset; what :func:`~franka_wm.data.lerobot.schema.schema_for` lists is kept.
 
     An episode of the dataset begins with the recording or with an episode of the environment, and ends with either;
@@ -86,8 +106,8 @@ class DatasetRecorder:
         return len(self.steps)
 
     def take(self, step: TensorDictBase) -> None:
-        """One step: observation, ``action`` and, under ``next``, what followed; nothing where it is full."""
-        if len(self) >= self.most:
+        """One step: observation, ``action`` and, under ``next``, what followed; nothing where it is full or closed."""
+        if self.closed or self.full:
             return
         keys = {*self.schema.sources.values(), *(key for key, _, _ in self.schema.derived.values())}
         flags = ("reward", "done", "terminated", "truncated", "success")

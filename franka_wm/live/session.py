@@ -23,6 +23,7 @@ from franka_wm.errors import UserError
 from franka_wm.live.commanded import commanded_path
 from franka_wm.live.recorder import DatasetRecorder, VideoRecorder
 from franka_wm.live.settings import Setting, planner_settings, rebuilt
+from franka_wm.training.progress import say
 
 PREFERRED = ("planner", "oracle", "noop")
 """Which policy starts, the first one that there is."""
@@ -45,6 +46,7 @@ class Frame:
         success: Of the last step.
         decision: Time that the policy took for the last step [s].
         recording: Steps recorded so far; None where nothing is recorded.
+        recording_full: Whether the recording has come to its end by itself: further steps are not in it.
     """
 
     steps: int
@@ -60,6 +62,7 @@ class Frame:
     success: bool
     decision: float
     recording: int | None
+    recording_full: bool = False
 
 
 class Session:
@@ -101,6 +104,7 @@ class Session:
         self._thread: threading.Thread | None = None
         self._listeners: list[Callable[[Frame], None]] = []
         self._recorder: VideoRecorder | DatasetRecorder | None = None
+        self._writing = threading.Lock()
         self._steps = self._episode = 0
         self._reward = self._decision = 0.0
         self._success = False
@@ -134,7 +138,7 @@ class Session:
             if bool(after["done"]):
                 self._begin_episode()
             if self._recorder is not None:
-                self._recorder.take(done)
+                self._record(self._recorder, done)
             frame = self._frame(stepped=True)
         return self._tell(frame)
 
@@ -257,14 +261,25 @@ class Session:
     def stop_recording(self, path: str | Path) -> Path:
         """Writes what was recorded since :meth:`start_recording`: an .mp4, or a dataset's folder.
 
+        Where it cannot be written it is kept, and grows no more: call this again with another path, or
+        :meth:`start_recording` to give it up.
+
         Raises:
             UserError: Nothing was recorded, or the file cannot be written.
         """
-        with self._lock:
-            recorder, self._recorder = self._recorder, None
-        if recorder is None:
-            raise UserError("nothing is being recorded")
-        return recorder.write(path)
+        with self._writing:  # who asks a second time meanwhile waits, and finds it written
+            with self._lock:
+                recorder = self._recorder
+                if recorder is None:
+                    raise UserError("nothing is being recorded")
+                recorder.close()
+                if not len(recorder):
+                    self._recorder = None  # there is nothing to keep
+            written = recorder.write(path)
+            with self._lock:
+                if self._recorder is recorder:
+                    self._recorder = None
+            return written
 
     # -- the thread --------------------------------------------------------------------------------------
 
@@ -318,6 +333,15 @@ class Session:
             hint = "; that one needs a checkpoint of a family that has it" if learned else ""
             raise UserError(f"policy={name!r}: choose from {', '.join(self.policies)}{hint}")
 
+    def _record(self, recorder: VideoRecorder | DatasetRecorder, step: TensorDictBase) -> None:
+        before = recorder.full
+        recorder.take(step)
+        if recorder.full and not before:
+            say(
+                f"the recording is full after {len(recorder):,} steps: further ones are not in it; "
+                f"stop it to save it"
+            )
+
     def _begin_episode(self) -> None:
         self._episode += 1
         self._path = None
@@ -362,6 +386,7 @@ class Session:
             success=self._success,
             decision=self._decision,
             recording=None if self._recorder is None else len(self._recorder),
+            recording_full=self._recorder is not None and self._recorder.full,
         )
 
     def _tell(self, frame: Frame) -> Frame:

@@ -10,7 +10,7 @@ from typing import Any
 from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from franka_wm.envs import FrankaConfig, FrankaEnv, TransformedFrankaEnv
+from franka_wm.envs import FrankaConfig, FrankaEnv
 from franka_wm.errors import UserError
 from franka_wm.training.progress import announced, say
 
@@ -90,6 +90,8 @@ def parse(arguments: Sequence[str]) -> Options:
             raise UserError(f"view: {argument}: must be a number") from error
     if not 0 <= options.port <= 65535:
         raise UserError(f"view: port={options.port}: must be from 0 to 65535")
+    if options.rerun is not None and not options.rerun.endswith(".rrd"):
+        raise UserError(f"view: rerun={options.rerun}: must end in .rrd")
     if options.seconds is not None and not 0 < options.seconds < float("inf"):
         raise UserError(f"view: seconds={options.seconds:g}: must be above 0 and finite")
     return options
@@ -141,6 +143,8 @@ def build(options: Options) -> Stage:
         UserError: A checkpoint that cannot be loaded, or one of another environment.
     """
     changes = {**ENDLESS, **options.env}
+    if options.checkpoint is not None:
+        check_arm(options.checkpoint)
     with announced("building the arm; on a machine's first start this compiles kernels for a minute or two"):
         if options.checkpoint is None:
             return untrained(options, changes)
@@ -149,10 +153,22 @@ def build(options: Options) -> Stage:
         agent = load_agent(
             options.checkpoint, num_envs=1, device=options.device, env_changes=changes, seed=options.seed
         )
-    if not isinstance(agent.env, FrankaEnv | TransformedFrankaEnv):
-        raise UserError(f"{options.checkpoint}: acts in another environment than the arm; view shows the arm")
     title = f"{agent.cfg.model.name}, {int(agent.counters.get('updates', 0)):,} updates"
     return Stage(agent.env, agent.policies, title, int(agent.cfg.env.episode_length))
+
+
+def check_arm(checkpoint: str) -> None:
+    """Whether a checkpoint acts with the arm; only its configuration is read.
+
+    Raises:
+        UserError: It does not, or there is none.
+    """
+    from franka_wm.training.load import find_checkpoint
+
+    env = find_checkpoint(checkpoint).config.env
+    if env.kind != "franka":
+        what = "recorded data alone" if env.kind == "none" else f"another environment ({env.kind})"
+        raise UserError(f"view: {checkpoint}: was trained on {what}; the live page shows the arm only")
 
 
 def untrained(options: Options, changes: Mapping[str, Any]) -> Stage:

@@ -8,6 +8,7 @@ import socket
 import subprocess
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 from omegaconf import OmegaConf
@@ -39,6 +40,7 @@ def test_arguments() -> None:
         ("port=70000", "must be from 0 to 65535"),
         ("seconds=0", "must be above 0"),
         ("seconds=nan", "must be above 0"),
+        ("rerun=x.txt", "rerun=x.txt: must end in .rrd"),
     ],
 )
 def test_bad_arguments_are_one_line(argument: str, said: str, capsys: pytest.CaptureFixture[str]) -> None:
@@ -46,6 +48,51 @@ def test_bad_arguments_are_one_line(argument: str, said: str, capsys: pytest.Cap
     captured = capsys.readouterr()
     assert said in captured.err
     assert captured.err.count("\n") == 1
+    assert captured.out == "", "before anything that takes time"
+
+
+@pytest.mark.parametrize(("kind", "what"), [("gym", "another environment (gym)"), ("none", "recorded data")])
+def test_a_checkpoint_of_another_environment_is_refused_before_anything_is_built(
+    kind: str, what: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    from franka_wm.training import load
+
+    found = SimpleNamespace(config=OmegaConf.create({"env": {"kind": kind}}))
+    monkeypatch.setattr(load, "find_checkpoint", lambda folder: found)
+    monkeypatch.setattr(load, "load_agent", lambda *a, **k: pytest.fail("built"))
+    assert cli.main(["view", "checkpoint=run"]) == 1
+    captured = capsys.readouterr()
+    assert what in captured.err and "the live page shows the arm only" in captured.err
+    assert captured.err.count("\n") == 1
+    assert captured.out == ""
+
+
+def test_a_full_recording_is_said_once_and_a_failed_write_keeps_it(
+    make_session, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    session = make_session(policy="noop")
+    session.start_recording(size=32, most=2)
+    frames = [session.step() for _ in range(4)]
+    assert [(f.recording, f.recording_full) for f in frames] == [(1, False)] + [(2, True)] * 3
+    assert capsys.readouterr().out.count("the recording is full after 2 steps") == 1
+    (tmp_path / "file").write_text("in the way")
+    with pytest.raises(UserError, match="cannot write"):
+        session.stop_recording(tmp_path / "file" / "live.mp4")
+    assert session.recording, "what was not written is kept"
+    assert session.stop_recording(tmp_path / "live.mp4").stat().st_size > 0
+    assert not session.recording
+
+
+def test_what_is_kept_after_a_failed_write_grows_no_more(make_session, tmp_path: Path) -> None:
+    session = make_session(policy="noop")
+    session.start_recording(size=32)
+    session.step()
+    (tmp_path / "file").write_text("in the way")
+    with pytest.raises(UserError, match="cannot write"):
+        session.stop_recording(tmp_path / "file" / "live.mp4")
+    assert session.step().recording == 1
+    session.start_recording(size=32)  # gives it up
+    assert session.step().recording == 1 and session.step().recording == 2
 
 
 def test_bad_worlds_policies_and_checkpoints_are_one_line(
