@@ -217,17 +217,19 @@ def _look_ahead(
     agent: Any, held: diagnose.Held, evaluation: Evaluation, results: dict[str, Any], say: Say
 ) -> tuple[Imagined, Any, Any] | None:
     say("predictions without looking …")
+    ahead: dict[str, Any]
     try:
-        results["open_loop"] = diagnose.open_loop(agent, held)
+        ahead = diagnose.open_loop(agent, held)
     except NothingToPredictError as error:
-        results["open_loop"] = {"not_measured": str(error)}
+        ahead = {"not_measured": str(error)}
         say(f"warning: open loop not measured: {error}")
+    results["open_loop"] = ahead
     say("values against true returns …")
     results["calibration"] = diagnose.calibration(agent)
     results["health"] = diagnose.health(agent, evaluation)
     imagined = diagnose.imagine(agent, held, say=say)
     if imagined is not None:
-        results["open_loop"]["decoder"] = imagined[2]
+        ahead["decoder"] = imagined[2]
     return imagined
 
 
