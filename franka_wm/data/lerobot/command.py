@@ -124,7 +124,10 @@ def _allowed(folder: Any, message: str, options: Sequence[str]) -> list[str]:
     place = unknown[1].rpartition(".")[0] if "/" not in unknown[1] and "@" not in unknown[1] else ""
     found = OmegaConf.select(node, place) if place else node
     if isinstance(found, DictConfig):
-        return [f"{place}.{key}" if place else str(key) for key in [*([] if place else options), *found]]
+        return [
+            f"{place}.{key}" if place else str(key)
+            for key in dict.fromkeys([*([] if place else options), *found])
+        ]
     return [*options, *(str(key) for key in node)]
 
 
