@@ -22,8 +22,8 @@ from franka_wm.evaluation.decoder import (
 from franka_wm.evaluation.health import paired_gain, planner_health
 from franka_wm.evaluation.open_loop import (
     cost_ranks,
+    grouped_spearman,
     horizon_error,
-    spearman,
     steps_until_forgotten,
     value_calibration,
 )
@@ -178,7 +178,10 @@ def calibration(agent: Any, *, episodes: int = 32) -> dict[str, Any]:
     result = value_calibration(values[use].squeeze(-1), returns[use].squeeze(-1))
     if arm_of(env) is not None:
         distance = played.get("physical")[:, :length, 17:20].norm(dim=-1)[use].cpu()
-        result["rank_with_goal_distance"] = spearman(-values[use].squeeze(-1).cpu(), distance).as_dict()
+        episode = torch.arange(use.shape[0], device=use.device).unsqueeze(1).expand_as(use)[use].cpu()
+        groups = torch.stack((episode, episode), -1)
+        ranks = grouped_spearman(-values[use].squeeze(-1).cpu(), distance, groups)
+        result["rank_with_goal_distance"] = ranks.as_dict()
     return result | {"tail": tail}
 
 

@@ -194,9 +194,12 @@ class Page:
             self.session.start_recording(kind)
             self._record.label, self._kind.disabled = "Stop and save", True
             return
-        self._record.label, self._kind.disabled = "Record", False
         name = f"live-{datetime.now():%Y-%m-%d-%H-%M-%S}{'.mp4' if kind == 'video' else ''}"
-        path = self.session.stop_recording(self.folder / name)
+        try:
+            path = self.session.stop_recording(self.folder / name)
+        finally:  # what could not be written is kept, and the button still saves it
+            if not self.session.recording:
+                self._record.label, self._kind.disabled = "Record", False
         self._notify("Saved", str(path.resolve()))
 
     def _try(self, action: Callable[[], Any]) -> None:
@@ -242,7 +245,8 @@ class Page:
         else:
             lines.append("paused")
         if frame.recording is not None:
-            lines.append(f"recording: {frame.recording / fps:.1f} s")
+            full = " (full: stop and save)" if frame.recording_full else ""
+            lines.append(f"recording: {frame.recording / fps:.1f} s{full}")
         return "  \n".join(lines)
 
 
