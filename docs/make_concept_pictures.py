@@ -89,9 +89,9 @@ def collapse(env: FrankaEnv) -> None:
         axes.plot(range(0, 301, 25), spread, marker="o", markersize=3, label=guard)
         print(f"{guard:8s} spread {spread[0]:.4f} → {spread[-1]:.4f}", flush=True)
     axes.set_yscale("log")
-    axes.legend(frameon=False)
+    axes.legend(frameon=False, loc="center right")
     axes.set_xlabel("updates")
-    axes.set_ylabel("standard deviation of features over pictures")
+    axes.set_ylabel("spread of the features")
     axes.set_title("I-JEPA on the arm, by guard against collapse")
     save_figure(figure, OUT / "collapse.png")
 
