@@ -11,6 +11,7 @@ from torch.nn import functional as F
 from franka_wm.models.groups import decay_groups
 from franka_wm.models.parts import NormedLinear, SimNorm, TwoHotSymlog, initialize, mlp
 from franka_wm.models.pixel_encoder import PixelEncoder
+from franka_wm.models.vectors import copy_statistics
 from franka_wm.models.vision import RandomShift, check_image_sizes, check_pictures
 
 
@@ -171,17 +172,7 @@ class MuZero(nn.Module):
         Raises:
             ValueError: a wrong shape, a value that is not finite, or a negative standard deviation.
         """
-        for name, value in (("mean", mean), ("std", std)):
-            if value.shape != self.observation_mean.shape:
-                expected = tuple(self.observation_mean.shape)
-                raise ValueError(f"{name} must have shape {expected}, got {tuple(value.shape)}")
-            if not bool(torch.isfinite(value).all()):
-                raise ValueError(f"{name} of the observations must be finite")
-        if bool((std < 0).any()):
-            raise ValueError("std of the observations must not be negative")
-        # In place, so that a captured CUDA graph sees the new values.
-        self.observation_mean.copy_(mean)
-        self.observation_std.copy_(torch.where(std > 1e-6, std, torch.ones_like(std)))
+        copy_statistics(self.observation_mean, self.observation_std, mean, std)
 
     def encode(self, observation: TensorDictBase) -> Tensor:
         """Observations with keys `observation_sizes`, each (..., size), and `image_sizes`, each

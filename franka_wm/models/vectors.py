@@ -7,6 +7,27 @@ from tensordict import TensorDictBase
 from torch import Tensor, nn
 
 
+def copy_statistics(to_mean: Tensor, to_std: Tensor, mean: Tensor, std: Tensor) -> None:
+    """Checks a mean and a standard deviation and copies them, in place: a captured CUDA graph sees the new values.
+
+    Args:
+        to_mean, to_std: (size,) buffers of a model.
+        mean, std: (size,), in the units of the observations; a deviation of zero becomes 1, which centres only.
+
+    Raises:
+        ValueError: a wrong shape, a value that is not finite, or a negative standard deviation.
+    """
+    for name, value in (("mean", mean), ("std", std)):
+        if value.shape != to_mean.shape:
+            raise ValueError(f"{name} must have shape {tuple(to_mean.shape)}, got {tuple(value.shape)}")
+        if not bool(torch.isfinite(value).all()):
+            raise ValueError(f"{name} of the observations must be finite")
+    if bool((std < 0).any()):
+        raise ValueError("std of the observations must not be negative")
+    to_mean.copy_(mean)
+    to_std.copy_(torch.where(std > 1e-6, std, torch.ones_like(std)))
+
+
 class Vectors(nn.Module):
     """Concatenates vector observations in a fixed order and standardises them: (s - mean) / std.
 
@@ -43,13 +64,4 @@ class Vectors(nn.Module):
         Raises:
             ValueError: a wrong shape, a value that is not finite, or a negative standard deviation.
         """
-        for name, value in (("mean", mean), ("std", std)):
-            if value.shape != self.observation_mean.shape:
-                raise ValueError(f"{name} must have shape {(self.size,)}, got {tuple(value.shape)}")
-            if not bool(torch.isfinite(value).all()):
-                raise ValueError(f"{name} of the observations must be finite")
-        if bool((std < 0).any()):
-            raise ValueError("std of the observations must not be negative")
-        # In place, so that a captured CUDA graph sees the new values.
-        self.observation_mean.copy_(mean)
-        self.observation_std.copy_(torch.where(std > 1e-6, std, torch.ones_like(std)))
+        copy_statistics(self.observation_mean, self.observation_std, mean, std)
