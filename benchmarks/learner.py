@@ -57,13 +57,16 @@ def main() -> None:
     parser.add_argument("--device", default="auto")
     parser.add_argument("--seconds", type=float, default=3.0)
     parser.add_argument("--compile", action="store_true", help="compile the loss, too")
+    parser.add_argument("--precision", choices=["float32", "bfloat16"], default="float32")
+    parser.add_argument("--sizes", nargs="+", choices=SIZES, default=list(SIZES), help="default: all")
     parser.add_argument("--out")
     arguments = parser.parse_args()
     device = resolve_device(arguments.device)
     if device.type == "cuda":
         torch.set_float32_matmul_precision("high")
     rows = []
-    for name, (latent, encoder, hidden, batch) in SIZES.items():
+    for name in arguments.sizes:
+        latent, encoder, hidden, batch = SIZES[name]
         torch.manual_seed(0)
         model = models.make(
             "tdmpc2",
@@ -74,7 +77,7 @@ def main() -> None:
             encoder_dim=encoder,
             hidden_dim=hidden,
         ).to(device)
-        learner = Learner(model, compile=arguments.compile)
+        learner = Learner(model, compile=arguments.compile, precision=arguments.precision)
         replay = make_replay(capacity=100_000, num_envs=64, window=3, batch_size=batch, device=device)
         replay.extend(experience(64, 500, device))
         fixed = replay.sample()

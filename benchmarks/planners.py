@@ -2,8 +2,10 @@
 
     python benchmarks/planners.py                          each with the numbers of its file in conf/planner
     python benchmarks/planners.py --planners mppi cem --sizes laptop --envs 1 16
+    python benchmarks/planners.py --sizes lewm --planners cem           to a goal picture
 
-The control rate is how many decisions per second each arm gets, if all are planned for in one call.
+The control rate is how many decisions per second each arm gets, if all are planned for in one call. On CUDA every
+decision is timed twice: with each operation launched from Python, and as one captured graph, which is what runs do.
 """
 
 from __future__ import annotations
@@ -19,12 +21,21 @@ from tensordict import TensorDict
 
 from franka_wm import models
 from franka_wm.envs import resolve_device
-from franka_wm.planning import CEM, ICEM, MPPI, GradientPlanner, PlannerPolicy
+from franka_wm.planning import (
+    CEM,
+    ICEM,
+    MPPI,
+    GoalImage,
+    GradientPlanner,
+    PlannerPolicy,
+    RewardPlusValue,
+)
 
 PLANNERS = {"mppi": MPPI, "cem": CEM, "icem": ICEM, "gradient": GradientPlanner}
 SIZES = {  # latent, encoder, hidden
-    "laptop": ("128/256 (laptop)", (128, 256, 256)),
-    "paper": ("512/512 (paper)", (512, 256, 512)),
+    "laptop": ("TD-MPC2 128/256 (laptop)", (128, 256, 256)),
+    "paper": ("TD-MPC2 512/512 (paper)", (512, 256, 512)),
+    "lewm": ("LeWorldModel (paper)", None),
 }
 REFERENCE_SECONDS = 1.39
 """One plan of MPPI, 512 × 6 × 3, for one environment of the reference library, on 2 CPU cores."""
@@ -55,61 +66,100 @@ def model_steps(policy: PlannerPolicy, observation: TensorDict) -> int:
     return count // observation.batch_size[0]
 
 
+def make_model(size: str) -> Any:
+    """The world model of this size, untrained; planning time does not depend on weights."""
+    sizes = SIZES[size][1]
+    if sizes is None:
+        return models.make("lewm", image_sizes={"pixels": (64, 64, 3)}, action_dim=7)
+    latent, encoder, hidden = sizes
+    return models.make(
+        "tdmpc2",
+        observation_sizes={"state": 20, "joint_target": 7},
+        action_dim=7,
+        episode_length=50,
+        latent_dim=latent,
+        encoder_dim=encoder,
+        hidden_dim=hidden,
+    )
+
+
+def make_observation(model: Any, envs: int, device: torch.device) -> TensorDict:
+    """What the policy reads."""
+    entries: dict[str, torch.Tensor] = {
+        key: torch.randn(envs, size, device=device) for key, size in model.observation_sizes.items()
+    }
+    for key, shape in model.image_sizes.items():
+        entries[key] = torch.randint(256, (envs, *shape), dtype=torch.uint8, device=device)
+        entries[f"goal_{key}"] = torch.randint(256, (envs, *shape), dtype=torch.uint8, device=device)
+    entries["is_init"] = torch.zeros(envs, 1, dtype=torch.bool, device=device)
+    return TensorDict(entries, batch_size=[envs])
+
+
+def make_objective(model: Any, compiled: bool) -> Any:
+    """Rewards plus value, or the distance to the goal's picture."""
+    if not hasattr(model, "value"):
+        return GoalImage(model.encode_goal, embed=model.embed)
+    wrap = torch.compile if compiled else lambda function: function
+    return RewardPlusValue(wrap(model.reward), wrap(model.value), model.discount)
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--device", default="auto")
     parser.add_argument("--planners", nargs="+", choices=PLANNERS, default=list(PLANNERS))
-    parser.add_argument("--sizes", nargs="+", choices=SIZES, default=list(SIZES), help="of the model")
+    parser.add_argument("--sizes", nargs="+", choices=SIZES, default=["laptop", "paper"], help="of the model")
     parser.add_argument("--envs", type=int, nargs="+", help="planned for in one call")
     parser.add_argument("--seconds", type=float, default=3.0, help="of each of three measurements")
+    parser.add_argument("--compile", action="store_true", help="torch.compile what the planner calls")
+    parser.add_argument("--precision", choices=["float32", "bfloat16"], default="float32")
+    parser.add_argument("--launched", nargs="+", choices=["eager", "captured"], help="default: both on CUDA")
     parser.add_argument("--out", help="JSON file to write")
     arguments = parser.parse_args()
     device = resolve_device(arguments.device)
-    if device.type == "cuda":
+    cuda = device.type == "cuda"
+    if cuda:
         torch.set_float32_matmul_precision("high")
     rows = []
+    low = torch.autocast(
+        device.type, torch.bfloat16, enabled=arguments.precision == "bfloat16", cache_enabled=False
+    )
     for size in arguments.sizes:
-        label, (latent, encoder, hidden) = SIZES[size]
-        model = models.make(
-            "tdmpc2",
-            observation_sizes={"state": 20, "joint_target": 7},
-            action_dim=7,
-            episode_length=50,
-            latent_dim=latent,
-            encoder_dim=encoder,
-            hidden_dim=hidden,
-        ).to(device)
+        model = make_model(size).to(device)
         for name in arguments.planners:
-            policy = PlannerPolicy.for_model(model, make_planner(name))
-            for envs in arguments.envs or ([1, 64, 1024] if device.type == "cuda" else [1, 4]):
-                observation = TensorDict(
-                    {
-                        "state": torch.randn(envs, 20, device=device),
-                        "joint_target": torch.randn(envs, 7, device=device),
-                        "is_init": torch.zeros(envs, 1, dtype=torch.bool, device=device),
-                    },
-                    batch_size=[envs],
+            objective = make_objective(model, arguments.compile)
+            for launched in arguments.launched or (["eager", "captured"] if cuda else ["eager"]):
+                policy = PlannerPolicy.for_model(
+                    model, make_planner(name), objective=objective, capture=launched == "captured"
                 )
-                steps = model_steps(policy, observation)
-                calls = rate(lambda: policy(observation), seconds=arguments.seconds)
-                rows.append(
-                    {
-                        "planner": name,
-                        "latent/hidden": label,
-                        "environments": envs,
-                        "model steps per decision": steps,
-                        "time per call [ms]": 1e3 / calls,
-                        "control rate [Hz]": calls,
-                        "decisions [1/s]": calls * envs,
-                        "reference / ours": REFERENCE_SECONDS * calls
-                        if envs == 1 and name == "mppi"
-                        else "–",
-                    }
-                )
-                print(rows[-1], flush=True)
-    publish("planners, with rewards and a terminal value", rows, arguments.out)
+                if arguments.compile:
+                    policy.next = torch.compile(policy.next)
+                for envs in arguments.envs or ([1, 64, 1024] if cuda else [1, 4]):
+                    observation = make_observation(model, envs, device)
+                    with low:
+                        steps = model_steps(policy, observation)
+                        calls = rate(lambda: policy(observation), seconds=arguments.seconds)
+                    rows.append(
+                        {
+                            "planner": name,
+                            "model": SIZES[size][0],
+                            "launched": launched,
+                            "environments": envs,
+                            "model steps per decision": steps,
+                            "time per call [ms]": 1e3 / calls,
+                            "control rate [Hz]": calls,
+                            "decisions [1/s]": calls * envs,
+                            "reference / ours": REFERENCE_SECONDS * calls
+                            if envs == 1 and name == "mppi" and size != "lewm"
+                            else "–",
+                        }
+                    )
+                    print(rows[-1], flush=True)
+    details = ", compiled" if arguments.compile else ""
+    publish(
+        f"planners, with rewards and a terminal value, {arguments.precision}{details}", rows, arguments.out
+    )
 
 
 if __name__ == "__main__":

@@ -2,14 +2,14 @@
 
 python benchmarks/search.py                  50 simulations of PUCT and of Gumbel over 15 moves
 python benchmarks/search.py --envs 1 --variants puct
+
+On CUDA every search is timed twice: launched operation by operation, and as one captured graph, which is what runs do.
 """
 
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable
 from functools import partial
-from typing import Any
 
 import torch
 from common import publish, rate
@@ -45,7 +45,6 @@ def main() -> None:
     rows = []
     for variant in arguments.variants:
         search = MCTS(num_actions=MOVES, num_simulations=arguments.simulations, variant=variant)
-        policy = SearchPolicy.for_model(model, search, explore=True)
         for envs in arguments.envs:
             observation = TensorDict(
                 {
@@ -54,12 +53,9 @@ def main() -> None:
                 },
                 batch_size=[envs],
             )
-            eager = partial(policy, observation)
-            ways: dict[str, Callable[[], Any]] = {"eager": eager}
-            if device.type == "cuda":
-                ways["CUDA graph"] = captured(eager)
-            for way, decide in ways.items():
-                decisions = rate(decide, seconds=arguments.seconds, warmup=1)
+            for way in ("eager", "captured") if device.type == "cuda" else ("eager",):
+                policy = SearchPolicy.for_model(model, search, explore=True, capture=way == "captured")
+                decisions = rate(partial(policy, observation), seconds=arguments.seconds)
                 rows.append(
                     {
                         "variant": variant,
@@ -73,20 +69,6 @@ def main() -> None:
                 )
                 print(rows[-1], flush=True)
     publish(f"tree search: {arguments.simulations} simulations, {MOVES} moves", rows, arguments.out)
-
-
-def captured(work: Callable[[], Any]) -> Callable[[], Any]:
-    """`work` as one CUDA graph."""
-    stream = torch.cuda.Stream()
-    stream.wait_stream(torch.cuda.current_stream())
-    with torch.cuda.stream(stream):
-        for _ in range(3):
-            work()
-    torch.cuda.current_stream().wait_stream(stream)
-    graph = torch.cuda.CUDAGraph()
-    with torch.cuda.graph(graph):
-        work()
-    return graph.replay
 
 
 if __name__ == "__main__":

@@ -7,11 +7,12 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 import torch
-from tensordict import TensorDictBase
+from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import InteractionType, TensorDictModuleBase
 from tensordict.nn.probabilistic import interaction_type
 from torch import Tensor, nn
 
+from franka_wm.planning.capture import GraphCache
 from franka_wm.planning.mppi import MPPI, Objective
 from franka_wm.planning.objectives import RewardPlusValue
 
@@ -38,6 +39,10 @@ class PlannerPolicy(TensorDictModuleBase):
     An objective that depends on the observation (a goal picture) has `bind(tensordict)`, which is called at
     every decision.
 
+    On CUDA the third decision of a kind (so many environments, exploring or not, these settings) is captured as
+    a graph, which the later ones replay; see `franka_wm.planning.capture.GraphCache`. Then weights must be
+    changed in place, and planner, model and objective must not read values on the host.
+
     Args:
         planner: MPPI or anything with its `plan`.
         encode: observation TensorDict of batch size [E] -> latents (E, D).
@@ -50,6 +55,10 @@ class PlannerPolicy(TensorDictModuleBase):
         model: the module behind the callables, so that collectors find its parameters and move it along. If
             the policy is to be copied (as collectors do for other processes), pass bound methods and objects,
             not closures.
+        capture: replay decisions as CUDA graphs; None: where the observations are on CUDA.
+
+    Raises:
+        RuntimeError: at a decision that cannot be captured.
     """
 
     def __init__(
@@ -64,6 +73,7 @@ class PlannerPolicy(TensorDictModuleBase):
         prior: Callable[[Tensor], Tensor] | None = None,
         explore: bool | None = None,
         model: nn.Module | None = None,
+        capture: bool | None = None,
     ) -> None:
         super().__init__()
         self.in_keys = [*observation_keys, *getattr(objective, "in_keys", ()), "is_init"]
@@ -71,7 +81,8 @@ class PlannerPolicy(TensorDictModuleBase):
         self.out_keys = ["action", "plan", *context]
         self.planner, self.explore, self.model = planner, explore, model
         self.encode, self.next, self.objective, self.prior = encode, next, objective, prior
-        self.observe = observe
+        self.observe, self.capture = observe, capture
+        self._graphs = GraphCache()
 
     @classmethod
     def for_model(
@@ -82,13 +93,14 @@ class PlannerPolicy(TensorDictModuleBase):
         observation_keys: Sequence[str] | None = None,
         objective: Objective | None = None,
         explore: bool | None = None,
+        capture: bool | None = None,
     ) -> "PlannerPolicy":
         """Plan with any model that has `encode` and `next`.
 
         Args:
             observation_keys: the model's own, `observation_keys` or `observation_sizes`, when None.
             objective: rewards plus value of the model, with its `discount`, when None.
-            explore: see the class.
+            explore, capture: see the class.
 
         A model with `policy` supplies the prior.
 
@@ -114,6 +126,7 @@ class PlannerPolicy(TensorDictModuleBase):
             prior=getattr(model, "policy", None),
             explore=explore,
             model=model if isinstance(model, nn.Module) else None,
+            capture=capture,
         )
 
     @torch.no_grad()
@@ -125,11 +138,38 @@ class PlannerPolicy(TensorDictModuleBase):
         """
         if len(tensordict.batch_size) != 1:
             raise ValueError(f"expected batch size [E], got {list(tensordict.batch_size)}")
-        previous, is_init = tensordict.get("plan", None), tensordict.get("is_init", None)
-        if previous is not None and is_init is None:
+        # The last action is read by objectives that weigh smoothness.
+        read = (*self.in_keys, "plan", "context", "context_action", "action")
+        inputs = TensorDict(
+            {key: value for key in read if (value := tensordict.get(key, None)) is not None},
+            batch_size=tensordict.batch_size,
+        )
+        if "plan" in inputs and "is_init" not in inputs:
             raise ValueError(
                 "a plan is carried but is_init is missing: append torchrl.envs.InitTracker to the env"
             )
+        explore = _explores(self.explore)
+        if self._captures(inputs):
+            modes = (explore, None if self.model is None else self.model.training)
+            held = (self.planner, self.encode, self.next, self.objective, self.observe, self.prior)
+            decision = self._graphs(
+                lambda entries: self._decide(entries, explore),
+                inputs,
+                key=(modes, *sorted((name, repr(value)) for name, value in vars(self.planner).items())),
+                held=held,
+            )
+        else:
+            decision = self._decide(inputs, explore)
+        return tensordict.update(decision)
+
+    def _captures(self, inputs: TensorDictBase) -> bool:
+        if self.capture is not None:
+            return self.capture
+        return inputs.get(self.in_keys[0]).is_cuda
+
+    def _decide(self, tensordict: TensorDictBase, explore: bool) -> TensorDict:
+        """What the policy writes."""
+        is_init = tensordict.get("is_init", None)
         z = self._latent(tensordict, is_init)
         bind = getattr(self.objective, "bind", None)
         result = self.planner.plan(
@@ -137,15 +177,14 @@ class PlannerPolicy(TensorDictModuleBase):
             self.next,
             self.objective if bind is None else bind(tensordict),
             prior=self.prior,
-            previous=previous,
+            previous=tensordict.get("plan", None),
             is_init=is_init,
-            explore=_explores(self.explore),
+            explore=explore,
         )
-        tensordict.set("action", result.get("action"))
-        tensordict.set("plan", result.get("plan"))
+        decision = result.select("action", "plan")
         if self.observe is not None:
-            tensordict.set("context", z).set("context_action", result.get("action"))
-        return tensordict
+            decision.set("context", z).set("context_action", result.get("action"))
+        return decision
 
     def _latent(self, tensordict: TensorDictBase, is_init: Tensor | None) -> Tensor:
         before = None if self.observe is None else tensordict.get("context", None)

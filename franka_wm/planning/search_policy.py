@@ -4,11 +4,12 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 import torch
-from tensordict import TensorDictBase
+from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import InteractionType, TensorDictModuleBase
 from tensordict.nn.probabilistic import interaction_type
 from torch import Tensor, nn
 
+from franka_wm.planning.capture import GraphCache
 from franka_wm.planning.mcts import MCTS
 from franka_wm.planning.tree import Recurrent
 
@@ -30,6 +31,10 @@ class SearchPolicy(TensorDictModuleBase):
         model: the module behind the callables, so that collectors find its parameters and move it along. If
             the policy is to be copied, pass bound methods, not closures.
         generator: source of the noise.
+        capture: replay decisions as CUDA graphs, see `PlannerPolicy`; None: where the observations are on CUDA.
+
+    Raises:
+        RuntimeError: at a decision that cannot be captured.
     """
 
     def __init__(
@@ -43,12 +48,14 @@ class SearchPolicy(TensorDictModuleBase):
         explore: bool | None = None,
         model: nn.Module | None = None,
         generator: torch.Generator | None = None,
+        capture: bool | None = None,
     ) -> None:
         super().__init__()
         self.in_keys = list(observation_keys)
         self.out_keys = ["action", "search_policy", "search_value"]
         self.search, self.explore, self.model, self.generator = search, explore, model, generator
         self.encode, self.prediction, self.recurrent = encode, prediction, recurrent
+        self.capture, self._graphs = capture, GraphCache()
 
     @classmethod
     def for_model(
@@ -58,6 +65,7 @@ class SearchPolicy(TensorDictModuleBase):
         *,
         explore: bool | None = None,
         generator: torch.Generator | None = None,
+        capture: bool | None = None,
     ) -> "SearchPolicy":
         """Search with a model that has `encode`, `prediction`, `recurrent` and `num_actions`.
 
@@ -86,6 +94,7 @@ class SearchPolicy(TensorDictModuleBase):
             explore=explore,
             model=model if isinstance(model, nn.Module) else None,
             generator=generator,
+            capture=capture,
         )
 
     @torch.no_grad()
@@ -97,12 +106,34 @@ class SearchPolicy(TensorDictModuleBase):
         """
         if len(tensordict.batch_size) != 1:
             raise ValueError(f"expected batch size [E], got {list(tensordict.batch_size)}")
+        explore = interaction_type() is InteractionType.RANDOM if self.explore is None else self.explore
+        inputs = tensordict.select(*self.in_keys)
+        captures = inputs.get(self.in_keys[0]).is_cuda if self.capture is None else self.capture
+        if not captures:
+            return tensordict.update(self._decide(inputs, explore))
+        modes = (explore, None if self.model is None else self.model.training)
+        return tensordict.update(
+            self._graphs(
+                lambda entries: self._decide(entries, explore),
+                inputs,
+                key=(modes, *sorted((name, repr(value)) for name, value in vars(self.search).items())),
+                held=(self.search, self.encode, self.prediction, self.recurrent),
+                generators=() if self.generator is None else (self.generator,),
+            )
+        )
+
+    def _decide(self, tensordict: TensorDictBase, explore: bool) -> TensorDict:
+        """What the policy writes."""
         z = self.encode(tensordict)
         logits, value = self.prediction(z)
-        explore = interaction_type() is InteractionType.RANDOM if self.explore is None else self.explore
         found = self.search.search(
             logits, value, z, self.recurrent, explore=explore, generator=self.generator
         )
-        for key, entry in (("action", "action"), ("search_policy", "policy"), ("search_value", "value")):
-            tensordict.set(key, found.get(entry))
-        return tensordict
+        return TensorDict(
+            {
+                "action": found.get("action"),
+                "search_policy": found.get("policy"),
+                "search_value": found.get("value"),
+            },
+            batch_size=tensordict.batch_size,
+        )

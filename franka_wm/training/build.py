@@ -250,7 +250,14 @@ def make_objective(cfg: DictConfig, model: Any) -> Any:
 
 
 def make_policies(
-    model: Any, planner: Any, env: Any, *, seed: int = 0, smoothness: float = 0.7, objective: Any = None
+    model: Any,
+    planner: Any,
+    env: Any,
+    *,
+    seed: int = 0,
+    smoothness: float = 0.7,
+    objective: Any = None,
+    capture: bool | None = None,
 ) -> dict[str, Any]:
     """Every policy that can act or be compared, by name.
 
@@ -260,9 +267,9 @@ def make_policies(
     policies: dict[str, Any] = {}
     discrete = not env.action_spec.dtype.is_floating_point
     if discrete:
-        policies["planner"] = planning.SearchPolicy.for_model(model, planner)
+        policies["planner"] = planning.SearchPolicy.for_model(model, planner, capture=capture)
     elif hasattr(model, "next"):
-        policies["planner"] = PlannerPolicy.for_model(model, planner, objective=objective)
+        policies["planner"] = PlannerPolicy.for_model(model, planner, objective=objective, capture=capture)
     if hasattr(model, "policy"):
         policies["policy"] = ModelPolicy.for_model(model)
     return policies | make_scripted_policies(env, seed=seed, smoothness=smoothness)
@@ -300,6 +307,7 @@ def make_agent_policies(cfg: DictConfig, model: Any, env: Any, spaces: Spaces) -
         seed=cfg.seed,
         smoothness=cfg.collector.smoothness,
         objective=make_objective(cfg, model),
+        capture=cfg.trainer.capture,
     )
 
 

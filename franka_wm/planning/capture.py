@@ -1,0 +1,131 @@
+"""A decision as one CUDA graph: planning is thousands of small operations, and launching them takes the time."""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+from collections.abc import Callable, Hashable, Sequence
+from typing import Any, NamedTuple
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+
+Work = Callable[[TensorDictBase], TensorDict]
+"""Entries in, entries out: tensors of fixed shapes, nothing read back by the host."""
+
+
+class _Graph(NamedTuple):
+    graph: torch.cuda.CUDAGraph
+    inputs: TensorDict
+    outputs: TensorDict
+    held: tuple[Any, ...]
+
+
+class GraphCache:
+    """Calls work eagerly at first, then as a CUDA graph, one for each kind of input.
+
+    A graph repeats the very operations on the very memory that it was captured with. So weights must be changed in
+    place, as optimisers do, and what else decides on the operations (settings, modes) belongs into `key`. Work that
+    reads values on the host cannot be captured.
+
+    Noise of the default generator goes on from where it stands, and follows `torch.manual_seed`, in a graph too; other
+    generators must be named.
+
+    Args:
+        keep: how many graphs are kept; the one not used for longest goes first.
+    """
+
+    EAGER_CALLS = 2
+    """Before the capture: they let libraries allocate what a graph may not."""
+
+    def __init__(self, keep: int = 8) -> None:
+        self.keep = keep
+        self._seen: dict[Hashable, int] = {}
+        self._graphs: OrderedDict[Hashable, _Graph] = OrderedDict()
+
+    def __call__(
+        self,
+        work: Work,
+        inputs: TensorDictBase,
+        *,
+        key: Hashable = None,
+        held: tuple[Any, ...] = (),
+        generators: Sequence[torch.Generator] = (),
+    ) -> TensorDict:
+        """`work(inputs)`; from the third call of a kind on, by replaying a graph.
+
+        Args:
+            inputs: on a CUDA device; names, shapes and dtypes are part of the kind.
+            key: what else is.
+            held: objects that the graph reads from: the same objects are part of the kind, and are kept alive.
+            generators: sources of noise besides the default one.
+
+        Returns:
+            Entries of their own memory: the next call does not overwrite them.
+
+        Raises:
+            RuntimeError: the work cannot be captured.
+        """
+        shapes = tuple(
+            (name, tuple(x.shape), x.dtype)
+            for name, x in sorted(inputs.items(), key=lambda item: str(item[0]))
+        )
+        kind = (key, tuple(id(one) for one in held), shapes, inputs.device)
+        found = self._graphs.get(kind)
+        if found is None:
+            seen = self._seen.get(kind, 0)
+            if seen < self.EAGER_CALLS:
+                if len(self._seen) > 64:  # kinds that came once and never again
+                    self._seen.clear()
+                self._seen[kind] = seen + 1
+                return _beside(work, inputs)
+            found = self._graphs[kind] = _record(work, inputs, held, generators)
+            del self._seen[kind]
+            while len(self._graphs) > self.keep:
+                self._graphs.popitem(last=False)
+        else:
+            self._graphs.move_to_end(kind)
+            for name, static in found.inputs.items():
+                static.copy_(inputs.get(name))
+        found.graph.replay()
+        return found.outputs.clone()
+
+    def clear(self) -> None:
+        """Forget all graphs."""
+        self._seen.clear()
+        self._graphs.clear()
+
+    # A graph belongs to its process and its memory.
+    def __deepcopy__(self, memo: dict[int, Any]) -> GraphCache:
+        return GraphCache(self.keep)
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return GraphCache, (self.keep,)
+
+
+def _beside(work: Work, inputs: TensorDictBase) -> TensorDict:
+    """`work(inputs)` on a stream of its own, as the capture will be."""
+    stream = torch.cuda.Stream()
+    stream.wait_stream(torch.cuda.current_stream())
+    with torch.cuda.stream(stream):
+        outputs = work(inputs)
+    torch.cuda.current_stream().wait_stream(stream)
+    return outputs
+
+
+def _record(
+    work: Work, inputs: TensorDictBase, held: tuple[Any, ...], generators: Sequence[torch.Generator]
+) -> _Graph:
+    static = TensorDict({name: x.clone() for name, x in inputs.items()}, batch_size=inputs.batch_size)
+    graph = torch.cuda.CUDAGraph()
+    for generator in generators:
+        graph.register_generator_state(generator)
+    try:
+        # Other threads (a live page, a data loader) may allocate meanwhile.
+        with torch.cuda.graph(graph, capture_error_mode="thread_local"):
+            outputs = work(static)
+    except RuntimeError as error:
+        raise RuntimeError(
+            "this decision cannot be captured as a CUDA graph, because something in it waits for the device or copies "
+            f"from the host; mend it, or give capture=False (train.py: trainer.capture=false): {error}"
+        ) from error
+    return _Graph(graph, static, outputs, held)

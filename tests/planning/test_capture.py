@@ -1,0 +1,223 @@
+"""Decisions as CUDA graphs: when one is captured, what it remembers, and, on a GPU, that it decides the same."""
+
+import copy
+import pickle
+
+import pytest
+import torch
+from tensordict import TensorDict
+
+from franka_wm import models
+from franka_wm.planning import CEM, MCTS, MPPI, PlannerPolicy, SearchPolicy, capture
+from franka_wm.planning.capture import GraphCache
+
+on_gpu = pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
+
+
+class FakeGraph:
+    """Replays by running the work again on the captured memory, as a graph does."""
+
+    def __init__(self, work, inputs, outputs):
+        self.work, self.inputs, self.outputs = work, inputs, outputs
+
+    def replay(self):
+        self.outputs.update_(self.work(self.inputs))
+
+
+@pytest.fixture
+def recorded(monkeypatch):
+    """How often a capture took place, without a GPU."""
+    count = []
+
+    def record(work, inputs, held, generators):
+        count.append(1)
+        static = inputs.clone()
+        outputs = work(static).clone()
+        return capture._Graph(FakeGraph(work, static, outputs), static, outputs, held)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(capture, "_record", record)
+    monkeypatch.setattr(capture, "_beside", lambda work, inputs: work(inputs))
+    return count
+
+
+def double(entries):
+    return TensorDict({"y": 2 * entries["x"]}, batch_size=entries.batch_size)
+
+
+def numbers(value, size=3):
+    return TensorDict({"x": torch.full((size,), float(value))}, batch_size=[size])
+
+
+def test_the_third_call_of_a_kind_is_captured_and_sees_new_inputs(recorded):
+    cache = GraphCache()
+    results = [cache(double, numbers(n)) for n in range(6)]
+    assert len(recorded) == 1
+    for n, result in enumerate(results):  # none was overwritten by a later one
+        assert (result["y"] == 2 * n).all()
+
+
+def test_kinds_are_kept_apart(recorded):
+    cache, one, other = GraphCache(), object(), object()
+    for _ in range(4):
+        for size in (2, 3):
+            for key in ("a", "b"):
+                for held in (one, other):
+                    assert cache(double, numbers(1, size), key=key, held=(held,))["y"].shape == (size,)
+    assert len(recorded) == 8
+
+
+def test_the_graph_not_used_for_longest_is_forgotten(recorded):
+    cache = GraphCache(keep=2)
+    for key in "abab" * 2 + "ccc":
+        cache(double, numbers(1), key=key)
+    assert len(recorded) == 3 and len(cache._graphs) == 2
+    assert [kind[0] for kind in cache._graphs] == ["b", "c"]  # type: ignore[index]
+
+
+def test_copies_have_no_graphs(recorded):
+    cache = GraphCache(keep=5)
+    for n in range(3):
+        cache(double, numbers(n))
+    for twin in (copy.deepcopy(cache), pickle.loads(pickle.dumps(cache))):
+        assert not twin._graphs and twin.keep == 5
+
+
+def test_a_policy_captures_anew_when_settings_mode_or_planner_change(recorded):
+    model = small_model()
+    policy = PlannerPolicy.for_model(model, small(MPPI), capture=True, explore=False)
+
+    def decide():
+        for _ in range(3):
+            policy(observation(4))
+
+    decide()
+    assert len(recorded) == 1
+    for change in (
+        lambda: setattr(policy.planner, "temperature", 2.0),
+        lambda: setattr(policy, "planner", small(CEM)),
+        lambda: model.eval(),
+        lambda: setattr(policy, "explore", True),
+    ):
+        before = len(recorded)
+        decide()
+        assert len(recorded) == before
+        change()
+        decide()
+        assert len(recorded) == before + 1
+
+
+def test_no_capture_on_the_cpu_unless_asked_for(recorded):
+    policy = PlannerPolicy.for_model(small_model(), small(MPPI))
+    for _ in range(4):
+        policy(observation(2))
+    assert not recorded
+
+
+def small_model(device="cpu"):
+    torch.manual_seed(0)
+    return models.make(
+        "tdmpc2",
+        observation_sizes={"state": 6},
+        action_dim=2,
+        episode_length=20,
+        latent_dim=16,
+        encoder_dim=16,
+        hidden_dim=16,
+    ).to(device)
+
+
+def small(planner):
+    return planner(action_dim=2, horizon=2, num_samples=16, num_elites=4, iterations=2, num_policy_samples=2)
+
+
+def observation(envs, device="cpu", seed=0):
+    generator = torch.Generator().manual_seed(seed)
+    entries = {
+        "state": torch.randn(envs, 6, generator=generator),
+        "plan": torch.zeros(envs, 2, 2),
+        "is_init": torch.zeros(envs, 1, dtype=torch.bool),
+    }
+    return TensorDict(entries, batch_size=[envs]).to(device)
+
+
+# -- on a GPU ---------------------------------------------------------------------------------------------
+
+
+@pytest.mark.gpu
+@on_gpu
+@pytest.mark.parametrize("explore", [False, True])
+def test_captured_plans_are_the_eager_ones(explore):
+    """With the same seed: noise goes on from where the default generator stands, in a graph as outside."""
+    model = small_model("cuda")
+    eager, captured = (
+        PlannerPolicy.for_model(model, small(MPPI), explore=explore, capture=wanted)
+        for wanted in (False, True)
+    )
+    for seed in range(6):
+        torch.manual_seed(seed)
+        expected = eager(observation(8, "cuda", seed))
+        torch.manual_seed(seed)
+        found = captured(observation(8, "cuda", seed))
+        for key in ("action", "plan"):
+            torch.testing.assert_close(found[key], expected[key], rtol=1e-3, atol=1e-4)
+    assert len(captured._graphs._graphs) == 1
+
+
+@pytest.mark.gpu
+@on_gpu
+def test_a_captured_decision_sees_new_weights():
+    model = small_model("cuda").eval()
+    policy = PlannerPolicy.for_model(model, small(MPPI), explore=False)
+    for _ in range(4):
+        torch.manual_seed(0)
+        before = policy(observation(8, "cuda"))["action"]
+    torch.manual_seed(0)
+    assert torch.equal(policy(observation(8, "cuda"))["action"], before)
+    with torch.no_grad():
+        for parameter in model.parameters():
+            parameter.add_(torch.randn_like(parameter))
+    torch.manual_seed(0)
+    assert not torch.equal(policy(observation(8, "cuda"))["action"], before)
+
+
+@pytest.mark.gpu
+@on_gpu
+@pytest.mark.parametrize("variant", ["puct", "gumbel"])
+@pytest.mark.parametrize("own_generator", [False, True])
+def test_captured_searches_are_the_eager_ones(variant, own_generator):
+    torch.manual_seed(0)
+    model = models.make("muzero", observation_sizes={"state": 6}, num_actions=5, latent_dim=16, hidden_dim=16)
+    model = model.cuda().eval()
+    search = MCTS(num_actions=5, num_simulations=12, variant=variant)
+    generators = [torch.Generator("cuda") if own_generator else None for _ in range(2)]
+    eager, captured = (
+        SearchPolicy.for_model(model, search, explore=True, capture=wanted, generator=generator)
+        for wanted, generator in zip((False, True), generators, strict=True)
+    )
+    agreeing = []
+    for seed in range(6):
+        found = []
+        for policy, generator in ((eager, generators[0]), (captured, generators[1])):
+            torch.manual_seed(seed)
+            if generator is not None:
+                generator.manual_seed(seed)
+            found.append(policy(observation(64, "cuda", seed).select("state")))
+        agreeing.append((found[0]["action"] == found[1]["action"]).float().mean())
+        assert (found[0]["search_policy"].sum(-1) - 1).abs().max() < 1e-5
+    assert torch.stack(agreeing).mean() > 0.95  # rounding may turn a tie
+    assert len(captured._graphs._graphs) == 1
+
+
+@pytest.mark.gpu
+@on_gpu
+def test_work_that_waits_for_the_device_is_refused_in_one_line():
+    def waits(entries):
+        return TensorDict({"y": entries["x"] * entries["x"].sum().item()}, batch_size=entries.batch_size)
+
+    cache, inputs = GraphCache(), numbers(1).to("cuda")
+    for _ in range(GraphCache.EAGER_CALLS):
+        cache(waits, inputs)
+    with pytest.raises(RuntimeError, match=r"trainer\.capture=false"):
+        cache(waits, inputs)
+    torch.cuda.synchronize()
+    assert torch.ones(2, device="cuda").sum().item() == 2  # the device goes on working
