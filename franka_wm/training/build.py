@@ -43,8 +43,13 @@ def actor(cfg: DictConfig) -> str:
     there = {"planner": hasattr(family, "next"), "policy": hasattr(family, "policy")}
     searched = bool(getattr(family, "replay_keys", ()))  # the loss needs what the search found
     if acts == "auto":
-        usable = [name for name in ("policy", "planner") if there[name]]
-        return "planner" if searched else (usable or ["random"])[0]
+        if searched:
+            return "planner"
+        if there["policy"]:
+            return "policy"
+        # A planner without a policy's candidates takes far longer to decide than the worlds to step, and a model that
+        # is given goals by their pictures can learn from any motion.
+        return "planner" if objective_name(cfg) == "reward_value" else "random"
     if not there.get(acts, True) or (searched and acts != "planner"):
         fitting = "planner" if there["planner"] else "smooth"
         raise UserError(f"collector.acts={acts}: model={cfg.model.name} cannot; use collector.acts={fitting}")
