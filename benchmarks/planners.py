@@ -11,6 +11,7 @@ decision is timed twice: with each operation launched from Python, and as one ca
 from __future__ import annotations
 
 import argparse
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -28,7 +29,6 @@ from franka_wm.planning import (
     GoalImage,
     GradientPlanner,
     PlannerPolicy,
-    RewardPlusValue,
 )
 
 PLANNERS = {"mppi": MPPI, "cem": CEM, "icem": ICEM, "gradient": GradientPlanner}
@@ -45,7 +45,8 @@ def make_planner(name: str) -> Any:
     """The planner as `planner=NAME` sets it up."""
     file = Path(__file__).resolve().parents[1] / "conf" / "planner" / f"{name}.yaml"
     settings = dict(OmegaConf.to_container(OmegaConf.load(file)))  # type: ignore[arg-type]
-    settings.pop("name")
+    for key in ("name", "precision", "compile"):
+        settings.pop(key)
     return PLANNERS[name](action_dim=7, **settings)
 
 
@@ -95,14 +96,6 @@ def make_observation(model: Any, envs: int, device: torch.device) -> TensorDict:
     return TensorDict(entries, batch_size=[envs])
 
 
-def make_objective(model: Any, compiled: bool) -> Any:
-    """Rewards plus value, or the distance to the goal's picture."""
-    if not hasattr(model, "value"):
-        return GoalImage(model.encode_goal, embed=model.embed)
-    wrap = torch.compile if compiled else lambda function: function
-    return RewardPlusValue(wrap(model.reward), wrap(model.value), model.discount)
-
-
 def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
@@ -122,24 +115,24 @@ def main() -> None:
     if cuda:
         torch.set_float32_matmul_precision("high")
     rows = []
-    low = torch.autocast(
-        device.type, torch.bfloat16, enabled=arguments.precision == "bfloat16", cache_enabled=False
-    )
     for size in arguments.sizes:
         model = make_model(size).to(device)
         for name in arguments.planners:
-            objective = make_objective(model, arguments.compile)
+            # Rewards plus value, or the distance to the goal's picture.
+            objective = None if hasattr(model, "value") else GoalImage(model.encode_goal, embed=model.embed)
             for launched in arguments.launched or (["eager", "captured"] if cuda else ["eager"]):
                 policy = PlannerPolicy.for_model(
-                    model, make_planner(name), objective=objective, capture=launched == "captured"
+                    model,
+                    make_planner(name),
+                    objective=objective,
+                    capture=launched == "captured",
+                    precision=arguments.precision,
+                    compile=arguments.compile,
                 )
-                if arguments.compile:
-                    policy.next = torch.compile(policy.next)
                 for envs in arguments.envs or ([1, 64, 1024] if cuda else [1, 4]):
                     observation = make_observation(model, envs, device)
-                    with low:
-                        steps = model_steps(policy, observation)
-                        calls = rate(lambda: policy(observation), seconds=arguments.seconds)
+                    steps = model_steps(policy, observation)
+                    calls = rate(partial(policy, observation), seconds=arguments.seconds)
                     rows.append(
                         {
                             "planner": name,

@@ -138,14 +138,17 @@ def check_external(config: ExternalConfig) -> None:
 
 
 def _make_one(config: ExternalConfig) -> EnvBase:
+    # The device is said, or TorchRL would not move the masks of a reset to where the simulator is.
     try:
         if config.kind == "gym":
             from torchrl.envs import GymEnv
 
-            return GymEnv(config.name, frame_skip=config.frame_skip, categorical_action_encoding=True)
+            return GymEnv(
+                config.name, frame_skip=config.frame_skip, categorical_action_encoding=True, device="cpu"
+            )
         from torchrl.envs import DMControlEnv
 
-        return DMControlEnv(config.name, config.task, frame_skip=config.frame_skip)
+        return DMControlEnv(config.name, config.task, frame_skip=config.frame_skip, device="cpu")
     except ImportError as error:
         extra = config.kind
         raise UserError(f"env={extra} needs pip install 'franka-wm[{extra}]' ({error})") from error

@@ -22,7 +22,7 @@ class Randomizer:
     """Draws for the masked worlds at every reset, inside the captured graph.
 
     The drawn values live in the Newton model's own arrays, which hold one row for each world; MuJoCo's copy of
-    the physical ones is refreshed only in steps in which some world is reset.
+    the physical ones is refreshed, on the CPU only in steps in which some world is reset.
 
     Args:
         sim: The simulation; its config says what is drawn.
@@ -87,6 +87,11 @@ class Randomizer:
                 ],
                 device=sim.device,
             )  # fmt: skip
+            if wp.get_device(sim.device).is_cuda:
+                # A conditional part of a CUDA graph must not allocate, which MuJoCo's refresh does; the values of
+                # worlds that are not reset are the ones that they had.
+                self.apply()
+                return
             self._any.zero_()
             wp.launch(kernels.any_masked, sim.num_envs, [mask, self._any], device=sim.device)
             wp.capture_if(self._any, self.apply)

@@ -41,6 +41,25 @@ def hide_invalid(mask: Tensor, valid: Tensor, tokens: int = 1) -> Tensor:
     return (mask & seen) | itself
 
 
+SHORT = 8
+"""Sequences up to this length are attended to by `short_attention` on CUDA."""
+
+
+def short_attention(q: Tensor, k: Tensor, v: Tensor, mask: Tensor) -> Tensor:
+    """`scaled_dot_product_attention` for sequences of a few tokens, written out.
+
+    Fused kernels work on tiles of at least 64 queries and keys: for a history of three frames, which a planner
+    asks about ten thousand times at once, they compute hundreds of products to use nine.
+
+    Args:
+        q, k, v: (N, heads, L, D).
+        mask: broadcasts to (N, heads, L, L), bool.
+    """
+    scores = (q.unsqueeze(3) * k.unsqueeze(2)).sum(-1) * q.shape[-1] ** -0.5
+    weights = scores.masked_fill(~mask, -torch.inf).softmax(-1).to(v.dtype)
+    return (weights.unsqueeze(-1) * v.unsqueeze(2)).sum(3)
+
+
 def rotary(x: Tensor, positions: Tensor) -> Tensor:
     """Rotate pairs of features of queries or keys (N, heads, L, D) by their positions (L,); D even."""
     half = x.shape[-1] // 2
@@ -112,9 +131,11 @@ class CausalBlock(nn.Module):
 
     def _attend(self, x: Tensor, positions: Tensor, mask: Tensor) -> Tensor:
         q, k, v = self.qkv(x).unflatten(-1, (3, self.heads, -1)).permute(2, 0, 3, 1, 4)
-        attended = F.scaled_dot_product_attention(
-            rotary(q, positions), rotary(k, positions), v, attn_mask=mask
-        )
+        q, k = rotary(q, positions), rotary(k, positions)
+        if x.is_cuda and x.shape[1] <= SHORT:
+            attended = short_attention(q, k, v, mask)
+        else:
+            attended = F.scaled_dot_product_attention(q, k, v, attn_mask=mask)
         return self.out(attended.transpose(1, 2).flatten(-2))
 
     def _mlp(self, x: Tensor, dropout: bool) -> Tensor:

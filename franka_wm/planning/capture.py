@@ -117,6 +117,8 @@ def _record(
 ) -> _Graph:
     static = TensorDict({name: x.clone() for name, x in inputs.items()}, batch_size=inputs.batch_size)
     graph = torch.cuda.CUDAGraph()
+    default = torch.cuda.default_generators[static.device.index or 0]  # type: ignore[union-attr]
+    noise = default.get_state()
     for generator in generators:
         graph.register_generator_state(generator)
     try:
@@ -124,6 +126,10 @@ def _record(
         with torch.cuda.graph(graph, capture_error_mode="thread_local"):
             outputs = work(static)
     except RuntimeError as error:
+        # The default generator believes that it is still being captured, and would refuse to draw from now on.
+        fresh = torch.Generator(static.device)  # type: ignore[arg-type]
+        fresh.set_state(noise)
+        default.graphsafe_set_state(fresh.graphsafe_get_state())
         raise RuntimeError(
             "this decision cannot be captured as a CUDA graph, because something in it waits for the device or copies "
             f"from the host; mend it, or give capture=False (train.py: trainer.capture=false): {error}"

@@ -54,6 +54,12 @@ class RewardPlusValue:
             raise ValueError(f"discount must be in [0, 1], got {discount}")
         self.reward, self.value, self.discount = reward, value, discount
 
+    def compiled(self) -> "RewardPlusValue":
+        """The same, with what it calls compiled by `torch.compile`."""
+        return RewardPlusValue(
+            torch.compile(self.reward, dynamic=False), torch.compile(self.value, dynamic=False), self.discount
+        )
+
     def __call__(self, trajectory: Tensor, actions: Tensor) -> Tensor:
         horizon = actions.shape[2]
         rewards = self.reward(trajectory[:, :, :horizon], actions).squeeze(-1)  # (E, S, H), one call
@@ -180,6 +186,12 @@ class Sum:
                 )
         self.terms = [(float(weight), objective) for weight, objective in terms]
         self.in_keys = [key for _, objective in terms for key in getattr(objective, "in_keys", ())]
+
+    def compiled(self) -> "Sum":
+        """The same, with every term compiled that can be."""
+        return Sum(
+            [(weight, one.compiled() if hasattr(one, "compiled") else one) for weight, one in self.terms]  # pyright: ignore[reportFunctionMemberAccess]
+        )
 
     def bind(self, tensordict: TensorDictBase) -> "Sum":
         """The same sum of bound terms."""

@@ -16,6 +16,8 @@ from franka_wm.planning.capture import GraphCache
 from franka_wm.planning.mppi import MPPI, Objective
 from franka_wm.planning.objectives import RewardPlusValue
 
+PRECISIONS = ("float32", "bfloat16")
+
 
 def _explores(explore: bool | None) -> bool:
     return interaction_type() is InteractionType.RANDOM if explore is None else explore
@@ -56,8 +58,12 @@ class PlannerPolicy(TensorDictModuleBase):
             the policy is to be copied (as collectors do for other processes), pass bound methods and objects,
             not closures.
         capture: replay decisions as CUDA graphs; None: where the observations are on CUDA.
+        precision: `float32`, or `bfloat16`: the model computes under autocast; plans and actions stay float32.
+        compile: `torch.compile` what the planner calls thousands of times: `next`, `prior`, and an objective
+            that has `compiled`. Takes a minute at the first decisions of each batch size.
 
     Raises:
+        ValueError: no such precision.
         RuntimeError: at a decision that cannot be captured.
     """
 
@@ -74,8 +80,17 @@ class PlannerPolicy(TensorDictModuleBase):
         explore: bool | None = None,
         model: nn.Module | None = None,
         capture: bool | None = None,
+        precision: str = "float32",
+        compile: bool = False,
     ) -> None:
         super().__init__()
+        if precision not in PRECISIONS:
+            raise ValueError(f"precision={precision!r}: must be one of {', '.join(PRECISIONS)}")
+        if compile:
+            next = torch.compile(next, dynamic=False)
+            prior = prior if prior is None else torch.compile(prior, dynamic=False)
+            objective = getattr(objective, "compiled", lambda: objective)()
+        self.precision = precision
         self.in_keys = [*observation_keys, *getattr(objective, "in_keys", ()), "is_init"]
         context = [] if observe is None else ["context", "context_action"]
         self.out_keys = ["action", "plan", *context]
@@ -94,13 +109,15 @@ class PlannerPolicy(TensorDictModuleBase):
         objective: Objective | None = None,
         explore: bool | None = None,
         capture: bool | None = None,
+        precision: str = "float32",
+        compile: bool = False,
     ) -> "PlannerPolicy":
         """Plan with any model that has `encode` and `next`.
 
         Args:
             observation_keys: the model's own, `observation_keys` or `observation_sizes`, when None.
             objective: rewards plus value of the model, with its `discount`, when None.
-            explore, capture: see the class.
+            explore, capture, precision, compile: see the class.
 
         A model with `policy` supplies the prior.
 
@@ -127,6 +144,8 @@ class PlannerPolicy(TensorDictModuleBase):
             explore=explore,
             model=model if isinstance(model, nn.Module) else None,
             capture=capture,
+            precision=precision,
+            compile=compile,
         )
 
     @torch.no_grad()
@@ -170,21 +189,28 @@ class PlannerPolicy(TensorDictModuleBase):
     def _decide(self, tensordict: TensorDictBase, explore: bool) -> TensorDict:
         """What the policy writes."""
         is_init = tensordict.get("is_init", None)
-        z = self._latent(tensordict, is_init)
         bind = getattr(self.objective, "bind", None)
-        result = self.planner.plan(
-            z,
-            self.next,
-            self.objective if bind is None else bind(tensordict),
-            prior=self.prior,
-            previous=tensordict.get("plan", None),
-            is_init=is_init,
-            explore=explore,
-        )
+        low = self.precision == "bfloat16"
+        # No cache of cast weights: it would hold tensors of one captured decision into the next.
+        with torch.autocast(tensordict.get(self.in_keys[0]).device.type, torch.bfloat16, low, False):
+            z = self._latent(tensordict, is_init)
+            z = z.float() if low else z
+            result = self.planner.plan(
+                z,
+                self._next_in_float32 if low else self.next,
+                self.objective if bind is None else bind(tensordict),
+                prior=self.prior,
+                previous=tensordict.get("plan", None),
+                is_init=is_init,
+                explore=explore,
+            )
         decision = result.select("action", "plan")
         if self.observe is not None:
             decision.set("context", z).set("context_action", result.get("action"))
         return decision
+
+    def _next_in_float32(self, z: Tensor, action: Tensor) -> Tensor:
+        return self.next(z, action).float()
 
     def _latent(self, tensordict: TensorDictBase, is_init: Tensor | None) -> Tensor:
         before = None if self.observe is None else tensordict.get("context", None)

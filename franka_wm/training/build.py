@@ -180,13 +180,17 @@ def make_model(cfg: DictConfig, surroundings: Any, device: torch.device | str | 
 # -- planners and policies ----------------------------------------------------------------------------------
 
 
+NOT_FOR_PLANNERS = ("precision", "compile")
+"""Entries of ``conf/planner`` that are about how the policy around the planner computes."""
+
+
 def make_planner(cfg: DictConfig, actions: int) -> Any:
     """The planner that ``cfg.planner`` names.
 
     Args:
         actions: Size of a continuous action, or the number of moves.
     """
-    values = plain(cfg.planner)
+    values = {key: value for key, value in plain(cfg.planner).items() if key not in NOT_FOR_PLANNERS}
     name = values.pop("name")
     discrete = is_discrete(cfg)
     try:
@@ -263,6 +267,7 @@ def make_policies(
     smoothness: float = 0.7,
     objective: Any = None,
     capture: bool | None = None,
+    **computing: Any,
 ) -> dict[str, Any]:
     """Every policy that can act or be compared, by name.
 
@@ -313,6 +318,7 @@ def make_agent_policies(cfg: DictConfig, model: Any, env: Any, spaces: Spaces) -
         smoothness=cfg.collector.smoothness,
         objective=make_objective(cfg, model),
         capture=cfg.trainer.capture,
+        **{key: cfg.planner[key] for key in NOT_FOR_PLANNERS if key in cfg.planner},
     )
 
 

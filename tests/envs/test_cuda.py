@@ -104,13 +104,21 @@ def test_no_step_waits_or_copies(case: str) -> None:
 @pytest.mark.parametrize("case", CASES)
 def test_as_on_the_cpu(case: str, random_actions) -> None:
     """The same episodes: draws are exact, physics agree to single precision over an episode and its reset."""
-    config = FrankaConfig(**BASE | CASES[case])
     actions = 0.3 * random_actions(N, STEPS)
-    here = play(FrankaEnv(config, num_envs=N, device="cpu"), actions)
-    there = play(FrankaEnv(config, num_envs=N, device="cuda"), actions.cuda())
+    check_agreement(episodes(case, "cpu", actions), episodes(case, "cuda", actions))
+
+
+def episodes(case: str, device: str, actions: torch.Tensor) -> dict[str, torch.Tensor]:
+    """What a case gives on a device."""
+    env = FrankaEnv(FrankaConfig(**BASE | CASES[case]), num_envs=N, device=device)
+    return {key: value.cpu() for key, value in play(env, actions.to(device)).items()}
+
+
+def check_agreement(here: dict[str, torch.Tensor], there: dict[str, torch.Tensor]) -> None:
+    """Whether two devices gave the same, but for rounding."""
     assert here.keys() == there.keys()
     for key, expected in here.items():
-        got = there[key].cpu()
+        got = there[key]
         assert got.dtype == expected.dtype and got.shape == expected.shape, key
         if expected.dtype == torch.uint8:  # rounding moves an edge by a pixel here and there
             differing = (got.float() - expected.float()).abs().amax(-1) > 8

@@ -220,4 +220,4 @@ def test_work_that_waits_for_the_device_is_refused_in_one_line():
     with pytest.raises(RuntimeError, match=r"trainer\.capture=false"):
         cache(waits, inputs)
     torch.cuda.synchronize()
-    assert torch.ones(2, device="cuda").sum().item() == 2  # the device goes on working
+    assert torch.randn(2, device="cuda").isfinite().all()  # the device goes on working, its generator, too
