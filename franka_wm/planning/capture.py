@@ -117,7 +117,8 @@ def _record(
 ) -> _Graph:
     static = TensorDict({name: x.clone() for name, x in inputs.items()}, batch_size=inputs.batch_size)
     graph = torch.cuda.CUDAGraph()
-    default = torch.cuda.default_generators[static.device.index or 0]  # type: ignore[union-attr]
+    device = next(iter(static.values())).device  # type: ignore[union-attr]
+    default = torch.cuda.default_generators[device.index or 0]
     noise = default.get_state()
     for generator in generators:
         graph.register_generator_state(generator)
@@ -127,7 +128,7 @@ def _record(
             outputs = work(static)
     except RuntimeError as error:
         # The default generator believes that it is still being captured, and would refuse to draw from now on.
-        fresh = torch.Generator(static.device)  # type: ignore[arg-type]
+        fresh = torch.Generator(device)
         fresh.set_state(noise)
         default.graphsafe_set_state(fresh.graphsafe_get_state())
         raise RuntimeError(

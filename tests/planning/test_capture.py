@@ -2,6 +2,7 @@
 
 import copy
 import pickle
+from contextlib import contextmanager
 
 import pytest
 import torch
@@ -72,6 +73,38 @@ def test_the_graph_not_used_for_longest_is_forgotten(recorded):
         cache(double, numbers(1), key=key)
     assert len(recorded) == 3 and len(cache._graphs) == 2
     assert [kind[0] for kind in cache._graphs] == ["b", "c"]  # type: ignore[index]
+
+
+def test_a_failed_capture_gives_the_generator_back(monkeypatch):
+    """The steps of a capture, with stand-ins for CUDA's."""
+    given = []
+
+    class Noise:
+        def __init__(self, device=None, state="before"):
+            self.state = state
+
+        def get_state(self):
+            return self.state
+
+        def set_state(self, state):
+            self.state = state
+
+        graphsafe_get_state = get_state
+        graphsafe_set_state = given.append
+
+    @contextmanager
+    def refuse(graph, capture_error_mode):
+        assert capture_error_mode == "thread_local"
+        yield
+        raise RuntimeError("operation not permitted")
+
+    monkeypatch.setattr(torch.cuda, "CUDAGraph", lambda: None)
+    monkeypatch.setattr(torch.cuda, "default_generators", (Noise(),))
+    monkeypatch.setattr(torch.cuda, "graph", refuse)
+    monkeypatch.setattr(torch, "Generator", Noise)
+    with pytest.raises(RuntimeError, match="give capture=False"):
+        capture._record(double, numbers(1), (), ())
+    assert given == ["before"]
 
 
 def test_copies_have_no_graphs(recorded):
