@@ -55,6 +55,8 @@ class LeWorldModel(nn.Module):
         history: frames that the predictor sees.
         encoder_size, encoder_width, encoder_depth, encoder_heads, patch_size: the vision transformer.
         projector_hidden: of the MLPs after encoder and predictor.
+        predictor_width: of the predictor's tokens; None: a frame's embedding is a token, as published. A small
+            embedding needs wider ones.
         predictor_depth, predictor_heads, predictor_head_dim, predictor_mlp, dropout: the predictor.
         sigreg_coef, sigreg_directions: of the regulariser.
         rollout: 1, as published: predict from true embeddings. More: feed predictions back for so many steps
@@ -86,6 +88,7 @@ class LeWorldModel(nn.Module):
         encoder_heads: int | None = None,
         patch_size: int = 8,
         projector_hidden: int = 2048,
+        predictor_width: int | None = None,
         predictor_depth: int = 6,
         predictor_heads: int = 16,
         predictor_head_dim: int = 64,
@@ -138,19 +141,21 @@ class LeWorldModel(nn.Module):
         frame = self.image_part + self.state_part
         self.memory = Memory(history=history, frame_dim=frame, action_dim=action_dim)
         self.latent_dim = self.memory.size
-        self.action_encoder = nn.Sequential(nn.Linear(action_dim, frame), nn.SiLU(), nn.Linear(frame, frame))
+        width = frame if predictor_width is None else predictor_width
+        self.lift = nn.Identity() if predictor_width is None else nn.Linear(frame, width)
+        self.action_encoder = nn.Sequential(nn.Linear(action_dim, width), nn.SiLU(), nn.Linear(width, width))
         initialize(self.action_encoder)
         _spread(self.action_encoder)
         self.predictor = CausalTransformer(
-            width=frame,
+            width=width,
             depth=predictor_depth,
             heads=predictor_heads,
             head_dim=predictor_head_dim,
             hidden=predictor_mlp,
-            condition=frame,
+            condition=width,
             dropout=dropout,
         )
-        self.head = ProjectionMLP(frame, frame, hidden=projector_hidden)
+        self.head = ProjectionMLP(width, frame, hidden=projector_hidden)
         self.sigreg = SIGReg(directions=sigreg_directions)
         self.reward_probe = None
         if reward_head:
@@ -299,7 +304,7 @@ class LeWorldModel(nn.Module):
         """Frames (N, K, F), the action taken at each (N, K, A) -> the frame after each (N, K, F)."""
         positions = torch.arange(frames.shape[1], device=frames.device)
         condition = self.action_encoder(actions.to(frames.dtype))
-        x = self.predictor(frames, positions, mask, condition, dropout=training)
+        x = self.predictor(self.lift(frames), positions, mask, condition, dropout=training)
         return self.head(x, batch_statistics=training)
 
     def _sigreg(self, frames: Tensor) -> Tensor:

@@ -169,7 +169,7 @@ class PlannerPolicy(TensorDictModuleBase):
             )
         explore = _explores(self.explore)
         if self._captures(inputs):
-            modes = (explore, None if self.model is None else self.model.training)
+            modes = (explore, self.precision, None if self.model is None else self.model.training)
             held = (self.planner, self.encode, self.next, self.objective, self.observe, self.prior)
             decision = self._graphs(
                 lambda entries: self._decide(entries, explore),

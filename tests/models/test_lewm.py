@@ -5,7 +5,12 @@ from tensordict import TensorDict
 from franka_wm.models import make
 from franka_wm.models.lewm import LeWorldModel
 from franka_wm.models.memory import Memory
-from franka_wm.models.transformer import CausalTransformer, block_causal_mask, hide_invalid
+from franka_wm.models.transformer import (
+    CausalTransformer,
+    block_causal_mask,
+    hide_invalid,
+    short_attention,
+)
 
 
 @pytest.fixture(autouse=True)
@@ -93,6 +98,16 @@ def test_a_short_history_predicts_alike_wherever_it_stands():
     inside = net(torch.cat((junk, real), 1), torch.arange(4), hide_invalid(block_causal_mask(4), valid))
     assert inside.isfinite().all()
     torch.testing.assert_close(inside[:, 2:], alone, rtol=1e-4, atol=1e-5)
+
+
+@pytest.mark.parametrize("lengths", [(1, 1), (3, 3), (8, 4)])
+def test_short_attention_is_attention(lengths):
+    length, real = lengths
+    q, k, v = torch.randn(3, 5, 2, length, 16, dtype=torch.float64).unbind()
+    valid = (torch.arange(length) >= length - real).double().expand(5, -1)
+    mask = hide_invalid(block_causal_mask(length), valid)
+    expected = torch.nn.functional.scaled_dot_product_attention(q, k, v, attn_mask=mask)
+    torch.testing.assert_close(short_attention(q, k, v, mask), expected)
 
 
 def test_memory_is_a_queue():
@@ -278,6 +293,18 @@ def plan_to(model, dots, position, goal, *, steps: int, horizon: int = 3, sample
         position = dots.move(position, mean[:, 0])
         z = model.observe(picture(position), z, mean[:, 0], torch.zeros(envs, 1, dtype=torch.bool))
     return position
+
+
+def test_a_small_embedding_may_have_a_wide_predictor(dots):
+    model = small(embed_dim=4, predictor_width=32)
+    batch = dots.windows(6, 3)
+    z = model.encode(batch[:, 0])
+    assert model.embed(z).shape == (6, 4)
+    assert model.embed(model.next(z, batch["action"][:, 0])).shape == (6, 4)
+    before = {name: p.clone() for name, p in model.named_parameters()}
+    train(model, dots.windows, steps=3)
+    still = [name for name, p in model.named_parameters() if torch.equal(p, before[name])]
+    assert still == []
 
 
 def test_a_saved_model_is_the_same_model(dots):

@@ -249,3 +249,44 @@ def test_the_model_policy_samples_or_takes_the_mode():
     assert not torch.equal(noisy(td.clone())["action"], noisy(td.clone())["action"])
     mode = model.policy(model.encode(td), deterministic=True)
     assert torch.equal(quiet(td.clone())["action"], mode)
+
+
+def test_plans_in_low_precision_stay_float32_and_close():
+    model = make(
+        "tdmpc2", observation_sizes={"state": 2}, action_dim=2, episode_length=9, latent_dim=32, hidden_dim=32
+    )
+    model.eval()
+    planner = CEM(action_dim=2, horizon=HORIZON, num_samples=64, num_elites=8, iterations=4)
+    found = {}
+    for precision in ("float32", "bfloat16"):
+        policy = PlannerPolicy.for_model(model, planner, explore=False, precision=precision)
+        torch.manual_seed(1)
+        td = policy(TensorDict({"state": torch.ones(5, 2)}, batch_size=[5]))
+        assert td["action"].dtype == td["plan"].dtype == torch.float32
+        found[precision] = policy.encode(td)
+    assert torch.equal(*found.values())  # outside of planning nothing changes
+    with pytest.raises(ValueError, match="float32, bfloat16"):
+        PlannerPolicy.for_model(model, planner, precision="float16")
+
+
+def test_a_compiled_policy_decides_the_same():
+    model = make(
+        "tdmpc2", observation_sizes={"state": 2}, action_dim=2, episode_length=9, latent_dim=16, hidden_dim=16
+    )
+    model.eval()
+    planner = MPPI(action_dim=2, horizon=2, num_samples=16, num_elites=4, iterations=2, num_policy_samples=0)
+    calls, compiled = [], torch.compile
+
+    def compile(function, **options):
+        calls.append(function)
+        return compiled(function, backend="eager", **options)
+
+    actions = []
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(torch, "compile", compile)
+        for wanted in (False, True):
+            policy = PlannerPolicy.for_model(model, planner, explore=False, compile=wanted)
+            torch.manual_seed(1)
+            actions.append(policy(TensorDict({"state": torch.ones(3, 2)}, batch_size=[3]))["action"])
+    assert model.next in calls and model.reward in calls and model.value in calls
+    torch.testing.assert_close(*actions)
