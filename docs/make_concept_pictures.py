@@ -1,24 +1,32 @@
-"""Makes the pictures of the concept pages: what masks hide, how latents collapse, what planners plan.
+"""Makes the pictures of the concept pages: what an environment shows, what a dataset holds, what masks hide, how
+latents collapse, what planners plan; of a trained run also how its model imagines and how it was judged.
 
-python docs/make_concept_pictures.py          writes docs/images/{masks,collapse,plans}.png, about two minutes
+python docs/make_concept_pictures.py            docs/images/{environment,dataset,masks,collapse,plans}.png, two minutes
+python docs/make_concept_pictures.py RUN        docs/images/{contract,evaluation}.png, after franka-wm evaluate
 """
 
 from __future__ import annotations
 
+import json
+import sys
+import tempfile
 from pathlib import Path
 
 import torch
 from tensordict import TensorDict
 
 from franka_wm import models
-from franka_wm.data.policies import SmoothRandomPolicy
+from franka_wm.data.policies import OraclePolicy, SmoothRandomPolicy
 from franka_wm.envs import FrankaConfig, FrankaEnv
 from franka_wm.envs.camera import project
 from franka_wm.live.commanded import KinematicModel, commanded_path
 from franka_wm.models.masks import make_masks
 from franka_wm.planning import registry
-from franka_wm.report.figure import new_figure, save_figure
-from franka_wm.report.frames import mask_figure
+from franka_wm.report.bars import bars_figure
+from franka_wm.report.figure import finish_axes, new_figure, save_figure
+from franka_wm.report.frames import mask_figure, strip_figure
+from franka_wm.report.spectra import principal_components
+from franka_wm.report.style import BLUE, GREY, VERMILION, policy_colour, policy_name, series_style
 
 OUT = Path(__file__).parent / "images"
 SIDE, PATCH = 32, 4
@@ -31,6 +39,115 @@ CONFIG = FrankaConfig(
     action_scale=0.085,
     limit_velocity=True,
 )
+
+
+def environment() -> None:
+    """Everything one arm shows while inverse kinematics drives it to its goal."""
+    config = FrankaConfig(
+        observations=("pixels", "depth", "segmentation", "goal_pixels", "state", "joint_target"),
+        cameras=("front", "wrist"),
+        goal_sampling="reachable",
+        gravity_compensation=True,
+        limit_velocity=True,
+        action_scale=0.085,
+        show_goal=True,
+        substeps=4,
+        image_size=96,
+    )
+    env = FrankaEnv(config, num_envs=1, device="cpu", seed=4)
+    policy = OraclePolicy(env.kinematics, config)
+    state, rows = env.reset(), {}
+    for _ in range(11):
+        kinds = torch.unique(state["segmentation"], return_inverse=True)[1].float()
+        shown = {
+            "pixels": state["pixels"],
+            "wrist": state["pixels_wrist"],
+            "depth": grey((1.0 - state["depth"] / 2.0).clamp(0.0, 1.0) * (state["depth"] > 0.0)),
+            "segmentation": grey(kinds / kinds.max().clamp_min(1.0)),
+            "goal_pixels": state["goal_pixels"],
+        }
+        for name, picture in shown.items():
+            rows.setdefault(name, []).append(picture[0])
+        state = env.step(policy(state))["next"]
+    save_figure(
+        strip_figure({k: torch.stack(v) for k, v in rows.items()}, columns=6), OUT / "environment.png"
+    )
+
+
+def grey(values: torch.Tensor) -> torch.Tensor:
+    """(N, H, W) or (N, H, W, 1) in [0, 1] -> (N, H, W, 3) uint8."""
+    values = values.reshape(*values.shape[:3], 1)
+    return (255 * values).to(torch.uint8).expand(*values.shape[:3], 3)
+
+
+def dataset() -> None:
+    """One recorded episode, as LeRobot's own reader gives it back."""
+    from lerobot.datasets.lerobot_dataset import LeRobotDataset
+
+    from franka_wm.data.lerobot.collect import collect
+
+    with tempfile.TemporaryDirectory() as folder:
+        root = Path(folder) / "reach"
+        collect(
+            [f"out={root}", "episodes=1", "policy=ik", "env=reach_pixels", "env.episode_length=24", "seed=3"]
+        )
+        rows = LeRobotDataset("local/reach", root=root)
+        camera = next(key for key in rows.meta.camera_keys if not key.endswith("goal"))
+        episode = [rows[k] for k in range(len(rows))]
+    frames = torch.stack([(255 * row[camera]).round().to(torch.uint8).permute(1, 2, 0) for row in episode])
+    figure, panels = new_figure(rows=3, width=7.0, height=1.5)
+    taken = [round(k * (len(frames) - 1) / 7) for k in range(8)]
+    panels[0].imshow(torch.cat([frames[k] for k in taken], 1).numpy(), interpolation="nearest")
+    panels[0].set_axis_off()
+    panels[0].set_title(camera, fontsize=9)
+    time = [float(row["timestamp"]) for row in episode]
+    for axes, key, count in ((panels[1], "action", 7), (panels[2], "next.reward", 1)):
+        values = torch.stack([row[key].reshape(-1)[:count] for row in episode])
+        for index, line in enumerate(values.unbind(1)):
+            axes.plot(time, line.numpy(), linewidth=1.2, color=series_style(index)[0])
+        finish_axes(axes, y=key, x="time [s]" if count == 1 else "")
+    save_figure(figure, OUT / "dataset.png")
+
+
+def contract(run: str) -> None:
+    """What `encode` says of an episode, and what `next` imagines from some of its steps."""
+    from franka_wm.evaluation.rollouts import embedding, encode_episodes, gather_episodes
+    from franka_wm.training.load import load_agent
+
+    agent = load_agent(run, num_envs=1, device="cpu")
+    episode, _ = gather_episodes(
+        agent.env, agent.policies["planner"], keys=list(agent.model.observation_sizes)
+    )
+    embed = embedding(agent.model)
+    with torch.no_grad():
+        real = encode_episodes(agent.model, episode)[0]
+        branches = {}
+        for start in range(0, len(real) - 6, 4):
+            z = [real[start]]
+            for action in episode["action"][0, start : start + 6]:
+                z.append(agent.model.next(z[-1], action))
+            branches[start] = torch.stack(z)
+    every = torch.cat([embed(real), *(embed(z) for z in branches.values())]).numpy()
+    points = torch.as_tensor(principal_components(every).points)[:, :2]
+    figure, (axes,) = new_figure(width=6.0, height=3.6)
+    path, rest = points[: len(real)], points[len(real) :]
+    axes.plot(path[:, 0], path[:, 1], "-o", color=GREY, markersize=4, label="encode(observation)")
+    for index, branch in enumerate(rest.split(7)):
+        label = "next(next(…)), six steps from here" if index == 0 else None
+        axes.plot(branch[:, 0], branch[:, 1], "-", color=BLUE, linewidth=1.2, marker=".", label=label)
+        axes.plot(*branch[0], "o", color=VERMILION, markersize=6, fillstyle="none")
+    axes.legend(fontsize=8, frameon=False)
+    finish_axes(axes, x="first principal component of the latents", y="second")
+    save_figure(figure, OUT / "contract.png")
+
+
+def evaluation(run: str) -> None:
+    """How far from the goal every policy ended, with intervals."""
+    policies = json.loads((Path(run) / "evaluation" / "evaluation.json").read_text())["policies"]
+    bars = {policy_name(name): {"": values["final_distance"]} for name, values in policies.items()}
+    colours = {policy_name(name): policy_colour(name) for name in policies}
+    figure = bars_figure(bars, label="final distance to the goal [cm]", scale=100, colours=colours)
+    save_figure(figure, OUT / "evaluation.png")
 
 
 def masks(env: FrankaEnv) -> None:
@@ -138,7 +255,13 @@ def plans(env: FrankaEnv) -> None:
     save_figure(figure, OUT / "plans.png")
 
 
-def main() -> None:
+def main(runs: list[str]) -> None:
+    if runs:
+        contract(runs[0])
+        evaluation(runs[0])
+        return
+    environment()
+    dataset()
     env = FrankaEnv(CONFIG, num_envs=16, device="cpu", seed=1)
     env.reset()
     masks(env)
@@ -147,4 +270,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    main(sys.argv[1:])

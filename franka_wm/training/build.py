@@ -196,6 +196,7 @@ def make_planner(cfg: DictConfig, actions: int) -> Any:
     try:
         if registry.is_search(name) != discrete:
             fitting = [one for one in registry.available() if registry.is_search(one) == discrete]
+            fitting += ["gumbel"] if discrete else []  # mcts with other settings: a name in conf/planner alone
             what = "chooses among moves" if discrete else "has continuous actions"
             raise UserError(
                 f"planner={name}: model={cfg.model.name} {what}; use planner={' or '.join(fitting)}"
