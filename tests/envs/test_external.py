@@ -76,3 +76,22 @@ def test_refusals(values: dict, named: str) -> None:
     with pytest.raises(UserError) as caught:
         ExternalEnv(external_config(values), num_envs=1)
     assert named in str(caught.value) and "\n" not in str(caught.value)
+
+
+@pytest.mark.gpu
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
+def test_episodes_end_and_begin_on_the_gpu_as_on_the_cpu() -> None:
+    """The simulator stays on the CPU, also for the masks of a reset."""
+    rollouts = []
+    for device in ("cpu", "cuda"):
+        env = ExternalEnv(
+            ExternalConfig(kind="gym", name="CartPole-v1"), num_envs=3, seed=1, device=torch.device(device)
+        )
+        tensordict, rows = env.reset(), []
+        for _ in range(30):
+            action = torch.ones(3, dtype=torch.int64, device=device)  # falls within a dozen steps
+            step, tensordict = env.step_and_maybe_reset(tensordict.set("action", action))
+            rows.append(step["next", "state"].cpu())
+            assert step["next", "state"].device.type == tensordict["state"].device.type == device
+        rollouts.append(torch.stack(rows))
+    torch.testing.assert_close(*rollouts)
