@@ -11,6 +11,10 @@ class FrankaError(Exception):
         super().__init__(" ".join(message.split()))
 
 
+class CaptureError(FrankaError, RuntimeError):
+    """Work that cannot be captured as a CUDA graph."""
+
+
 class UserError(FrankaError, ValueError):
     """Bad input: an option, a value, a file or a folder that cannot be used.
 

@@ -22,7 +22,7 @@ class Randomizer:
     """Draws for the masked worlds at every reset, inside the captured graph.
 
     The drawn values live in the Newton model's own arrays, which hold one row for each world; MuJoCo's copy of
-    the physical ones is refreshed, on the CPU only in steps in which some world is reset.
+    the physical ones is refreshed: on the CPU in steps in which some world is reset, on CUDA in every step.
 
     Args:
         sim: The simulation; its config says what is drawn.

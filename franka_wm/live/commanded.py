@@ -97,4 +97,5 @@ def kinematic_planner(env: FrankaEnv) -> PlannerPolicy:
         max_std=1.0,
         temperature=2.0,
     )
-    return PlannerPolicy.for_model(model, planner, objective=model.score)
+    # Its inverse kinematics solve a linear system, which waits for the device.
+    return PlannerPolicy.for_model(model, planner, objective=model.score, capture=False)

@@ -9,6 +9,8 @@ from typing import Any, NamedTuple
 import torch
 from tensordict import TensorDict, TensorDictBase
 
+from franka_wm.errors import CaptureError
+
 Work = Callable[[TensorDictBase], TensorDict]
 """Entries in, entries out: tensors of fixed shapes, nothing read back by the host."""
 
@@ -63,13 +65,13 @@ class GraphCache:
             Entries of their own memory: the next call does not overwrite them.
 
         Raises:
-            RuntimeError: the work cannot be captured.
+            CaptureError: the work cannot be captured.
         """
         shapes = tuple(
             (name, tuple(x.shape), x.dtype)
             for name, x in sorted(inputs.items(), key=lambda item: str(item[0]))
         )
-        kind = (key, tuple(id(one) for one in held), shapes, inputs.device)
+        kind = (key, tuple(id(one) for one in held), shapes, _device(inputs))
         found = self._graphs.get(kind)
         if found is None:
             seen = self._seen.get(kind, 0)
@@ -86,7 +88,8 @@ class GraphCache:
             self._graphs.move_to_end(kind)
             for name, static in found.inputs.items():
                 static.copy_(inputs.get(name))
-        found.graph.replay()
+        with torch.cuda.device(_device(inputs)):
+            found.graph.replay()
         return found.outputs.clone()
 
     def clear(self) -> None:
@@ -104,12 +107,17 @@ class GraphCache:
 
 def _beside(work: Work, inputs: TensorDictBase) -> TensorDict:
     """`work(inputs)` on a stream of its own, as the capture will be."""
-    stream = torch.cuda.Stream()
-    stream.wait_stream(torch.cuda.current_stream())
-    with torch.cuda.stream(stream):
-        outputs = work(inputs)
-    torch.cuda.current_stream().wait_stream(stream)
+    with torch.cuda.device(_device(inputs)):
+        stream = torch.cuda.Stream()
+        stream.wait_stream(torch.cuda.current_stream())
+        with torch.cuda.stream(stream):
+            outputs = work(inputs)
+        torch.cuda.current_stream().wait_stream(stream)
     return outputs
+
+
+def _device(inputs: TensorDictBase) -> torch.device:
+    return next(iter(inputs.values())).device
 
 
 def _record(
@@ -117,21 +125,24 @@ def _record(
 ) -> _Graph:
     static = TensorDict({name: x.clone() for name, x in inputs.items()}, batch_size=inputs.batch_size)
     graph = torch.cuda.CUDAGraph()
-    device = next(iter(static.values())).device  # type: ignore[union-attr]
+    device = _device(static)
     default = torch.cuda.default_generators[device.index or 0]
-    noise = default.get_state()
+    noise = [generator.get_state() for generator in (default, *generators)]
     for generator in generators:
         graph.register_generator_state(generator)
     try:
         # Other threads (a live page, a data loader) may allocate meanwhile.
-        with torch.cuda.graph(graph, capture_error_mode="thread_local"):
+        with torch.cuda.device(device), torch.cuda.graph(graph, capture_error_mode="thread_local"):
             outputs = work(static)
     except RuntimeError as error:
-        # The default generator believes that it is still being captured, and would refuse to draw from now on.
-        fresh = torch.Generator(device)
-        fresh.set_state(noise)
-        default.graphsafe_set_state(fresh.graphsafe_get_state())
-        raise RuntimeError(
+        # Generators believe that they are still being captured, and would refuse to draw from now on.
+        for generator, state in zip((default, *generators), noise, strict=True):
+            fresh = torch.Generator(device)
+            fresh.set_state(state)
+            generator.graphsafe_set_state(fresh.graphsafe_get_state())
+        if isinstance(error, torch.OutOfMemoryError):
+            raise
+        raise CaptureError(
             "this decision cannot be captured as a CUDA graph, because something in it waits for the device or copies "
             f"from the host; mend it, or give capture=False (train.py: trainer.capture=false): {error}"
         ) from error

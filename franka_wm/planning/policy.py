@@ -17,6 +17,18 @@ from franka_wm.planning.mppi import MPPI, Objective
 from franka_wm.planning.objectives import RewardPlusValue
 
 PRECISIONS = ("float32", "bfloat16")
+"""How a model may compute while planning."""
+
+
+def captures(wanted: bool | None, observation: Tensor) -> bool:
+    """Whether decisions are captured: where the observations are on CUDA, unless it is not wanted.
+
+    Raises:
+        ValueError: it is wanted elsewhere.
+    """
+    if wanted and not observation.is_cuda:
+        raise ValueError(f"capture=True needs observations on CUDA, these are on {observation.device}")
+    return observation.is_cuda if wanted is None else wanted
 
 
 def _explores(explore: bool | None) -> bool:
@@ -39,11 +51,12 @@ class PlannerPolicy(TensorDictModuleBase):
     the action taken in it travel along, too, as `context` (E, Z) and `context_action` (E, A).
 
     An objective that depends on the observation (a goal picture) has `bind(tensordict)`, which is called at
-    every decision.
+    every decision. It sees what the policy reads: other entries that it needs are named by its `in_keys`.
 
     On CUDA the third decision of a kind (so many environments, exploring or not, these settings) is captured as
     a graph, which the later ones replay; see `franka_wm.planning.capture.GraphCache`. Then weights must be
-    changed in place, and planner, model and objective must not read values on the host.
+    changed in place, and planner, model and objective must not read values on the host. Settings of the planner
+    may be changed at any time; those of an objective need a new objective.
 
     Args:
         planner: MPPI or anything with its `plan`.
@@ -56,15 +69,15 @@ class PlannerPolicy(TensorDictModuleBase):
         explore: whether to add noise to the action; None follows TorchRL's exploration type.
         model: the module behind the callables, so that collectors find its parameters and move it along. If
             the policy is to be copied (as collectors do for other processes), pass bound methods and objects,
-            not closures.
+            not closures, and leave `compile`: compiled functions cannot be sent to another process.
         capture: replay decisions as CUDA graphs; None: where the observations are on CUDA.
         precision: `float32`, or `bfloat16`: the model computes under autocast; plans and actions stay float32.
         compile: `torch.compile` what the planner calls thousands of times: `next`, `prior`, and an objective
             that has `compiled`. Takes a minute at the first decisions of each batch size.
 
     Raises:
-        ValueError: no such precision.
-        RuntimeError: at a decision that cannot be captured.
+        ValueError: no such precision; or, at a decision, `capture` where the observations are not on CUDA.
+        CaptureError: at a decision that cannot be captured.
     """
 
     def __init__(
@@ -182,9 +195,7 @@ class PlannerPolicy(TensorDictModuleBase):
         return tensordict.update(decision)
 
     def _captures(self, inputs: TensorDictBase) -> bool:
-        if self.capture is not None:
-            return self.capture
-        return inputs.get(self.in_keys[0]).is_cuda
+        return captures(self.capture, inputs[self.in_keys[0]])
 
     def _decide(self, tensordict: TensorDictBase, explore: bool) -> TensorDict:
         """What the policy writes."""

@@ -11,6 +11,7 @@ from torch import Tensor, nn
 
 from franka_wm.planning.capture import GraphCache
 from franka_wm.planning.mcts import MCTS
+from franka_wm.planning.policy import captures
 from franka_wm.planning.tree import Recurrent
 
 
@@ -34,7 +35,7 @@ class SearchPolicy(TensorDictModuleBase):
         capture: replay decisions as CUDA graphs, see `PlannerPolicy`; None: where the observations are on CUDA.
 
     Raises:
-        RuntimeError: at a decision that cannot be captured.
+        ValueError, CaptureError: see `PlannerPolicy`.
     """
 
     def __init__(
@@ -108,8 +109,7 @@ class SearchPolicy(TensorDictModuleBase):
             raise ValueError(f"expected batch size [E], got {list(tensordict.batch_size)}")
         explore = interaction_type() is InteractionType.RANDOM if self.explore is None else self.explore
         inputs = tensordict.select(*self.in_keys)
-        captures = inputs.get(self.in_keys[0]).is_cuda if self.capture is None else self.capture
-        if not captures:
+        if not captures(self.capture, inputs[self.in_keys[0]]):
             return tensordict.update(self._decide(inputs, explore))
         modes = (explore, None if self.model is None else self.model.training)
         return tensordict.update(

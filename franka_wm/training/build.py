@@ -22,6 +22,7 @@ from franka_wm.envs.config import ACTION_MODES
 from franka_wm.envs.discretize import DiscreteActions
 from franka_wm.errors import UserError
 from franka_wm.planning import ModelPolicy, PlannerPolicy, registry
+from franka_wm.planning.policy import PRECISIONS
 from franka_wm.training.spaces import Spaces
 
 ACTORS = {"policy": "policy", "planner": "planner", "smooth": "random", "noop": "noop", "ik": "oracle"}
@@ -180,8 +181,8 @@ def make_model(cfg: DictConfig, surroundings: Any, device: torch.device | str | 
 # -- planners and policies ----------------------------------------------------------------------------------
 
 
-NOT_FOR_PLANNERS = ("precision", "compile")
-"""Entries of ``conf/planner`` that are about how the policy around the planner computes."""
+OF_THE_POLICY = ("precision", "compile")
+"""Entries of ``conf/planner`` that are not for the planner but for the policy around it: how the model computes."""
 
 
 def make_planner(cfg: DictConfig, actions: int) -> Any:
@@ -190,16 +191,24 @@ def make_planner(cfg: DictConfig, actions: int) -> Any:
     Args:
         actions: Size of a continuous action, or the number of moves.
     """
-    values = {key: value for key, value in plain(cfg.planner).items() if key not in NOT_FOR_PLANNERS}
+    values = {key: value for key, value in plain(cfg.planner).items() if key not in OF_THE_POLICY}
     name = values.pop("name")
+    precision, compiled = cfg.planner.get("precision", "float32"), cfg.planner.get("compile", False)
+    if precision not in PRECISIONS:
+        raise UserError(f"planner.precision={precision!r}: must be one of {', '.join(PRECISIONS)}")
+    if not isinstance(compiled, bool):
+        raise UserError(f"planner.compile={compiled!r}: must be true or false")
     discrete = is_discrete(cfg)
     try:
         if registry.is_search(name) != discrete:
             fitting = [one for one in registry.available() if registry.is_search(one) == discrete]
-            fitting += ["gumbel"] if discrete else []  # mcts with other settings: a name in conf/planner alone
+            fitting += (
+                ["gumbel"] if discrete else []
+            )  # mcts with other settings: a name in conf/planner alone
             what = "chooses among moves" if discrete else "has continuous actions"
+            typed = "gumbel" if values.get("variant") == "gumbel" else name
             raise UserError(
-                f"planner={name}: model={cfg.model.name} {what}; use planner={' or '.join(fitting)}"
+                f"planner={typed}: model={cfg.model.name} {what}; use planner={' or '.join(fitting)}"
             )
         for key, value in values.items():
             counts = key in ("horizon", "iterations") or key.startswith("num_")
@@ -268,19 +277,23 @@ def make_policies(
     smoothness: float = 0.7,
     objective: Any = None,
     capture: bool | None = None,
-    **computing: Any,
+    precision: str = "float32",
+    compile: bool = False,
 ) -> dict[str, Any]:
     """Every policy that can act or be compared, by name.
 
     ``planner`` and ``policy`` where the model has what they need; ``noop`` and ``random`` (smooth random:
-    first-order autoregressive); for the arm ``oracle``, inverse kinematics with true geometry.
+    first-order autoregressive); for the arm ``oracle``, inverse kinematics with true geometry. ``capture``,
+    ``precision`` and ``compile``: of the planner's, see :class:`~franka_wm.planning.PlannerPolicy`.
     """
     policies: dict[str, Any] = {}
     discrete = not env.action_spec.dtype.is_floating_point
     if discrete:
         policies["planner"] = planning.SearchPolicy.for_model(model, planner, capture=capture)
     elif hasattr(model, "next"):
-        policies["planner"] = PlannerPolicy.for_model(model, planner, objective=objective, capture=capture)
+        policies["planner"] = PlannerPolicy.for_model(
+            model, planner, objective=objective, capture=capture, precision=precision, compile=compile
+        )
     if hasattr(model, "policy"):
         policies["policy"] = ModelPolicy.for_model(model)
     return policies | make_scripted_policies(env, seed=seed, smoothness=smoothness)
@@ -318,8 +331,8 @@ def make_agent_policies(cfg: DictConfig, model: Any, env: Any, spaces: Spaces) -
         seed=cfg.seed,
         smoothness=cfg.collector.smoothness,
         objective=make_objective(cfg, model),
-        capture=cfg.trainer.capture,
-        **{key: cfg.planner[key] for key in NOT_FOR_PLANNERS if key in cfg.planner},
+        capture=None if cfg.trainer.capture else cfg.trainer.capture,  # true asks for what CUDA does anyway
+        **{key: cfg.planner[key] for key in OF_THE_POLICY if key in cfg.planner},
     )
 
 

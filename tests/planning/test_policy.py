@@ -251,30 +251,42 @@ def test_the_model_policy_samples_or_takes_the_mode():
     assert torch.equal(quiet(td.clone())["action"], mode)
 
 
+def opinionated(**sizes):
+    """A model whose rewards, values and policy differ from action to action; untrained ones are zero."""
+    model = make("tdmpc2", observation_sizes={"state": 2}, action_dim=2, episode_length=9, **sizes).eval()
+    with torch.no_grad():
+        for parameter in model.parameters():
+            parameter.add_(0.1 * torch.randn_like(parameter))
+    return model
+
+
 def test_plans_in_low_precision_stay_float32_and_close():
-    model = make(
-        "tdmpc2", observation_sizes={"state": 2}, action_dim=2, episode_length=9, latent_dim=32, hidden_dim=32
-    )
-    model.eval()
+    model = opinionated(latent_dim=32, hidden_dim=32)
     planner = CEM(action_dim=2, horizon=HORIZON, num_samples=64, num_elites=8, iterations=4)
-    found = {}
-    for precision in ("float32", "bfloat16"):
+    actions = []
+    for precision, linear in (("float32", torch.float32), ("bfloat16", torch.bfloat16)):
         policy = PlannerPolicy.for_model(model, planner, explore=False, precision=precision)
+        dtypes = []
+        handle = model.dynamics[0].linear.register_forward_hook(
+            lambda module, args, out, dtypes=dtypes: dtypes.append(out.dtype)
+        )
         torch.manual_seed(1)
         td = policy(TensorDict({"state": torch.ones(5, 2)}, batch_size=[5]))
+        handle.remove()
+        assert set(dtypes) == {linear}
         assert td["action"].dtype == td["plan"].dtype == torch.float32
-        found[precision] = policy.encode(td)
-    assert torch.equal(*found.values())  # outside of planning nothing changes
+        actions.append(td["action"])
+    assert not torch.equal(*actions)
+    assert (
+        actions[0] - actions[1]
+    ).abs().mean() < 0.2  # of a range of 2; scores near each other may change places
     with pytest.raises(ValueError, match="float32, bfloat16"):
         PlannerPolicy.for_model(model, planner, precision="float16")
 
 
 def test_a_compiled_policy_decides_the_same():
-    model = make(
-        "tdmpc2", observation_sizes={"state": 2}, action_dim=2, episode_length=9, latent_dim=16, hidden_dim=16
-    )
-    model.eval()
-    planner = MPPI(action_dim=2, horizon=2, num_samples=16, num_elites=4, iterations=2, num_policy_samples=0)
+    model = opinionated(latent_dim=16, hidden_dim=16)
+    planner = MPPI(action_dim=2, horizon=2, num_samples=16, num_elites=4, iterations=2, num_policy_samples=4)
     calls, compiled = [], torch.compile
 
     def compile(function, **options):
@@ -288,5 +300,13 @@ def test_a_compiled_policy_decides_the_same():
             policy = PlannerPolicy.for_model(model, planner, explore=False, compile=wanted)
             torch.manual_seed(1)
             actions.append(policy(TensorDict({"state": torch.ones(3, 2)}, batch_size=[3]))["action"])
-    assert model.next in calls and model.reward in calls and model.value in calls
+    assert all(part in calls for part in (model.next, model.reward, model.value, model.policy))
     torch.testing.assert_close(*actions)
+
+
+def test_capture_is_refused_where_there_is_no_gpu():
+    policy = PlannerPolicy.for_model(
+        opinionated(latent_dim=16, hidden_dim=16), MPPI(action_dim=2), capture=True
+    )
+    with pytest.raises(ValueError, match="on CUDA"):
+        policy(TensorDict({"state": torch.ones(3, 2)}, batch_size=[3]))

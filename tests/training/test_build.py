@@ -10,6 +10,7 @@ from franka_wm.envs import FrankaConfig
 from franka_wm.errors import UserError
 from franka_wm.training import build
 from franka_wm.training.check import check
+from franka_wm.training.spaces import Spaces
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -119,6 +120,8 @@ def test_environments_of_a_run(composed) -> None:
         ("collector.acts=oracle", "acts"),
         ("collector.steps_per_batch=0", "steps_per_batch"),
         ("collector.seed_steps=0", "seed_steps"),
+        ("planner.precision=float16", "float32, bfloat16"),
+        ("planner.compile=maybe", "true or false"),
         ("replay.window=0", "window"),
         ("replay.batch_size=-1", "batch_size"),
         ("trainer.updates=-1", "updates"),
@@ -140,3 +143,17 @@ def test_planner_and_model_that_do_not_exist(composed, small_env) -> None:
         build.make_planner(composed("planner.name=crystal_ball"), 7)
     with pytest.raises(UserError, match="model"):
         build.make_model(composed("model.name=oracle_bone"), small_env(1))
+
+
+def test_the_planner_computes_as_configured(composed) -> None:
+    """`planner.precision` and `planner.compile` reach the policy that plans."""
+    cfg = composed("scale=smoke", "planner.precision=bfloat16", "trainer.capture=false")
+    env = build.make_evaluation_env(cfg, num_envs=2)
+    spaces = Spaces.of_env(env)
+    model = build.make_model(cfg, spaces, "cpu")
+    policy = build.make_agent_policies(cfg, model, env, spaces)["planner"]
+    assert policy.precision == "bfloat16" and policy.capture is False and policy.next == model.next
+    cfg.planner.compile, cfg.trainer.capture = True, True
+    policy = build.make_agent_policies(cfg, model, env, spaces)["planner"]
+    assert policy.next != model.next  # compiled
+    assert policy.capture is None  # a checkpoint of a GPU acts on a CPU, too
