@@ -89,7 +89,7 @@ def dataset() -> None:
     with tempfile.TemporaryDirectory() as folder:
         root = Path(folder) / "reach"
         collect(
-            [f"out={root}", "episodes=1", "policy=ik", "env=reach_pixels", "env.episode_length=24", "seed=3"]
+            [f"out={root}", "episodes=1", "policy=ik", "env=reach_pixels", "env.episode_length=24", "seed=5"]
         )
         rows = LeRobotDataset("local/reach", root=root)
         camera = next(key for key in rows.meta.camera_keys if not key.endswith("goal"))

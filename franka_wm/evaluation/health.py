@@ -70,7 +70,7 @@ def _value_consistency(
 
 @torch.no_grad()
 def planner_health(policy: Any, observation: TensorDictBase) -> dict[str, Any]:
-    """How the planner searches, on held-out states.
+    """How the planner searches, on held-out states; computed in float32, whatever precision the policy plans in.
 
     Args:
         policy: A :class:`~franka_wm.planning.PlannerPolicy`.
