@@ -6,6 +6,7 @@ To add a family: a line in CASES, `"name": learned("name", ...)`.
 # pyright: reportArgumentType=false, reportCallIssue=false, reportAttributeAccessIssue=false
 from collections.abc import Callable
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -17,6 +18,7 @@ from torch import nn
 from franka_wm import models
 from franka_wm.planning import CEM, ICEM, MPPI, GoalDistance, GradientPlanner, PlannerPolicy, RewardPlusValue
 from franka_wm.planning.objectives import bind
+from franka_wm.training.build import OF_THE_POLICY
 
 PLANNERS: dict[str, type] = {"mppi": MPPI, "cem": CEM, "icem": ICEM, "gradient": GradientPlanner}
 ENVS = 4
@@ -150,10 +152,16 @@ def case(request):
     return CASES[request.param]()
 
 
+def planner_settings(root: Path, name: str) -> dict:
+    """What conf/planner says, but for what is the policy's."""
+    settings = dict(OmegaConf.to_container(OmegaConf.load(root / f"conf/planner/{name}.yaml")))
+    return {key: value for key, value in settings.items() if key not in OF_THE_POLICY}
+
+
 @pytest.fixture(params=PLANNERS)
 def planner(request, case, root):
     """With the numbers of its file in conf/planner."""
-    settings = dict(OmegaConf.to_container(OmegaConf.load(root / f"conf/planner/{request.param}.yaml")))
+    settings = planner_settings(root, request.param)
     assert settings.pop("name") == request.param
     return PLANNERS[request.param](action_dim=case.action_dim, **settings)
 
@@ -203,7 +211,7 @@ def test_closed_loop_beats_doing_nothing(name, which, root):
     """The toys are their own worlds: what is executed counts, not what was imagined."""
     torch.manual_seed(0)
     case = CASES[name]()
-    settings = dict(OmegaConf.to_container(OmegaConf.load(root / f"conf/planner/{which}.yaml")))
+    settings = planner_settings(root, which)
     settings.pop("name")
     planner = PLANNERS[which](action_dim=case.action_dim, **settings)
     policy = PlannerPolicy.for_model(case.model, planner, objective=case.objective, explore=False)
