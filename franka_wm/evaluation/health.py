@@ -87,7 +87,7 @@ def planner_health(policy: Any, observation: TensorDictBase) -> dict[str, Any]:
     objective = policy.objective if bind is None else bind(observation)
     z = policy.encode(observation)
     found = policy.planner.plan(z, policy.next, objective, prior=policy.prior, explore=False)
-    plan = found.get("plan")
+    plan = found.get("best", found.get("plan"))  # iCEM acts by the best one, and its `plan` holds elites, too
     if policy.prior is None:
         before = torch.zeros_like(plan)
     else:

@@ -363,6 +363,8 @@ class Session:
 
     def _planned(self, decided: TensorDictBase) -> torch.Tensor | None:
         plan = decided.get("plan", None)
+        if plan is not None and plan.dim() == 4:  # iCEM's holds its mean first, then elites
+            plan = plan[:, 0]
         if plan is None or not plan.is_floating_point() or plan.shape[2:] != (self.arm.action_dim,):
             return None  # no plan, or one of numbered moves
         return commanded_path(self.arm, plan)

@@ -9,7 +9,7 @@ from tensordict import TensorDict
 from franka_wm.evaluation.health import paired_gain, planner_health, training_diagnostics
 from franka_wm.evaluation.spectrum import collapse_warning, latent_statistics
 from franka_wm.models.tdmpc2 import TDMPC2
-from franka_wm.planning import MPPI, PlannerPolicy
+from franka_wm.planning import CEM, ICEM, MPPI, GradientPlanner, PlannerPolicy
 
 
 @pytest.fixture
@@ -111,8 +111,10 @@ def states() -> TensorDict:
     return TensorDict({"position": position, "is_init": torch.ones(40, 1, dtype=torch.bool)}, batch_size=[40])
 
 
-def test_planning_gains_over_doing_nothing(point_model, states: TensorDict) -> None:
-    planner = MPPI(action_dim=2, horizon=2, num_samples=256, num_elites=32, num_policy_samples=0)
+@pytest.mark.parametrize("kind", [MPPI, CEM, ICEM, GradientPlanner])
+def test_planning_gains_over_doing_nothing(point_model, states: TensorDict, kind) -> None:
+    sizes = {} if kind is GradientPlanner else {"num_samples": 256, "num_elites": 32}
+    planner = kind(action_dim=2, horizon=2, num_policy_samples=0, **sizes)
     policy = PlannerPolicy.for_model(point_model, planner, objective=nearest_to_origin)
     torch.manual_seed(0)
     found = planner_health(policy, states)
@@ -121,7 +123,9 @@ def test_planning_gains_over_doing_nothing(point_model, states: TensorDict) -> N
     assert found["gain"]["mean"] == pytest.approx(found["plan"] - found["prior"], rel=1e-5)
     assert found["gain"]["low"] > 0.5 * -stays
     assert found["better"] > 0.9 and found["states"] == 40
-    assert 1 <= found["effective_samples"]["mean"] <= 32
+    assert ("effective_samples" in found) == (kind is MPPI)
+    if kind is MPPI:
+        assert 1 <= found["effective_samples"]["mean"] <= 32
 
 
 def test_a_perfect_prior_leaves_nothing_to_gain(point_model, states: TensorDict) -> None:
