@@ -55,6 +55,21 @@ def rate(work: Callable[[], Any], *, seconds: float = 2.0, warmup: int = 3, repe
     return sorted(rates)[repeats // 2]
 
 
+def tdmpc2(latent: int, encoder: int, hidden: int) -> Any:
+    """An untrained TD-MPC2 of these widths that reads the arm's vectors."""
+    from franka_wm import models
+
+    return models.make(
+        "tdmpc2",
+        observation_sizes={"state": 20, "joint_target": 7},
+        action_dim=7,
+        episode_length=50,
+        latent_dim=latent,
+        encoder_dim=encoder,
+        hidden_dim=hidden,
+    )
+
+
 def table(rows: list[dict[str, Any]]) -> str:
     """Rows of equal keys as Markdown."""
     names = list(rows[0])

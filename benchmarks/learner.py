@@ -10,10 +10,9 @@ from __future__ import annotations
 import argparse
 
 import torch
-from common import publish, rate
+from common import publish, rate, tdmpc2
 from tensordict import TensorDict
 
-from franka_wm import models
 from franka_wm.data.replay import make_replay
 from franka_wm.envs import resolve_device
 from franka_wm.training.learner import Learner
@@ -68,15 +67,7 @@ def main() -> None:
     for name in arguments.sizes:
         latent, encoder, hidden, batch = SIZES[name]
         torch.manual_seed(0)
-        model = models.make(
-            "tdmpc2",
-            observation_sizes={"state": 20, "joint_target": 7},
-            action_dim=7,
-            episode_length=50,
-            latent_dim=latent,
-            encoder_dim=encoder,
-            hidden_dim=hidden,
-        ).to(device)
+        model = tdmpc2(latent, encoder, hidden).to(device)
         learner = Learner(model, compile=arguments.compile, precision=arguments.precision)
         replay = make_replay(capacity=100_000, num_envs=64, window=3, batch_size=batch, device=device)
         replay.extend(experience(64, 500, device))

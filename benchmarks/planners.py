@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from common import publish, rate
+from common import publish, rate, tdmpc2
 from omegaconf import OmegaConf
 from tensordict import TensorDict
 
@@ -73,15 +73,7 @@ def make_model(size: str) -> Any:
     if sizes is None:
         return models.make("lewm", image_sizes={"pixels": (64, 64, 3)}, action_dim=7)
     latent, encoder, hidden = sizes
-    return models.make(
-        "tdmpc2",
-        observation_sizes={"state": 20, "joint_target": 7},
-        action_dim=7,
-        episode_length=50,
-        latent_dim=latent,
-        encoder_dim=encoder,
-        hidden_dim=hidden,
-    )
+    return tdmpc2(latent, encoder, hidden)
 
 
 def make_observation(model: Any, envs: int, device: torch.device) -> TensorDict:
