@@ -23,6 +23,10 @@ GROUND = (0.34, 0.37, 0.41)
 WRIST_FOV_DEGREES = 75.0
 GOAL_MARKER = "goal_marker"
 
+_QUARTER = wp.quat_from_axis_angle(wp.vec3f(0.0, 0.0, 1.0), -math.pi / 2.0)
+TURNS = {"front": wp.transform_identity(), "side": wp.transformf(wp.vec3f(0.0, 0.0, 0.0), _QUARTER)}
+"""Around the base's vertical axis, from where the config puts the front camera: where the fixed cameras stand."""
+
 
 def camera_framing(config: FrankaConfig) -> tuple[tuple[float, float, float], tuple[float, float, float]]:
     """(eye, target) in world metres."""
@@ -61,7 +65,7 @@ class Camera:
     Args:
         model: The Newton model.
         config: Framing, field of view, shadows.
-        name: ``"front"``, which stands still, or ``"wrist"``, which rides on the hand.
+        name: ``"front"`` or ``"side"``, which stand still, or ``"wrist"``, which rides on the hand.
         kinds: What it renders: any of ``"pixels"``, ``"depth"``, ``"segmentation"``.
         size: Side of the square picture [px]; ``config.image_size`` if not given.
         num_views: How many worlds are seen at once.
@@ -109,13 +113,14 @@ class Camera:
             enable_shadows=config.enable_shadows,
             direction=wp.vec3f(*(light / np.linalg.norm(light)).tolist()),
         )
-        pose = look_at(*camera_framing(config))
+        self._turn = TURNS.get(name, TURNS["front"])
+        pose = self._turn * look_at(*camera_framing(config))  # pyright: ignore[reportOperatorIssue]
         self.transforms = wp.array([pose] * views, dtype=wp.transformf, device=model.device)
         self.views = wp.array(np.arange(views), dtype=int, device=model.device)
         self.rays = SensorCamera.compute_camera_rays_pinhole(
             size,
             size,
-            camera_fov=math.radians(config.camera_fov_degrees if name == "front" else WRIST_FOV_DEGREES),
+            camera_fov=math.radians(WRIST_FOV_DEGREES if name == "wrist" else config.camera_fov_degrees),
             sample_count=samples * samples,
             device=model.device,
         )
@@ -146,7 +151,8 @@ class Camera:
             inputs = [arm.body_q, arm.tool_body, arm.mount, self.views, self.transforms]
             wp.launch(kernels.aim_wrist, n, inputs, device=device)
         elif self._moves:
-            wp.launch(kernels.aim_front, n, [arm.poses, self.views, self.transforms], device=device)
+            inputs = [arm.poses, self._turn, self.views, self.transforms]
+            wp.launch(kernels.aim_fixed, n, inputs, device=device)
         self.sensor.update(
             state,
             self.transforms,

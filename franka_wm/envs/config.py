@@ -12,7 +12,7 @@ OBSERVATIONS = ("pixels", "depth", "segmentation", "goal_pixels", "state", "join
 """Observation groups that can be asked for; ``goal`` is always emitted."""
 
 IMAGES = ("pixels", "depth", "segmentation", "goal_pixels")
-CAMERAS = ("front", "wrist")
+CAMERAS = ("front", "side", "wrist")
 ACTION_MODES = {"joint_delta": 7, "joint_position": 7, "ee_delta": 3}
 """Meaning of an action, and its size."""
 
@@ -36,7 +36,7 @@ class Randomization:
     Attributes:
         color: Offset of the red, green and blue of every shape but the ground, which all worlds share.
         brightness: Factor of the whole picture.
-        camera_position: Offset of the front camera's eye [m] in x, y and z.
+        camera_position: Offset of the front camera's eye [m] in x, y and z; the side camera moves alike.
         camera_target: Offset of the point it looks at [m].
         gains: Factor of the servo's stiffness and damping.
         armature: Factor of the joints' armature.
@@ -129,8 +129,11 @@ class FrankaConfig:
         reward: ``"dense"`` (−tanh distance), ``"sparse"`` (1 where solved, else 0) or ``"normalized"`` (the part
             of the episode's initial distance that has been closed, at least −1); all minus the action penalty.
         track_radius, track_period: Of the circle [m] and of one turn [s], for ``task="track"``.
-        cameras: Which of ``("front", "wrist")`` the image observations come from. The first one's keys are
-            ``pixels``, ``depth``, …; another's ``pixels_wrist``, ….
+        cameras: Which of ``("front", "side", "wrist")`` the image observations come from. The first one's keys
+            are ``pixels``, ``depth``, …; another's ``pixels_wrist``, …. ``side`` is ``front`` a quarter turn
+            around the base's vertical axis: it sees the depth that the front camera cannot.
+        frame_stack: Pictures in ``pixels`` and ``pixels_…``, oldest first along the channels: the present one
+            and those of the steps before it. An episode begins with copies of its first.
         show_goal: Draw the goal as a small red ball in every picture.
         randomization: Ranges that each episode of each world draws from; :class:`Randomization`.
         finger_opening: Each finger's distance from the closed position [m]; the fingers are held there.
@@ -179,6 +182,7 @@ class FrankaConfig:
     track_radius: float = 0.1
     track_period: float = 4.0
     cameras: tuple[str, ...] = ("front",)
+    frame_stack: int = 1
     show_goal: bool = False
     randomization: Randomization = field(default_factory=lambda: Randomization())
     finger_opening: float = 0.02
@@ -206,6 +210,7 @@ class FrankaConfig:
         elif not isinstance(self.randomization, Randomization):
             raise UserError(f"randomization={self.randomization!r}: must be a mapping of ranges")
         self._check_whole("image_size", 1, MAX_IMAGE_SIZE, "pixels")
+        self._check_whole("frame_stack", 1, 64, "pictures along the channels")
         self._check_whole("substeps", 1, 1000, "physics steps per control step")
         self._check_whole("episode_length", 1, 1_000_000, "control steps")
         self._check_whole("solver_iterations", 1, 1000, "iterations")

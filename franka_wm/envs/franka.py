@@ -17,6 +17,7 @@ from torchrl.envs import EnvBase, TransformedEnv
 
 from franka_wm.envs.camera import Camera, as_torch, camera_framing
 from franka_wm.envs.config import STATE_DIM, FrankaConfig
+from franka_wm.envs.frames import FrameStack
 from franka_wm.envs.kinematics import Kinematics
 from franka_wm.envs.robots import load_robot
 from franka_wm.envs.simulation import STATISTICS, Simulation
@@ -72,7 +73,7 @@ class FrankaEnv(EnvBase):
     ==================  ======================  ==================================================================
     key                 shape, dtype            meaning
     ==================  ======================  ==================================================================
-    ``pixels``          (N, H, W, 3) uint8      the camera; present when asked for
+    ``pixels``          (N, H, W, 3) uint8      the camera; present when asked for; 3 · ``frame_stack`` channels
     ``state``           (N, 20) float32         joints 7 [rad], velocities 7 [rad/s], tool 3 [m], tool − goal 3 [m]
     ``joint_target``    (N, 7) float32          the servo's commanded angles [rad]; present when asked for
     ``goal``            (N, 3) float32          reach target in the world [m]
@@ -139,6 +140,8 @@ class FrankaEnv(EnvBase):
             time.perf_counter() - started,
         )
         self._torchrl_native_autoreset = config.auto_reset == "native"
+        self._stack = FrameStack(config.frame_stack) if config.frame_stack > 1 else None
+        self._stacked = [key for key in self.simulation.images if self._stack and key.startswith("pixels")]
         self._make_specs()
         self._renderers: dict[tuple[int, int], Camera] = {}
 
@@ -149,7 +152,7 @@ class FrankaEnv(EnvBase):
             if key.startswith("depth"):
                 entries[key] = Unbounded(shape=(n, size, size, 1), device=device)
             else:
-                channels = 1 if key.startswith("segmentation") else 3
+                channels = 1 if key.startswith("segmentation") else 3 * self.config.frame_stack
                 entries[key] = Bounded(
                     0, 255, shape=(n, size, size, channels), dtype=torch.uint8, device=device
                 )
@@ -181,6 +184,8 @@ class FrankaEnv(EnvBase):
             self._set_seed(seed)
         mask = None if tensordict is None else tensordict.get("_reset", None)
         sim.reset(mask)
+        for key in self._stacked:
+            self._stack.restart(key, sim.images[key], sim._reset_mask[: self.num_envs])
         out = self._present()
         out["is_init"] = sim._reset_mask[: self.num_envs].clone().unsqueeze(-1)
         out["success"] = torch.zeros_like(sim.success)
@@ -197,10 +202,17 @@ class FrankaEnv(EnvBase):
             )
         sim.action.copy_(action)
         sim.step()
+        for key in self._stacked:
+            self._stack.push(key, sim.next_images[key])
         out = {
-            key: (sim.next_images[key] if key in sim.images else getattr(sim, f"next_{key}")).clone()
+            key: self._picture(key, sim.next_images)
+            if key in sim.images
+            else getattr(sim, f"next_{key}").clone()
             for key in self._observed
         }
+        if self._torchrl_native_autoreset:  # the next episode has begun where one has ended
+            for key in self._stacked:
+                self._stack.restart(key, sim.images[key], sim.done.squeeze(-1))
         for key in ("success", "reward", "done", "terminated", "truncated"):
             out[key] = getattr(sim, key).clone()
         out["is_init"] = torch.zeros_like(sim.done)
@@ -223,16 +235,27 @@ class FrankaEnv(EnvBase):
     def _present(self) -> dict[str, torch.Tensor]:
         sim = self.simulation
         return {
-            key: (sim.images[key] if key in sim.images else getattr(sim, key)).clone()
+            key: self._picture(key, sim.images) if key in sim.images else getattr(sim, key).clone()
             for key in self._observed
         }
+
+    def _picture(self, key: str, images: dict[str, torch.Tensor]) -> torch.Tensor:
+        """A copy of a picture as it is observed; pictures of the goal, which stands still, are stacked alike."""
+        if key in self._stacked:
+            return self._stack[key]
+        if self._stack is not None and key.startswith("goal_pixels"):
+            return self._stack.still(images[key])
+        return images[key].clone()
 
     def get_state(self) -> TensorDict:
         """Everything that the futures of the worlds depend on, batch size (N,): a checkpoint of the simulation.
 
         Index it, save it, or branch from it: ``state[3].expand(N)`` is world 3, N times.
         """
-        return TensorDict(self.simulation.get_state(), batch_size=self.batch_size, device=self.device)
+        state = self.simulation.get_state()
+        if self._stack is not None:
+            state |= {f"frames_{key}": frames.clone() for key, frames in self._stack.memory().items()}
+        return TensorDict(state, batch_size=self.batch_size, device=self.device)
 
     def set_state(self, state: TensorDictBase) -> TensorDict:
         """Puts all worlds where :meth:`get_state` found them and returns what they observe, as a reset does.
@@ -248,7 +271,16 @@ class FrankaEnv(EnvBase):
             raise UserError(
                 f"set_state: {tuple(state.batch_size)} worlds for {self.num_envs}; index or expand the state first"
             )
+        frames = {key: state.get(f"frames_{key}", None) for key in self._stacked}
+        for key, stacked in frames.items():
+            if stacked is None or stacked.shape != self.observation_spec[key].shape:
+                raise UserError(
+                    f"set_state: frames_{key} must be {tuple(self.observation_spec[key].shape)}; take the state "
+                    "from get_state() of an environment with the same config that was reset"
+                )
         sim.set_state(dict(state.items()))
+        if self._stack is not None:
+            self._stack.load(frames)
         return self._observed_anew()
 
     def set_goal(self, goal: torch.Tensor) -> TensorDict:
@@ -276,6 +308,8 @@ class FrankaEnv(EnvBase):
     def _observed_anew(self) -> TensorDict:
         """What the worlds observe after something was set by hand."""
         sim = self.simulation
+        for key in self._stacked:  # a goal marker may have moved in it
+            self._stack.replace(key, sim.images[key])
         out = self._present()
         out["is_init"] = sim.step_count == 0
         out["success"] = torch.zeros_like(sim.success)

@@ -111,7 +111,9 @@ class FrankaVectorEnv(gymnasium.vector.VectorEnv):
         entries: dict[str, spaces.Space] = {}
         if "pixels" in env.config.observations:
             side = env.config.image_size
-            entries["pixels"] = spaces.Dict({CAMERA: spaces.Box(0, 255, (side, side, 3), np.uint8)})
+            entries["pixels"] = spaces.Dict(
+                {CAMERA: spaces.Box(0, 255, (side, side, 3 * env.config.frame_stack), np.uint8)}
+            )
         # Joints may overshoot their limits a little, so the box is open.
         entries["agent_pos"] = spaces.Box(-np.inf, np.inf, (NUM_JOINTS,), np.float32)
         entries["environment_state"] = spaces.Box(-np.inf, np.inf, (3,), np.float32)

@@ -413,12 +413,17 @@ def aim_wrist(
 
 
 @wp.kernel(enable_backward=False)
-def aim_front(poses: wp.array[wp.transformf], views: wp.array[int], transforms: wp.array[wp.transformf]):
-    """Each view's world's own camera frame."""
+def aim_fixed(
+    poses: wp.array[wp.transformf],
+    turn: wp.transformf,
+    views: wp.array[int],
+    transforms: wp.array[wp.transformf],
+):
+    """Each view's world's own camera frame, turned in the world."""
     view = wp.tid()
     world = views[view]
     if world >= 0:
-        transforms[view] = poses[world]
+        transforms[view] = turn * poses[world]
 
 
 @wp.kernel(enable_backward=False)

@@ -177,7 +177,7 @@ class Simulation:
         self._seed.copy_(state["seed"][:1])
         self.randomizer.apply()
         self._observe_anew()
-        if self._cameras or self._goal_camera is not None:
+        if self._cameras or self._goal_cameras:
             self.show_all()
 
     def set_goal(self, goal: torch.Tensor) -> None:
@@ -189,7 +189,7 @@ class Simulation:
         self._task_goal.copy_(goal)
         self.goal_q.copy_(self.kinematics.solve(goal, self.goal_q, iterations=24))
         self._observe_anew()
-        if self._goal_camera is not None or (self._cameras and self.config.show_goal):
+        if self._goal_cameras or (self._cameras and self.config.show_goal):
             self.show_all()
 
     def _observe_anew(self) -> None:
@@ -205,7 +205,7 @@ class Simulation:
         stream = wp.stream_from_torch(torch.cuda.current_stream(self.device)) if device.is_cuda else None
         with wp.ScopedStream(stream) if stream is not None else wp.ScopedDevice(device):
             self._launch_marker()
-            if self._goal_camera is not None:
+            if self._goal_cameras:
                 newton.eval_fk(self.model, self.warp.goal_q.flatten(), self._no_speed, self._goal_state)
             self._counts.zero_()
             everywhere = wp.ones(self.num_envs, dtype=wp.bool, device=self.device)
@@ -323,14 +323,14 @@ class Simulation:
             for kind in kinds:
                 self.images[kind + suffix] = as_torch(kind, full.images[kind])
                 self.next_images[kind + suffix] = as_torch(kind, after[kind])
-        self._goal_camera = None
+        self._goal_cameras: list[tuple[Camera, wp.array, wp.array]] = []
         if "goal_pixels" in cfg.images:
-            self._goal_camera = Camera(self.model, cfg, name=cfg.cameras[0], num_views=some)
-            self._goal_image, self._next_goal_image = (
-                self._goal_camera.allocate(n)["pixels"] for _ in range(2)
-            )
-            self.images["goal_pixels"] = as_torch("pixels", self._goal_image)
-            self.next_images["goal_pixels"] = as_torch("pixels", self._next_goal_image)
+            for name in cfg.cameras:
+                camera = Camera(self.model, cfg, name=name, num_views=some)
+                now, after = (camera.allocate(n)["pixels"] for _ in range(2))
+                self._goal_cameras.append((camera, now, after))
+                key = "goal_pixels" if name == cfg.cameras[0] else f"goal_pixels_{name}"
+                self.images[key], self.next_images[key] = as_torch("pixels", now), as_torch("pixels", after)
             self._goal_state = self.model.state()
             self._goal_arm = SimpleNamespace(**vars(self.warp))
             self._goal_arm.body_q = self._goal_state.body_q.reshape((n, self.model.body_count // n))
@@ -376,8 +376,8 @@ class Simulation:
         arrays += [self.newton_state.body_qd, *self._solver_memory().values(), *self.randomizer.arrays()]
         for _, _, now, after in self._cameras:
             arrays += [*now.values(), *after.values()]
-        if self._goal_camera is not None:
-            arrays += [self._goal_image, self._next_goal_image]
+        for _, now, after in self._goal_cameras:
+            arrays += [now, after]
         return [a for a in arrays if a is not None and a.size]
 
     def _solver_memory(self) -> dict[str, wp.array]:
@@ -437,8 +437,8 @@ class Simulation:
                 camera.render(self.newton_state, w, images=after)
                 for kind, image in after.items():
                     wp.copy(now[kind], image)
-        if self._goal_camera is not None:
-            wp.copy(self._next_goal_image, self._goal_image)
+        for _, now, after in self._goal_cameras:
+            wp.copy(after, now)
         self._launch_reset_and_observe()
 
     def _launch_action(self) -> None:
@@ -524,11 +524,11 @@ class Simulation:
         self._launch_observe(w.true_state, w.joint_target, w.goal)
         self.task.begin(self, w.arms_mask)
         self._launch_noise(w.true_state, w.state)
-        if self._cameras or self._goal_camera is not None:
+        if self._cameras or self._goal_cameras:
             self._launch_marker()
             self._counts.zero_()
             wp.launch(kernels.list_worlds, n, [w.arms_mask, self._reset_worlds, self._counts], device=d)
-            if self._goal_camera is not None:
+            if self._goal_cameras:
                 q = w.goal_q.flatten()
                 newton.eval_fk(self.model, q, self._no_speed, self._goal_state)
             wp.capture_while(self._counts[2:], self._render_some)
@@ -537,11 +537,10 @@ class Simulation:
         """Renders the next few of the worlds that were reset into their pictures."""
         d, views, some = self.device, self._views, self._views.shape[0]
         wp.launch(kernels.choose_views, some, [self._reset_worlds, self._counts, SKIP_VIEW, views], device=d)
-        if self._goal_camera is not None:
+        if self._goal_cameras:
             self.model.bvh_refit_shapes(self._goal_state)
-            self._render_into(
-                self._goal_camera, self._goal_state, self._goal_arm, {"pixels": self._goal_image}
-            )
+            for camera, now, _ in self._goal_cameras:
+                self._render_into(camera, self._goal_state, self._goal_arm, {"pixels": now})
         self.model.bvh_refit_shapes(self.newton_state)
         for _, few, now, _ in self._cameras:
             self._render_into(few, self.newton_state, self.warp, now)

@@ -9,7 +9,7 @@ Its `in_keys` name the entries that it cannot do without.
 """
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Literal, get_args
 
 import torch
@@ -115,37 +115,38 @@ class GoalDistance:
 
 
 class GoalImage:
-    """Minus the distance to what the goal's picture looks like to the model.
+    """Minus the distance to what the goal's picture, or its pictures from several cameras, look like to the model.
 
-    The picture is encoded once per decision, by `bind`; planning then is `GoalDistance`.
+    They are encoded once per decision, by `bind`; planning then is `GoalDistance`.
 
     Args:
-        encode_goal: observation of a goal, a TensorDict of batch size [E] whose entry `pixels` holds the
-            goal's picture -> (E, D). It holds nothing else: other entries of the present observation
-            (joint angles) are not those of the goal.
+        encode_goal: observation of a goal, a TensorDict of batch size [E] with the goal's pictures -> (E, D). It
+            holds nothing else: other entries of the present observation (joint angles) are not those of the goal.
         embed: latents (..., Z) -> (..., D), the space of `encode_goal`; None: the latents themselves.
-        pixels: the key that the model's encoder reads.
-        goal: the key of the goal's picture in the observation, (E, H, W, C) uint8.
+        goals: key that the model's encoder reads -> key of the goal's picture in the observation,
+            (E, H, W, C) uint8. None: `pixels` -> `goal_pixels`.
         metric, summed: see `GoalDistance`.
 
     Raises:
-        ValueError: there is no such metric.
+        ValueError: there is no such metric, or no picture.
     """
 
     def __init__(
         self,
         encode_goal: Callable[[TensorDictBase], Tensor],
         embed: Callable[[Tensor], Tensor] | None = None,
-        pixels: str = "pixels",
-        goal: str = "goal_pixels",
+        goals: Mapping[str, str] | None = None,
         metric: Metric = "l2",
         summed: bool = True,
     ) -> None:
         _require_metric(metric)
-        self.encode_goal, self.embed, self.pixels, self.goal = encode_goal, embed, pixels, goal
+        self.goals = {"pixels": "goal_pixels"} if goals is None else dict(goals)
+        if not self.goals:
+            raise ValueError("goals is empty: name at least one picture")
+        self.encode_goal, self.embed = encode_goal, embed
         self.metric: Metric = metric
         self.summed = summed
-        self.in_keys = [goal]
+        self.in_keys = list(self.goals.values())
 
     def bind(self, tensordict: TensorDictBase) -> GoalDistance:
         """The objective of the present decision.
@@ -153,13 +154,14 @@ class GoalImage:
         Raises:
             ValueError: the observation has no picture of the goal.
         """
-        picture = tensordict.get(self.goal, None)
-        if picture is None:
-            raise ValueError(
-                f"the observation has no {self.goal!r}, the picture of the goal to plan towards: "
-                "add it to env.observations"
-            )
-        observation = TensorDict({self.pixels: picture}, batch_size=tensordict.batch_size)
+        pictures = {key: tensordict.get(goal, None) for key, goal in self.goals.items()}
+        for key, picture in pictures.items():
+            if picture is None:
+                raise ValueError(
+                    f"the observation has no {self.goals[key]!r}, the picture of the goal to plan towards: "
+                    "add goal_pixels to env.observations"
+                )
+        observation = TensorDict(pictures, batch_size=tensordict.batch_size)
         return GoalDistance(self.encode_goal(observation), self.summed, metric=self.metric, embed=self.embed)
 
     def __call__(self, trajectory: Tensor, actions: Tensor) -> Tensor:

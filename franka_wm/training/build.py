@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from typing import Any
 
 import torch
@@ -226,6 +227,11 @@ def plans_to_pictures(cfg: DictConfig) -> bool:
     return objective_name(cfg) == "goal_image"
 
 
+def goal_pictures(keys: Iterable[str]) -> dict[str, str]:
+    """Key of a picture that a model reads → that of the same camera's picture of the goal."""
+    return {key: f"goal_{key}" for key in keys}
+
+
 def objective_name(cfg: DictConfig) -> str | None:
     """``reward_value``, ``goal_image``, or ``None`` for a family that does not plan by an objective."""
     name = cfg.objective.name
@@ -256,7 +262,11 @@ def make_objective(cfg: DictConfig, model: Any) -> Any:
                 f"objective=goal_image: model={cfg.model.name} has no encode_goal; use objective=reward_value"
             )
         chosen = planning.GoalImage(
-            model.encode_goal, embed=getattr(model, "embed", None), metric=o.metric, summed=o.summed
+            model.encode_goal,
+            embed=getattr(model, "embed", None),
+            goals=goal_pictures(model.image_sizes),
+            metric=o.metric,
+            summed=o.summed,
         )
     else:
         raise UserError(f"objective.name={name!r}: must be auto, reward_value or goal_image")

@@ -98,11 +98,14 @@ def check(cfg: DictConfig) -> None:
     spaces = _spaces(cfg)
     if spaces is not None:
         model = build.make_model(cfg, spaces, "cpu")
-        if build.objective_name(cfg) == "goal_image" and "goal_pixels" not in spaces.image_sizes:
-            raise UserError(
-                f"planning to a goal image needs goal_pixels among env.observations={list(cfg.env.observations)}; "
-                "use env=reach_goal_image or reach_fixed_goal_image"
-            )
+        if build.objective_name(cfg) == "goal_image":
+            goals = build.goal_pictures(getattr(model, "image_sizes", {})).values()
+            if not goals or any(goal not in spaces.image_sizes for goal in goals):
+                raise UserError(
+                    "planning to a goal image needs goal_pixels among env.observations="
+                    f"{list(cfg.env.observations)}, and a model that reads pixels, not {model.observation_keys}; "
+                    "use env=reach_goal_image or reach_fixed_goal_image"
+                )
         build.make_objective(cfg, model)
         if hasattr(model, "next"):
             build.make_planner(cfg, spaces.num_actions or spaces.action_dim)

@@ -73,7 +73,8 @@ class Spaces:
         """Of the arm, before it is built."""
         pictures = [key for key in config.observations if key in IMAGES]
         names = {key: image_names(key, config) for key in pictures}
-        channels = {"depth": 1, "segmentation": 1}
+        channels = {"depth": 1, "segmentation": 1, "pixels": 3 * config.frame_stack}
+        channels["goal_pixels"] = channels["pixels"]
         size = config.image_size
         images = {name: (size, size, channels.get(key, 3)) for key in pictures for name in names[key]}
         vectors = {"state": STATE_DIM, "joint_target": NUM_JOINTS}
@@ -111,8 +112,7 @@ class Spaces:
 
 def image_names(key: str, config: FrankaConfig) -> list[str]:
     """The TensorDict keys of a picture: the plain name for the first camera, with the camera's for others."""
-    others = () if key == "goal_pixels" else config.cameras[1:]
-    return [key, *(f"{key}_{camera}" for camera in others)]
+    return [key, *(f"{key}_{camera}" for camera in config.cameras[1:])]
 
 
 def _list(keys: Any) -> str:

@@ -129,7 +129,7 @@ def test_a_goal_picture_becomes_a_distance(trajectory, actions):
 
 def test_other_names_for_pictures():
     td = TensorDict({"wanted": torch.full((1, 2, 2, 1), 255, dtype=torch.uint8)}, [1])
-    objective = GoalImage(lambda o: o["eye"].float().mean((1, 2)), pixels="eye", goal="wanted")
+    objective = GoalImage(lambda o: o["eye"].float().mean((1, 2)), goals={"eye": "wanted"})
     assert objective.bind(td).goal_latent.tolist() == [[255.0]]
 
 

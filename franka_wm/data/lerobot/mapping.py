@@ -83,7 +83,7 @@ def map_features(
     ==================================  ==============================================================
     feature                             entry
     ==================================  ==============================================================
-    ``observation.images.goal``         ``goal_pixels``
+    ``observation.images.goal``         ``goal_pixels`` (ours: ``….goal_<camera>`` as ``goal_pixels_<camera>``)
     first other picture                 ``pixels``
     further ones                        ``pixels_<camera>``
     ``observation.state``               ``state``
@@ -207,7 +207,8 @@ def _by_convention(
         if name.startswith(_IMAGE) and is_image(spec):
             camera = name.rsplit(".", 1)[-1]
             key = f"pixels_{camera}" if "pixels" in observed else "pixels"
-            key = "goal_pixels" if name == schema.IMAGE_PREFIX + "goal" else key
+            if name == schema.IMAGE_PREFIX + "goal" or (ours and camera.startswith("goal_")):
+                key = "goal_pixels" + camera.removeprefix("goal")
             usable = not is_depth(spec) and len(spec["shape"]) == 3
         elif name.startswith(_OBSERVATION):
             key = name.removeprefix(_OBSERVATION).replace(".", "_")

@@ -152,10 +152,14 @@ def schema_for(
 
     Raises:
         UserError: An unknown format, a frame rate that is not whole, or an observation that has no place in a
-            LeRobot dataset.
+            LeRobot dataset, stacked pictures among them.
     """
     if format not in FORMATS:
         raise UserError(f"format={format!r}: must be one of {', '.join(FORMATS)}")
+    if config.frame_stack > 1 and config.images:
+        raise UserError(
+            f"env.frame_stack={config.frame_stack}: a dataset holds single pictures; record with env.frame_stack=1"
+        )
     if config.fps != round(config.fps):
         raise UserError(
             f"env.fps={config.fps:g}: LeRobot counts whole frames per second; choose a whole number"
@@ -218,9 +222,10 @@ def schema_for(
 
 
 def image_feature(key: str, cameras: Sequence[str]) -> str:
-    """``pixels`` → ``observation.images.front``, ``pixels_wrist`` → ``….wrist``, ``goal_pixels`` → ``….goal``."""
-    if key == "goal_pixels":
-        return IMAGE_PREFIX + "goal"
+    """``pixels`` → ``observation.images.front``, ``pixels_wrist`` → ``….wrist``, ``goal_pixels`` → ``….goal``,
+    ``goal_pixels_side`` → ``….goal_side``."""
+    if key.startswith("goal_pixels"):
+        return IMAGE_PREFIX + "goal" + key.removeprefix("goal_pixels")
     return IMAGE_PREFIX + (cameras[0] if key == "pixels" else key.removeprefix("pixels_"))
 
 
@@ -250,11 +255,10 @@ _TASKS = {
 
 
 def _image_keys(config: FrankaConfig) -> list[str]:
-    """As the environment names them: the first camera's without a suffix, one goal picture."""
+    """As the environment names them: the first camera's without a suffix."""
     out = []
     for kind in config.images:
-        names = config.cameras[:1] if kind == "goal_pixels" else config.cameras
-        out += [kind if camera == config.cameras[0] else f"{kind}_{camera}" for camera in names]
+        out += [kind if camera == config.cameras[0] else f"{kind}_{camera}" for camera in config.cameras]
     return out
 
 

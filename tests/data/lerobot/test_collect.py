@@ -273,4 +273,5 @@ def test_schemas_of_several_cameras() -> None:
         IMAGE_PREFIX + "wrist": "pixels",
         IMAGE_PREFIX + "front": "pixels_front",
         IMAGE_PREFIX + "goal": "goal_pixels",
+        IMAGE_PREFIX + "goal_front": "goal_pixels_front",
     }

@@ -1,0 +1,50 @@
+"""The last few pictures of every world, side by side along the channels."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+
+class FrameStack:
+    """The last ``count`` pictures of N worlds by observation key, oldest first; nothing waits for the device.
+
+    Args:
+        count: Pictures that are kept, the present one included.
+    """
+
+    def __init__(self, count: int):
+        self.count = count
+        self._frames: dict[str, Tensor] = {}
+
+    def __getitem__(self, key: str) -> Tensor:
+        """A copy of what is kept under ``key``, (N, H, W, C · count)."""
+        return self._frames[key].clone()
+
+    def push(self, key: str, picture: Tensor) -> None:
+        """``picture`` (N, H, W, C) is the present one from now on, and the oldest is forgotten."""
+        self._frames[key] = torch.cat((self._frames[key][..., picture.shape[-1] :], picture), -1)
+
+    def restart(self, key: str, picture: Tensor, mask: Tensor | None = None) -> None:
+        """Copies of ``picture`` (N, H, W, C) where ``mask`` (N,) is true, or everywhere: an episode begins."""
+        copies = self.still(picture)
+        if mask is not None and key in self._frames:
+            copies = torch.where(mask.view(-1, 1, 1, 1), copies, self._frames[key])
+        self._frames[key] = copies
+
+    def replace(self, key: str, picture: Tensor) -> None:
+        """``picture`` (N, H, W, C) instead of the present one."""
+        kept = self._frames[key]
+        self._frames[key] = torch.cat((kept[..., : -picture.shape[-1]], picture), -1)
+
+    def still(self, picture: Tensor) -> Tensor:
+        """``picture`` (N, H, W, C) as if nothing had moved, (N, H, W, C · count)."""
+        return picture.repeat(1, 1, 1, self.count)
+
+    def memory(self) -> dict[str, Tensor]:
+        """What is kept, by key: not copies."""
+        return dict(self._frames)
+
+    def load(self, frames: dict[str, Tensor]) -> None:
+        """Keeps copies of what :meth:`memory` gave."""
+        self._frames = {key: frame.clone() for key, frame in frames.items()}
