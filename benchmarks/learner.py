@@ -2,7 +2,7 @@
 
     python benchmarks/learner.py                 the sizes of the reference library, and the published one
 
-On CUDA the update is one captured graph, as in training.
+On CUDA the update is one captured graph, and sampling another, as in training.
 """
 
 from __future__ import annotations
@@ -13,6 +13,7 @@ import torch
 from common import publish, rate, tdmpc2
 from tensordict import TensorDict
 
+from franka_wm.data.captured import CapturedSampling
 from franka_wm.data.replay import make_replay
 from franka_wm.envs import resolve_device
 from franka_wm.training.learner import Learner
@@ -73,7 +74,8 @@ def main() -> None:
         replay.extend(experience(64, 500, device))
         fixed = replay.sample()
         alone = rate(lambda: learner.update(fixed), seconds=arguments.seconds, warmup=8)
-        sampled = rate(lambda: learner.update(replay.sample()), seconds=arguments.seconds, warmup=8)
+        draw = CapturedSampling(replay) if learner.capture else replay.sample
+        sampled = rate(lambda: learner.update(draw()), seconds=arguments.seconds, warmup=8)
         rows.append(
             {
                 "latent/hidden, batch": name,

@@ -42,33 +42,64 @@ class WindowSampler(Sampler):
         self._missing: torch.Tensor | None = None
 
     def sample(self, storage: Any, batch_size: int) -> tuple[Any, dict]:
-        data = storage._storage
-        capacity, worlds = data.shape[:2]
+        span, oldest = self.bounds(storage)
+        worlds = storage._storage.shape[1]
+        count = self.candidates(batch_size)
+        draw = torch.randint(span * worlds, (count,), device=storage._storage.device)
+        time, world, crossing = self.choose(storage._storage, draw, oldest, batch_size)
+        if crossing is not None:
+            self.record_missing(crossing)
+        return (time, world), {}
+
+    def bounds(self, storage: Any) -> tuple[int, int]:
+        """How many times a window may start at, in each world, and the oldest of them.
+
+        Raises:
+            UserError: There are fewer steps than a window has.
+        """
         filled = storage._len_along_dim0
         span = filled - self.length + 1
         if span < 1:
             raise UserError(
                 f"the replay buffer holds {filled} steps per world, a window needs {self.length}; collect more first"
             )
-        device = data.device
-        oldest = self.writer._cursor if filled == capacity else 0
-        count = self.oversample * batch_size + 64
-        draw = torch.randint(span * worlds, (count,), device=device)
+        return span, self.writer._cursor if filled == storage._storage.shape[0] else 0
+
+    def candidates(self, batch_size: int) -> int:
+        """How many windows are drawn for a batch of so many."""
+        return self.oversample * batch_size + 64
+
+    def choose(
+        self, data: Any, draw: torch.Tensor, oldest: int | torch.Tensor, batch_size: int
+    ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor | None]:
+        """Whole windows among the drawn ones; no operation waits for the device.
+
+        Args:
+            data: The storage, (time, worlds).
+            draw: (candidates,) int64, from [0, span · worlds): uniform.
+            oldest: The first time that a window may start at.
+
+        Returns:
+            Time and world of each step, (batch_size, length) both, and which windows cross an episode's start
+            after all, (batch_size,) bool: none where there are enough whole ones.
+        """
+        (capacity, worlds), device = data.shape[:2], draw.device
         world = draw % worlds
         time = (torch.div(draw, worlds, rounding_mode="floor").unsqueeze(1) + oldest
                 + torch.arange(self.length, device=device)) % capacity  # fmt: skip
+        crossing = None
         if self.length > 1:
             starts = data.get(self.boundary)[time[:, 1:], world.unsqueeze(1)]
             crossing = starts.flatten(1).any(1)
             # Stable: keeps the order of the draws, so the first batch_size whole windows are a uniform sample.
             order = torch.sort(crossing, stable=True).indices[:batch_size]
-            self._record_missing(crossing[order])
-            time, world = time[order], world[order]
+            time, world, crossing = time[order], world[order], crossing[order]
         else:
             time, world = time[:batch_size], world[:batch_size]
-        return (time, world.unsqueeze(1).expand_as(time)), {}
+        return time, world.unsqueeze(1).expand_as(time), crossing
 
-    def _record_missing(self, crossing: torch.Tensor) -> None:
+    def record_missing(self, crossing: torch.Tensor) -> None:
+        """Keeps in mind whether a batch holds windows that are not whole, for :meth:`check`."""
         if crossing.device.type == "cpu":
             self._missing = crossing.any()
             self.check()

@@ -241,11 +241,11 @@ class FrankaEnv(EnvBase):
 
     def _picture(self, key: str, images: dict[str, torch.Tensor]) -> torch.Tensor:
         """A copy of a picture as it is observed; pictures of the goal, which stands still, are stacked alike."""
+        if self._stack is None:
+            return images[key].clone()
         if key in self._stacked:
             return self._stack[key]
-        if self._stack is not None and key.startswith("goal_pixels"):
-            return self._stack.still(images[key])
-        return images[key].clone()
+        return self._stack.still(images[key]) if key.startswith("goal_pixels") else images[key].clone()
 
     def get_state(self) -> TensorDict:
         """Everything that the futures of the worlds depend on, batch size (N,): a checkpoint of the simulation.

@@ -1,6 +1,6 @@
 """TD-MPC2: a latent world model without decoder (Hansen, Su & Wang, ICLR 2024, arXiv:2310.16828)."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal
 
@@ -11,6 +11,7 @@ from torch.nn import functional as F
 
 from franka_wm.models.parts import Ensemble, GaussianPolicy, RunningScale, SimNorm, TwoHotSymlog, mlp
 from franka_wm.models.pixel_encoder import PixelEncoder
+from franka_wm.models.streams import beside
 from franka_wm.models.vectors import copy_statistics
 from franka_wm.models.vision import RandomShift, check_image_sizes, check_pictures
 
@@ -281,7 +282,12 @@ class TDMPC2(nn.Module):
         """Same as `loss`, for wrappers that call the module."""
         return self.loss(batch)
 
-    def loss(self, batch: TensorDictBase) -> TensorDict:
+    parts_of_loss = ("_encode_window", "_td_target", "_unroll", "_model_losses", "_policy_loss")
+    """Methods that `loss` calls, and that are compiled one by one: what runs side by side must not be one program."""
+
+    def loss(
+        self, batch: TensorDictBase, *, parts: Mapping[str, Callable[..., Any]] | None = None
+    ) -> TensorDict:
         """Losses of a batch of windows; call `backward` once on the entry `loss`.
 
         The policy's parameters then hold the gradient of the policy loss alone, and all others that of the
@@ -293,6 +299,7 @@ class TDMPC2(nn.Module):
                 (B, H, 1) bool. The observations after steps 0..H-2 are read from the root of the following
                 step; only the last one is read from `next`, and it must be the true one, also where the
                 episode ended. A truncated episode is bootstrapped, a terminated one is not.
+            parts: what to call instead of the methods that `parts_of_loss` names.
 
         Returns:
             batch size []: `loss` to differentiate, and detached: `loss_consistency`, `loss_reward`,
@@ -304,6 +311,7 @@ class TDMPC2(nn.Module):
         """
         if len(batch.batch_size) != 2:
             raise ValueError(f"a batch of windows has batch size [B, H], got {list(batch.batch_size)}")
+        call = {name: getattr(self, name) for name in self.parts_of_loss} | dict(parts or {})
         # Time leads from here on: (H, B, ...).
         action, reward, terminated = (
             batch.get(key).transpose(0, 1) for key in ("action", ("next", "reward"), ("next", "terminated"))
@@ -313,24 +321,20 @@ class TDMPC2(nn.Module):
             -1, 1, 1
         )
 
-        encoded = self._encode_window(batch)  # (H+1, B, D), one call
+        encoded = call["_encode_window"](batch)  # (H+1, B, D), one call
         after = encoded[1:].detach()
-        with torch.no_grad():
-            target = self._td_target(after, reward, terminated)
-
-        latents = [encoded[0]]
-        for t in range(horizon):
-            latents.append(self.next(latents[-1], action[t]))
-        predicted = torch.stack(latents)  # (H+1, B, D): unrolled from the first observation
-        before = torch.cat((predicted[:-1], action), dim=-1)
-
-        reward_logits = self.reward_head(before)
-        q_logits = self.q_ensemble(before, dropout=self.training)  # (num_q, H, B, bins)
-        step_weight = weight[:-1]
-        consistency = (step_weight * F.mse_loss(predicted[1:], after, reduction="none")).mean()
-        reward_loss = (step_weight * self.two_hot.loss(reward_logits, reward)).mean()
-        value_loss = (step_weight * self.two_hot.loss(q_logits, target)).mean()
-        policy_loss, entropy = self._policy_loss(predicted.detach(), weight)
+        # Targets, model and policy need each other's inputs only: on CUDA they run side by side.
+        with beside(after, reward, terminated) as targets, torch.no_grad():
+            target = call["_td_target"](after, reward, terminated)
+        predicted = call["_unroll"](encoded[0], action)  # (H+1, B, D)
+        detached = predicted.detach()
+        with beside(detached, weight, lane=1) as policy:
+            policy_loss, entropy = call["_policy_loss"](detached, weight)
+        targets.join(target)
+        consistency, reward_loss, value_loss, q_logits, reward_logits = call["_model_losses"](
+            predicted, after, action, reward, target, weight[:-1]
+        )
+        policy.join(policy_loss, entropy)
 
         total = (
             self.consistency_coef * consistency
@@ -402,6 +406,25 @@ class TDMPC2(nn.Module):
     def _random_pair(self, device: torch.device) -> Tensor:
         # Ranking noise draws without replacement, on the device; torch.randperm may wait for the host.
         return torch.rand(self.num_q, device=device).topk(2).indices
+
+    def _unroll(self, z: Tensor, actions: Tensor) -> Tensor:
+        """Latents (H+1, B, D) from the first one (B, D) and actions (H, B, A)."""
+        latents = [z]
+        for action in actions:
+            latents.append(self.next(latents[-1], action))
+        return torch.stack(latents)
+
+    def _model_losses(
+        self, predicted: Tensor, after: Tensor, action: Tensor, reward: Tensor, target: Tensor, weight: Tensor
+    ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+        """Losses of consistency, reward and value, and the logits of values (num_q, H, B, bins) and rewards."""
+        before = torch.cat((predicted[:-1], action), dim=-1)
+        reward_logits = self.reward_head(before)
+        q_logits = self.q_ensemble(before, dropout=self.training)
+        consistency = (weight * F.mse_loss(predicted[1:], after, reduction="none")).mean()
+        reward_loss = (weight * self.two_hot.loss(reward_logits, reward)).mean()
+        value_loss = (weight * self.two_hot.loss(q_logits, target)).mean()
+        return consistency, reward_loss, value_loss, q_logits, reward_logits
 
     def _td_target(self, after: Tensor, reward: Tensor, terminated: Tensor) -> Tensor:
         """One-step targets (H, B, 1) from encoded next latents (H, B, D): r + γ min of two target Qs."""

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import torch
@@ -83,7 +85,7 @@ class Learner:
         self.optimizer = torch.optim.AdamW(groups, lr=lr, weight_decay=0.0, fused=True, capturable=on_cuda)
         self._rates = [float(group["lr"]) for group in self.optimizer.param_groups]
         self.precision = precision
-        self._loss = torch.compile(model.loss, mode="default") if compile else model.loss
+        self._loss = _compiled(model) if compile else model.loss
         self.updates = 0
         self._names: list[str] = []
         self._sums: torch.Tensor | None = None
@@ -92,12 +94,16 @@ class Learner:
         self._batch: TensorDictBase | None = None
         self._seen = 0
 
-    def update(self, batch: TensorDictBase) -> None:
-        """One update from ``batch`` of batch size (B, H); no host sync."""
+    def update(self, batch: TensorDictBase, *, static: bool = False) -> None:
+        """One update from ``batch`` of batch size (B, H); no host sync.
+
+        Args:
+            static: Every batch lies in the memory of this one: a captured update reads it there.
+        """
         if self._scheduled:
             self._set_rates()
         if self._graph is None and self.capture and self._seen >= self.EAGER_UPDATES:
-            self._record(batch)
+            self._record(batch, static)
         if self._graph is None:
             if self.capture:  # warm up on the kind of stream that the capture will use
                 stream = torch.cuda.Stream()
@@ -111,7 +117,8 @@ class Learner:
                 self._eager(batch)
         else:
             assert self._batch is not None
-            self._batch.update_(batch.select(*self._batch.keys(True, True)))
+            if batch is not self._batch:
+                self._batch.update_(batch.select(*self._batch.keys(True, True)))
             self._graph.replay()
         self._seen += 1
         self._summed += 1
@@ -161,11 +168,19 @@ class Learner:
                 self._sums = torch.zeros_like(row)
             self._sums += row
 
-    def _record(self, batch: TensorDictBase) -> None:
+    def _record(self, batch: TensorDictBase, static: bool) -> None:
         """Captures the update. Capturing runs nothing, so no update is lost or counted twice."""
-        self._batch = batch.clone()
+        self._batch = batch if static else batch.clone()
         self.optimizer.zero_grad(set_to_none=True)
         graph = torch.cuda.CUDAGraph()
         with torch.cuda.graph(graph):
             self._eager(self._batch)
         self._graph = graph
+
+
+def _compiled(model: Any) -> Callable[[TensorDictBase], TensorDictBase]:
+    """`model.loss` compiled: as a whole, or part by part where the model names them."""
+    names = getattr(model, "parts_of_loss", ())
+    if not names:
+        return torch.compile(model.loss)
+    return partial(model.loss, parts={name: torch.compile(getattr(model, name)) for name in names})

@@ -15,6 +15,7 @@ from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torchrl.collectors import Collector
 
+from franka_wm.data.captured import CapturedSampling
 from franka_wm.training.checkpoint import Checkpoint, save_checkpoint
 from franka_wm.training.learner import Learner
 from franka_wm.training.loggers import log_numbers
@@ -108,6 +109,10 @@ class Trainer:
         self.validation = validation
         self.diagnose = diagnose
         self._batch: TensorDictBase | None = None
+        self._draw, self._static = replay.sample, lambda batch: False
+        if learner.capture and env is not None:
+            self._draw = sampling = CapturedSampling(replay)
+            self._static = sampling.is_static
         self.spaces = Spaces.of_env(env) if spaces is None else spaces
         self._vectors = list(self.model.observation_sizes)
         self._keys = list(getattr(self.model, "observation_keys", self._vectors))
@@ -142,8 +147,8 @@ class Trainer:
                 if self.env is not None:
                     self.gather()
                 for _ in range(min(trainer.updates_per_batch, total - self.learner.updates)):
-                    self._batch = self.replay.sample()
-                    self.learner.update(self._batch)
+                    self._batch = self._draw()
+                    self.learner.update(self._batch, static=self._static(self._batch))
                 self.seconds = time.perf_counter() - started
                 now = time.perf_counter()
                 last = self.learner.updates >= total

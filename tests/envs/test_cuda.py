@@ -41,6 +41,11 @@ CASES: dict[str, dict[str, Any]] = {
         "goal_sampling": "reachable",
         "show_goal": True,
     },
+    "stacked": {
+        "observations": ("pixels", "goal_pixels", "state", "joint_target"),
+        "cameras": ("side", "front"),
+        "frame_stack": 3,
+    },
     "joint_position": {"action_mode": "joint_position"},
     "ee_delta": {"action_mode": "ee_delta"},
     "track": {"task": "track"},

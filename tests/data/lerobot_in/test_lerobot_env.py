@@ -45,6 +45,7 @@ def test_observations_are_those_of_a_dataset(config: FrankaWMEnv) -> None:
         "observation.images.front": (3, 16, 16),
         "observation.images.wrist": (3, 16, 16),
         "observation.images.goal": (3, 16, 16),
+        "observation.images.goal_wrist": (3, 16, 16),
         "observation.state": (20,),
         "observation.environment_state": (3,),
     }

@@ -1,0 +1,84 @@
+"""A batch of windows as one CUDA graph: drawing and gathering it is dozens of small operations."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from tensordict import TensorDictBase
+from torchrl.data import ReplayBuffer
+
+from franka_wm.data.replay import WindowSampler
+
+
+class CapturedSampling:
+    """Calls give a batch of a replay buffer's windows: eagerly at first, then by replaying one CUDA graph.
+
+    The distribution is :class:`~franka_wm.data.replay.WindowSampler`'s; where the present experience begins and ends is
+    read from the device by the graph and written before each replay, so the buffer may grow and wrap around.
+
+    A captured batch lies in the same memory in every call: the next one overwrites it.
+
+    Args:
+        replay: From :func:`~franka_wm.data.replay.make_replay`, on a CUDA device.
+    """
+
+    EAGER_CALLS = 2
+    """Before the capture: they let libraries allocate what a graph may not."""
+
+    def __init__(self, replay: ReplayBuffer):
+        self.replay = replay
+        self._calls = 0
+        self._memory: tuple[int, int] | None = None
+        self._graph: torch.cuda.CUDAGraph | None = None
+        self._batch: TensorDictBase | None = None
+
+    def __call__(self) -> TensorDictBase:
+        """A batch of batch size (batch_size, length); no host sync.
+
+        Raises:
+            UserError: There are fewer steps than a window has.
+        """
+        self._calls += 1
+        if self._calls <= self.EAGER_CALLS:
+            return self.replay.sample()
+        storage: Any = self.replay.storage
+        sampler = self.replay.sampler
+        assert isinstance(sampler, WindowSampler)
+        span, oldest = sampler.bounds(storage)
+        data = storage._storage
+        memory = (id(data), data.get(sampler.boundary).data_ptr())
+        if memory != self._memory:
+            self._record(data, sampler)
+            self._memory = memory
+        assert self._graph is not None and self._batch is not None
+        self._choices.fill_(span * data.shape[1])
+        self._oldest.fill_(oldest)
+        self._graph.replay()
+        sampler.record_missing(self._crossing)
+        return self._batch
+
+    def is_static(self, batch: TensorDictBase) -> bool:
+        """Whether later batches will lie in the memory of this one."""
+        return batch is self._batch
+
+    def _record(self, data: Any, sampler: WindowSampler) -> None:
+        device, size = data.device, self.replay._batch_size
+        assert size is not None
+        self._choices = torch.ones((), dtype=torch.float64, device=device)
+        self._oldest = torch.zeros((), dtype=torch.int64, device=device)
+        graph = torch.cuda.CUDAGraph()
+        with torch.cuda.graph(graph, capture_error_mode="thread_local"):
+            self._draw(data, sampler, size)
+        self._graph = graph
+
+    def _draw(self, data: Any, sampler: WindowSampler, size: int) -> None:
+        """Draws a batch; everything that changes from call to call is read from tensors."""
+        uniform = torch.rand(sampler.candidates(size), dtype=torch.float64, device=data.device)
+        # The largest product rounds up to the number of choices itself for huge buffers only; hence the bound.
+        draw = torch.minimum(uniform * self._choices, self._choices - 1.0).long()
+        time, world, crossing = sampler.choose(data, draw, self._oldest, size)
+        self._batch = data[time, world]
+        self._crossing = (
+            torch.zeros((), dtype=torch.bool, device=data.device) if crossing is None else crossing
+        )
