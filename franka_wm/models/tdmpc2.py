@@ -282,7 +282,7 @@ class TDMPC2(nn.Module):
         """Same as `loss`, for wrappers that call the module."""
         return self.loss(batch)
 
-    parts_of_loss = ("_encode_window", "_td_target", "_unroll", "_model_losses", "_policy_loss")
+    parts_of_loss = ("_encode_window", "_td_target", "_unroll", "_model_losses", "_policy_loss", "_metrics")
     """Methods that `loss` calls, and that are compiled one by one: what runs side by side must not be one program."""
 
     def loss(
@@ -343,18 +343,21 @@ class TDMPC2(nn.Module):
             + policy_loss
         )
         with torch.no_grad():
-            metrics = {
-                "loss_consistency": consistency.detach(),
-                "loss_reward": reward_loss.detach(),
-                "loss_value": value_loss.detach(),
-                "loss_policy": policy_loss.detach(),
-                "q_mean": self.two_hot.decode(q_logits.detach()).mean(),
-                "q_target_mean": target.mean(),
-                "policy_entropy": entropy.detach(),
-                "policy_scale": self.scale.value.clone(),
-                "latent_norm": encoded.detach().norm(dim=-1).mean(),
-                "reward_error": (self.two_hot.decode(reward_logits.detach()) - reward).abs().mean(),
-            }
+            q_mean, q_target_mean, latent_norm, reward_error = call["_metrics"](
+                q_logits.detach(), reward_logits.detach(), target, encoded.detach(), reward
+            )
+        metrics = {
+            "loss_consistency": consistency.detach(),
+            "loss_reward": reward_loss.detach(),
+            "loss_value": value_loss.detach(),
+            "loss_policy": policy_loss.detach(),
+            "q_mean": q_mean,
+            "q_target_mean": q_target_mean,
+            "policy_entropy": entropy.detach(),
+            "policy_scale": self.scale.value.clone(),
+            "latent_norm": latent_norm,
+            "reward_error": reward_error,
+        }
         return TensorDict({"loss": total, **metrics}, batch_size=[])
 
     def parameter_groups(self, lr: float) -> list[dict[str, Any]]:
@@ -425,6 +428,13 @@ class TDMPC2(nn.Module):
         reward_loss = (weight * self.two_hot.loss(reward_logits, reward)).mean()
         value_loss = (weight * self.two_hot.loss(q_logits, target)).mean()
         return consistency, reward_loss, value_loss, q_logits, reward_logits
+
+    def _metrics(
+        self, q_logits: Tensor, reward_logits: Tensor, target: Tensor, encoded: Tensor, reward: Tensor
+    ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """Mean values, targets and norm of latents, and the mean absolute error of rewards."""
+        error = (self.two_hot.decode(reward_logits) - reward).abs().mean()
+        return self.two_hot.decode(q_logits).mean(), target.mean(), encoded.norm(dim=-1).mean(), error
 
     def _td_target(self, after: Tensor, reward: Tensor, terminated: Tensor) -> Tensor:
         """One-step targets (H, B, 1) from encoded next latents (H, B, D): r + γ min of two target Qs."""

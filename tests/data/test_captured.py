@@ -108,7 +108,9 @@ def test_what_cannot_be_filled_is_reported(device: str, kind: type[CapturedSampl
 @pytest.mark.gpu
 @on_gpu
 def test_a_captured_batch_stays_where_it_is() -> None:
-    replay = make_replay(capacity=WORLDS * STEPS, num_envs=WORLDS, window=WINDOW, batch_size=64, device="cuda")
+    replay = make_replay(
+        capacity=WORLDS * STEPS, num_envs=WORLDS, window=WINDOW, batch_size=64, device="cuda"
+    )
     replay.extend(experience(0, 30).to("cuda"))
     sampling = CapturedSampling(replay)
     batches = [sampling() for _ in range(5)]

@@ -2,7 +2,7 @@ import pytest
 import torch
 from torch.nn import functional as F
 
-from franka_wm.models import available, make
+from franka_wm.models import available, make, parts
 from franka_wm.models.parts import (
     Ensemble,
     GaussianPolicy,
@@ -175,3 +175,42 @@ def test_running_scale_follows_the_percentile_range():
     small = RunningScale(tau=1.0)
     small.update(0.01 * x / 100)
     assert small.value == 1.0
+
+
+# -- products padded for tensor cores ---------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("kind", ["mlp", "ensemble", "members"])
+def test_padding_changes_neither_results_nor_gradients(monkeypatch, kind):
+    """As on CUDA: sizes 13, 10 and 5 become 16, 16 and 8."""
+    if kind == "mlp":
+        network = mlp(13, (10, 10), 5).double()
+    else:
+        network = Ensemble(members=3, in_features=13, hidden=(10, 10), out_features=5).double()
+        for parameter in network.parameters():
+            torch.nn.init.normal_(parameter)
+    x = torch.randn(4, 6, 13, dtype=torch.float64, requires_grad=True)
+    options = {"members": 2} if kind == "members" else {}
+
+    def results() -> list[torch.Tensor]:
+        y = network(x, **options)
+        return [y, *torch.autograd.grad(y.square().sum(), [x, *network.parameters()])]
+
+    plain, padded_products = results(), []
+    monkeypatch.setattr(parts, "_missing", lambda size, like: -size % 8)
+    product = torch.baddbmm if kind != "mlp" else F.linear
+
+    def noted(*inputs):
+        padded_products.append([tuple(x.shape) for x in inputs])
+        return product(*inputs)
+
+    monkeypatch.setattr(*((torch, "baddbmm") if kind != "mlp" else (F, "linear")), noted)
+    for found, expected in zip(results(), plain, strict=True):
+        torch.testing.assert_close(found, expected)
+    assert len(padded_products) == 3
+    assert all(
+        size[-2] % 8 == size[-1] % 8 == 0
+        for sizes in padded_products
+        for size in sizes[1:]
+        if len(size) > 1 and size[-2] > 1
+    )
