@@ -56,6 +56,9 @@ def build_model(
             has_shape_collision=False, has_particle_collision=False, density=0.0
         )
         arm.add_shape_sphere(body=-1, radius=0.025, cfg=ghost, color=(0.90, 0.22, 0.12), label=GOAL_MARKER)
+    if torch.device(device).type == "cuda":
+        # Warp's default there builds trees fast and traces them slowly; a robot's are built once.
+        scene.default_bvh_cfg.mesh_constructor = "cubql"
     scene.replicate(arm, num_envs)
     ground = newton.ModelBuilder.ShapeConfig(has_shape_collision=False, has_particle_collision=False)
     scene.add_ground_plane(cfg=ground, color=GROUND)

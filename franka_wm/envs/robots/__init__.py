@@ -19,7 +19,7 @@ import warp as wp
 
 from franka_wm.envs.config import HOME, NUM_JOINTS, FrankaConfig
 from franka_wm.envs.robots import meshes
-from franka_wm.envs.robots.sources import SOURCES, Source, urdf_source
+from franka_wm.envs.robots.sources import SOURCES, Source, detail, urdf_source
 from franka_wm.errors import UserError
 
 __all__ = ["SOURCES", "TOOL_LINKS", "Robot", "Source", "add_robot", "load_robot", "urdf_source"]
@@ -87,7 +87,9 @@ def add_robot(
         parse_visuals_as_colliders=False,
     )
     for body, label in enumerate(builder.body_label):
-        meshes.draw(builder, body, drawn.get(label.rsplit("/", 1)[-1], []), SOURCES[config.robot].cell)
+        meshes.draw(
+            builder, body, drawn.get(label.rsplit("/", 1)[-1], []), detail(SOURCES[config.robot], config)
+        )
     movable = [j for j in range(builder.joint_count) if builder.joint_type[j] != newton.JointType.FIXED]
     if len(movable) != NUM_JOINTS or builder.joint_coord_count != NUM_JOINTS:
         names = ", ".join(builder.joint_label[j] for j in movable)

@@ -5,6 +5,7 @@ To add a robot, write such a function and give it a line in :data:`SOURCES`; ``d
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from importlib.metadata import PackageNotFoundError, distribution
@@ -23,8 +24,8 @@ if TYPE_CHECKING:
 PANDA = "cmeel.prefix/share/example-robot-data/robots/panda_description/urdf/panda.urdf"
 """The Panda inside the package ``example-robot-data``."""
 
-CELL = 0.008
-"""Details of meshes smaller than this are not drawn [m], unless a source says otherwise."""
+CELL, COARSEST = 0.008, 0.02
+"""Details of meshes smaller than this are not drawn [m] where nobody says otherwise: for people, and at most."""
 
 
 @dataclass(frozen=True)
@@ -33,11 +34,12 @@ class Source:
 
     Attributes:
         find: From the config to the URDF file; raises ``UserError`` if it cannot be had.
-        cell: Details of meshes smaller than this are not drawn [m]; 0 draws every triangle.
+        cell: Details of meshes smaller than this are not drawn [m]; 0 draws every triangle. ``None``: as the config's
+            ``mesh_detail`` says, see :func:`detail`.
     """
 
     find: Callable[[FrankaConfig], Path]
-    cell: float = CELL
+    cell: float | None = None
 
 
 def embedded(config: FrankaConfig) -> Path:
@@ -107,3 +109,19 @@ def urdf_source(config: FrankaConfig, urdf_path: str | Path | None) -> Path:
             f"urdf_path={path}: no such file; give a URDF with seven arm joints, or use robot=embedded"
         )
     return path
+
+
+def detail(source: Source, config: FrankaConfig) -> float:
+    """Size of the smallest detail of meshes that is drawn [m]: the source's, the config's, or that of one pixel.
+
+    A pixel of the observed pictures, where the fixed cameras look at; the wrist camera is closer to what it sees.
+    """
+    if source.cell is not None:
+        return source.cell
+    if config.mesh_detail is not None:
+        return config.mesh_detail
+    if not config.images or "wrist" in config.cameras:
+        return CELL
+    away = math.hypot(config.camera_distance, config.camera_height - config.camera_target_height)
+    pixel = 2.0 * away * math.tan(0.5 * math.radians(config.camera_fov_degrees)) / config.image_size
+    return min(pixel, COARSEST)
