@@ -44,6 +44,7 @@ def actor(cfg: DictConfig) -> str:
     family = models.family(cfg.model.name)
     there = {"planner": hasattr(family, "next"), "policy": hasattr(family, "policy")}
     searched = bool(getattr(family, "replay_keys", ()))  # the loss needs what the search found
+    smooth = "varied" if cfg.collector.get("calmest", 1.0) < 1.0 else "random"
     if acts == "auto":
         if searched:
             return "planner"
@@ -51,11 +52,11 @@ def actor(cfg: DictConfig) -> str:
             return "policy"
         # A planner without a policy's candidates takes far longer to decide than the worlds to step, and a model that
         # is given goals by their pictures can learn from any motion.
-        return "planner" if objective_name(cfg) == "reward_value" else "random"
+        return "planner" if objective_name(cfg) == "reward_value" else smooth
     if not there.get(acts, True) or (searched and acts != "planner"):
         fitting = "planner" if there["planner"] else "smooth"
         raise UserError(f"collector.acts={acts}: model={cfg.model.name} cannot; use collector.acts={fitting}")
-    return ACTORS[acts]
+    return smooth if acts == "smooth" else ACTORS[acts]
 
 
 def plain(node: Any) -> dict[str, Any]:
@@ -285,6 +286,7 @@ def make_policies(
     *,
     seed: int = 0,
     smoothness: float = 0.7,
+    calmest: float = 1.0,
     objective: Any = None,
     capture: bool | None = None,
     precision: str = "float32",
@@ -293,7 +295,8 @@ def make_policies(
     """Every policy that can act or be compared, by name.
 
     ``planner`` and ``policy`` where the model has what they need; ``noop`` and ``random`` (smooth random:
-    first-order autoregressive); for the arm ``oracle``, inverse kinematics with true geometry. ``capture``,
+    first-order autoregressive), and ``varied``, scaled anew in every episode, where ``calmest`` is below 1; for the arm
+    ``oracle``, inverse kinematics with true geometry. ``capture``,
     ``precision`` and ``compile``: of the planner's, see :class:`~franka_wm.planning.PlannerPolicy`.
     """
     policies: dict[str, Any] = {}
@@ -306,21 +309,28 @@ def make_policies(
         )
     if hasattr(model, "policy"):
         policies["policy"] = ModelPolicy.for_model(model)
-    return policies | make_scripted_policies(env, seed=seed, smoothness=smoothness)
+    return policies | make_scripted_policies(env, seed=seed, smoothness=smoothness, calmest=calmest)
 
 
-def make_scripted_policies(env: Any, *, seed: int = 0, smoothness: float = 0.7) -> dict[str, Any]:
-    """Policies that need no model: ``noop``, ``random`` and, for the arm, ``oracle``."""
+def make_scripted_policies(
+    env: Any, *, seed: int = 0, smoothness: float = 0.7, calmest: float = 1.0
+) -> dict[str, Any]:
+    """Policies that need no model: ``noop``, ``random``, ``varied`` and, for the arm, ``oracle``."""
     generator = torch.Generator(device=env.device).manual_seed(seed)
     discrete = not env.action_spec.dtype.is_floating_point
     arm = isinstance(env, (FrankaEnv, TransformedFrankaEnv))
     if discrete and not arm:
-        return {"random": RandomMovesPolicy(env.action_dim, generator=generator)}
+        moves_at_random = RandomMovesPolicy(env.action_dim, generator=generator)
+        return {"random": moves_at_random} | ({"varied": moves_at_random} if calmest < 1.0 else {})
     size = env.config.action_dim if arm else env.action_dim
     scripted: dict[str, Any] = {
         "noop": NoopPolicy(size),
         "random": SmoothRandomPolicy(size, smoothness=smoothness, generator=generator),
     }
+    if calmest < 1.0:  # beside random, the baseline that every agent is compared with
+        scripted["varied"] = SmoothRandomPolicy(
+            size, smoothness=smoothness, calmest=calmest, generator=generator
+        )
     if arm:
         scripted["oracle"] = OraclePolicy(env.kinematics, env.config)
     if discrete:
@@ -340,6 +350,7 @@ def make_agent_policies(cfg: DictConfig, model: Any, env: Any, spaces: Spaces) -
         env,
         seed=cfg.seed,
         smoothness=cfg.collector.smoothness,
+        calmest=cfg.collector.get("calmest", 1.0),  # runs of before it was there
         objective=make_objective(cfg, model),
         capture=None if cfg.trainer.capture else cfg.trainer.capture,  # true asks for what CUDA does anyway
         **{key: cfg.planner[key] for key in OF_THE_POLICY if key in cfg.planner},

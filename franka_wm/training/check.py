@@ -69,6 +69,9 @@ def check(cfg: DictConfig) -> None:
             raise UserError(f"{name}={value!r}: must be a number of seconds above 0")
     if not 0 <= cfg.collector.smoothness < 1:
         raise UserError(f"collector.smoothness={cfg.collector.smoothness}: must be at least 0 and below 1")
+    calmest = cfg.collector.calmest
+    if isinstance(calmest, bool) or not isinstance(calmest, (int, float)) or not 0 <= calmest <= 1:
+        raise UserError(f"collector.calmest={calmest!r}: must be a number from 0 to 1")
     if cfg.replay.capacity < (steps := cfg.collector.num_envs * (window + 1)):
         raise UserError(
             f"replay.capacity={cfg.replay.capacity}: must be at least {steps}, one window for every world"
