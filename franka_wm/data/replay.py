@@ -28,10 +28,19 @@ class WindowSampler(Sampler):
         boundary: Key of the flag that marks the first step of an episode.
         oversample: Candidates per window kept. With episodes of L steps a candidate is kept with probability
             (L − H + 1) / L; 4 is enough for L ≥ 2 H and batches of 32.
+        past_end: Windows may go on past the end of an episode, into the next one: for losses that look at
+            ``boundary`` themselves. Then every step starts windows, also the last ones of an episode, and
+            episodes shorter than a window are seen.
     """
 
     def __init__(
-        self, writer: RoundRobinWriter, *, length: int, boundary: str = "is_init", oversample: int = 4
+        self,
+        writer: RoundRobinWriter,
+        *,
+        length: int,
+        boundary: str = "is_init",
+        oversample: int = 4,
+        past_end: bool = False,
     ):
         if length < 1 or oversample < 1:
             raise UserError(f"window length={length}, oversample={oversample}: both must be at least 1")
@@ -39,6 +48,7 @@ class WindowSampler(Sampler):
         self.length = length
         self.boundary = boundary
         self.oversample = oversample
+        self.past_end = past_end
         self._missing: torch.Tensor | None = None
 
     def sample(self, storage: Any, batch_size: int) -> tuple[Any, dict]:
@@ -65,14 +75,19 @@ class WindowSampler(Sampler):
             )
         return span, self.writer._cursor if filled == storage._storage.shape[0] else 0
 
+    @property
+    def _checks(self) -> bool:
+        """Whether windows across an episode's start are rejected."""
+        return self.length > 1 and not self.past_end
+
     def candidates(self, batch_size: int) -> int:
         """How many windows are drawn for a batch of so many."""
-        return self.oversample * batch_size + 64
+        return self.oversample * batch_size + 64 if self._checks else batch_size
 
     def choose(
         self, data: Any, draw: torch.Tensor, oldest: int | torch.Tensor, batch_size: int
     ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor | None]:
-        """Whole windows among the drawn ones; no operation waits for the device.
+        """The windows of a batch among the drawn ones; no operation waits for the device.
 
         Args:
             data: The storage, (time, worlds).
@@ -80,22 +95,20 @@ class WindowSampler(Sampler):
             oldest: The first time that a window may start at.
 
         Returns:
-            Time and world of each step, (batch_size, length) both, and which windows cross an episode's start
-            after all, (batch_size,) bool: none where there are enough whole ones.
+            Time and world of each step, (batch_size, length) both, and which windows cross an episode's start though
+            they should not, (batch_size,) bool: none where there are enough whole ones, ``None`` where all may.
         """
         (capacity, worlds), device = data.shape[:2], draw.device
         world = draw % worlds
         time = (torch.div(draw, worlds, rounding_mode="floor").unsqueeze(1) + oldest
                 + torch.arange(self.length, device=device)) % capacity  # fmt: skip
         crossing = None
-        if self.length > 1:
+        if self._checks:
             starts = data.get(self.boundary)[time[:, 1:], world.unsqueeze(1)]
             crossing = starts.flatten(1).any(1)
             # Stable: keeps the order of the draws, so the first batch_size whole windows are a uniform sample.
             order = torch.sort(crossing, stable=True).indices[:batch_size]
             time, world, crossing = time[order], world[order], crossing[order]
-        else:
-            time, world = time[:batch_size], world[:batch_size]
         return time, world.unsqueeze(1).expand_as(time), crossing
 
     def record_missing(self, crossing: torch.Tensor) -> None:
@@ -129,7 +142,13 @@ class WindowSampler(Sampler):
 
 
 def make_replay(
-    *, capacity: int, num_envs: int, window: int, batch_size: int, device: torch.device | str
+    *,
+    capacity: int,
+    num_envs: int,
+    window: int,
+    batch_size: int,
+    device: torch.device | str,
+    past_end: bool = False,
 ) -> ReplayBuffer:
     """A buffer of (time, worlds) that is extended with the collector's (worlds, time) batches.
 
@@ -139,6 +158,7 @@ def make_replay(
         window: Transitions per sampled window, H.
         batch_size: Windows per sample.
         device: Where everything lives.
+        past_end: Windows may go on past the end of an episode, see :class:`WindowSampler`.
 
     Returns:
         A ``ReplayBuffer`` whose samples have batch size (batch_size, window).
@@ -152,7 +172,7 @@ def make_replay(
     writer = RoundRobinWriter()
     return ReplayBuffer(
         storage=LazyTensorStorage(steps * num_envs, ndim=2, device=device),
-        sampler=WindowSampler(writer, length=window),
+        sampler=WindowSampler(writer, length=window, past_end=past_end),
         writer=writer,
         batch_size=batch_size,
         dim_extend=1,

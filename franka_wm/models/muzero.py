@@ -27,10 +27,9 @@ class MuZero(nn.Module):
     latent of the observation that came (EfficientZero's consistency, Ye et al., arXiv:2111.00210). The first
     step weighs 1, each later one 1 / `unroll`, and the gradient into z is halved at each use of g.
 
-    Half of the unrolls start at the first step of their window, the others anywhere in it. Past the end of an
-    episode that terminated, moves are random, rewards and values 0: so the search learns that nothing is
-    earned there, and no state is left untrained because it is near the end. Past any other end nothing is
-    learned.
+    Every step starts windows, so a window may go on past the end of its episode; what follows is ignored. Past
+    an end that terminated, moves are random, rewards and values 0: so the search learns that nothing is earned
+    there. Past any other end nothing is learned.
 
     Deliberate differences from the papers:
       * Small networks with LayerNorm, and SimNorm in place of min-max scaling, as in TD-MPC2
@@ -66,6 +65,7 @@ class MuZero(nn.Module):
 
     discrete = True
     replay_keys = ("search_policy", "search_value")
+    past_end = True  # the loss looks for the end itself: whole windows would seldom show what comes before it
     observation_mean: Tensor
     observation_std: Tensor
     moves: Tensor
@@ -222,11 +222,13 @@ class MuZero(nn.Module):
         """Losses of a batch of windows; call `backward` once on the entry `loss`.
 
         Args:
-            batch: batch size [B, H], H ≥ `unroll`: H contiguous transitions, all of one episode, with the
-                observation keys, `action` (B, H) int64, `search_policy` (B, H, M), `search_value` (B, H, 1),
-                and in `next` the observation keys, `reward` (B, H, 1) and `terminated` (B, H, 1) bool, which
-                only the last may be. An entry `weight` (B, H) or (B, H, 1), if there, weighs the windows by its
-                first step. With H < `window`, value targets are shorter.
+            batch: batch size [B, H], H ≥ `unroll`: H contiguous transitions, with the observation keys,
+                `action` (B, H) int64, `search_policy` (B, H, M), `search_value` (B, H, 1), and in `next` the
+                observation keys, `reward` (B, H, 1) and `terminated` (B, H, 1) bool. An entry `is_init`
+                (B, H, 1) bool, if there, marks first steps: from the first such step after step 0 on, a window
+                is another episode's and ignored. `terminated` may be True only where an episode ends. An entry
+                `weight` (B, H) or (B, H, 1), if there, weighs the windows by its first step. With H < `window`,
+                value targets are shorter.
 
         Returns:
             batch size []: `loss` to differentiate, and detached: `loss_reward`, `loss_value`, `loss_policy`,
@@ -252,30 +254,30 @@ class MuZero(nn.Module):
         action, reward, terminated = (
             batch.get(key) for key in ("action", ("next", "reward"), ("next", "terminated"))
         )
-        returns = self.value_targets(reward, terminated, batch.get("search_value"))
-        row = torch.arange(count, device=action.device).unsqueeze(-1)
-        step = self._starts(count, length, action.device) + torch.arange(
-            self.unroll + 1, device=action.device
-        )  # (B, K+1)
-        inside, held = step < length, step.clamp_max(length - 1)
+        steps, device = self.unroll, action.device
+        ends = self._ends(batch)  # (B, 1): the transitions of the first episode
+        over = terminated[..., 0].gather(1, ends - 1)  # (B, 1)
+        returns = self.value_targets(reward, terminated, batch.get("search_value"), ends)
+        step = torch.arange(steps + 1, device=device)
+        inside = step < ends  # (B, K+1)
 
-        def at(values: Tensor, steps: int) -> Tensor:
-            """Entries of windows (B, H, ...) at the first `steps` of the unroll, 0 past the window's end."""
-            picked = values[row, held[:, :steps]]
-            return torch.where(inside[:, :steps, None], picked, torch.zeros_like(picked))
+        def at(values: Tensor, count: int) -> Tensor:
+            """The first `count` steps of windows (B, H, ...), 0 past the episode's end."""
+            values = F.pad(values[:, :count], (0, 0, 0, max(0, count - length)))
+            return torch.where(inside[:, :count, None], values, torch.zeros_like(values))
 
         moves = torch.where(
             inside[:, :-1],
-            action[row, held[:, :-1]],
-            torch.randint(self.num_actions, (count, self.unroll), device=action.device),
+            action[:, :steps],
+            torch.randint(self.num_actions, (count, steps), device=device),
         )
-        observations = self._at(batch, row, step.clamp_max(length))
-        latents = [self._encode({key: value[:, 0] for key, value in observations.items()})]
+        frames = self._frames(batch)
+        latents = [self._encode({key: value[:, 0] for key, value in frames.items()})]
         with torch.no_grad():
-            came = self._encode({key: value[:, 1:] for key, value in observations.items()})
+            came = self._encode({key: value[:, 1:] for key, value in frames.items()})
         reward_logits = []
         z = latents[0]
-        for k in range(self.unroll):
+        for k in range(steps):
             body = self._body(z, moves[:, k])
             reward_logits.append(self.reward_head(body))
             latents.append(self.dynamics_head(body))
@@ -284,9 +286,9 @@ class MuZero(nn.Module):
         body = self.prediction_body(predicted)
         policy_logits, value_logits = self.policy_head(body).log_softmax(-1), self.value_head(body)
 
-        over = terminated[:, -1]  # (B, 1)
+        # A window that ends before its unroll does, with the episode going on, knows nothing of its last step.
         known = (inside | over).unsqueeze(-1)
-        scale = torch.full((self.unroll + 1, 1), 1.0 / self.unroll, device=z.device, dtype=z.dtype)
+        scale = torch.full((steps + 1, 1), 1.0 / steps, device=device, dtype=z.dtype)
         scale[0] = 1.0
         weight = batch.get("weight", None)
         weight = 1.0 if weight is None else weight.reshape(count, length, 1)[:, :1]
@@ -295,14 +297,14 @@ class MuZero(nn.Module):
             """Mean over windows of the sum over the steps (B, steps, 1) that count."""
             return (weight * scale * torch.where(mask, values, torch.zeros_like(values))).sum(1).mean()
 
-        reward_target, value_target = at(reward, self.unroll), at(returns, self.unroll + 1)
-        policy_target = at(batch.get("search_policy"), self.unroll + 1)
+        reward_target, value_target = at(reward, steps), at(returns, steps + 1)
+        policy_target = at(batch.get("search_policy"), steps + 1)
         reward_loss = total(self.two_hot.loss(reward_logits, reward_target), known[:, :-1], scale[1:])
         value_loss = total(self.two_hot.loss(value_logits, value_target), known, scale)
         policy_loss = total(
             -(policy_target * policy_logits).sum(-1, keepdim=True), inside.unsqueeze(-1), scale
         )
-        seen = (step[:, 1:] <= length).unsqueeze(-1)
+        seen = (step[1:] <= ends).unsqueeze(-1)
         consistency_loss = total(self._consistency(predicted[:, 1:], came), seen, scale[1:])
         loss = (
             self.reward_coef * reward_loss
@@ -328,31 +330,38 @@ class MuZero(nn.Module):
             }
         return TensorDict({"loss": loss, **metrics}, batch_size=[])
 
-    def value_targets(self, reward: Tensor, terminated: Tensor, search_value: Tensor) -> Tensor:
-        """n-step returns of the H steps of windows, each within its window.
+    def value_targets(
+        self, reward: Tensor, terminated: Tensor, search_value: Tensor, ends: Tensor | None = None
+    ) -> Tensor:
+        """n-step returns of the H steps of windows, each within its window and episode.
 
         Step t sums `n_step` discounted rewards and adds the discounted `search_value` of the step that
-        follows. Near the end of a window that ends with the episode terminated, what is left of the rewards is
-        all. Near any other end, the last step of the window lends its search value, however near.
+        follows. Near the end of an episode that terminated, what is left of the rewards is all. Near any other
+        end, also the window's, the last step lends its search value, however near.
 
         Args:
             reward, search_value: (B, H, 1).
-            terminated: (B, H, 1) bool; only the last may be True.
+            terminated: (B, H, 1) bool; the last transition of the episode decides.
+            ends: (B, 1) int64 in 1 … H, how many transitions belong to the episode; None: all H.
 
         Returns:
-            (B, H, 1).
+            (B, H, 1); without meaning past the end.
         """
-        length, n = reward.shape[1], self.n_step
-        over = terminated[:, -1:]  # (B, 1, 1)
-        to_end = [torch.where(over, reward[:, -1:], search_value[:, -1:])]
-        for t in range(length - 2, -1, -1):
-            to_end.append(reward[:, t : t + 1] + self.discount * to_end[-1])
-        if length <= n:
-            return torch.cat(to_end[::-1], dim=1)
-        full = self.discount**n * search_value[:, n:]
-        for k in range(n):
-            full = full + self.discount**k * reward[:, k : k + length - n]
-        return torch.cat((full, *to_end[n - 1 :: -1]), dim=1)
+        length, device = reward.shape[1], reward.device
+        if ends is None:
+            ends = torch.full((reward.shape[0], 1), length, device=device)
+        over = terminated[..., 0].gather(1, ends - 1)
+        step = torch.arange(length, device=device)
+        stop = torch.minimum(step + self.n_step, ends - 1 + over.long())  # (B, H): the first step not summed
+        ahead = step - step.unsqueeze(-1)  # (H, H): steps from t, in rows, to k
+        base = torch.full((), self.discount, device=device, dtype=reward.dtype)
+        discount = base ** ahead.clamp_min(0).to(reward.dtype)
+        summed = discount * ((ahead >= 0) & (step < stop.unsqueeze(-1)))  # (B, H, H)
+        # Where the episode is over, nothing is lent: stop is then past its last step.
+        lent = discount * ((step == stop.unsqueeze(-1)) & (step < ends).unsqueeze(1))
+        # Not a matrix product: autocast would round the targets.
+        rewards, values = reward.transpose(1, 2), search_value.transpose(1, 2)  # (B, 1, H)
+        return (summed * rewards + lent * values).sum(-1, keepdim=True)
 
     def parameter_groups(self, lr: float) -> list[dict[str, Any]]:
         """Parameter groups for AdamW: matrices with weight decay, the rest without; one gradient norm."""
@@ -375,16 +384,22 @@ class MuZero(nn.Module):
             vectors = (x.to(self.observation_mean.dtype) - self.observation_mean) / self.observation_std
         return self.encoder(pictures, vectors) if pictures else self.encoder(vectors)
 
-    def _starts(self, count: int, length: int, device: torch.device) -> Tensor:
-        """Where unrolls begin (B, 1): half at 0, half anywhere in the window."""
-        anywhere = torch.randint(length, (count, 1), device=device)
-        return anywhere * torch.randint(2, (count, 1), device=device)
+    def _ends(self, batch: TensorDictBase) -> Tensor:
+        """How many transitions of each window are of its first episode (B, 1)."""
+        count, length = batch.batch_size
+        first = batch.get("is_init", None)
+        if first is None:
+            return torch.full((count, 1), length, device=batch.get("action").device)
+        step = torch.arange(length, device=first.device)
+        other = first.reshape(count, length) & (step > 0)
+        return torch.where(other, step, length).amin(1, keepdim=True)
 
-    def _at(self, batch: TensorDictBase, row: Tensor, step: Tensor) -> dict[str, Tensor]:
-        """Observations (B, K+1, ...) at the steps (B, K+1) of the H + 1 of each window."""
-        last, found = batch.get("next")[:, -1:], {}
+    def _frames(self, batch: TensorDictBase) -> dict[str, Tensor]:
+        """The first K + 1 observations (B, K+1, ...) of each window; where an episode ends, its true last one."""
+        found = {}
         for key in self.observation_keys:
-            found[key] = torch.cat((batch.get(key), last.get(key)), dim=1)[row, step]
+            after = batch.get(("next", key))[:, : self.unroll]
+            found[key] = torch.cat((batch.get(key)[:, :1], after), dim=1)
             if key in self.image_sizes:
                 found[key] = self.random_shift(check_pictures(found[key]))
         return found

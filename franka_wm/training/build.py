@@ -117,6 +117,11 @@ def window(cfg: DictConfig) -> int:
     return cfg.model.window if cfg.replay.window is None else cfg.replay.window
 
 
+def looks_past_ends(cfg: DictConfig) -> bool:
+    """Whether the model's loss takes windows that go on past the end of an episode."""
+    return bool(getattr(models.family(cfg.model.name), "past_end", False))
+
+
 def learning_rate(cfg: DictConfig) -> float:
     """``trainer.lr``, or the model's own."""
     return cfg.model.lr if cfg.trainer.lr is None else cfg.trainer.lr
@@ -368,6 +373,7 @@ def make_replay_buffer(cfg: DictConfig, device: torch.device) -> ReplayBuffer:
         window=window(cfg),
         batch_size=cfg.replay.batch_size,
         device=device,
+        past_end=looks_past_ends(cfg),
     )
 
 

@@ -36,9 +36,14 @@ def experience(steps: int, *, start: int = 0, lengths: tuple[int, ...] = (5, 3, 
     return TensorDict(data, batch_size=time.shape)
 
 
-def buffer(steps: int, window: int, batch_size: int = 64) -> ReplayBuffer:
+def buffer(steps: int, window: int, batch_size: int = 64, *, past_end: bool = False) -> ReplayBuffer:
     return make_replay(
-        capacity=steps * WORLDS, num_envs=WORLDS, window=window, batch_size=batch_size, device="cpu"
+        capacity=steps * WORLDS,
+        num_envs=WORLDS,
+        window=window,
+        batch_size=batch_size,
+        device="cpu",
+        past_end=past_end,
     )
 
 
@@ -92,6 +97,24 @@ def test_every_last_transition_can_be_sampled() -> None:
         assert not sample["next", "done"][:, :-1].any()
     data = experience(35)
     assert seen == {(w, t) for w, t in data["next", "done"].nonzero().tolist()}
+
+
+def test_windows_past_the_end_of_an_episode() -> None:
+    """Every step starts one, equally often, in episodes shorter than a window too; none crosses the writer."""
+    torch.manual_seed(0)
+    replay = buffer(40, 6, 400, past_end=True)
+    for start in range(0, 63, 9):
+        replay.extend(experience(9, start=start))
+    counts: Counter[tuple[int, int]] = Counter()
+    for _ in range(60):
+        sample = replay.sample()
+        assert sample.batch_size == (400, 6)
+        assert (sample["time"] == sample["time"][:, :1] + torch.arange(6)).all()
+        assert (sample["world"] == sample["world"][:, :1]).all()
+        counts.update(zip(sample["world"][:, 0].tolist(), sample["time"][:, 0].tolist(), strict=True))
+    expected = {(world, t) for world in range(WORLDS) for t in range(63 - 40, 63 - 5)}
+    assert set(counts) == expected
+    assert chisquare([counts[w] for w in sorted(expected)]).pvalue > 1e-3
 
 
 def test_cost_does_not_depend_on_capacity() -> None:

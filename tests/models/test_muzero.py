@@ -28,7 +28,11 @@ def small(**overrides) -> MuZero:
     return make("muzero", **{**settings, **overrides})
 
 
-def windows(batch: int = 6, length: int = 5, *, terminated: bool = False, **images) -> TensorDict:
+def windows(
+    batch: int = 6, length: int = 5, *, ends: int | None = None, terminated: bool = False, **images
+) -> TensorDict:
+    """Windows whose first episode has `ends` transitions; None: all."""
+
     def observation() -> dict[str, torch.Tensor]:
         vectors = {"state": torch.randn(batch, length, 3), "joint_target": torch.randn(batch, length, 2)}
         pictures = {
@@ -37,25 +41,24 @@ def windows(batch: int = 6, length: int = 5, *, terminated: bool = False, **imag
         }
         return vectors | pictures
 
-    ends = torch.zeros(batch, length, 1, dtype=torch.bool)
-    ends[:, -1] = terminated
+    ends = length if ends is None else ends
+    over, first = torch.zeros(2, batch, length, 1, dtype=torch.bool)
+    over[:, ends - 1] = terminated
+    first[:, ends:][:, :1] = True
     data = TensorDict(
         {
             **observation(),
             "action": torch.randint(MOVES, (batch, length)),
             "search_policy": torch.randn(batch, length, MOVES).softmax(-1),
             "search_value": torch.randn(batch, length, 1),
-            "next": {**observation(), "reward": torch.randn(batch, length, 1), "terminated": ends},
+            "next": {**observation(), "reward": torch.randn(batch, length, 1), "terminated": over},
+            "is_init": first,
         },
         batch_size=[batch, length],
     )
     for key in ("state", "joint_target", *images):
         data["next", key][:, :-1] = data[key][:, 1:]
     return data
-
-
-def start_at(model: MuZero, step: int) -> None:
-    model._starts = lambda count, length, device: torch.full((count, 1), step)  # type: ignore[method-assign]
 
 
 def randomise(model: MuZero) -> None:
@@ -192,37 +195,37 @@ def test_value_targets_in_numbers():
 
 
 @pytest.mark.parametrize("ends", [False, True])
-@pytest.mark.parametrize("start", [0, 2, 4])
-def test_the_losses_are_those_of_a_plain_unroll(ends, start):
-    """One window at a time, one step at a time; steps past the end count only where the episode terminated."""
+@pytest.mark.parametrize("held", [1, 3, 5])
+def test_the_losses_are_those_of_a_plain_unroll(ends, held):
+    """One window, one step at a time; steps past the end of its episode count only where that terminated."""
     model, length = small(random_shift=0), 5
     randomise(model)
-    start_at(model, start)
-    batch = windows(1, length, terminated=ends)
+    batch = windows(1, length, ends=held, terminated=ends)
     losses = model.loss(batch)
 
-    returns = model.value_targets(batch["next", "reward"], batch["next", "terminated"], batch["search_value"])
-    frames = torch.cat((model.encode(batch), model.encode(batch["next"])[:, -1:]), 1)[0]
-    z, policy, value, reward, consistency = frames[start], 0.0, 0.0, 0.0, 0.0
+    own = batch[:, :held]  # what is of the first episode
+    returns = model.value_targets(own["next", "reward"], own["next", "terminated"], own["search_value"])
+    frames = torch.cat((model.encode(own), model.encode(own["next"])[:, -1:]), 1)[0]
+    z, policy, value, reward, consistency = frames[0], 0.0, 0.0, 0.0, 0.0
     for k in range(model.unroll + 1):
-        t, scale = start + k, 1.0 if k == 0 else 1.0 / model.unroll
+        scale = 1.0 if k == 0 else 1.0 / model.unroll
         logits, _ = model.prediction(z)
         value_logits = model.value_head(model.prediction_body(z))
-        if t < length:
-            value += scale * model.two_hot.loss(value_logits, returns[0, t]).item()
-            policy += scale * F.cross_entropy(logits, batch["search_policy"][0, t]).item()
+        if k < held:
+            value += scale * model.two_hot.loss(value_logits, returns[0, k]).item()
+            policy += scale * F.cross_entropy(logits, own["search_policy"][0, k]).item()
         elif ends:
             value += scale * model.two_hot.loss(value_logits, torch.zeros(1)).item()
-        if k == model.unroll or t >= length:
+        if k == model.unroll or k >= held:
             break  # moves past the end are random: checked below
-        body = model._body(z, batch["action"][0, t])
-        target = batch["next", "reward"][0, t]
+        body = model._body(z, own["action"][0, k])
+        target = own["next", "reward"][0, k]
         reward += model.two_hot.loss(model.reward_head(body), target).item() / model.unroll
-        z = model.next(z, batch["action"][0, t])
-        consistency += model._consistency(z, frames[t + 1]).item() / model.unroll
+        z = model.next(z, own["action"][0, k])
+        consistency += model._consistency(z, frames[k + 1]).item() / model.unroll
     assert losses["loss_policy"].item() == pytest.approx(policy, rel=1e-4)
     assert losses["loss_consistency"].item() == pytest.approx(consistency, rel=1e-4)
-    if start + model.unroll <= length or not ends:
+    if model.unroll <= held or not ends:
         assert losses["loss_value"].item() == pytest.approx(value, rel=1e-4)
         assert losses["loss_reward"].item() == pytest.approx(reward, rel=1e-4)
     else:  # there is more to learn past the end
@@ -233,16 +236,29 @@ def test_the_losses_are_those_of_a_plain_unroll(ends, start):
     torch.testing.assert_close(losses["loss"].detach(), total)
 
 
-def test_unrolls_start_everywhere_and_at_the_first_step_most():
-    starts = small()._starts(20_000, 5, torch.device("cpu")).flatten()
-    shares = starts.bincount(minlength=5) / 20_000
-    torch.testing.assert_close(shares, torch.tensor([0.6, 0.1, 0.1, 0.1, 0.1]), atol=0.02, rtol=0)
+@pytest.mark.parametrize("terminated", [False, True])
+def test_what_follows_the_end_of_an_episode_changes_nothing(terminated):
+    model, batch = small(random_shift=0), windows(6, 5, ends=2, terminated=terminated)
+    randomise(model)
+    other = batch.clone()
+    other[:, 2:] = windows(6, 3)
+    other["is_init"] = batch["is_init"]
+    for data in (batch, other):
+        torch.manual_seed(1)  # of the moves past the end
+        data["losses"] = model.loss(data).expand(6, 5)
+    for name in ("loss_reward", "loss_value", "loss_policy", "loss_consistency"):
+        assert torch.equal(batch["losses", name], other["losses", name])
+    whole = batch[:, :2]
+    wanted = model.value_targets(whole["next", "reward"], whole["next", "terminated"], whole["search_value"])
+    found = model.value_targets(
+        batch["next", "reward"], batch["next", "terminated"], batch["search_value"], torch.full((6, 1), 2)
+    )
+    torch.testing.assert_close(found[:, :2], wanted)
 
 
 def test_weights_scale_the_loss_of_their_window():
     model, batch = small(), windows(2)
     randomise(model)
-    start_at(model, 0)
     first, second = (model.loss(batch[b : b + 1])["loss"] for b in range(2))
     batch["weight"] = torch.tensor([2.0, 0.5]).view(2, 1, 1).expand(2, 5, 1)
     torch.testing.assert_close(model.loss(batch)["loss"], (2.0 * first + 0.5 * second) / 2)
@@ -267,14 +283,13 @@ def test_no_gradient_passes_through_what_came():
     """Only the first observation of an unroll is learned from as an input."""
     model = small()
     randomise(model)
-    start_at(model, 1)
     batch = windows()
     batch["state"].requires_grad_()
     batch["next", "state"].requires_grad_()
     batch["search_value"].requires_grad_()
     model.loss(batch)["loss"].backward()
     reached = batch["state"].grad.abs().amax((0, 2)) > 0
-    assert reached.tolist() == [False, True, False, False, False]
+    assert reached.tolist() == [True, False, False, False, False]
     assert batch["next", "state"].grad is None or batch["next", "state"].grad.abs().max() == 0
     assert batch["search_value"].grad is None
 
@@ -287,7 +302,6 @@ def test_the_gradient_is_halved_at_each_use_of_the_dynamics():
         torch.manual_seed(1)
         model = small(policy_coef=0.0, consistency_coef=0.0, value_coef=0.0, reward_coef=1.0)
         randomise(model)
-        start_at(model, 0)
         z = model.encode(batch)[:, 0].detach().requires_grad_()
         latents, here = [], z
         for k in range(3):
@@ -302,7 +316,6 @@ def test_the_gradient_is_halved_at_each_use_of_the_dynamics():
     # And the loss does just that: its encoder gradient from the rewards is that of the halved chain.
     model = small(policy_coef=0.0, consistency_coef=0.0, value_coef=0.0)
     randomise(model)
-    start_at(model, 0)
     model.loss(batch)["loss"].backward()
     got = model.encoder[0].linear.weight.grad.clone()
     model.zero_grad()

@@ -5,6 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
+import torch
+from tensordict import TensorDict
 
 from franka_wm.envs import FrankaConfig
 from franka_wm.errors import UserError
@@ -136,6 +138,24 @@ def test_refused_before_anything_is_built(override: str, named: str, composed) -
     with pytest.raises(UserError) as caught:
         check(cfg)
     assert named in str(caught.value) and "\n" not in str(caught.value)
+
+
+def test_muzero_sees_ends_and_episodes_shorter_than_its_windows(composed) -> None:
+    """Else its value targets could not reach further than the shortest episode is long."""
+    episodes = TensorDict({"is_init": (torch.arange(80) % 8 == 0).expand(4, 80).unsqueeze(-1)}, [4, 80])
+    cfg = composed("env=gym", "model=muzero", "planner=gumbel", "collector.num_envs=4")
+    check(cfg)
+    assert build.window(cfg) == cfg.model.unroll + cfg.model.n_step > 8
+    assert cfg.collector.seed_steps >= build.window(cfg)
+    check(composed("env=gym", "model=muzero", "planner=gumbel", "env.episode_length=8"))
+    replay = build.make_replay_buffer(cfg, torch.device("cpu"))
+    replay.extend(episodes)
+    assert replay.sample().batch_size == (cfg.replay.batch_size, build.window(cfg))
+    cfg = composed("collector.num_envs=4", "replay.window=9")
+    replay = build.make_replay_buffer(cfg, torch.device("cpu"))
+    replay.extend(episodes)
+    with pytest.raises(UserError, match="episodes of at least 9"):  # TD-MPC2 takes whole windows alone
+        replay.sample()
 
 
 def test_planner_and_model_that_do_not_exist(composed, small_env) -> None:
