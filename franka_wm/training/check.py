@@ -46,8 +46,8 @@ def check(cfg: DictConfig) -> None:
         )
     if not build.is_offline(cfg):
         build.actor(cfg)
-    whole = not build.looks_past_ends(cfg)
-    if whole and cfg.env.kind != "none" and cfg.env.episode_length < window:
+    short = cfg.env.kind != "none" and cfg.env.episode_length < window
+    if short and not build.looks_past_ends(cfg):
         raise UserError(
             f"env.episode_length={cfg.env.episode_length} is shorter than replay.window={window}; "
             "no window would fit into an episode"
