@@ -68,18 +68,32 @@ def main() -> None:
     for name in arguments.sizes:
         latent, encoder, hidden, batch = SIZES[name]
         torch.manual_seed(0)
-        model = tdmpc2(latent, encoder, hidden).to(device)
-        learner = Learner(model, compile=arguments.compile, precision=arguments.precision)
+        one, other = (  # a captured update keeps the batch that it was captured with
+            Learner(
+                tdmpc2(latent, encoder, hidden).to(device),
+                compile=arguments.compile,
+                precision=arguments.precision,
+            )
+            for _ in range(2)
+        )
         replay = make_replay(capacity=100_000, num_envs=64, window=3, batch_size=batch, device=device)
         replay.extend(experience(64, 500, device))
         fixed = replay.sample()
-        alone = rate(lambda: learner.update(fixed), seconds=arguments.seconds, warmup=8)
-        draw = CapturedSampling(replay) if learner.capture else replay.sample
-        sampled = rate(lambda: learner.update(draw()), seconds=arguments.seconds, warmup=8)
+        alone = rate(lambda: one.update(fixed), seconds=arguments.seconds, warmup=8)
+        sampling = CapturedSampling(replay) if other.capture else None
+
+        def draw_and_update() -> None:
+            if sampling is None:
+                other.update(replay.sample())
+            else:
+                batch = sampling()
+                other.update(batch, static=sampling.is_static(batch))
+
+        sampled = rate(draw_and_update, seconds=arguments.seconds, warmup=8)
         rows.append(
             {
                 "latent/hidden, batch": name,
-                "parameters": f"{sum(p.numel() for p in model.parameters()) / 1e6:.2f} M",
+                "parameters": f"{sum(p.numel() for p in one.model.parameters()) / 1e6:.2f} M",
                 "update [1/s]": alone,
                 "sample + update [1/s]": sampled,
                 "reference, 2 CPU cores [1/s]": REFERENCE.get(name, "–"),

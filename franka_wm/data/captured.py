@@ -32,6 +32,7 @@ class CapturedSampling:
         self._memory: tuple[int, int] | None = None
         self._graph: torch.cuda.CUDAGraph | None = None
         self._batch: TensorDictBase | None = None
+        self._crossing: torch.Tensor | None = None
 
     def __call__(self) -> TensorDictBase:
         """A batch of batch size (batch_size, length); no host sync.
@@ -55,7 +56,8 @@ class CapturedSampling:
         self._choices.fill_(span * data.shape[1])
         self._oldest.fill_(oldest)
         self._graph.replay()
-        sampler.record_missing(self._crossing)
+        if self._crossing is not None:
+            sampler.record_missing(self._crossing)
         return self._batch
 
     def is_static(self, batch: TensorDictBase) -> bool:
@@ -79,6 +81,4 @@ class CapturedSampling:
         draw = torch.minimum(uniform * self._choices, self._choices - 1.0).long()
         time, world, crossing = sampler.choose(data, draw, self._oldest, size)
         self._batch = data[time, world]
-        self._crossing = (
-            torch.zeros((), dtype=torch.bool, device=data.device) if crossing is None else crossing
-        )
+        self._crossing = crossing

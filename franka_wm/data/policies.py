@@ -77,8 +77,10 @@ class SmoothRandomPolicy(TensorDictModuleBase):
         if self.calmest < 1.0:
             draw = torch.rand(is_init.shape, device=is_init.device, generator=self.generator)
             drawn = self.calmest + (1.0 - self.calmest) * draw
-            known = self._scale is not None and self._scale.shape == drawn.shape
-            self._scale = torch.where(is_init, drawn, self._scale) if known else drawn
+            before = self._scale
+            if before is not None and before.shape == drawn.shape:
+                drawn = torch.where(is_init, drawn, before)
+            self._scale = drawn
             action = action * self._scale
         return tensordict.set("action", action.clamp(-1.0, 1.0))
 
