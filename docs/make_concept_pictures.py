@@ -45,7 +45,7 @@ def environment() -> None:
     """Everything one arm shows while inverse kinematics drives it to its goal."""
     config = FrankaConfig(
         observations=("pixels", "depth", "segmentation", "goal_pixels", "state", "joint_target"),
-        cameras=("front", "wrist"),
+        cameras=("front", "side", "wrist"),
         goal_sampling="reachable",
         gravity_compensation=True,
         limit_velocity=True,
@@ -61,6 +61,7 @@ def environment() -> None:
         kinds = torch.unique(state["segmentation"], return_inverse=True)[1].float()
         shown = {
             "pixels": state["pixels"],
+            "side": state["pixels_side"],
             "wrist": state["pixels_wrist"],
             "depth": grey((1.0 - state["depth"] / 2.0).clamp(0.0, 1.0) * (state["depth"] > 0.0)),
             "segmentation": grey(kinds / kinds.max().clamp_min(1.0)),
