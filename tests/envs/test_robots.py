@@ -331,3 +331,43 @@ def test_colliders_are_drawn_where_there_is_nothing_else(tmp_path: Path) -> None
     same = state_env()
     assert env.model.shape_count == same.model.shape_count
     np.testing.assert_array_equal(env.model.body_mass.numpy(), same.model.body_mass.numpy())
+
+
+@pytest.mark.parametrize(
+    ("options", "expected"),
+    [
+        ({}, 0.02),  # a pixel of 64 is a little larger
+        ({"image_size": 128}, 0.0105),
+        ({"image_size": 128, "camera_fov_degrees": 30.0}, 0.0049),
+        ({"cameras": ("front", "wrist")}, 0.008),
+        ({"observations": ("state",)}, 0.008),
+        ({"mesh_detail": 0.03}, 0.03),
+        ({"mesh_detail": 0.0}, 0.0),
+    ],
+)
+def test_meshes_are_as_fine_as_the_pictures(options: dict, expected: float) -> None:
+    config = FrankaConfig(robot="panda_meshes", **options)
+    assert sources.detail(SOURCES["panda_meshes"], config) == pytest.approx(expected, rel=0.02)
+    assert sources.detail(SOURCES["panda_meshes_full"], config) == 0.0
+
+
+def test_thinning_does_not_shrink(monkeypatch) -> None:
+    """A ball loses far less of its volume than where vertices are put in the middle of their cubes."""
+    trimesh = pytest.importorskip("trimesh")
+    ball = trimesh.creation.icosphere(subdivisions=5)
+    piece = meshes.Piece(np.array(ball.vertices), np.array(ball.vertex_normals), np.array(ball.faces), None)
+
+    def lost() -> float:
+        thin = meshes.simplify(piece, 0.3)
+        assert len(thin.faces) < len(piece.faces) / 20
+        return 1 - abs(trimesh.Trimesh(thin.vertices, thin.faces, process=False).volume) / ball.volume
+
+    found = lost()
+    monkeypatch.setattr(meshes, "_meet", lambda piece, place, cell: meshes._mean(piece.vertices, place))
+    assert abs(found) < 0.5 * lost()
+
+
+def test_bad_mesh_detail() -> None:
+    for value in (-0.01, 0.2, "fine"):
+        with pytest.raises(UserError, match="mesh_detail"):
+            FrankaConfig(mesh_detail=value)

@@ -122,6 +122,8 @@ def test_environments_of_a_run(composed) -> None:
         ("collector.acts=oracle", "acts"),
         ("collector.steps_per_batch=0", "steps_per_batch"),
         ("collector.seed_steps=0", "seed_steps"),
+        ("collector.calmest=1.5", "calmest"),
+        ("collector.calmest=true", "calmest"),
         ("planner.precision=float16", "float32, bfloat16"),
         ("planner.compile=maybe", "true or false"),
         ("replay.window=0", "window"),
@@ -177,3 +179,33 @@ def test_the_planner_computes_as_configured(composed) -> None:
     policy = build.make_agent_policies(cfg, model, env, spaces)["planner"]
     assert policy.next != model.next  # compiled
     assert policy.capture is None  # a checkpoint of a GPU acts on a CPU, too
+
+
+def test_goal_pictures_of_every_camera_that_the_model_reads(composed) -> None:
+    two = ("env=reach_fixed_goal_image", "env.cameras=[front,side]", "model=lewm", "planner=icem")
+    cfg = composed(*two, "model.observations=[pixels,pixels_side]", "device=cpu", "env.image_size=16")
+    check(cfg)
+    with pytest.raises(UserError, match="reads pixels, not"):
+        check(composed(*two, "model.observations=[joint_target]"))
+    with pytest.raises(UserError, match="needs goal_pixels"):
+        check(composed(*two, "env.observations=[pixels,state]"))
+    cfg.model.patch_size = 8
+    env = build.make_evaluation_env(cfg, num_envs=2)
+    model = build.make_model(cfg, env)
+    objective = build.make_objective(cfg, model)
+    assert objective.in_keys == ["goal_pixels", "goal_pixels_side"]
+    observed = env.reset()
+    goal = objective.bind(observed).goal_latent
+    swapped = observed.clone().set("goal_pixels_side", observed["goal_pixels"])
+    assert not torch.equal(objective.bind(swapped).goal_latent, goal)  # the second picture counts
+
+
+def test_calm_motion_gathers_and_random_stays_the_baseline(composed) -> None:
+    lewm = ("env=reach_goal_image", "model=lewm", "planner=icem")
+    assert build.actor(composed(*lewm)) == "random"
+    cfg = composed(*lewm, "collector.calmest=0.0", "device=cpu", "env.observations=[state,joint_target]")
+    assert build.actor(cfg) == "varied"
+    env = build.make_env(cfg, num_envs=2)
+    policies = build.make_scripted_policies(env, calmest=0.0)
+    assert policies["varied"].calmest == 0.0 and policies["random"].calmest == 1.0
+    assert "varied" not in build.make_scripted_policies(env)

@@ -9,6 +9,7 @@ import torch
 from tensordict import TensorDict
 from torch import nn
 
+from franka_wm import models
 from franka_wm.errors import UserError
 from franka_wm.training import build
 from franka_wm.training.learner import Learner
@@ -175,3 +176,49 @@ def test_bfloat16_is_close_to_float32(composed, small_env) -> None:
 def test_options_that_do_not_exist(options: dict[str, str]) -> None:
     with pytest.raises(UserError):
         Learner(Line(), **options)
+
+
+def test_parts_of_a_loss_are_compiled_one_by_one(monkeypatch) -> None:
+    """What runs side by side on a GPU must not become one program; the numbers are the same."""
+    torch.manual_seed(0)
+    model = models.make(
+        "tdmpc2", observation_sizes={"state": 5}, action_dim=2, latent_dim=16, episode_length=20
+    )
+    model.eval()  # no dropout: both losses draw the same
+    compiled: list[str] = []
+
+    def noted(function: Any) -> Any:
+        compiled.append(function.__name__)
+        return function
+
+    monkeypatch.setattr(torch, "compile", noted)
+    learner = Learner(model, compile=True)
+    assert tuple(compiled) == model.parts_of_loss
+    data = TensorDict(
+        {
+            "state": torch.randn(4, 3, 5),
+            "action": torch.rand(4, 3, 2) * 2 - 1,
+            "next": TensorDict(
+                {
+                    "state": torch.randn(4, 3, 5),
+                    "reward": torch.randn(4, 3, 1),
+                    "terminated": torch.zeros(4, 3, 1, dtype=torch.bool),
+                },
+                batch_size=[4, 3],
+            ),
+        },
+        batch_size=[4, 3],
+    )
+    called: list[str] = []
+    parts = {
+        name: lambda *inputs, name=name: (called.append(name), getattr(model, name)(*inputs))[1]
+        for name in model.parts_of_loss
+    }
+    torch.manual_seed(1)
+    plain = model.loss(data)
+    torch.manual_seed(1)
+    assert torch.equal(model.loss(data, parts=parts)["loss"], plain["loss"])
+    assert sorted(called) == sorted(model.parts_of_loss)
+    torch.manual_seed(1)
+    learner.update(data)
+    assert learner.metrics()["loss"] == pytest.approx(plain["loss"].item())
