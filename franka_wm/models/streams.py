@@ -37,6 +37,8 @@ class beside:
         device = self.inputs[0].device
         if (device, self.lane) not in _LANES:
             _LANES[device, self.lane] = torch.cuda.Stream(device)
+            # Parts share parameters, whose gradients are summed on one stream: meant, and waited for by autograd.
+            torch.autograd.graph.set_warn_on_accumulate_grad_stream_mismatch(False)
         self.stream = _LANES[device, self.lane]
         self.outside = torch.cuda.current_stream(device)
         self.stream.wait_stream(self.outside)
