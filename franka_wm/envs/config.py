@@ -117,7 +117,7 @@ class FrankaConfig:
         enable_textures: Use mesh textures where the robot has them.
         mesh_detail: Details of meshes smaller than this are not drawn [m]; 0 draws every triangle. ``None``: the size
             of a pixel at the distance that the fixed cameras look at, at most 2 cm; 8 mm where no pictures are
-            observed, or the wrist camera's are.
+            observed, or the wrist camera's are. ``robot="panda_meshes_full"`` always draws every triangle.
         solver: ``"mujoco"``, ``"featherstone"``, or ``"auto"``, which is ``"mujoco"`` on every device.
         asset_name: Newton's downloadable asset, for ``robot="newton_asset"``.
         urdf_relative_path: URDF inside that asset.

@@ -23,7 +23,8 @@ class FrameStack:
 
     def push(self, key: str, picture: Tensor) -> None:
         """``picture`` (N, H, W, C) is the present one from now on, and the oldest is forgotten."""
-        self._frames[key] = torch.cat((self._frames[key][..., picture.shape[-1] :], picture), -1)
+        kept = self._kept(key, picture)
+        self._frames[key] = torch.cat((kept[..., picture.shape[-1] :], picture), -1)
 
     def restart(self, key: str, picture: Tensor, mask: Tensor | None = None) -> None:
         """Copies of ``picture`` (N, H, W, C) where ``mask`` (N,) is true, or everywhere: an episode begins."""
@@ -34,8 +35,12 @@ class FrameStack:
 
     def replace(self, key: str, picture: Tensor) -> None:
         """``picture`` (N, H, W, C) instead of the present one."""
-        kept = self._frames[key]
+        kept = self._kept(key, picture)
         self._frames[key] = torch.cat((kept[..., : -picture.shape[-1]], picture), -1)
+
+    def _kept(self, key: str, picture: Tensor) -> Tensor:
+        """What is kept, or, before the first reset, as if nothing had ever moved."""
+        return self._frames[key] if key in self._frames else self.still(picture)
 
     def still(self, picture: Tensor) -> Tensor:
         """``picture`` (N, H, W, C) as if nothing had moved, (N, H, W, C · count)."""

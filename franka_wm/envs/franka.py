@@ -273,10 +273,11 @@ class FrankaEnv(EnvBase):
             )
         frames = {key: state.get(f"frames_{key}", None) for key in self._stacked}
         for key, stacked in frames.items():
-            if stacked is None or stacked.shape != self.observation_spec[key].shape:
+            spec = self.observation_spec[key]
+            if stacked is None or stacked.shape != spec.shape or stacked.dtype != spec.dtype:
                 raise UserError(
-                    f"set_state: frames_{key} must be {tuple(self.observation_spec[key].shape)}; take the state "
-                    "from get_state() of an environment with the same config that was reset"
+                    f"set_state: frames_{key} must be {tuple(spec.shape)} {spec.dtype}; take the state from "
+                    "get_state() of an environment with the same config that was reset"
                 )
         sim.set_state(dict(state.items()))
         if self._stack is not None:

@@ -44,7 +44,7 @@ def actor(cfg: DictConfig) -> str:
     family = models.family(cfg.model.name)
     there = {"planner": hasattr(family, "next"), "policy": hasattr(family, "policy")}
     searched = bool(getattr(family, "replay_keys", ()))  # the loss needs what the search found
-    smooth = "varied" if cfg.collector.get("calmest", 1.0) < 1.0 else "random"
+    smooth = "varied" if _calmest(cfg) < 1.0 else "random"
     if acts == "auto":
         if searched:
             return "planner"
@@ -57,6 +57,16 @@ def actor(cfg: DictConfig) -> str:
         fitting = "planner" if there["planner"] else "smooth"
         raise UserError(f"collector.acts={acts}: model={cfg.model.name} cannot; use collector.acts={fitting}")
     return smooth if acts == "smooth" else ACTORS[acts]
+
+
+def _calmest(cfg: DictConfig) -> float:
+    return cfg.collector.get("calmest", 1.0)  # runs of before it was there have none
+
+
+def calmest(cfg: DictConfig) -> float:
+    """``collector.calmest`` where smooth motion is what gathers experience; else 1, motion of one size."""
+    moves_smoothly = _calmest(cfg) < 1.0 and not is_offline(cfg) and actor(cfg) == "varied"
+    return _calmest(cfg) if moves_smoothly else 1.0
 
 
 def plain(node: Any) -> dict[str, Any]:
@@ -355,7 +365,7 @@ def make_agent_policies(cfg: DictConfig, model: Any, env: Any, spaces: Spaces) -
         env,
         seed=cfg.seed,
         smoothness=cfg.collector.smoothness,
-        calmest=cfg.collector.get("calmest", 1.0),  # runs of before it was there
+        calmest=calmest(cfg),
         objective=make_objective(cfg, model),
         capture=None if cfg.trainer.capture else cfg.trainer.capture,  # true asks for what CUDA does anyway
         **{key: cfg.planner[key] for key in OF_THE_POLICY if key in cfg.planner},

@@ -44,8 +44,16 @@ def check(cfg: DictConfig) -> None:
         raise UserError(
             f"evaluation.video_size={cfg.evaluation.video_size}: must be even, video codecs want it"
         )
+    calmest = cfg.collector.get("calmest", 1.0)  # a run of before it was there may be resumed
+    if isinstance(calmest, bool) or not isinstance(calmest, (int, float)) or not 0 <= calmest <= 1:
+        raise UserError(f"collector.calmest={calmest!r}: must be a number from 0 to 1")
     if not build.is_offline(cfg):
         build.actor(cfg)
+    elif build.is_arm(cfg) and cfg.env.get("frame_stack", 1) > 1 and "pixels" in cfg.env.observations:
+        raise UserError(
+            f"env.frame_stack={cfg.env.frame_stack}: a dataset holds single pictures, and the model would be built for "
+            "them; use env.frame_stack=1"
+        )
     short = cfg.env.kind != "none" and cfg.env.episode_length < window
     if short and not build.looks_past_ends(cfg):
         raise UserError(
@@ -70,9 +78,6 @@ def check(cfg: DictConfig) -> None:
             raise UserError(f"{name}={value!r}: must be a number of seconds above 0")
     if not 0 <= cfg.collector.smoothness < 1:
         raise UserError(f"collector.smoothness={cfg.collector.smoothness}: must be at least 0 and below 1")
-    calmest = cfg.collector.calmest
-    if isinstance(calmest, bool) or not isinstance(calmest, (int, float)) or not 0 <= calmest <= 1:
-        raise UserError(f"collector.calmest={calmest!r}: must be a number from 0 to 1")
     if cfg.replay.capacity < (steps := cfg.collector.num_envs * (window + 1)):
         raise UserError(
             f"replay.capacity={cfg.replay.capacity}: must be at least {steps}, one window for every world"

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from functools import partial
+from inspect import signature
 from typing import Any
 
 import torch
@@ -181,6 +182,6 @@ class Learner:
 def _compiled(model: Any) -> Callable[[TensorDictBase], TensorDictBase]:
     """`model.loss` compiled: as a whole, or part by part where the model names them."""
     names = getattr(model, "parts_of_loss", ())
-    if not names:
+    if not names or "parts" not in signature(model.loss).parameters:  # a subclass may have a loss of its own
         return torch.compile(model.loss)
     return partial(model.loss, parts={name: torch.compile(getattr(model, name)) for name in names})

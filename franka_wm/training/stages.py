@@ -45,13 +45,20 @@ def pretrain(run: Run, env: Any, experience: Any, spaces: Spaces) -> None:
     first.export.kind = "none"
     model = build.make_model(first, spaces, run.device)
     say(f"first stage: {cfg.pretrain.model.name}, {cfg.pretrain.updates} updates on pictures alone")
-    policies = {} if env is None else build.make_scripted_policies(env, seed=cfg.seed)
+    policies = {}
+    if env is not None:
+        policies = build.make_scripted_policies(
+            env,
+            seed=cfg.seed,
+            smoothness=cfg.collector.smoothness,
+            calmest=cfg.collector.get("calmest", 1.0),
+        )
     trainer = Trainer(
         env=env,
         learner=Learner(model, **run.learner_options(first)),
         replay=experience if env is None else build.make_replay_buffer(first, env.device),
         policies=policies,
-        actor="random",
+        actor="varied" if "varied" in policies else "random",
         cfg=first,
         folder=run.folder / FOLDER,
         loggers=[],

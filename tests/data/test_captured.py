@@ -88,6 +88,23 @@ def test_windows_of_a_growing_buffer(device: str, kind: type[CapturedSampling]) 
 
 
 @pytest.mark.parametrize(("device", "kind"), DEVICES)
+def test_other_memory_is_captured_anew(device: str, kind: type[CapturedSampling]) -> None:
+    """A buffer that lies elsewhere than at the capture is read where it is."""
+    sampling = None
+    for first in (0, 100):
+        replay = make_replay(
+            capacity=WORLDS * STEPS, num_envs=WORLDS, window=WINDOW, batch_size=64, device=device
+        )
+        replay.extend(experience(first, first + 30).to(device))
+        if sampling is None:
+            sampling = kind(replay)
+        sampling.replay = replay
+        for _ in range(4):
+            time = sampling()["time"]
+            assert first <= time.min() and time.max() < first + 30
+
+
+@pytest.mark.parametrize(("device", "kind"), DEVICES)
 def test_what_cannot_be_filled_is_reported(device: str, kind: type[CapturedSampling]) -> None:
     replay = make_replay(capacity=WORLDS * STEPS, num_envs=WORLDS, window=8, batch_size=64, device=device)
     sampling = kind(replay)

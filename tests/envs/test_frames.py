@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 import torch
-from tensordict import TensorDictBase
+from tensordict import TensorDict, TensorDictBase
 from torchrl.envs.utils import check_env_specs
 
 from franka_wm.data.lerobot.schema import schema_for
@@ -116,3 +116,20 @@ def test_bad_input() -> None:
     with pytest.raises(UserError, match=r"record with env\.frame_stack=1"):
         schema_for(FrankaConfig(frame_stack=2))
     assert "pixels" not in schema_for(FrankaConfig(frame_stack=2, observations=("state",))).sources.values()
+
+
+def test_before_the_first_reset(small_env, actions) -> None:
+    """As without stacks: what is set by hand is seen, and a step can be made."""
+    env = small_env(N, frame_stack=COUNT, **OPTIONS)
+    assert env.set_goal(torch.tensor([0.4, 0.1, 0.5]))["pixels"].shape == (N, 16, 16, 3 * COUNT)
+    env = small_env(N, frame_stack=COUNT, **OPTIONS)
+    stepped = env.step(TensorDict({"action": actions[:, 0]}, batch_size=[N]))
+    assert stepped["next", "pixels"].dtype == torch.uint8
+
+
+def test_states_of_another_type_are_refused(small_env) -> None:
+    env = small_env(N, frame_stack=COUNT, **OPTIONS)
+    env.reset()
+    state = env.get_state()
+    with pytest.raises(UserError, match="uint8"):
+        env.set_state(state.set("frames_pixels", state["frames_pixels"].float()))

@@ -366,3 +366,55 @@ def test_the_value_averages_as_many_members_as_asked():
     model.value_members = 2
     torch.testing.assert_close(model.value(z), members[:2].mean(0))
     assert not torch.allclose(members[:2].mean(0), members.mean(0))
+
+
+@pytest.mark.gpu
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
+def test_side_by_side_is_as_one_after_the_other(monkeypatch):
+    """On a GPU, losses and gradients do not depend on the streams that they are computed on."""
+    from franka_wm.models import tdmpc2
+
+    class Plainly:
+        def __init__(self, *inputs, lane=0): ...
+
+        def __enter__(self):
+            return self
+
+        def __exit__(self, *error): ...
+
+        def join(self, *outputs): ...
+
+    model = make("tdmpc2", observation_sizes={"state": 20}, action_dim=7, episode_length=20).cuda().eval()
+    for parameter in model.parameters():
+        torch.nn.init.normal_(parameter, std=0.05)
+    shape = (256, 3)
+    batch = TensorDict(
+        {
+            "state": torch.randn(*shape, 20),
+            "action": torch.rand(*shape, 7) * 2 - 1,
+            "next": TensorDict(
+                {
+                    "state": torch.randn(*shape, 20),
+                    "reward": torch.randn(*shape, 1),
+                    "terminated": torch.rand(*shape, 1) < 0.1,
+                },
+                batch_size=shape,
+            ),
+        },
+        batch_size=shape,
+    ).cuda()
+
+    def results():
+        found = []
+        for seed in range(20):
+            torch.manual_seed(seed)
+            model.zero_grad()
+            losses = model.loss(batch)
+            losses["loss"].backward()
+            found += [losses["loss"].detach().clone(), *(p.grad.clone() for p in model.parameters())]
+        return found
+
+    beside = results()
+    monkeypatch.setattr(tdmpc2, "beside", Plainly)
+    for found, expected in zip(beside, results(), strict=True):
+        torch.testing.assert_close(found, expected, rtol=1e-4, atol=1e-6)

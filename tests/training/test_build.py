@@ -6,6 +6,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from omegaconf import OmegaConf
 from tensordict import TensorDict
 
 from franka_wm.envs import FrankaConfig
@@ -124,6 +125,8 @@ def test_environments_of_a_run(composed) -> None:
         ("collector.seed_steps=0", "seed_steps"),
         ("collector.calmest=1.5", "calmest"),
         ("collector.calmest=true", "calmest"),
+        ("collector.calmest=x", "calmest"),
+        ("collector.calmest=null", "calmest"),
         ("planner.precision=float16", "float32, bfloat16"),
         ("planner.compile=maybe", "true or false"),
         ("replay.window=0", "window"),
@@ -209,3 +212,28 @@ def test_calm_motion_gathers_and_random_stays_the_baseline(composed) -> None:
     policies = build.make_scripted_policies(env, calmest=0.0)
     assert policies["varied"].calmest == 0.0 and policies["random"].calmest == 1.0
     assert "varied" not in build.make_scripted_policies(env)
+
+
+def test_runs_of_before_an_option_was_there_go_on(composed) -> None:
+    cfg = composed("env=reach", "device=cpu", "env.observations=[state,joint_target]")
+    for node, key in ((cfg.collector, "calmest"), (cfg.env, "frame_stack"), (cfg.env, "mesh_detail")):
+        OmegaConf.set_struct(cfg, False)
+        del node[key]
+        OmegaConf.set_struct(cfg, True)
+    check(cfg)
+    env = build.make_env(cfg, num_envs=2)
+    spaces = Spaces.of_env(env)
+    policies = build.make_agent_policies(cfg, build.make_model(cfg, env), env, spaces)
+    assert set(policies) == {"planner", "policy", "noop", "random", "oracle"}
+
+
+def test_calm_motion_is_there_only_where_it_acts(composed) -> None:
+    cfg = composed("env=reach", "collector.calmest=0.0")
+    assert build.actor(cfg) == "policy" and build.calmest(cfg) == 1.0
+    assert build.calmest(composed("env=reach", "collector.calmest=0.0", "collector.acts=smooth")) == 0.0
+
+
+def test_stacked_frames_are_not_in_datasets(composed, tmp_path) -> None:
+    offline = ("dataset=lerobot", "trainer=offline", f"dataset.root={tmp_path}", "model=tdmpc2_pixels")
+    with pytest.raises(UserError, match=r"use env\.frame_stack=1"):
+        check(composed(*offline, "env=reach_fixed_pixels", "env.frame_stack=3"))
