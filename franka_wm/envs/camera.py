@@ -23,9 +23,8 @@ GROUND = (0.34, 0.37, 0.41)
 WRIST_FOV_DEGREES = 75.0
 GOAL_MARKER = "goal_marker"
 
-_QUARTER = wp.quat_from_axis_angle(wp.vec3f(0.0, 0.0, 1.0), -math.pi / 2.0)
-TURNS = {"front": wp.transform_identity(), "side": wp.transformf(wp.vec3f(0.0, 0.0, 0.0), _QUARTER)}
-"""Around the base's vertical axis, from where the config puts the front camera: where the fixed cameras stand."""
+TURNS = {"front": 0.0, "side": -math.pi / 2.0}
+"""Where the fixed cameras stand: so far around the base's vertical axis from the config's front camera [rad]."""
 
 
 def camera_framing(config: FrankaConfig) -> tuple[tuple[float, float, float], tuple[float, float, float]]:
@@ -113,7 +112,8 @@ class Camera:
             enable_shadows=config.enable_shadows,
             direction=wp.vec3f(*(light / np.linalg.norm(light)).tolist()),
         )
-        self._turn = TURNS.get(name, TURNS["front"])
+        turn = wp.quat_from_axis_angle(wp.vec3f(0.0, 0.0, 1.0), TURNS.get(name, 0.0))
+        self._turn = wp.transformf(wp.vec3f(0.0, 0.0, 0.0), turn)
         pose = self._turn * look_at(*camera_framing(config))  # pyright: ignore[reportOperatorIssue]
         self.transforms = wp.array([pose] * views, dtype=wp.transformf, device=model.device)
         self.views = wp.array(np.arange(views), dtype=int, device=model.device)

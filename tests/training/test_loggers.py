@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib.machinery
 import math
 import sys
+import time
 from pathlib import Path
 from types import ModuleType, SimpleNamespace
 from typing import Any
@@ -233,7 +234,10 @@ def test_wandb_offline_for_real(tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
     close_loggers(loggers)
     kept = tmp_path / "run" / "wandb"
     (history,) = kept.glob("offline-run-*/*.wandb")
-    assert b"reach" in (data := history.read_bytes()) and b"0.25" in data
+    until = time.monotonic() + 30.0  # a process of its own writes the file, and closing does not wait for it
+    while not (b"reach" in (data := history.read_bytes()) and b"0.25" in data):
+        assert time.monotonic() < until, data[:200]
+        time.sleep(0.1)
     (film,) = kept.glob("offline-run-*/files/media/videos/**/*.mp4")
     assert count_frames(film) == 6
 
