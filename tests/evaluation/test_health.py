@@ -124,8 +124,23 @@ def test_planning_gains_over_doing_nothing(point_model, states: TensorDict, kind
     assert found["gain"]["low"] > 0.5 * -stays
     assert found["better"] > 0.9 and found["states"] == 40
     assert ("effective_samples" in found) == (kind is MPPI)
-    if kind is MPPI:
-        assert 1 <= found["effective_samples"]["mean"] <= 32
+
+
+@pytest.mark.parametrize(("temperature", "expected"), [(1e-6, 32.0), (1e6, 1.0)])
+def test_effective_samples(point_model, states: TensorDict, temperature: float, expected: float) -> None:
+    """All elites where their scores hardly count, one where they decide all."""
+    planner = MPPI(
+        action_dim=2,
+        horizon=2,
+        num_policy_samples=0,
+        num_samples=256,
+        num_elites=32,
+        temperature=temperature,
+    )
+    policy = PlannerPolicy.for_model(point_model, planner, objective=nearest_to_origin)
+    torch.manual_seed(0)
+    found = planner_health(policy, states)
+    assert found["effective_samples"]["mean"] == pytest.approx(expected, rel=0.01)
 
 
 def test_a_perfect_prior_leaves_nothing_to_gain(point_model, states: TensorDict) -> None:
