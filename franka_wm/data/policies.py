@@ -36,8 +36,6 @@ class SmoothRandomPolicy(TensorDictModuleBase):
     Args:
         action_dim: Of the environment.
         smoothness: Correlation of successive actions, in [0, 1).
-        calmest: Every episode's actions are scaled by a factor of its own, drawn from [``calmest``, 1]: 0 makes
-            motion of every speed, which a model needs that is to plan for standing still, too.
         generator: Source of randomness.
     """
 
@@ -49,20 +47,15 @@ class SmoothRandomPolicy(TensorDictModuleBase):
         action_dim: int = 7,
         *,
         smoothness: float = 0.7,
-        calmest: float = 1.0,
         generator: torch.Generator | None = None,
     ):
         super().__init__()
         if not 0.0 <= smoothness < 1.0:
             raise UserError(f"smoothness={smoothness}: must be at least 0 and below 1")
-        if not 0.0 <= calmest <= 1.0:
-            raise UserError(f"calmest={calmest}: must be from 0 to 1")
-        self.calmest = calmest
         self.action_dim = action_dim
         self.smoothness = smoothness
         self.generator = generator
         self._present: torch.Tensor | None = None
-        self._scale: torch.Tensor | None = None
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         is_init = tensordict.get("is_init")
@@ -73,16 +66,7 @@ class SmoothRandomPolicy(TensorDictModuleBase):
         else:
             s = self.smoothness
             self._present = torch.where(is_init, noise, s * self._present + math.sqrt(1 - s * s) * noise)
-        action = self._present
-        if self.calmest < 1.0:
-            draw = torch.rand(is_init.shape, device=is_init.device, generator=self.generator)
-            drawn = self.calmest + (1.0 - self.calmest) * draw
-            before = self._scale
-            if before is not None and before.shape == drawn.shape:
-                drawn = torch.where(is_init, drawn, before)
-            self._scale = drawn
-            action = action * self._scale
-        return tensordict.set("action", action.clamp(-1.0, 1.0))
+        return tensordict.set("action", self._present.clamp(-1.0, 1.0))
 
 
 class OraclePolicy(TensorDictModuleBase):

@@ -42,7 +42,8 @@ class LeWorldModel(nn.Module):
     that of the state alone. With pictures, goals are compared by the picture's part.
 
     Deliberate differences: rotary positions in the predictor instead of learned ones, so that a history which
-    is still short predicts as in training; `rollout`, InfoNCE and the reward probe, off by default.
+    is still short predicts as in training; `rollout`, InfoNCE, inverse dynamics and the reward probe, off
+    by default.
 
     Args:
         image_sizes: picture key -> (height, width, channels); several of one size share the encoder.
@@ -62,6 +63,10 @@ class LeWorldModel(nn.Module):
         rollout: 1, as published: predict from true embeddings. More: feed predictions back for so many steps
             at the end of each window as well.
         infonce_coef: weight of an InfoNCE loss between predicted and true next embeddings.
+        inverse_coef: weight of inverse dynamics, after PLDM (Sobal et al. 2025, arXiv:2502.14819): the actions
+            of a window are read from the embeddings of its frames (of the pictures' part where there are any),
+            so that these tell of all that the actions move, the hand's turning as well as the large links.
+            Windows must then be at least `history` transitions long.
         reward_head: learn the reward as a probe of z whose gradient stops there, for planners that need it;
             the batch must then hold rewards.
         discount: of the rewards, for objectives that ask.
@@ -98,6 +103,7 @@ class LeWorldModel(nn.Module):
         sigreg_directions: int = 1024,
         rollout: int = 1,
         infonce_coef: float = 0.0,
+        inverse_coef: float = 0.0,
         reward_head: bool = False,
         discount: float = 0.99,
         weight_decay: float = 1e-3,
@@ -107,13 +113,14 @@ class LeWorldModel(nn.Module):
             raise ValueError("give observation_sizes or image_sizes: there is nothing to read")
         if rollout < 1:
             raise ValueError(f"rollout must be at least 1, got {rollout}")
-        if min(sigreg_coef, infonce_coef) < 0.0:
-            raise ValueError("sigreg_coef and infonce_coef must not be negative")
+        if min(sigreg_coef, infonce_coef, inverse_coef) < 0.0:
+            raise ValueError("sigreg_coef, infonce_coef and inverse_coef must not be negative")
         if not 0.0 <= discount <= 1.0:
             raise ValueError(f"discount must be in [0, 1], got {discount}")
         self.vectors = Vectors(observation_sizes or {})
         self.observation_sizes, self.action_dim = self.vectors.sizes, action_dim
         self.sigreg_coef, self.infonce_coef, self.rollout = sigreg_coef, infonce_coef, rollout
+        self.inverse_coef = inverse_coef
         self.weight_decay, self.discount = weight_decay, discount
         self.image_sizes: dict[str, tuple[int, int, int]] = {}
         self.encoder = self.projector = self.state_encoder = None
@@ -157,6 +164,10 @@ class LeWorldModel(nn.Module):
         )
         self.head = ProjectionMLP(width, frame, hidden=projector_hidden)
         self.sigreg = SIGReg(directions=sigreg_directions)
+        self.inverse_head = None
+        if inverse_coef:
+            seen = (history + 1) * (self.image_part or frame)
+            self.inverse_head = mlp(seen, (512, 512), history * action_dim)
         self.reward_probe = None
         if reward_head:
             self.two_hot = TwoHotSymlog()
@@ -231,7 +242,8 @@ class LeWorldModel(nn.Module):
         Returns:
             batch size []: `loss`, and detached `loss_prediction`, `loss_sigreg`, `relative_error` (squared
             error of the prediction over that of predicting no change), `feature_std` and `feature_rank`
-            (participation ratio) of the embeddings; `loss_infonce`, `loss_reward` where asked for.
+            (participation ratio) of the embeddings; `loss_rollout`, `loss_infonce`, `loss_inverse`,
+            `loss_reward` where asked for.
 
         Raises:
             ValueError: the batch size is not [B, H].
@@ -255,6 +267,8 @@ class LeWorldModel(nn.Module):
             extra["loss_rollout"] = self._rollout_loss(frames, action)
         if self.infonce_coef:
             extra["loss_infonce"] = self.infonce_coef * info_nce(predicted[:, -1], after[:, -1])
+        if self.inverse_head is not None:
+            extra["loss_inverse"] = self.inverse_coef * self._inverse_loss(before, after, actions)
         if self.reward_probe is not None:
             z = self.memory.gather(frames[:, :-1].detach(), action)
             logits = self.reward_probe(torch.cat((z, action.to(z.dtype)), dim=-1))
@@ -312,6 +326,18 @@ class LeWorldModel(nn.Module):
         parts = [part for part in (self.image_part, self.state_part) if part]
         values = [self.sigreg(x) for x in frames.split(parts, dim=-1)]
         return torch.stack(values).mean()
+
+    def _inverse_loss(self, before: Tensor, after: Tensor, actions: Tensor) -> Tensor:
+        """Squared error of a window's actions as its pictures tell them."""
+        assert self.inverse_head is not None
+        if actions.shape[1] < self.memory.history:
+            raise ValueError(
+                f"inverse_coef needs windows of at least history={self.memory.history} transitions, got "
+                f"{actions.shape[1]}"
+            )
+        frames = self._comparable(torch.cat((before, after[:, -1:]), dim=1))
+        read = self.inverse_head(frames.flatten(1)).float().view(actions.shape)
+        return F.mse_loss(read, actions.float())
 
     def _rollout_loss(self, frames: Tensor, action: Tensor) -> Tensor:
         """Squared error of predictions fed back, from the second step on, at the end of the windows."""

@@ -44,7 +44,6 @@ def actor(cfg: DictConfig) -> str:
     family = models.family(cfg.model.name)
     there = {"planner": hasattr(family, "next"), "policy": hasattr(family, "policy")}
     searched = bool(getattr(family, "replay_keys", ()))  # the loss needs what the search found
-    smooth = "varied" if _calmest(cfg) < 1.0 else "random"
     if acts == "auto":
         if searched:
             return "planner"
@@ -52,21 +51,11 @@ def actor(cfg: DictConfig) -> str:
             return "policy"
         # A planner without a policy's candidates takes far longer to decide than the worlds to step, and a model that
         # is given goals by their pictures can learn from any motion.
-        return "planner" if objective_name(cfg) == "reward_value" else smooth
+        return "planner" if objective_name(cfg) == "reward_value" else "random"
     if not there.get(acts, True) or (searched and acts != "planner"):
         fitting = "planner" if there["planner"] else "smooth"
         raise UserError(f"collector.acts={acts}: model={cfg.model.name} cannot; use collector.acts={fitting}")
-    return smooth if acts == "smooth" else ACTORS[acts]
-
-
-def _calmest(cfg: DictConfig) -> float:
-    return cfg.collector.get("calmest", 1.0)  # runs of before it was there have none
-
-
-def calmest(cfg: DictConfig) -> float:
-    """``collector.calmest`` where smooth motion is what gathers experience; else 1, motion of one size."""
-    moves_smoothly = _calmest(cfg) < 1.0 and not is_offline(cfg) and actor(cfg) == "varied"
-    return _calmest(cfg) if moves_smoothly else 1.0
+    return ACTORS[acts]
 
 
 def plain(node: Any) -> dict[str, Any]:
@@ -301,7 +290,6 @@ def make_policies(
     *,
     seed: int = 0,
     smoothness: float = 0.7,
-    calmest: float = 1.0,
     objective: Any = None,
     capture: bool | None = None,
     precision: str = "float32",
@@ -310,8 +298,7 @@ def make_policies(
     """Every policy that can act or be compared, by name.
 
     ``planner`` and ``policy`` where the model has what they need; ``noop`` and ``random`` (smooth random:
-    first-order autoregressive), and ``varied``, scaled anew in every episode, where ``calmest`` is below 1; for the arm
-    ``oracle``, inverse kinematics with true geometry. ``capture``,
+    first-order autoregressive); for the arm ``oracle``, inverse kinematics with true geometry. ``capture``,
     ``precision`` and ``compile``: of the planner's, see :class:`~franka_wm.planning.PlannerPolicy`.
     """
     policies: dict[str, Any] = {}
@@ -324,28 +311,21 @@ def make_policies(
         )
     if hasattr(model, "policy"):
         policies["policy"] = ModelPolicy.for_model(model)
-    return policies | make_scripted_policies(env, seed=seed, smoothness=smoothness, calmest=calmest)
+    return policies | make_scripted_policies(env, seed=seed, smoothness=smoothness)
 
 
-def make_scripted_policies(
-    env: Any, *, seed: int = 0, smoothness: float = 0.7, calmest: float = 1.0
-) -> dict[str, Any]:
-    """Policies that need no model: ``noop``, ``random``, ``varied`` and, for the arm, ``oracle``."""
+def make_scripted_policies(env: Any, *, seed: int = 0, smoothness: float = 0.7) -> dict[str, Any]:
+    """Policies that need no model: ``noop``, ``random`` and, for the arm, ``oracle``."""
     generator = torch.Generator(device=env.device).manual_seed(seed)
     discrete = not env.action_spec.dtype.is_floating_point
     arm = isinstance(env, (FrankaEnv, TransformedFrankaEnv))
     if discrete and not arm:
-        moves_at_random = RandomMovesPolicy(env.action_dim, generator=generator)
-        return {"random": moves_at_random} | ({"varied": moves_at_random} if calmest < 1.0 else {})
+        return {"random": RandomMovesPolicy(env.action_dim, generator=generator)}
     size = env.config.action_dim if arm else env.action_dim
     scripted: dict[str, Any] = {
         "noop": NoopPolicy(size),
         "random": SmoothRandomPolicy(size, smoothness=smoothness, generator=generator),
     }
-    if calmest < 1.0:  # beside random, the baseline that every agent is compared with
-        scripted["varied"] = SmoothRandomPolicy(
-            size, smoothness=smoothness, calmest=calmest, generator=generator
-        )
     if arm:
         scripted["oracle"] = OraclePolicy(env.kinematics, env.config)
     if discrete:
@@ -365,7 +345,6 @@ def make_agent_policies(cfg: DictConfig, model: Any, env: Any, spaces: Spaces) -
         env,
         seed=cfg.seed,
         smoothness=cfg.collector.smoothness,
-        calmest=calmest(cfg),
         objective=make_objective(cfg, model),
         capture=None if cfg.trainer.capture else cfg.trainer.capture,  # true asks for what CUDA does anyway
         **{key: cfg.planner[key] for key in OF_THE_POLICY if key in cfg.planner},

@@ -51,14 +51,13 @@ def pretrain(run: Run, env: Any, experience: Any, spaces: Spaces) -> None:
             env,
             seed=cfg.seed,
             smoothness=cfg.collector.smoothness,
-            calmest=cfg.collector.get("calmest", 1.0),
         )
     trainer = Trainer(
         env=env,
         learner=Learner(model, **run.learner_options(first)),
         replay=experience if env is None else build.make_replay_buffer(first, env.device),
         policies=policies,
-        actor="varied" if "varied" in policies else "random",
+        actor="random",
         cfg=first,
         folder=run.folder / FOLDER,
         loggers=[],

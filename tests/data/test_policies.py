@@ -72,25 +72,3 @@ def test_oracle_reaches_every_goal(env: FrankaEnv) -> None:
 def test_oracle_needs_the_targets() -> None:
     with pytest.raises(UserError, match="joint_target"):
         OraclePolicy(None, 0.25)(TensorDict({"goal": torch.zeros(1, 3)}, batch_size=[1]))  # type: ignore[arg-type]
-
-
-def test_episodes_of_every_speed() -> None:
-    """Each episode has a factor of its own, that stays until the next one; 1 changes nothing."""
-    generator = torch.Generator().manual_seed(0)
-    policy = SmoothRandomPolicy(smoothness=0.8, calmest=0.0, generator=generator)
-    worlds, steps = 400, 60
-    first = torch.ones(worlds, 1, dtype=torch.bool)
-    sizes = []
-    for t in range(2 * steps):
-        observed = TensorDict({"is_init": first if t % steps == 0 else ~first}, batch_size=[worlds])
-        sizes.append(policy(observed)["action"].square().mean(-1).sqrt())
-    halves = torch.stack(sizes).view(2, steps, worlds)
-    speed = halves.mean(1)
-    assert speed.min() < 0.03 and speed.max() > 0.6
-    again = torch.corrcoef(torch.stack([halves[0, : steps // 2].mean(0), halves[0, steps // 2 :].mean(0)]))[
-        0, 1
-    ]
-    anew = torch.corrcoef(speed)[0, 1]
-    assert again > 0.9 and abs(anew) < 0.2
-    with pytest.raises(UserError, match="calmest"):
-        SmoothRandomPolicy(calmest=1.5)

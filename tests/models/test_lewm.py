@@ -215,8 +215,30 @@ def test_the_loss_is_what_it_says(dots):
     changed = batch.clone()
     changed["next", "pixels"][:, -1] = 0
     assert model.loss(changed)["loss_prediction"] != model.loss(batch)["loss_prediction"]
-    extra = small(rollout=2, infonce_coef=0.1, reward_head=True).loss(batch)
-    assert {"loss_rollout", "loss_infonce", "loss_reward"} <= set(extra.keys())
+    extra = small(rollout=2, infonce_coef=0.1, inverse_coef=0.2, history=2, reward_head=True).loss(batch)
+    parts = {"loss_rollout", "loss_infonce", "loss_inverse", "loss_reward"}
+    assert parts <= set(extra.keys())
+    total = extra["loss_prediction"] + 0.09 * extra["loss_sigreg"] + sum(extra[part] for part in parts)
+    torch.testing.assert_close(extra["loss"].detach(), total)
+
+
+def test_inverse_dynamics_shape_the_embeddings_and_read_the_actions(dots):
+    """Its gradient reaches the encoder, and what was taken is told by the pictures alone, in time."""
+    model = small(inverse_coef=1.0, history=2)
+    batch = dots.windows(8, 2)
+    silent = small(inverse_coef=0.0, history=2)
+    silent.load_state_dict(model.state_dict(), strict=False)
+    gradients = []
+    for each in (model, silent, silent):
+        torch.manual_seed(0)  # SIGReg's directions
+        weight = each.encoder.patch_embedding.weight
+        gradients.append(torch.autograd.grad(each.loss(batch)["loss"], weight)[0])
+    assert torch.equal(gradients[1], gradients[2]) and not torch.allclose(gradients[0], gradients[1])
+    train(model, dots.windows, steps=150, horizon=2)
+    read = model.loss(dots.windows(64, 2))["loss_inverse"]
+    assert read < 0.5 * dots.windows(64, 2)["action"].var()
+    with pytest.raises(ValueError, match="history=2"):
+        model.loss(dots.windows(4, 1))
 
 
 def test_the_gradient_passes_through_the_target(dots):
@@ -328,7 +350,7 @@ def test_matrices_decay_and_nothing_else(dots):
 
 
 def test_the_loss_traces_without_graph_breaks_or_host_reads(dots):
-    model = small(rollout=2)
+    model = small(rollout=2, inverse_coef=0.1)
 
     def loss(pixels, last, action):
         batch = TensorDict({"pixels": pixels, "action": action, "next": {"pixels": last}}, [4, 3])
@@ -344,6 +366,7 @@ def test_settings_that_cannot_work_are_refused(dots):
         (dict(image_sizes={}), "nothing to read"),
         (dict(history=0), "history"),
         (dict(rollout=0), "rollout"),
+        (dict(inverse_coef=-0.1), "inverse_coef"),
         (dict(predictor_head_dim=3), "even"),
         (dict(dropout=1.0), "dropout"),
         (dict(encoder_size="huge"), "tiny"),

@@ -140,7 +140,6 @@ def _simple(name: str, options: dict[str, Any], overrides: list[str]) -> Source:
 
     cfg = compose(with_scale(overrides), tuple(OPTIONS))
     seed, smoothness = number(cfg, "seed"), number(cfg, "collector.smoothness", float)
-    calmest = number(cfg, "collector.calmest", float)
     worlds = options["num_envs"] or min(number(cfg, "collector.num_envs"), options["episodes"])
     if not build.is_arm(cfg):
         raise UserError(
@@ -168,7 +167,6 @@ def _simple(name: str, options: dict[str, Any], overrides: list[str]) -> Source:
         "smooth": lambda: SmoothRandomPolicy(
             env.action_dim,
             smoothness=smoothness,
-            calmest=calmest,
             generator=torch.Generator(device=env.device).manual_seed(seed),
         ),
     }
