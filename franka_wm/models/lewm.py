@@ -246,7 +246,7 @@ class LeWorldModel(nn.Module):
             `loss_reward` where asked for.
 
         Raises:
-            ValueError: the batch size is not [B, H].
+            ValueError: the batch size is not [B, H], or with `inverse_coef` H is below `history`.
         """
         if len(batch.batch_size) != 2:
             raise ValueError(f"a batch of windows has batch size [B, H], got {list(batch.batch_size)}")
@@ -328,7 +328,7 @@ class LeWorldModel(nn.Module):
         return torch.stack(values).mean()
 
     def _inverse_loss(self, before: Tensor, after: Tensor, actions: Tensor) -> Tensor:
-        """Squared error of a window's actions as its pictures tell them."""
+        """Squared error of a window's actions as its embeddings tell them."""
         assert self.inverse_head is not None
         if actions.shape[1] < self.memory.history:
             raise ValueError(

@@ -46,8 +46,13 @@ def check(cfg: DictConfig) -> None:
         )
     if cfg.collector.get("calmest", 1.0) != 1.0:  # of a run of before it was taken out
         raise UserError(
-            f"collector.calmest={cfg.collector.calmest!r}: this option is gone, it showed no gain; start the run "
-            "anew without it"
+            f"collector.calmest={cfg.collector.calmest!r}: this option is gone; start the run anew without it"
+        )
+    history = cfg.model.get("history", 0)
+    if cfg.model.get("inverse_coef", 0.0) and window < history:
+        raise UserError(
+            f"model.inverse_coef={cfg.model.inverse_coef}: reads the actions of windows of model.history={history} "
+            f"transitions, and they have {window}; use replay.window={history}, or model.inverse_coef=0"
         )
     if not build.is_offline(cfg):
         build.actor(cfg)

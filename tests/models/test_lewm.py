@@ -218,12 +218,16 @@ def test_the_loss_is_what_it_says(dots):
     extra = small(rollout=2, infonce_coef=0.1, inverse_coef=0.2, history=2, reward_head=True).loss(batch)
     parts = {"loss_rollout", "loss_infonce", "loss_inverse", "loss_reward"}
     assert parts <= set(extra.keys())
+    torch.manual_seed(0)
+    single, twice = small(inverse_coef=0.2, history=2), small(inverse_coef=0.4, history=2)
+    twice.load_state_dict(single.state_dict())
+    read, doubled = (each.eval().loss(batch)["loss_inverse"] for each in (single, twice))
+    torch.testing.assert_close(2 * read, doubled)
     total = extra["loss_prediction"] + 0.09 * extra["loss_sigreg"] + sum(extra[part] for part in parts)
     torch.testing.assert_close(extra["loss"].detach(), total)
 
 
-def test_inverse_dynamics_shape_the_embeddings_and_read_the_actions(dots):
-    """Its gradient reaches the encoder, and what was taken is told by the pictures alone, in time."""
+def test_inverse_dynamics_pull_the_encoder_and_read_the_actions(dots):
     model = small(inverse_coef=1.0, history=2)
     batch = dots.windows(8, 2)
     silent = small(inverse_coef=0.0, history=2)
@@ -239,6 +243,20 @@ def test_inverse_dynamics_shape_the_embeddings_and_read_the_actions(dots):
     assert read < 0.5 * dots.windows(64, 2)["action"].var()
     with pytest.raises(ValueError, match="history=2"):
         model.loss(dots.windows(4, 1))
+
+
+def test_inverse_dynamics_read_the_pictures_alone_where_there_are_any(dots):
+    """Vectors beside pictures, such as commanded angles, would give the actions away."""
+    model = small(inverse_coef=1.0, history=2, observation_sizes={"angles": 2}).eval()
+    batch = dots.windows(6, 4)  # longer than the history, too
+    angles = torch.rand(6, 5, 2)
+    batch.set("angles", angles[:, :-1]).set(("next", "angles"), angles[:, 1:])
+    other = batch.clone().set("angles", -angles[:, :-1]).set(("next", "angles"), -angles[:, 1:])
+    first, second = model.loss(batch), model.loss(other)
+    assert first["loss_inverse"] == second["loss_inverse"]
+    assert first["loss_prediction"] != second["loss_prediction"]
+    alone = small(image_sizes={}, observation_sizes={"angles": 2}, inverse_coef=1.0, history=2)
+    assert alone.loss(batch)["loss_inverse"] > 0
 
 
 def test_the_gradient_passes_through_the_target(dots):

@@ -124,6 +124,7 @@ def test_environments_of_a_run(composed) -> None:
         ("collector.steps_per_batch=0", "steps_per_batch"),
         ("collector.seed_steps=0", "seed_steps"),
         ("+collector.calmest=0.5", "calmest"),
+        (("model=lewm", "env=reach_goal_image", "model.inverse_coef=0.5", "model.history=4"), "inverse_coef"),
         ("planner.precision=float16", "float32, bfloat16"),
         ("planner.compile=maybe", "true or false"),
         ("replay.window=0", "window"),
@@ -135,8 +136,8 @@ def test_environments_of_a_run(composed) -> None:
         ("device=tpu", "tpu"),
     ],
 )
-def test_refused_before_anything_is_built(override: str, named: str, composed) -> None:
-    cfg = composed(override)
+def test_refused_before_anything_is_built(override: str | tuple[str, ...], named: str, composed) -> None:
+    cfg = composed(*([override] if isinstance(override, str) else override))
     with pytest.raises(UserError) as caught:
         check(cfg)
     assert named in str(caught.value) and "\n" not in str(caught.value)
@@ -207,6 +208,7 @@ def test_runs_of_before_an_option_was_there_go_on(composed) -> None:
         del node[key]
         OmegaConf.set_struct(cfg, True)
     check(cfg)
+    check(composed("env=reach", "+collector.calmest=1.0"))  # gone since, and it did nothing
     env = build.make_env(cfg, num_envs=2)
     spaces = Spaces.of_env(env)
     policies = build.make_agent_policies(cfg, build.make_model(cfg, env), env, spaces)
