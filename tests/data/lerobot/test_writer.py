@@ -499,6 +499,8 @@ def _kill_and_go_on(tmp_path, schema, episodes, load, moments: list[float]) -> N
             process.stdout.readline()
             time.sleep(moment)
             os.killpg(process.pid, signal.SIGKILL) if moment < 0.5 else process.kill()
+        if out.exists():  # it was done, and the kill met it while it removed its shards
+            continue
         shards = sorted((tmp_path / "set.writing/shards").glob("shard-*[0-9]"))
         for shard in shards[:2]:  # what is there is a dataset of whole episodes, without going on
             keys = [key for key in by_key if key in set(_keys(shard))]
