@@ -47,11 +47,7 @@ def pretrain(run: Run, env: Any, experience: Any, spaces: Spaces) -> None:
     say(f"first stage: {cfg.pretrain.model.name}, {cfg.pretrain.updates} updates on pictures alone")
     policies = {}
     if env is not None:
-        policies = build.make_scripted_policies(
-            env,
-            seed=cfg.seed,
-            smoothness=cfg.collector.smoothness,
-        )
+        policies = build.make_scripted_policies(env, seed=cfg.seed, smoothness=cfg.collector.smoothness)
     trainer = Trainer(
         env=env,
         learner=Learner(model, **run.learner_options(first)),
