@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from omegaconf import DictConfig
+from omegaconf import DictConfig, ListConfig
 
 from franka_wm.envs import FrankaConfig, resolve_device
 from franka_wm.envs.franka import check_robot
@@ -83,6 +83,7 @@ def check(cfg: DictConfig) -> None:
     ):
         if isinstance(value, bool) or not isinstance(value, (int, float)) or not value > 0:
             raise UserError(f"{name}={value!r}: must be a number of seconds above 0")
+    _check_at_steps(cfg)
     if not 0 <= cfg.collector.smoothness < 1:
         raise UserError(f"collector.smoothness={cfg.collector.smoothness}: must be at least 0 and below 1")
     if cfg.replay.capacity < (steps := cfg.collector.num_envs * (window + 1)):
@@ -177,6 +178,22 @@ def _check_dataset(cfg: DictConfig) -> None:
         roots = [cfg.dataset.root] if isinstance(cfg.dataset.root, str) else list(cfg.dataset.root)
         for root in roots:
             read_source(root)
+
+
+def _check_at_steps(cfg: DictConfig) -> None:
+    at_steps = cfg.evaluation.get("at_steps", [])  # checkpoints of earlier versions have none
+    whole = isinstance(at_steps, (list, ListConfig)) and all(
+        isinstance(steps, int) and not isinstance(steps, bool) and steps > 0 for steps in at_steps
+    )
+    if not whole:
+        raise UserError(
+            f"evaluation.at_steps={at_steps}: must be a list of whole numbers above 0, such as [50000,100000]"
+        )
+    if len(at_steps) and build.is_offline(cfg):
+        raise UserError(
+            "evaluation.at_steps counts environment steps, and a run on recorded data makes none; "
+            "use evaluation.every=SECONDS"
+        )
 
 
 def _check_names(option: str, names: Any, known: Sequence[str]) -> None:

@@ -135,6 +135,7 @@ class Trainer:
             total, done=self.learner.updates, env_steps=self.env_steps, every=trainer.log_every
         )
         evaluated = saved = time.perf_counter()
+        ahead = sorted(steps for steps in self.cfg.evaluation.get("at_steps", []) if steps > self.env_steps)
         with interruptible() as stop:
             if self.env is None:
                 self.standardize(self.replay.statistics())
@@ -154,7 +155,9 @@ class Trainer:
                 last = self.learner.updates >= total
                 if progress.due() or last:
                     self.log(progress)
-                if now - evaluated >= self.cfg.evaluation.every and not last:
+                reached = bool(ahead) and self.env_steps >= ahead[0]
+                ahead = [steps for steps in ahead if steps > self.env_steps]
+                if (reached or now - evaluated >= self.cfg.evaluation.every) and not last:
                     evaluated = self.record(self.evaluate(), say_it=True)
                     started += evaluated - now  # seconds count training, not evaluation
                 if now - saved >= trainer.checkpoint_every and not last:

@@ -133,6 +133,9 @@ def test_environments_of_a_run(composed) -> None:
         ("trainer.updates_per_batch=0", "updates_per_batch"),
         ("evaluation.episodes=1", "episodes"),
         ("evaluation.video_size=97", "video_size"),
+        ("evaluation.at_steps=1000", "at_steps"),
+        ("evaluation.at_steps=[1000,-5]", "at_steps"),
+        (("dataset=lerobot", "trainer=offline", "dataset.root=/tmp", "evaluation.at_steps=[9]"), "at_steps"),
         ("device=tpu", "tpu"),
     ],
 )

@@ -162,6 +162,22 @@ def test_evaluation_while_training(make: Make, cfg: DictConfig) -> None:
     assert rows[0]["updates"] == 10
 
 
+def test_evaluation_at_environment_steps(make: Make) -> None:
+    """At the end of the batch in which the steps are reached, once, and not again by a resumed run."""
+    trainer = make(updates=40, evaluate=lambda: {"eval/policy/success": 0.5})
+    trainer.cfg.evaluation.at_steps = [17 * N, 21 * N, 22 * N]
+    trainer.fit()  # 10 steps to begin with, then 5 for every 10 updates
+    rows = [row for row in trainer.rows if "eval/policy/success" in row]
+    assert [row["env_steps"] for row in rows] == [20 * N, 25 * N]
+
+    resumed = make("resumed", updates=60, evaluate=lambda: {"eval/policy/success": 0.5})
+    resumed.cfg.evaluation.at_steps = [17 * N, 33 * N]
+    resumed.restore(load_checkpoint(latest_checkpoint(trainer.folder)))
+    resumed.fit()
+    rows = [row for row in resumed.rows[len(trainer.rows) :] if "eval/policy/success" in row]
+    assert [row["env_steps"] for row in rows] == [35 * N]
+
+
 def test_policies_take_turns(make: Make) -> None:
     """Smooth random motion first, then the actor."""
     trainer = make(updates=10)

@@ -24,8 +24,11 @@ if TYPE_CHECKING:
 PANDA = "cmeel.prefix/share/example-robot-data/robots/panda_description/urdf/panda.urdf"
 """The Panda inside the package ``example-robot-data``."""
 
-CELL, COARSEST = 0.008, 0.02
+CELL, COARSEST = 0.008, 0.03
 """Details of meshes smaller than this are not drawn [m] where nobody says otherwise: for people, and at most."""
+
+PIXELS = 1.5
+"""How many pixels of the observed pictures such a detail may span: ``docs/robots.md`` has what that costs and gains."""
 
 
 @dataclass(frozen=True)
@@ -112,9 +115,9 @@ def urdf_source(config: FrankaConfig, urdf_path: str | Path | None) -> Path:
 
 
 def detail(source: Source, config: FrankaConfig) -> float:
-    """Size of the smallest detail of meshes that is drawn [m]: the source's, the config's, or that of one pixel.
+    """Size of the smallest detail of meshes that is drawn [m]: the source's, the config's, or a pixel and a half.
 
-    A pixel of the observed pictures, where the fixed cameras look at; the wrist camera is closer to what it sees.
+    Pixels of the observed pictures, where the fixed cameras look at; the wrist camera is closer to what it sees.
     """
     if source.cell is not None:
         return source.cell
@@ -124,4 +127,4 @@ def detail(source: Source, config: FrankaConfig) -> float:
         return CELL
     away = math.hypot(config.camera_distance, config.camera_height - config.camera_target_height)
     pixel = 2.0 * away * math.tan(0.5 * math.radians(config.camera_fov_degrees)) / config.image_size
-    return min(pixel, COARSEST)
+    return min(PIXELS * pixel, COARSEST)
