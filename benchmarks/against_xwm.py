@@ -2,6 +2,10 @@
 
     python -m venv /tmp/xwm && /tmp/xwm/bin/pip install "xwm[newton]"
     python benchmarks/against_xwm.py --python /tmp/xwm/bin/python
+    python benchmarks/against_xwm.py --python /tmp/xwm/bin/python --compile      some minutes longer
+
+xwm is compiled throughout. `--compile` compiles what `trainer.compile=true` and `planner.compile=true` compile in a
+run; without it all operations are launched one by one.
 
 Same sizes: state of 27 numbers, 7 actions, latent and hidden 512, batch 64 windows of 3 for TD-MPC2; MPPI 512 × 6 × 3;
 50 simulations of MCTS over 15 moves; a tiny ViT (patches of 8) on clips of 4 frames of 64 × 64 for the action world
@@ -47,16 +51,16 @@ def windows(batch: int, length: int, **observations: torch.Tensor) -> TensorDict
     return TensorDict(root | {"next": nested}, batch_size=[batch, length])
 
 
-def ours(seconds: float) -> dict[str, float]:
+def ours(seconds: float, *, compile: bool) -> dict[str, float]:
     torch.manual_seed(0)
     rows = {}
     agent = models.make("tdmpc2", observation_sizes={"state": 27}, action_dim=7, episode_length=50)
-    learner, batch = Learner(agent), windows(64, 3, state=torch.randn(64, 4, 27))
+    learner, batch = Learner(agent, compile=compile), windows(64, 3, state=torch.randn(64, 4, 27))
     rows["TD-MPC2 updates, 512/512, batch 64"] = rate(lambda: learner.update(batch), seconds=seconds)
 
     agent.eval()
     objective = RewardPlusValue(agent.reward, agent.value, agent.discount)
-    policy = PlannerPolicy.for_model(agent, MPPI(action_dim=7), objective=objective)
+    policy = PlannerPolicy.for_model(agent, MPPI(action_dim=7), objective=objective, compile=compile)
     seen = TensorDict(
         {"state": torch.randn(1, 27), "is_init": torch.zeros(1, 1, dtype=torch.bool)}, batch_size=[1]
     )
@@ -89,7 +93,7 @@ def ours(seconds: float) -> dict[str, float]:
         freeze_encoder=True,
     )
     clips = windows(16, 3, pixels=torch.randint(0, 255, (16, 4, 64, 64, 3), dtype=torch.uint8))
-    learner = Learner(world)
+    learner = Learner(world, compile=compile)
     name = "action world model updates, 64 x 64, batch 16 of 4 frames"
     rows[name] = rate(lambda: learner.update(clips), seconds=seconds)
 
@@ -110,10 +114,11 @@ def main() -> None:
     )
     parser.add_argument("--python", required=True, help="a Python that has xwm")
     parser.add_argument("--seconds", type=float, default=5.0, help="for each row")
+    parser.add_argument("--compile", action="store_true", help="torch.compile updates and MPPI")
     parser.add_argument("--out", help="JSON file")
     args = parser.parse_args()
     urdf = files("franka_wm.envs.robots") / "fr3.urdf"
-    mine = ours(args.seconds / 3)  # rate() takes the median of three measurements
+    mine = ours(args.seconds / 3, compile=args.compile)  # rate() takes the median of three measurements
     print("ours measured; now xwm, which compiles first", flush=True)
     side = Path(__file__).parent / "_xwm_side.py"
     command = [args.python, str(side), str(args.seconds), str(urdf)]

@@ -8,6 +8,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
+from franka_wm.models.attention import attention
 from franka_wm.models.parts import mlp
 
 
@@ -39,26 +40,6 @@ def hide_invalid(mask: Tensor, valid: Tensor, tokens: int = 1) -> Tensor:
     seen = (valid > 0.5).repeat_interleave(tokens, dim=1)[:, None, None, :]
     itself = torch.eye(mask.shape[0], dtype=torch.bool, device=mask.device)
     return (mask & seen) | itself
-
-
-SHORT = 8
-"""Sequences up to this length are attended to by `short_attention` on CUDA."""
-
-
-def short_attention(q: Tensor, k: Tensor, v: Tensor, mask: Tensor) -> Tensor:
-    """`scaled_dot_product_attention` for sequences of a few tokens, written out.
-
-    Fused kernels work on tiles of at least 64 queries and keys: for a history of three frames, which a planner
-    asks about ten thousand times at once, they compute hundreds of products to use nine. Its rounding in bfloat16 is
-    a little coarser. Training on CUDA uses it, too.
-
-    Args:
-        q, k, v: (N, heads, L, D).
-        mask: broadcasts to (N, heads, L, L), bool.
-    """
-    scores = (q.unsqueeze(3) * k.unsqueeze(2)).sum(-1) * q.shape[-1] ** -0.5
-    weights = scores.masked_fill(~mask, -torch.inf).softmax(-1).to(v.dtype)
-    return (weights.unsqueeze(-1) * v.unsqueeze(2)).sum(3)
 
 
 def rotary(x: Tensor, positions: Tensor) -> Tensor:
@@ -133,11 +114,7 @@ class CausalBlock(nn.Module):
     def _attend(self, x: Tensor, positions: Tensor, mask: Tensor) -> Tensor:
         q, k, v = self.qkv(x).unflatten(-1, (3, self.heads, -1)).permute(2, 0, 3, 1, 4)
         q, k = rotary(q, positions), rotary(k, positions)
-        if x.is_cuda and x.shape[1] <= SHORT:
-            attended = short_attention(q, k, v, mask)
-        else:
-            attended = F.scaled_dot_product_attention(q, k, v, attn_mask=mask)
-        return self.out(attended.transpose(1, 2).flatten(-2))
+        return self.out(attention(q, k, v, mask).transpose(1, 2).flatten(-2))
 
     def _mlp(self, x: Tensor, dropout: bool) -> Tensor:
         return self.down(self._drop(F.gelu(self.up(x)), dropout))

@@ -5,12 +5,7 @@ from tensordict import TensorDict
 from franka_wm.models import make
 from franka_wm.models.lewm import LeWorldModel
 from franka_wm.models.memory import Memory
-from franka_wm.models.transformer import (
-    CausalTransformer,
-    block_causal_mask,
-    hide_invalid,
-    short_attention,
-)
+from franka_wm.models.transformer import CausalTransformer, block_causal_mask, hide_invalid
 
 
 @pytest.fixture(autouse=True)
@@ -98,16 +93,6 @@ def test_a_short_history_predicts_alike_wherever_it_stands():
     inside = net(torch.cat((junk, real), 1), torch.arange(4), hide_invalid(block_causal_mask(4), valid))
     assert inside.isfinite().all()
     torch.testing.assert_close(inside[:, 2:], alone, rtol=1e-4, atol=1e-5)
-
-
-@pytest.mark.parametrize("lengths", [(1, 1), (3, 3), (8, 4)])
-def test_short_attention_is_attention(lengths):
-    length, real = lengths
-    q, k, v = torch.randn(3, 5, 2, length, 16, dtype=torch.float64).unbind()
-    valid = (torch.arange(length) >= length - real).double().expand(5, -1)
-    mask = hide_invalid(block_causal_mask(length), valid)
-    expected = torch.nn.functional.scaled_dot_product_attention(q, k, v, attn_mask=mask)
-    torch.testing.assert_close(short_attention(q, k, v, mask), expected)
 
 
 def test_memory_is_a_queue():
