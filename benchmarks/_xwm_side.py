@@ -77,6 +77,10 @@ def main() -> None:
 
     rows["MCTS moves, 50 simulations"] = rate(lambda: move(draw(27), jr.PRNGKey(1)), seconds)
 
+    many = eqx.filter_jit(jax.vmap(move))
+    keys, observations = jr.split(jr.PRNGKey(1), 64), draw(64, 27)
+    rows["MCTS moves, 50 simulations, 64 at once"] = 64 * rate(lambda: many(observations, keys), seconds)
+
     world = xwm.families.jepa.action_world_model(
         action_dim=7, size="tiny", img_size=64, patch_size=8, freeze_encoder=True
     )

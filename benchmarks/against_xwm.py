@@ -5,7 +5,8 @@
     python benchmarks/against_xwm.py --python /tmp/xwm/bin/python --compile      some minutes longer
 
 xwm is compiled throughout. `--compile` compiles what `trainer.compile=true` and `planner.compile=true` compile in a
-run; without it all operations are launched one by one.
+run; without it all operations are launched one by one. Updates and MPPI are measured in bfloat16, too
+(`trainer.precision`, `planner.precision`); xwm in float32 alone.
 
 Same sizes: state of 27 numbers, 7 actions, latent and hidden 512, batch 64 windows of 3 for TD-MPC2; MPPI 512 × 6 × 3;
 50 simulations of MCTS over 15 moves; a tiny ViT (patches of 8) on clips of 4 frames of 64 × 64 for the action world
@@ -33,7 +34,7 @@ from franka_wm.training.learner import Learner
 NOTES = {
     "TD-MPC2 updates": "ours: 5 Q-functions, theirs: 2",
     "MPPI plans": "ours: elites, policy candidates, batched over environments",
-    "MCTS moves": "both PUCT; ours is batched, here for one environment",
+    "MCTS moves": "both PUCT; 64 at once by jax.vmap there",
     "action world": "encoder frozen in both",
     "environment": "both Newton; theirs Featherstone, ours MuJoCo in a captured graph",
 }
@@ -51,21 +52,44 @@ def windows(batch: int, length: int, **observations: torch.Tensor) -> TensorDict
     return TensorDict(root | {"next": nested}, batch_size=[batch, length])
 
 
-def ours(seconds: float, *, compile: bool) -> dict[str, float]:
+def learning(seconds: float, *, compile: bool, precision: str) -> dict[str, float]:
+    """Updates and plans per second, in one precision."""
     torch.manual_seed(0)
     rows = {}
     agent = models.make("tdmpc2", observation_sizes={"state": 27}, action_dim=7, episode_length=50)
-    learner, batch = Learner(agent, compile=compile), windows(64, 3, state=torch.randn(64, 4, 27))
+    learner = Learner(agent, compile=compile, precision=precision)
+    batch = windows(64, 3, state=torch.randn(64, 4, 27))
     rows["TD-MPC2 updates, 512/512, batch 64"] = rate(lambda: learner.update(batch), seconds=seconds)
 
     agent.eval()
     objective = RewardPlusValue(agent.reward, agent.value, agent.discount)
-    policy = PlannerPolicy.for_model(agent, MPPI(action_dim=7), objective=objective, compile=compile)
+    policy = PlannerPolicy.for_model(
+        agent, MPPI(action_dim=7), objective=objective, compile=compile, precision=precision
+    )
     seen = TensorDict(
         {"state": torch.randn(1, 27), "is_init": torch.zeros(1, 1, dtype=torch.bool)}, batch_size=[1]
     )
     rows["MPPI plans, 512 x 6 x 3"] = rate(lambda: policy(seen), seconds=seconds)
 
+    world = models.make(
+        "action_world_model",
+        observation_sizes={},
+        image_sizes={"pixels": (64, 64, 3)},
+        action_dim=7,
+        episode_length=50,
+        freeze_encoder=True,
+    )
+    clips = windows(16, 3, pixels=torch.randint(0, 255, (16, 4, 64, 64, 3), dtype=torch.uint8))
+    learner = Learner(world, compile=compile, precision=precision)
+    name = "action world model updates, 64 x 64, batch 16 of 4 frames"
+    rows[name] = rate(lambda: learner.update(clips), seconds=seconds)
+    return rows
+
+
+def searching_and_stepping(seconds: float) -> dict[str, float]:
+    """What has one precision: moves of a tree search, steps of the arm."""
+    rows = {}
+    seen = TensorDict({"state": torch.randn(1, 27)}, batch_size=[1])
     muzero = models.make(
         "muzero",
         observation_sizes={"state": 27},
@@ -77,25 +101,14 @@ def ours(seconds: float, *, compile: bool) -> dict[str, float]:
     search = MCTS(num_actions=15, num_simulations=50)
 
     @torch.no_grad()
-    def move() -> torch.Tensor:
+    def move(seen: TensorDict) -> torch.Tensor:
         z = muzero.encode(seen)
         logits, value = muzero.prediction(z)
         return search.search(logits, value, z, muzero.recurrent, explore=False).get("action")
 
-    rows["MCTS moves, 50 simulations"] = rate(move, seconds=seconds)
-
-    world = models.make(
-        "action_world_model",
-        observation_sizes={},
-        image_sizes={"pixels": (64, 64, 3)},
-        action_dim=7,
-        episode_length=50,
-        freeze_encoder=True,
-    )
-    clips = windows(16, 3, pixels=torch.randint(0, 255, (16, 4, 64, 64, 3), dtype=torch.uint8))
-    learner = Learner(world, compile=compile)
-    name = "action world model updates, 64 x 64, batch 16 of 4 frames"
-    rows[name] = rate(lambda: learner.update(clips), seconds=seconds)
+    rows["MCTS moves, 50 simulations"] = rate(lambda: move(seen), seconds=seconds)
+    many = seen.expand(64).clone()
+    rows["MCTS moves, 50 simulations, 64 at once"] = 64 * rate(lambda: move(many), seconds=seconds)
 
     env = FrankaEnv(FrankaConfig(observations=("pixels", "state")), num_envs=1, device="cpu")
     box = {"at": env.reset()}
@@ -118,7 +131,9 @@ def main() -> None:
     parser.add_argument("--out", help="JSON file")
     args = parser.parse_args()
     urdf = files("franka_wm.envs.robots") / "fr3.urdf"
-    mine = ours(args.seconds / 3, compile=args.compile)  # rate() takes the median of three measurements
+    each = args.seconds / 3  # rate() takes the median of three measurements
+    mine = learning(each, compile=args.compile, precision="float32") | searching_and_stepping(each)
+    half = learning(each, compile=args.compile, precision="bfloat16")
     print("ours measured; now xwm, which compiles first", flush=True)
     side = Path(__file__).parent / "_xwm_side.py"
     command = [args.python, str(side), str(args.seconds), str(urdf)]
@@ -132,6 +147,8 @@ def main() -> None:
             "ours [1/s]": mine[name],
             "xwm [1/s]": theirs[name],
             "ratio": mine[name] / theirs[name],
+            "ours, bfloat16 [1/s]": half.get(name, float("nan")),
+            "bfloat16 ratio": half.get(name, float("nan")) / theirs[name],
             "what differs": next(note for start, note in NOTES.items() if name.startswith(start)),
         }
         for name in mine
