@@ -20,6 +20,7 @@ from franka_wm.training.checkpoint import Checkpoint, save_checkpoint
 from franka_wm.training.learner import Learner
 from franka_wm.training.loggers import log_numbers
 from franka_wm.training.progress import Progress, say
+from franka_wm.training.room import held, left_out
 from franka_wm.training.spaces import Spaces
 
 
@@ -109,6 +110,7 @@ class Trainer:
         self.validation = validation
         self.diagnose = diagnose
         self._batch: TensorDictBase | None = None
+        self._said = False
         self._draw, self._static = replay.sample, lambda batch: False
         if learner.capture and env is not None:
             self._draw = sampling = CapturedSampling(replay)
@@ -161,7 +163,7 @@ class Trainer:
                     evaluated = self.record(self.evaluate(), say_it=True)
                     started += evaluated - now  # seconds count training, not evaluation
                 if now - saved >= trainer.checkpoint_every and not last:
-                    self.save()
+                    self.save(last=False)
                     saved = time.perf_counter()
             self.interrupted = stop()
             self.save()
@@ -258,11 +260,15 @@ class Trainer:
             say("  " + "   ".join(f"{name} {value:.3f}" for name, value in numbers.items()))
         return time.perf_counter()
 
-    def save(self) -> Path:
-        """Writes ``checkpoints/latest``."""
+    def save(self, *, last: bool = True) -> Path:
+        """Writes ``checkpoints/latest``; with the experience if it is wanted and there is room, or says so."""
         replay = None
         if self.env is not None and self.cfg.trainer.checkpoint_replay and len(self.replay):
-            replay = self.experience()
+            why = left_out(held(self.replay), self.folder, last=last)
+            replay = self.experience() if why is None else None
+            if why is not None and (last or not self._said):
+                say(f"  {why}")
+                self._said = True
         return save_checkpoint(
             self.folder / "checkpoints" / "latest",
             model=self.model,

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -11,7 +12,7 @@ from omegaconf import DictConfig
 from tensordict import TensorDict
 
 from franka_wm.envs import FrankaEnv
-from franka_wm.training import build
+from franka_wm.training import build, room
 from franka_wm.training.checkpoint import latest_checkpoint, load_checkpoint
 from franka_wm.training.learner import Learner
 from franka_wm.training.trainer import Trainer
@@ -151,6 +152,30 @@ def test_going_on_without_the_experience_keeps_the_scale_of_observations(make: M
     second.fit()
     assert second.learner.updates == 25
     assert not calls, "weights learned with one scale would see another"
+
+
+def test_a_disk_without_room_costs_the_experience_not_the_weights(make: Make, monkeypatch, capsys) -> None:
+    monkeypatch.setattr(room.shutil, "disk_usage", lambda folder: SimpleNamespace(free=10e6))
+    trainer = make()
+    trainer.cfg.trainer.checkpoint_every = 1e-9
+    trainer.fit()
+    said = capsys.readouterr().out
+    assert said.count("WITHOUT the experience") == 2  # once on the way, and at the end
+    checkpoint = load_checkpoint(latest_checkpoint(trainer.folder))
+    assert checkpoint.counters["updates"] == 20 and checkpoint.replay("cpu") is None
+
+
+def test_large_experience_is_written_at_the_end_alone(make: Make, monkeypatch, capsys) -> None:
+    monkeypatch.setattr(room, "BETWEEN", 10.0)
+    trainer = make(updates=40)
+    trainer.cfg.trainer.checkpoint_every = 1e-9
+    written = []
+    experience = trainer.experience
+    trainer.experience = lambda: (written.append(trainer.learner.updates), experience())[1]  # type: ignore[method-assign]
+    trainer.fit()
+    assert written == [40]
+    assert capsys.readouterr().out.count("written at the end") == 1
+    assert load_checkpoint(latest_checkpoint(trainer.folder)).replay("cpu") is not None
 
 
 def test_evaluation_while_training(make: Make, cfg: DictConfig) -> None:
