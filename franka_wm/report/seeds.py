@@ -34,6 +34,22 @@ def read_evaluation(run: str | Path) -> dict[str, Any]:
         ) from error
 
 
+def runs_of(folder: str | Path) -> list[Path]:
+    """The runs of a Hydra sweep (``train.py --multirun``), in the order in which they ran; else the folder itself.
+
+    Raises:
+        UserError: The sweep has no runs.
+    """
+    folder = Path(folder)
+    if not (folder / "multirun.yaml").is_file():
+        return [folder]
+    runs = {path: path.name.split("-")[0] for path in folder.iterdir() if path.is_dir()}
+    numbered = sorted((int(number), path) for path, number in runs.items() if number.isdigit())
+    if not numbered:
+        raise UserError(f"{folder}: a sweep without runs; give folders of runs that were finished")
+    return [path for _, path in numbered]
+
+
 def seeds_table(evaluations: Sequence[Mapping[str, Any]]) -> str:
     """Markdown: one row per policy, `mean over runs (lowest – highest)` in every cell."""
     policies = [p for p in evaluations[0] if all(p in e for e in evaluations)]
@@ -56,10 +72,12 @@ def seeds_table(evaluations: Sequence[Mapping[str, Any]]) -> str:
 
 
 def summary(arguments: list[str]) -> None:
-    """``franka-wm summary RUN RUN …``: runs of different seeds in one table."""
+    """``franka-wm summary RUN RUN …`` or ``franka-wm summary SWEEP``: runs of different seeds in one table."""
     if not arguments or arguments[0].startswith("-"):
-        raise UserError("summary needs folders of runs: franka-wm summary outputs/RUN outputs/RUN …")
-    evaluations = [read_evaluation(run) for run in arguments]
+        raise UserError(
+            "summary needs folders of runs: franka-wm summary outputs/RUN outputs/RUN …, or multirun/SWEEP"
+        )
+    evaluations = [read_evaluation(run) for folder in arguments for run in runs_of(folder)]
     first = next(iter(evaluations[0].values()))
     print(
         f"{len(evaluations)} runs of {first['episodes']} episodes each: mean over runs (lowest – highest run)\n"

@@ -5,7 +5,7 @@ import json
 import pytest
 
 from franka_wm.errors import UserError
-from franka_wm.report.seeds import read_evaluation, seeds_table, summary
+from franka_wm.report.seeds import read_evaluation, runs_of, seeds_table, summary
 
 
 def evaluation(distance: float, success: float) -> dict:
@@ -41,3 +41,20 @@ def test_a_run_without_evaluation_is_refused(tmp_path):
         read_evaluation(tmp_path)
     with pytest.raises(UserError, match="needs folders"):
         summary([])
+
+
+def test_a_sweep_stands_for_its_runs(tmp_path, capsys):
+    """Those of Hydra's numbers, in that order; one that was not finished is refused, not left out."""
+    (tmp_path / "multirun.yaml").touch()
+    with pytest.raises(UserError, match="without runs"):
+        summary([str(tmp_path)])
+    for k in (10, 9, 2):
+        (tmp_path / f"{k}-reach").mkdir()
+        (tmp_path / f"{k}-reach" / "evaluation.json").write_text(json.dumps(evaluation(k / 100, 1.0)))
+    (tmp_path / "figures").mkdir()
+    assert [path.name for path in runs_of(tmp_path)] == ["2-reach", "9-reach", "10-reach"]
+    summary([str(tmp_path)])
+    assert "7.00 (2.00 – 10.00)" in capsys.readouterr().out
+    (tmp_path / "9-reach" / "evaluation.json").unlink()
+    with pytest.raises(UserError, match="9-reach: no evaluation"):
+        summary([str(tmp_path)])
