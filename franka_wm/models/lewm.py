@@ -177,6 +177,17 @@ class LeWorldModel(nn.Module):
 
     # ------------------------------------------------------------------ what a planner uses
 
+    @staticmethod
+    def refusal(settings: Mapping[str, Any], window: int) -> str | None:
+        """Why a run with these options (``conf/model``) cannot learn from windows of so many transitions."""
+        history = settings.get("history", 3)
+        if not settings.get("inverse_coef", 0.0) or window >= history:
+            return None
+        return (
+            f"model.inverse_coef={settings['inverse_coef']}: reads the actions of windows of model.history={history} "
+            f"transitions, and they have {window}; use replay.window={history}, or model.inverse_coef=0"
+        )
+
     def set_observation_statistics(self, mean: Tensor, std: Tensor) -> None:
         """Standardise state vectors from now on, see `Vectors.set_statistics`."""
         self.vectors.set_statistics(mean, std)

@@ -116,6 +116,12 @@ def window(cfg: DictConfig) -> int:
     return cfg.model.window if cfg.replay.window is None else cfg.replay.window
 
 
+def refusal(cfg: DictConfig, window: int) -> str | None:
+    """Why the family cannot learn with these settings from windows of so many transitions; ``None``: it can."""
+    asked = getattr(models.family(cfg.model.name), "refusal", None)
+    return None if asked is None else asked(plain(cfg.model), window)
+
+
 def looks_past_ends(cfg: DictConfig) -> bool:
     """Whether the model's loss takes windows that go on past the end of an episode."""
     return bool(getattr(models.family(cfg.model.name), "past_end", False))

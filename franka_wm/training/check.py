@@ -48,12 +48,9 @@ def check(cfg: DictConfig) -> None:
         raise UserError(
             f"collector.calmest={cfg.collector.calmest!r}: this option is gone; start the run anew without it"
         )
-    history = cfg.model.get("history", 0)
-    if cfg.model.get("inverse_coef", 0.0) and window < history:
-        raise UserError(
-            f"model.inverse_coef={cfg.model.inverse_coef}: reads the actions of windows of model.history={history} "
-            f"transitions, and they have {window}; use replay.window={history}, or model.inverse_coef=0"
-        )
+    refuses = build.refusal(cfg, window)
+    if refuses is not None:
+        raise UserError(refuses)
     if not build.is_offline(cfg):
         build.actor(cfg)
     elif build.is_arm(cfg) and cfg.env.get("frame_stack", 1) > 1 and "pixels" in cfg.env.observations:

@@ -32,13 +32,14 @@ import torch
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 from safetensors import SafetensorError
-from safetensors.torch import load_file, save_file
+from safetensors.torch import load_file
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor, nn
 from torch.optim import Optimizer
 
 from franka_wm import __version__
 from franka_wm.errors import UserError
+from franka_wm.training.tree import read_tree, save_tensors, tree_files, write_json, write_tree
 
 FORMAT_VERSION = 1
 
@@ -117,20 +118,20 @@ def _write_contents(
     replay: TensorDictBase | None,
     extra: Mapping[str, Any] | None,
 ) -> None:
-    _save_tensors(_tensor_state(model), folder / "model.safetensors")
+    save_tensors(_tensor_state(model), folder / "model.safetensors")
     if optimizer is not None:
         state = {
             name: {"type": type(one).__name__, "state_dict": one.state_dict()}
             for name, one in _by_name(optimizer).items()
         }
-        _write_tree(folder, "optimizer", state)
-    _write_tree(folder, "rng", _rng_state())
+        write_tree(folder, "optimizer", state)
+    write_tree(folder, "rng", _rng_state())
     if replay is not None:
-        _write_tree(folder, "replay", {"batch_size": list(replay.batch_size), "entries": _entries(replay)})
+        write_tree(folder, "replay", {"batch_size": list(replay.batch_size), "entries": _entries(replay)})
     if extra is not None:
-        _write_tree(folder, "extra", extra)
+        write_tree(folder, "extra", extra)
     OmegaConf.save(_resolved(config), folder / "config.yaml")
-    _write_json(folder / "counters.json", {name: _plain_number(name, n) for name, n in counters.items()})
+    write_json(folder / "counters.json", {name: _plain_number(name, n) for name, n in counters.items()})
 
     files = sorted(folder.iterdir())
     for path in files:
@@ -142,7 +143,7 @@ def _write_contents(
         "saved_at_ns": time.time_ns(),
         "files": {p.name: {"bytes": p.stat().st_size, "sha256": _sha256(p)} for p in files},
     }
-    _write_json(folder / _MANIFEST, manifest)
+    write_json(folder / _MANIFEST, manifest)
     _sync(folder / _MANIFEST)
     _sync(folder)
 
@@ -263,7 +264,7 @@ class Checkpoint:
             UserError: its file is damaged.
         """
         # By far the largest file, and evaluation never opens it: its checksum waits until here.
-        for name in _tree_files("replay"):
+        for name in tree_files("replay"):
             _check_sum(self.folder, name, self._files)
         saved = self._tree("replay")
         if saved is None:
@@ -275,7 +276,7 @@ class Checkpoint:
         return self._tree("extra")
 
     def _tree(self, name: str) -> Any:
-        return _read_tree(self.folder, name) if f"{name}.json" in self._files else None
+        return read_tree(self.folder, name) if f"{name}.json" in self._files else None
 
 
 def load_checkpoint(folder: str | Path) -> Checkpoint:
@@ -294,7 +295,9 @@ def load_checkpoint(folder: str | Path) -> Checkpoint:
         )
     try:
         manifest = json.loads((path / _MANIFEST).read_bytes())
-        version, model_name, files = manifest["format_version"], manifest["model"], manifest["files"]
+        version, model_name, files = manifest["format_version"], manifest["model"], dict(manifest["files"])
+        if not all(isinstance(one["bytes"], int) and isinstance(one["sha256"], str) for one in files.values()):
+            raise ValueError("files")
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise UserError(
             f"checkpoint {path} is damaged: {_MANIFEST} cannot be read ({type(error).__name__}); "
@@ -308,10 +311,16 @@ def load_checkpoint(folder: str | Path) -> Checkpoint:
     for name in files:
         _check_size(path, name, files)
     for name in files:
-        if name not in _tree_files("replay"):
+        if name not in tree_files("replay"):
             _check_sum(path, name, files)
     config = OmegaConf.load(path / "config.yaml")
     assert isinstance(config, DictConfig)
+    # Saved configurations are resolved; reading one `${oc.env:…}` would take secrets from this machine.
+    if "${" in json.dumps(OmegaConf.to_container(config, resolve=False), default=str):
+        raise UserError(
+            f"checkpoint {path}: its config.yaml holds an interpolation (${{…}}), which no run writes; "
+            "use another checkpoint."
+        )
     counters = json.loads((path / "counters.json").read_bytes())
     return Checkpoint(path, model_name, config, counters, files)
 
@@ -384,79 +393,6 @@ def _as_it_runs_here(state: Mapping[str, Any], optimizer: Optimizer) -> dict[str
             group["lr"] = group["lr"].item()
         groups.append(group)
     return {"state": state["state"], "param_groups": groups}
-
-
-# -- nested values as JSON + safetensors -------------------------------------------------------------------
-
-
-def _write_tree(folder: Path, name: str, tree: Any) -> None:
-    """Nested values into `name.json`, the tensors among them into `name.safetensors`."""
-    tensors: dict[str, Tensor] = {}
-    structure = _encode(tree, name, tensors)
-    _write_json(folder / f"{name}.json", structure)
-    _save_tensors(tensors, folder / f"{name}.safetensors")
-
-
-def _read_tree(folder: Path, name: str) -> Any:
-    structure = json.loads((folder / f"{name}.json").read_bytes())
-    return _decode(structure, load_file(folder / f"{name}.safetensors"))
-
-
-def _tree_files(name: str) -> tuple[str, str]:
-    return f"{name}.json", f"{name}.safetensors"
-
-
-def _encode(value: Any, where: str, tensors: dict[str, Tensor]) -> Any:
-    """JSON for `value`. What JSON has not (tensors, tuples, dicts with int keys) becomes a tagged list."""
-    if value is None or isinstance(value, str | bool | int | float):
-        return value
-    if isinstance(value, Tensor):
-        tensors[where] = value
-        return ["tensor", where]
-    if isinstance(value, Mapping):
-        items = [[_key(k, where), _encode(v, f"{where}/{k}", tensors)] for k, v in value.items()]
-        return ["dict", items]
-    if isinstance(value, tuple | list):
-        kind = "tuple" if isinstance(value, tuple) else "list"
-        return [kind, [_encode(v, f"{where}/{i}", tensors) for i, v in enumerate(value)]]
-    if isinstance(value, np.ndarray | np.generic):
-        return _encode(value.tolist(), where, tensors)
-    raise TypeError(
-        f"{where} is a {type(value).__name__}, which a checkpoint cannot hold: use numbers, strings, None, "
-        "tensors, and dicts, lists and tuples of these"
-    )
-
-
-def _decode(value: Any, tensors: Mapping[str, Tensor]) -> Any:
-    if not isinstance(value, list):
-        return value
-    kind, content = value
-    if kind == "tensor":
-        return tensors[content]
-    if kind == "dict":
-        return {k: _decode(v, tensors) for k, v in content}
-    items = [_decode(v, tensors) for v in content]
-    return tuple(items) if kind == "tuple" else items
-
-
-def _key(key: Any, where: str) -> str | int:
-    if isinstance(key, str | int):
-        return key
-    raise TypeError(f"{where} has the key {key!r}; a checkpoint holds dicts with str and int keys only")
-
-
-def _save_tensors(tensors: Mapping[str, Tensor], path: Path) -> None:
-    """Like safetensors' `save_file`, which refuses tensors that share memory: such are written twice."""
-    storages: set[int] = set()
-    separate = {}
-    for name, tensor in tensors.items():
-        tensor = tensor.detach().cpu().contiguous()
-        pointer = tensor.untyped_storage().data_ptr()
-        if pointer in storages:
-            tensor = tensor.clone()
-        storages.add(pointer)
-        separate[name] = tensor
-    save_file(separate, path)
 
 
 # -- parts of the state ------------------------------------------------------------------------------------
@@ -540,11 +476,6 @@ def _saved_at(folder: Path) -> int:
         return int(json.loads((folder / _MANIFEST).read_bytes())["saved_at_ns"])
     except (OSError, ValueError, KeyError, TypeError):
         return -1
-
-
-def _write_json(path: Path, value: Any) -> None:
-    # No newline at the end: so every truncation, even by one byte, leaves invalid JSON.
-    path.write_text(json.dumps(value, indent=1), encoding="utf-8")
 
 
 def _sync(path: Path) -> None:

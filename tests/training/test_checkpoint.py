@@ -1,5 +1,6 @@
 """Checkpoints: exact after a round trip, whole after a kill at any step, and clear about what is wrong."""
 
+import hashlib
 import json
 import os
 import random
@@ -407,6 +408,31 @@ def test_damage_to_any_file_is_named(tmp_path: Path) -> None:
             read_all(folder)
         path.write_bytes(whole)
     read_all(folder)
+
+
+@pytest.mark.parametrize("entry", [{}, {"bytes": 1}, {"bytes": "many", "sha256": ""}, None])
+def test_a_manifest_that_lacks_something_is_damage(entry: object, tmp_path: Path) -> None:
+    folder = everything(tmp_path / "a")
+    manifest = json.loads((folder / "manifest.json").read_text())
+    manifest["files"]["model.safetensors"] = entry
+    (folder / "manifest.json").write_text(json.dumps(manifest))
+    with pytest.raises(UserError, match="damaged: manifest"):
+        load_checkpoint(folder)
+
+
+def test_a_configuration_that_would_read_this_machines_secrets_is_refused(
+    tmp_path: Path, monkeypatch
+) -> None:
+    monkeypatch.setenv("SECRET", "a token")
+    folder = everything(tmp_path / "a")
+    (folder / "config.yaml").write_text("model:\n  name: ${oc.env:SECRET}\n")
+    manifest = json.loads((folder / "manifest.json").read_text())
+    content = (folder / "config.yaml").read_bytes()
+    manifest["files"]["config.yaml"] = {"bytes": len(content), "sha256": hashlib.sha256(content).hexdigest()}
+    (folder / "manifest.json").write_text(json.dumps(manifest))
+    with pytest.raises(UserError, match="interpolation") as caught:
+        load_checkpoint(folder)
+    assert "a token" not in str(caught.value)
 
 
 def test_a_newer_format_is_not_guessed_at(tmp_path: Path) -> None:

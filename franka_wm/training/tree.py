@@ -1,0 +1,97 @@
+"""Nested values in two files: their structure as JSON, the tensors among them as safetensors. Nothing is pickled."""
+
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from safetensors.torch import load_file, save_file
+from torch import Tensor
+
+
+def write_tree(folder: Path, name: str, tree: Any) -> None:
+    """Nested values into `name.json`, the tensors among them into `name.safetensors`.
+
+    Args:
+        folder: exists.
+        name: of both files.
+        tree: dicts with str and int keys, lists and tuples, of numbers, strings, None, arrays and tensors.
+
+    Raises:
+        TypeError: anything else is among them; the message names the place.
+    """
+    tensors: dict[str, Tensor] = {}
+    structure = _encode(tree, name, tensors)
+    write_json(folder / f"{name}.json", structure)
+    save_tensors(tensors, folder / f"{name}.safetensors")
+
+
+def read_tree(folder: Path, name: str) -> Any:
+    """What `write_tree` wrote; tensors on the CPU."""
+    structure = json.loads((folder / f"{name}.json").read_bytes())
+    return _decode(structure, load_file(folder / f"{name}.safetensors"))
+
+
+def tree_files(name: str) -> tuple[str, str]:
+    """The names of the two files."""
+    return f"{name}.json", f"{name}.safetensors"
+
+
+def _encode(value: Any, where: str, tensors: dict[str, Tensor]) -> Any:
+    """JSON for `value`. What JSON has not (tensors, tuples, dicts with int keys) becomes a tagged list."""
+    if value is None or isinstance(value, str | bool | int | float):
+        return value
+    if isinstance(value, Tensor):
+        tensors[where] = value
+        return ["tensor", where]
+    if isinstance(value, Mapping):
+        items = [[_key(k, where), _encode(v, f"{where}/{k}", tensors)] for k, v in value.items()]
+        return ["dict", items]
+    if isinstance(value, tuple | list):
+        kind = "tuple" if isinstance(value, tuple) else "list"
+        return [kind, [_encode(v, f"{where}/{i}", tensors) for i, v in enumerate(value)]]
+    if isinstance(value, np.ndarray | np.generic):
+        return _encode(value.tolist(), where, tensors)
+    raise TypeError(
+        f"{where} is a {type(value).__name__}, which a checkpoint cannot hold: use numbers, strings, None, "
+        "tensors, and dicts, lists and tuples of these"
+    )
+
+
+def _decode(value: Any, tensors: Mapping[str, Tensor]) -> Any:
+    if not isinstance(value, list):
+        return value
+    kind, content = value
+    if kind == "tensor":
+        return tensors[content]
+    if kind == "dict":
+        return {k: _decode(v, tensors) for k, v in content}
+    items = [_decode(v, tensors) for v in content]
+    return tuple(items) if kind == "tuple" else items
+
+
+def _key(key: Any, where: str) -> str | int:
+    if isinstance(key, str | int):
+        return key
+    raise TypeError(f"{where} has the key {key!r}; a checkpoint holds dicts with str and int keys only")
+
+
+def save_tensors(tensors: Mapping[str, Tensor], path: Path) -> None:
+    """Like safetensors' `save_file`, which refuses tensors that share memory: such are written twice."""
+    storages: set[int] = set()
+    separate = {}
+    for name, tensor in tensors.items():
+        tensor = tensor.detach().cpu().contiguous()
+        pointer = tensor.untyped_storage().data_ptr()
+        if pointer in storages:
+            tensor = tensor.clone()
+        storages.add(pointer)
+        separate[name] = tensor
+    save_file(separate, path)
+
+
+def write_json(path: Path, value: Any) -> None:
+    """One JSON value."""
+    # No newline at the end: so every truncation, even by one byte, leaves invalid JSON.
+    path.write_text(json.dumps(value, indent=1), encoding="utf-8")
