@@ -296,7 +296,9 @@ def load_checkpoint(folder: str | Path) -> Checkpoint:
     try:
         manifest = json.loads((path / _MANIFEST).read_bytes())
         version, model_name, files = manifest["format_version"], manifest["model"], dict(manifest["files"])
-        if not all(isinstance(one["bytes"], int) and isinstance(one["sha256"], str) for one in files.values()):
+        if not all(
+            isinstance(one["bytes"], int) and isinstance(one["sha256"], str) for one in files.values()
+        ):
             raise ValueError("files")
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise UserError(
