@@ -73,6 +73,10 @@ def check(cfg: DictConfig) -> None:
     ):
         if isinstance(value, bool) or not isinstance(value, (int, float)) or not value > 0:
             raise UserError(f"{name}={value!r}: must be above 0")
+    if cfg.trainer.checkpoint_replay not in (None, True, False):
+        raise UserError(
+            f"trainer.checkpoint_replay={cfg.trainer.checkpoint_replay!r}: must be true, false, or null (up to 8 GB)"
+        )
     for name, value in (
         ("trainer.log_every", cfg.trainer.log_every),
         ("trainer.checkpoint_every", cfg.trainer.checkpoint_every),

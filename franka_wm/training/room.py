@@ -6,8 +6,9 @@ import shutil
 from pathlib import Path
 from typing import Any
 
-BETWEEN = 2e9
-"""Checkpoints while a run goes on take along up to so much experience [bytes]: writing tens of GB takes minutes."""
+BETWEEN, KEPT = 2e9, 8e9
+"""Up to so much experience [bytes] goes into checkpoints while a run goes on, and, unless all of it is asked for, into
+the last one: writing tens of GB of pictures takes minutes, and a GPU gathers them anew in seconds."""
 
 SPARE = 5e8
 """What must stay free on the disk [bytes], for the weights and for what else a run writes."""
@@ -20,14 +21,20 @@ def held(replay: Any) -> int:
     return storage._storage.bytes() * filled // slots
 
 
-def left_out(size: int, folder: Path, *, last: bool) -> str | None:
+def left_out(size: int, folder: Path, *, last: bool, wanted: bool | None) -> str | None:
     """Why a checkpoint in ``folder`` is written without ``size`` bytes of experience, in a line; ``None``: it is not.
 
     Args:
         size: Of the experience [bytes].
         folder: Of the run; need not exist yet.
         last: Whether the run ends with this checkpoint.
+        wanted: ``trainer.checkpoint_replay``; ``None``: unless there is much of it.
     """
+    if wanted is None and size > KEPT:
+        return (
+            f"checkpoint without the experience ({size / 1e9:.1f} GB): a run that goes on from it gathers anew; "
+            f"trainer.checkpoint_replay=true keeps more than {KEPT / 1e9:.0f} GB"
+        )
     if not last and size > BETWEEN:
         return f"checkpoint without the experience ({size / 1e9:.1f} GB), which is written at the end"
     there = next(path for path in (folder.resolve(), *folder.resolve().parents) if path.exists())

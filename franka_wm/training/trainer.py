@@ -263,8 +263,9 @@ class Trainer:
     def save(self, *, last: bool = True) -> Path:
         """Writes ``checkpoints/latest``; with the experience if it is wanted and there is room, or says so."""
         replay = None
-        if self.env is not None and self.cfg.trainer.checkpoint_replay and len(self.replay):
-            why = left_out(held(self.replay), self.folder, last=last)
+        wanted = self.cfg.trainer.checkpoint_replay
+        if self.env is not None and wanted is not False and len(self.replay):
+            why = left_out(held(self.replay), self.folder, last=last, wanted=wanted)
             replay = self.experience() if why is None else None
             if why is not None and (last or not self._said):
                 say(f"  {why}")

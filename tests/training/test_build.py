@@ -95,7 +95,7 @@ def test_every_other_option(group: str, name: str, composed) -> None:
 def test_the_default_is_to_reach_sampled_goals(composed) -> None:
     cfg = composed()
     assert cfg.env.goal_sampling == "reachable" and cfg.env.gravity_compensation is True
-    assert cfg.evaluation.episodes >= 64 and cfg.trainer.checkpoint_replay is True
+    assert cfg.evaluation.episodes >= 64 and cfg.trainer.checkpoint_replay is None
 
 
 def test_environments_of_a_run(composed) -> None:
@@ -133,6 +133,7 @@ def test_environments_of_a_run(composed) -> None:
         ("trainer.updates_per_batch=0", "updates_per_batch"),
         ("evaluation.episodes=1", "episodes"),
         ("evaluation.video_size=97", "video_size"),
+        ("trainer.checkpoint_replay=8", "checkpoint_replay"),
         ("evaluation.at_steps=1000", "at_steps"),
         ("evaluation.at_steps=[1000,-5]", "at_steps"),
         (("dataset=lerobot", "trainer=offline", "dataset.root=/tmp", "evaluation.at_steps=[9]"), "at_steps"),

@@ -18,18 +18,23 @@ def test_size_of_what_is_filled() -> None:
 
 
 @pytest.mark.parametrize(
-    ("size", "free", "last", "why"),
+    ("size", "free", "last", "wanted", "why"),
     [
-        (1e9, 100e9, False, None),
-        (3e9, 100e9, False, "written at the end"),
-        (3e9, 100e9, True, None),
-        (3e9, 3.1e9, True, "WITHOUT"),
-        (1e9, 1.1e9, False, "WITHOUT"),
+        (1e9, 100e9, False, None, None),
+        (3e9, 100e9, False, None, "written at the end"),
+        (3e9, 100e9, True, None, None),
+        (9e9, 100e9, True, None, "checkpoint_replay=true keeps more than 8 GB"),
+        (9e9, 100e9, False, True, "written at the end"),
+        (9e9, 100e9, True, True, None),
+        (3e9, 3.1e9, True, True, "WITHOUT"),
+        (1e9, 1.1e9, False, None, "WITHOUT"),
     ],
 )
-def test_left_out(size: float, free: float, last: bool, why: str | None, tmp_path: Path, monkeypatch) -> None:
+def test_left_out(
+    size: float, free: float, last: bool, wanted: bool | None, why: str | None, tmp_path: Path, monkeypatch
+) -> None:
     monkeypatch.setattr(room.shutil, "disk_usage", lambda folder: SimpleNamespace(free=free))
-    said = room.left_out(int(size), tmp_path / "not" / "yet", last=last)
+    said = room.left_out(int(size), tmp_path / "not" / "yet", last=last, wanted=wanted)
     if why is None:
         assert said is None
     else:
