@@ -54,9 +54,12 @@ class MuZero(nn.Module):
         channels: of each convolution over pictures.
         random_shift: pixels by which pictures are shifted at most, in each direction.
         unroll: moves, K.
-        n_step: rewards in a value target before the stored value of the search takes over.
+        n_step: rewards in a value target before the stored value of the search takes over, or the model's own.
         bins, value_low, value_high: two-hot code of rewards and values; the range is in symlog space.
         reward_coef, value_coef, policy_coef, consistency_coef: weights of the losses.
+        fresh_values: value targets end in the model's value of now instead of in what the search found when it
+            acted: half of MuZero Reanalyse (Schrittwieser et al., arXiv:2104.06294), whose policy targets are
+            fresh, too.
         weight_decay: of the matrices.
 
     Raises:
@@ -95,6 +98,7 @@ class MuZero(nn.Module):
         value_coef: float = 0.25,
         policy_coef: float = 1.0,
         consistency_coef: float = 2.0,
+        fresh_values: bool = False,
         weight_decay: float = 1e-4,
     ) -> None:
         super().__init__()
@@ -121,6 +125,7 @@ class MuZero(nn.Module):
         self.unroll, self.n_step, self.weight_decay = unroll, n_step, weight_decay
         self.reward_coef, self.value_coef = reward_coef, value_coef
         self.policy_coef, self.consistency_coef = policy_coef, consistency_coef
+        self.fresh_values = fresh_values
 
         observation_dim = sum(sizes.values())
         if self.image_sizes:
@@ -257,7 +262,8 @@ class MuZero(nn.Module):
         steps, device = self.unroll, action.device
         ends = self._ends(batch)  # (B, 1): the transitions of the first episode
         over = terminated[..., 0].gather(1, ends - 1)  # (B, 1)
-        returns = self.value_targets(reward, terminated, batch.get("search_value"), ends)
+        lent = self._fresh(batch, ends) if self.fresh_values else batch.get("search_value")
+        returns = self.value_targets(reward, terminated, lent, ends)
         step = torch.arange(steps + 1, device=device)
         inside = step < ends  # (B, K+1)
 
@@ -393,6 +399,17 @@ class MuZero(nn.Module):
         step = torch.arange(length, device=first.device)
         other = first.reshape(count, length) & (step > 0)
         return torch.where(other, step, length).amin(1, keepdim=True)
+
+    @torch.no_grad()
+    def _fresh(self, batch: TensorDictBase, ends: Tensor) -> Tensor:
+        """`search_value` (B, H, 1) with the model's own value where the first K + 1 value targets end."""
+        known = batch.get("search_value")
+        step = torch.arange(self.unroll + 1, device=known.device)
+        stop = torch.minimum(step + self.n_step, ends - 1).unsqueeze(-1)  # (B, K+1, 1)
+        row = torch.arange(known.shape[0], device=known.device).unsqueeze(-1)
+        seen = {key: batch.get(key)[row, stop[..., 0]] for key in self.observation_keys}
+        value = self.two_hot.decode(self.value_head(self.prediction_body(self._encode(seen))))
+        return known.scatter(1, stop, value.to(known.dtype))
 
     def _frames(self, batch: TensorDictBase) -> dict[str, Tensor]:
         """The first K + 1 observations (B, K+1, ...) of each window; where an episode ends, its true last one."""

@@ -236,6 +236,33 @@ def test_the_losses_are_those_of_a_plain_unroll(ends, held):
     torch.testing.assert_close(losses["loss"].detach(), total)
 
 
+@pytest.mark.parametrize(("ends", "terminated"), [(8, False), (5, False), (5, True), (1, False), (2, True)])
+def test_fresh_values_are_the_models_and_not_the_searchs(ends, terminated):
+    """unroll 3, n_step 2: the targets of steps 0 … 3 end at steps 2 … 5, or with the episode."""
+    model, batch = small(fresh_values=True, discount=0.5), windows(length=8, ends=ends, terminated=terminated)
+    torch.nn.init.normal_(model.value_head.weight)
+    scrambled = batch.clone()
+    scrambled["search_value"].normal_(100.0, 10.0)
+    rng = torch.get_rng_state()
+    found = model.loss(batch)
+    torch.set_rng_state(rng)
+    other = model.loss(scrambled)
+    for name in ("loss", "loss_value", "value_target_mean"):
+        torch.testing.assert_close(found[name], other[name])
+
+    stop = min(2, ends - 1)
+    if terminated and ends <= 2:
+        lent = torch.zeros(6, 1)  # over: nothing is lent
+        summed = ends
+    else:
+        lent = model.prediction(model.encode(batch[:, stop]))[1].detach()
+        summed = stop
+    rewards = batch["next", "reward"][:, :summed, 0] * 0.5 ** torch.arange(summed)
+    expected = rewards.sum(-1, keepdim=True) + 0.5**summed * lent
+    torch.testing.assert_close(found["value_target_mean"], expected.mean())
+    assert not found["value_target_mean"].requires_grad
+
+
 @pytest.mark.parametrize("terminated", [False, True])
 def test_what_follows_the_end_of_an_episode_changes_nothing(terminated):
     model, batch = small(random_shift=0), windows(6, 5, ends=2, terminated=terminated)
@@ -429,7 +456,7 @@ def test_it_learns_a_chain_from_its_own_searches(variant):
     explores, decides = (SearchPolicy.for_model(model, search, explore=e) for e in (True, False))
     optimiser = torch.optim.AdamW(model.parameter_groups(3e-3))
     replay, right = [], 0
-    for _ in range(60):
+    for _ in range(120):  # 27 to 58 rounds, by seed and by the rounding of the processor
         replay = [*replay[-7:], episodes(Chain(torch.randint(5, (16,))), explores, Chain.STEPS, random=0.3)]
         data = torch.cat(replay)
         for _ in range(12):
