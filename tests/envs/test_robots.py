@@ -269,6 +269,26 @@ def test_panda_looks_like_one() -> None:
 
 
 @needs_meshes
+def test_the_hand_is_seen_in_small_pictures() -> None:
+    """What a model gets by default, 64 × 64: shapes as small as fingers are not thinned out like arms."""
+    seen, triangles = {}, {}
+    for robot in ("panda_meshes", "panda_meshes_full"):
+        env = FrankaEnv(
+            FrankaConfig(robot=robot, observations=("segmentation", "pixels")), num_envs=16, device="cpu"
+        )
+        seen[robot] = env.reset(seed=3)
+        drawn = {id(s): s for s in env.model.shape_source if isinstance(s, newton.Mesh)}
+        triangles[robot] = [len(mesh.indices) // 3 for mesh in drawn.values()]
+    thin, full = seen["panda_meshes"], seen["panda_meshes_full"]
+    hand = full["segmentation"] == full["segmentation"].max()
+    assert (thin["segmentation"] != full["segmentation"])[hand].float().mean() < 0.12
+    assert (thin["pixels"].float() - full["pixels"].float()).abs().mean() < 2.0
+    assert (
+        sum(triangles["panda_meshes"]) < 3_000 and min(triangles["panda_meshes"][-4:]) >= 12
+    )  # two to a finger
+
+
+@needs_meshes
 def test_worlds_share_the_meshes_and_triangles_are_few() -> None:
     triangles = {}
     for robot in ("panda_meshes", "panda_meshes_full"):
