@@ -75,6 +75,8 @@ def table(rows: list[dict[str, Any]]) -> str:
     names = list(rows[0])
 
     def cell(value: Any) -> str:
+        if isinstance(value, float) and value != value:
+            return "–"  # not measured here
         if isinstance(value, float):
             return f"{value:,.0f}" if abs(value) >= 100 else f"{value:.3g}"
         return str(value)

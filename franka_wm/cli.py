@@ -26,7 +26,7 @@ VERBS: dict[str, tuple[str, str, str]] = {
         "checkpoint=… [key=value …]",
         "judge a checkpoint on held-out episodes: success, predictions, latents, robustness",
     ),
-    "summary": ("franka_wm.report.seeds:summary", "RUN …", "runs of several seeds in one table"),
+    "summary": ("franka_wm.report.seeds:summary", "RUN … | SWEEP", "runs of several seeds in one table"),
     "report": (
         "franka_wm.report.page:report",
         "RUN [out=…]",

@@ -22,7 +22,7 @@ from franka_wm.report.document import (
 )
 from franka_wm.report.horizon import horizon_figure
 from franka_wm.report.page import split_arguments, wants_help
-from franka_wm.report.run import RunFiles, read_run
+from franka_wm.report.run import RunFiles, but_for_the_seed, read_run
 from franka_wm.report.sections import SHOWN
 from franka_wm.report.spectra import spectrum_figure
 from franka_wm.report.table import Table, evaluation_tables, html, is_interval
@@ -30,9 +30,6 @@ from franka_wm.report.table import Table, evaluation_tables, html, is_interval
 FILE = "compare.html"
 
 MISSING = "–"
-SAME_BUT = ("seed", "device", "resume")
-"""Runs whose configurations differ in these alone are repetitions of one another."""
-
 QUANTITIES = ("final_distance", "success", "return")
 
 
@@ -116,10 +113,8 @@ def repetitions(runs: Mapping[str, RunFiles]) -> dict[str, dict[str, RunFiles]]:
     """Runs grouped by configuration, whatever their seed; a group is called by its run, or by the first of them."""
     groups: dict[str, dict[str, RunFiles]] = {}
     for name, run in runs.items():
-        flat = {k: v for k, v in flat_config(run.config).items() if k not in SAME_BUT}
         # Runs without a configuration are known to be the same as nothing.
-        key = json.dumps(flat, sort_keys=True, default=str) if flat else name
-        groups.setdefault(key, {})[name] = run
+        groups.setdefault(but_for_the_seed(run.config) or name, {})[name] = run
     return {next(iter(group)): group for group in groups.values()}
 
 

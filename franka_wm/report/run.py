@@ -40,6 +40,9 @@ from omegaconf.errors import OmegaConfBaseException
 
 from franka_wm.errors import UserError
 
+SAME_BUT = ("seed", "device", "resume")
+"""Runs whose configurations differ in these alone are repetitions of one another."""
+
 EXTRAS = (
     "open_loop",
     "probes",
@@ -146,6 +149,21 @@ def read_run(folder: str | Path) -> RunFiles:
         pictures={name: p / name for p in reversed(places) for name in PICTURES if (p / name).is_file()},
         timing=timing,
     )
+
+
+def read_config(folder: str | Path) -> dict[str, Any]:
+    """The configuration of a run; empty if it has none.
+
+    Raises:
+        UserError: It cannot be read.
+    """
+    return _yaml(Path(folder) / "config.yaml") or {}
+
+
+def but_for_the_seed(config: Mapping[str, Any]) -> str:
+    """The same for repetitions, and for nothing else; empty for an empty configuration."""
+    kept = {name: value for name, value in config.items() if name not in SAME_BUT}
+    return json.dumps(kept, sort_keys=True, default=str) if kept else ""
 
 
 def split_evaluation(

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from franka_wm.errors import UserError
+from franka_wm.report.run import but_for_the_seed, read_config
 
 COLUMNS = (
     ("return", lambda r: r["return"]["mean"], 2),
@@ -44,7 +45,7 @@ def runs_of(folder: str | Path) -> list[Path]:
     if not (folder / "multirun.yaml").is_file():
         return [folder]
     runs = {path: path.name.split("-")[0] for path in folder.iterdir() if path.is_dir()}
-    numbered = sorted((int(number), path) for path, number in runs.items() if number.isdigit())
+    numbered = sorted((int(number), path) for path, number in runs.items() if number.isdecimal())
     if not numbered:
         raise UserError(f"{folder}: a sweep without runs; give folders of runs that were finished")
     return [path for _, path in numbered]
@@ -72,14 +73,24 @@ def seeds_table(evaluations: Sequence[Mapping[str, Any]]) -> str:
 
 
 def summary(arguments: list[str]) -> None:
-    """``franka-wm summary RUN RUN …`` or ``franka-wm summary SWEEP``: runs of different seeds in one table."""
+    """``franka-wm summary RUN RUN …`` or ``franka-wm summary SWEEP``: runs of different seeds in one table.
+
+    Runs that differ in more than their seed get a table for each configuration.
+    """
     if not arguments or arguments[0].startswith("-"):
         raise UserError(
             "summary needs folders of runs: franka-wm summary outputs/RUN outputs/RUN …, or multirun/SWEEP"
         )
-    evaluations = [read_evaluation(run) for folder in arguments for run in runs_of(folder)]
-    first = next(iter(evaluations[0].values()))
-    print(
-        f"{len(evaluations)} runs of {first['episodes']} episodes each: mean over runs (lowest – highest run)\n"
-    )
-    print(seeds_table(evaluations))
+    groups: dict[str, dict[Path, dict[str, Any]]] = {}
+    for run in [run for folder in arguments for run in runs_of(folder)]:
+        groups.setdefault(but_for_the_seed(read_config(run)), {})[run] = read_evaluation(run)
+    for group in groups.values():
+        evaluations = list(group.values())
+        first = next(iter(evaluations[0].values()))
+        runs = f"{len(evaluations)} run{'s' * (len(evaluations) > 1)}"
+        if len(groups) > 1:
+            runs += f" ({', '.join(run.name for run in group)})"
+        print(f"{runs} of {first['episodes']} episodes each: mean over runs (lowest – highest run)\n")
+        print(seeds_table(evaluations))
+        if len(groups) > 1:
+            print()

@@ -190,6 +190,11 @@ def _check_at_steps(cfg: DictConfig) -> None:
         raise UserError(
             f"evaluation.at_steps={at_steps}: must be a list of whole numbers above 0, such as [50000,100000]"
         )
+    if len(at_steps) and not cfg.evaluation.during:
+        raise UserError(
+            f"evaluation.at_steps={at_steps}: nothing is evaluated while training; name policies, such as "
+            "evaluation.during=[planner]"
+        )
     if len(at_steps) and build.is_offline(cfg):
         raise UserError(
             "evaluation.at_steps counts environment steps, and a run on recorded data makes none; "

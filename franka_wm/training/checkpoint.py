@@ -316,7 +316,10 @@ def load_checkpoint(folder: str | Path) -> Checkpoint:
         if name not in tree_files("replay"):
             _check_sum(path, name, files)
     config = OmegaConf.load(path / "config.yaml")
-    assert isinstance(config, DictConfig)
+    if not isinstance(config, DictConfig):
+        raise UserError(
+            f"checkpoint {path} is damaged: config.yaml holds no configuration; use another checkpoint."
+        )
     # Saved configurations are resolved; reading one `${oc.env:…}` would take secrets from this machine.
     if "${" in json.dumps(OmegaConf.to_container(config, resolve=False), default=str):
         raise UserError(

@@ -41,8 +41,8 @@ def left_out(size: int, folder: Path, *, last: bool, wanted: bool | None) -> str
     free = shutil.disk_usage(there).free
     if size > free - SPARE:
         return (
-            f"warning: checkpoint WITHOUT the experience, which takes {size / 1e9:.1f} GB where {free / 1e9:.1f} GB "
-            f"are free ({folder}); a run that goes on from it gathers anew. Choose a folder with more room "
-            "(hydra.run.dir=…), or trainer.checkpoint_replay=false"
+            f"warning: checkpoint WITHOUT the experience: {size / 1e9:.2f} GB and {SPARE / 1e9} GB of reserve do not "
+            f"fit into the {free / 1e9:.2f} GB that are free ({folder}); a run that goes on from it gathers anew. "
+            "Choose a folder with more room (hydra.run.dir=…), or trainer.checkpoint_replay=false"
         )
     return None

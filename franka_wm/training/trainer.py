@@ -43,7 +43,10 @@ class ActingPolicy(TensorDictModuleBase):
 
 @contextmanager
 def interruptible() -> Iterator[Any]:
-    """Yields a function that tells whether Ctrl-C was pressed; a second Ctrl-C stops at once."""
+    """Yields a function that tells whether the run shall end: after Ctrl-C, or the SIGTERM of a cluster's scheduler.
+
+    A second one stops at once.
+    """
     pressed = False
 
     def note(signum: int, frame: Any) -> None:
@@ -53,15 +56,17 @@ def interruptible() -> Iterator[Any]:
         pressed = True
         say("\ninterrupted: finishing this step and saving; press Ctrl-C again to stop at once")
 
+    numbers = (signal.SIGINT, signal.SIGTERM)
     try:
-        before = signal.signal(signal.SIGINT, note)
+        before = {number: signal.signal(number, note) for number in numbers}
     except ValueError:  # not in the main thread: the one who started us handles Ctrl-C
         yield lambda: False
         return
     try:
         yield lambda: pressed
     finally:
-        signal.signal(signal.SIGINT, before)
+        for number, handler in before.items():
+            signal.signal(number, handler)
 
 
 class Trainer:
@@ -166,6 +171,8 @@ class Trainer:
                     self.save(last=False)
                     saved = time.perf_counter()
             self.interrupted = stop()
+            if ahead:
+                say(f"  evaluation.at_steps={ahead}: not evaluated, the run ends at {self.env_steps} steps")
             self.save()
         if self._collector is not None:
             self._collector.shutdown()

@@ -28,7 +28,7 @@ def write_tree(folder: Path, name: str, tree: Any) -> None:
 
 
 def read_tree(folder: Path, name: str) -> Any:
-    """What `write_tree` wrote; tensors on the CPU."""
+    """What `write_tree` wrote; tensors on the CPU, arrays as lists."""
     structure = json.loads((folder / f"{name}.json").read_bytes())
     return _decode(structure, load_file(folder / f"{name}.safetensors"))
 
@@ -43,6 +43,8 @@ def _encode(value: Any, where: str, tensors: dict[str, Tensor]) -> Any:
     if value is None or isinstance(value, str | bool | int | float):
         return value
     if isinstance(value, Tensor):
+        while where in tensors:  # {"1": …, 1: …}, or {"a/b": …, "a": {"b": …}}
+            where += "'"
         tensors[where] = value
         return ["tensor", where]
     if isinstance(value, Mapping):

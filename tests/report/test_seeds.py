@@ -58,3 +58,16 @@ def test_a_sweep_stands_for_its_runs(tmp_path, capsys):
     (tmp_path / "9-reach" / "evaluation.json").unlink()
     with pytest.raises(UserError, match="9-reach: no evaluation"):
         summary([str(tmp_path)])
+
+
+def test_runs_of_different_tasks_are_not_averaged(tmp_path, capsys):
+    for k, (task, seed) in enumerate([("reach", 0), ("reach_fixed", 0), ("reach", 1)]):
+        run = tmp_path / f"{k}-{task}"
+        run.mkdir()
+        (run / "evaluation.json").write_text(json.dumps(evaluation((k + 1) / 100, 1.0)))
+        (run / "config.yaml").write_text(f"seed: {seed}\nenv: {{task: {task}}}\n")
+    (tmp_path / "multirun.yaml").touch()
+    summary([str(tmp_path)])
+    out = capsys.readouterr().out
+    assert "2 runs (0-reach, 2-reach)" in out and "2.00 (1.00 – 3.00)" in out
+    assert "1 run (1-reach_fixed)" in out and "| planner | 2.00 | 100 |" in out

@@ -136,6 +136,7 @@ def test_environments_of_a_run(composed) -> None:
         ("trainer.checkpoint_replay=8", "checkpoint_replay"),
         ("evaluation.at_steps=1000", "at_steps"),
         ("evaluation.at_steps=[1000,-5]", "at_steps"),
+        (("evaluation.at_steps=[1000]", "evaluation.during=[]"), "evaluation.during=[planner]"),
         (("dataset=lerobot", "trainer=offline", "dataset.root=/tmp", "evaluation.at_steps=[9]"), "at_steps"),
         ("device=tpu", "tpu"),
     ],

@@ -235,6 +235,26 @@ def test_extra_keeps_types(tmp_path: Path) -> None:
     assert isinstance(restored["t"], tuple)
 
 
+def test_tensors_whose_places_read_alike_stay_apart(tmp_path: Path) -> None:
+    save(
+        tmp_path / "a",
+        extra={
+            "1": torch.zeros(1),
+            1: torch.ones(1),
+            "a/b": torch.full((1,), 2.0),
+            "a": {"b": torch.full((1,), 3.0)},
+        },
+    )
+    restored = load_checkpoint(tmp_path / "a").extra()
+    assert restored is not None
+    assert [float(x) for x in (restored["1"], restored[1], restored["a/b"], restored["a"]["b"])] == [
+        0,
+        1,
+        2,
+        3,
+    ]
+
+
 def test_what_needs_pickle_is_refused_and_leaves_nothing(tmp_path: Path) -> None:
     with pytest.raises(TypeError, match="extra/thing is a object"):
         save(tmp_path / "a", extra={"thing": object()})

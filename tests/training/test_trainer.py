@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import signal
 from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
@@ -187,7 +189,7 @@ def test_evaluation_while_training(make: Make, cfg: DictConfig) -> None:
     assert rows[0]["updates"] == 10
 
 
-def test_evaluation_at_environment_steps(make: Make) -> None:
+def test_evaluation_at_environment_steps(make: Make, capsys) -> None:
     """At the end of the batch in which the steps are reached, once, and not again by a resumed run."""
     trainer = make(updates=40, evaluate=lambda: {"eval/policy/success": 0.5})
     trainer.cfg.evaluation.at_steps = [17 * N, 21 * N, 22 * N]
@@ -196,11 +198,26 @@ def test_evaluation_at_environment_steps(make: Make) -> None:
     assert [row["env_steps"] for row in rows] == [20 * N, 25 * N]
 
     resumed = make("resumed", updates=60, evaluate=lambda: {"eval/policy/success": 0.5})
-    resumed.cfg.evaluation.at_steps = [17 * N, 33 * N]
+    resumed.cfg.evaluation.at_steps = [17 * N, 33 * N, 999 * N]
     resumed.restore(load_checkpoint(latest_checkpoint(trainer.folder)))
     resumed.fit()
+    assert f"at_steps=[{999 * N}]: not evaluated" in capsys.readouterr().out
     rows = [row for row in resumed.rows[len(trainer.rows) :] if "eval/policy/success" in row]
     assert [row["env_steps"] for row in rows] == [35 * N]
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_ends_the_run_with_everything_saved(make: Make, number: int) -> None:
+    before = signal.getsignal(number)
+    trainer = make(
+        updates=40, evaluate=lambda: (os.kill(os.getpid(), number), {"eval/policy/success": 0.5})[1]
+    )
+    trainer.cfg.evaluation.every = 0.0
+    trainer.fit()
+    assert trainer.interrupted and trainer.learner.updates == 10
+    checkpoint = load_checkpoint(latest_checkpoint(trainer.folder))
+    assert checkpoint.counters["updates"] == 10 and checkpoint.replay("cpu") is not None
+    assert signal.getsignal(number) is before
 
 
 def test_policies_take_turns(make: Make) -> None:
