@@ -398,9 +398,11 @@ def test_mistakes_are_named():
         model.loss(batch.exclude("search_policy"))
 
 
-def test_the_loss_reads_nothing_on_the_host():
+@pytest.mark.parametrize("fresh_values", [False, True])
+def test_the_loss_reads_nothing_on_the_host(fresh_values):
     with FakeTensorMode():
-        model, batch = small(), windows()
+        model = small(fresh_values=fresh_values, image_sizes={"pixels": (64, 64, 3)}, channels=4)
+        batch = windows(pixels=(64, 64, 3))
         losses = model.loss(batch)
         losses["loss"].backward()
     assert losses["loss"].shape == ()
