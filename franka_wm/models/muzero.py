@@ -374,7 +374,7 @@ class MuZero(nn.Module):
         return decay_groups(self.parameters(), lr, weight_decay=self.weight_decay)
 
     def after_update(self) -> None:
-        """Nothing: MuZero has no slow copies; its targets come from the searches that were stored."""
+        """Nothing: MuZero has no slow copies; its targets come from stored searches, or from the model itself."""
 
     # ------------------------------------------------------------------ pieces
 

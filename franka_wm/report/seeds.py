@@ -82,8 +82,9 @@ def summary(arguments: list[str]) -> None:
             "summary needs folders of runs: franka-wm summary outputs/RUN outputs/RUN …, or multirun/SWEEP"
         )
     groups: dict[str, dict[Path, dict[str, Any]]] = {}
-    for run in [run for folder in arguments for run in runs_of(folder)]:
-        groups.setdefault(but_for_the_seed(read_config(run)), {})[run] = read_evaluation(run)
+    for folder in arguments:
+        for run in runs_of(folder):
+            groups.setdefault(but_for_the_seed(read_config(run)), {})[run] = read_evaluation(run)
     for group in groups.values():
         evaluations = list(group.values())
         first = next(iter(evaluations[0].values()))

@@ -6,9 +6,11 @@ import shutil
 from pathlib import Path
 from typing import Any
 
-BETWEEN, KEPT = 2e9, 8e9
-"""Up to so much experience [bytes] goes into checkpoints while a run goes on, and, unless all of it is asked for, into
-the last one: writing tens of GB of pictures takes minutes, and a GPU gathers them anew in seconds."""
+BETWEEN = 2e9
+"""Up to so much experience [bytes] goes into checkpoints while a run goes on: writing tens of GB takes minutes."""
+
+KEPT = 8e9
+"""Up to so much [bytes] goes into the last one unless all of it is asked for: a GPU gathers more of it in seconds."""
 
 SPARE = 5e8
 """What must stay free on the disk [bytes], for the weights and for what else a run writes."""
