@@ -9,6 +9,7 @@ from tensordict import TensorDictBase
 from torchrl.data import ReplayBuffer
 
 from franka_wm.data.replay import WindowSampler
+from franka_wm.data.stacks import StackStorage
 
 
 class CapturedSampling:
@@ -80,5 +81,6 @@ class CapturedSampling:
         # The largest product rounds up to the number of choices itself for huge buffers only; hence the bound.
         draw = torch.minimum(uniform * self._choices, self._choices - 1.0).long()
         time, world, crossing = sampler.choose(data, draw, self._oldest, size)
-        self._batch = data[time, world]
+        storage = self.replay.storage
+        self._batch = storage.windows(time, world) if isinstance(storage, StackStorage) else data[time, world]
         self._crossing = crossing

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import torch
 from torchrl.data import LazyTensorStorage, ReplayBuffer
 from torchrl.data.replay_buffers import RoundRobinWriter, Sampler
 
+from franka_wm.data.stacks import StackStorage
 from franka_wm.errors import UserError
 
 
@@ -31,6 +33,7 @@ class WindowSampler(Sampler):
         past_end: Windows may go on past the end of an episode, into the next one: for losses that look at
             ``boundary`` themselves. Then every step starts windows, also the last ones of an episode, and
             episodes shorter than a window are seen.
+        before: So many steps before each window must be kept as well: for stacked pictures.
     """
 
     def __init__(
@@ -41,6 +44,7 @@ class WindowSampler(Sampler):
         boundary: str = "is_init",
         oversample: int = 4,
         past_end: bool = False,
+        before: int = 0,
     ):
         if length < 1 or oversample < 1:
             raise UserError(f"window length={length}, oversample={oversample}: both must be at least 1")
@@ -49,6 +53,7 @@ class WindowSampler(Sampler):
         self.boundary = boundary
         self.oversample = oversample
         self.past_end = past_end
+        self.before = before
         self._missing: torch.Tensor | None = None
 
     def sample(self, storage: Any, batch_size: int) -> tuple[Any, dict]:
@@ -68,12 +73,14 @@ class WindowSampler(Sampler):
             UserError: There are fewer steps than a window has.
         """
         filled = storage._len_along_dim0
-        span = filled - self.length + 1
+        span = filled - self.before - self.length + 1
         if span < 1:
             raise UserError(
-                f"the replay buffer holds {filled} steps per world, a window needs {self.length}; collect more first"
+                f"the replay buffer holds {filled} steps per world, a window needs {self.before + self.length}; "
+                "collect more first"
             )
-        return span, self.writer._cursor if filled == storage._storage.shape[0] else 0
+        oldest = self.writer._cursor if filled == storage._storage.shape[0] else 0
+        return span, oldest + self.before
 
     @property
     def _checks(self) -> bool:
@@ -149,6 +156,8 @@ def make_replay(
     batch_size: int,
     device: torch.device | str,
     past_end: bool = False,
+    frame_stack: int = 1,
+    stacked: Sequence[str] = (),
 ) -> ReplayBuffer:
     """A buffer of (time, worlds) that is extended with the collector's (worlds, time) batches.
 
@@ -159,20 +168,28 @@ def make_replay(
         batch_size: Windows per sample.
         device: Where everything lives.
         past_end: Windows may go on past the end of an episode, see :class:`WindowSampler`.
+        frame_stack: Pictures in each observation under ``stacked``, as ``env.frame_stack``: each is kept once, and
+            samples have stacks again.
+        stacked: Keys of such observations.
 
     Returns:
         A ``ReplayBuffer`` whose samples have batch size (batch_size, window).
     """
-    steps = capacity // num_envs
-    if steps <= window:
+    steps, before = capacity // num_envs, frame_stack - 1 if stacked else 0
+    if steps <= window + before:
         raise UserError(
-            f"replay capacity {capacity} is {steps} steps for each of {num_envs} worlds, windows have {window}; "
-            f"use at least {num_envs * (window + 1)}"
+            f"replay capacity {capacity} is {steps} steps for each of {num_envs} worlds, windows have {window}"
+            f"{f', and {before} before them' if before else ''}; use at least {num_envs * (window + before + 1)}"
         )
     writer = RoundRobinWriter()
+    storage = (
+        StackStorage(steps * num_envs, frame_stack=frame_stack, stacked=stacked, device=device)
+        if before
+        else LazyTensorStorage(steps * num_envs, ndim=2, device=device)
+    )
     return ReplayBuffer(
-        storage=LazyTensorStorage(steps * num_envs, ndim=2, device=device),
-        sampler=WindowSampler(writer, length=window, past_end=past_end),
+        storage=storage,
+        sampler=WindowSampler(writer, length=window, past_end=past_end, before=before),
         writer=writer,
         batch_size=batch_size,
         dim_extend=1,

@@ -360,8 +360,14 @@ def make_agent_policies(cfg: DictConfig, model: Any, env: Any, spaces: Spaces) -
 # -- experience ---------------------------------------------------------------------------------------------
 
 
+def frame_stack(cfg: DictConfig) -> int:
+    """Pictures in each observation of one."""
+    return int(cfg.env.get("frame_stack", 1)) if is_arm(cfg) else 1
+
+
 def make_replay_buffer(cfg: DictConfig, device: torch.device) -> ReplayBuffer:
-    """The replay buffer that ``cfg.replay`` describes."""
+    """The replay buffer that ``cfg.replay`` describes; it keeps each picture of a stack once."""
+    pictures = ["pixels", *(f"pixels_{camera}" for camera in cfg.env.get("cameras", []))]
     return make_replay(
         capacity=cfg.replay.capacity,
         num_envs=cfg.collector.num_envs,
@@ -369,6 +375,8 @@ def make_replay_buffer(cfg: DictConfig, device: torch.device) -> ReplayBuffer:
         batch_size=cfg.replay.batch_size,
         device=device,
         past_end=looks_past_ends(cfg),
+        frame_stack=frame_stack(cfg),
+        stacked=pictures if frame_stack(cfg) > 1 else (),
     )
 
 

@@ -53,7 +53,7 @@ def check(cfg: DictConfig) -> None:
         raise UserError(refuses)
     if not build.is_offline(cfg):
         build.actor(cfg)
-    elif build.is_arm(cfg) and cfg.env.get("frame_stack", 1) > 1 and "pixels" in cfg.env.observations:
+    elif build.frame_stack(cfg) > 1 and "pixels" in cfg.env.observations:
         raise UserError(
             f"env.frame_stack={cfg.env.frame_stack}: a dataset holds single pictures, and the model would be built for "
             "them; use env.frame_stack=1"
@@ -87,7 +87,7 @@ def check(cfg: DictConfig) -> None:
     _check_at_steps(cfg)
     if not 0 <= cfg.collector.smoothness < 1:
         raise UserError(f"collector.smoothness={cfg.collector.smoothness}: must be at least 0 and below 1")
-    if cfg.replay.capacity < (steps := cfg.collector.num_envs * (window + 1)):
+    if cfg.replay.capacity < (steps := cfg.collector.num_envs * (window + build.frame_stack(cfg))):
         raise UserError(
             f"replay.capacity={cfg.replay.capacity}: must be at least {steps}, one window for every world"
         )

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -12,6 +12,7 @@ from franka_wm.data.lerobot.episodes import cut_replay
 from franka_wm.data.lerobot.provenance import describe
 from franka_wm.data.lerobot.schema import FORMATS, schema_for
 from franka_wm.data.lerobot.writer import DatasetWriter
+from franka_wm.data.stacks import newest
 from franka_wm.errors import UserError
 
 if TYPE_CHECKING:
@@ -133,6 +134,9 @@ def export_replay(
     """
     from franka_wm.envs.discretize import discrete_action_table
 
+    if config.frame_stack > 1:  # a replay keeps each picture once, and so does a dataset
+        stacked = [str(key) for key in data.keys() if str(key).startswith(("pixels", "goal_pixels"))]  # noqa: SIM118
+        data, config = newest(data, stacked, config.frame_stack), replace(config, frame_stack=1)
     after = data.get("next")
     known = ("state", "joint_target")
     keys = [key for key in data.keys() if key in known or str(key).startswith(("pixels", "goal_pixels"))]  # noqa: SIM118
@@ -215,7 +219,7 @@ def check_export(settings: Mapping[str, Any]) -> None:
         raise UserError(f"export.kind={wanted['kind']!r}: must be none or lerobot")
     if wanted["kind"] == "none":
         return
-    schema_for(arm_config(settings), format=wanted["format"])
+    schema_for(replace(arm_config(settings), frame_stack=1), format=wanted["format"])
     out = wanted["out"]
     if out and Path(out).exists():
         raise UserError(f"export.out={out} exists; choose another folder")

@@ -1,0 +1,187 @@
+"""A replay that keeps each picture once gives back the stacks that it was given, bit for bit."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+import torch
+from tensordict import TensorDict, TensorDictBase
+
+from franka_wm.data.captured import CapturedSampling
+from franka_wm.data.replay import make_replay
+from franka_wm.errors import UserError
+from franka_wm.training.room import held
+
+N, LENGTH, COUNT, WINDOW = 3, 4, 3, 2
+on_gpu = pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
+KEYS = ("pixels", "pixels_side")
+
+
+@pytest.fixture(scope="module")
+def played(small_env, random_actions) -> TensorDictBase:
+    """Steps (worlds, time) of the arm, with stacks from two cameras; each world has its own times of resets."""
+    env = small_env(
+        N,
+        observations=("pixels", "state"),
+        cameras=("front", "side"),
+        image_size=16,
+        episode_length=LENGTH,
+        frame_stack=COUNT,
+    )
+    root, steps = env.reset(seed=0), []
+    for t, action in enumerate(random_actions(N, 26).unbind(1)):
+        step, root = env.step_and_maybe_reset(root.clone().set("action", action))
+        steps.append(step.clone())
+        if t in (5, 14):  # one world alone starts anew, in the middle of its episode
+            mask = torch.tensor([[t == 5], [t == 14], [False]])
+            root = env.reset(root.exclude("reward").set("_reset", mask))
+    return torch.stack(steps, 1).select(*KEYS, "state", "is_init", "action", *(("next", key) for key in KEYS))
+
+
+def filled(played: TensorDictBase, chunks: list[int], steps: int = 12, **options: Any) -> Any:
+    replay = make_replay(
+        capacity=steps * N,
+        num_envs=N,
+        window=WINDOW,
+        batch_size=64,
+        device="cpu",
+        frame_stack=COUNT,
+        **options,
+    )
+    start = 0
+    for chunk in chunks:
+        replay.extend(played[:, start : start + chunk])
+        start += chunk
+    return replay
+
+
+@pytest.mark.parametrize("past_end", [False, True])
+@pytest.mark.parametrize("chunks", [[9], [5, 4], [1] * 11, [7, 6, 6, 7]])
+def test_windows_have_the_stacks_that_were_given(played, chunks: list[int], past_end: bool) -> None:
+    """Half full, filled step by step, wrapped around twice; across the ends of episodes, and within them."""
+    torch.manual_seed(0)
+    replay = filled(played, chunks, stacked=KEYS, past_end=past_end)
+    given = {
+        state.numpy().tobytes(): divmod(i, played.shape[1])
+        for i, state in enumerate(played["state"].flatten(0, 1))
+    }
+    assert len(given) == played.numel()  # each step is known by its state
+    seen = set()
+    for _ in range(20):
+        batch = replay.sample()
+        for row in batch.unbind(0):
+            world, time = given[row["state"][0].numpy().tobytes()]
+            seen.add((world, time))
+            expected = played[world, time : time + WINDOW]
+            for key in KEYS:
+                assert torch.equal(row[key], expected[key]), (world, time)
+                assert torch.equal(row["next", key], expected["next", key]), (world, time)
+    first = max(0, sum(chunks) - 12) + COUNT - 1  # the older pictures of those before are gone
+    begins = played["is_init"].squeeze(-1)
+    assert seen == {
+        (world, time)
+        for world in range(N)
+        for time in range(first, sum(chunks) - WINDOW + 1)
+        if past_end or not begins[world, time + 1 : time + WINDOW].any()
+    }
+
+
+def test_ends_of_episodes_and_single_resets_are_among_them(played) -> None:
+    """Or the test above could not fail where it matters."""
+    begins = played["is_init"].squeeze(-1)
+    assert begins.sum(1).tolist() == [7, 7, 7] and begins.float().std(0).max() > 0
+    assert (played["pixels"][:, 1:, ..., :3] != played["pixels"][:, :-1, ..., :3]).any()
+
+
+def test_each_picture_is_kept_once(played) -> None:
+    stacked, plain = (
+        filled(played, [9], stacked=KEYS),
+        make_replay(capacity=12 * N, num_envs=N, window=WINDOW, batch_size=64, device="cpu"),
+    )
+    plain.extend(played[:, :9])
+    pictures = 2 * len(KEYS) * 16 * 16 * 3 * 9 * N
+    assert held(plain) - held(stacked) == (COUNT - 1) * pictures
+    before = played["pixels"].clone()
+    assert torch.equal(played["pixels"], before) and stacked[:]["pixels"].shape[-1] == 3
+
+
+def test_what_a_checkpoint_kept_is_taken_as_it_is(played) -> None:
+    """Single pictures go in beside stacks: a run that goes on from a checkpoint."""
+    torch.manual_seed(0)
+    first = filled(played, [8], stacked=KEYS)
+    again = filled(played, [], stacked=KEYS)
+    again.extend(first[:])
+    again.extend(played[:, 8:10])
+    time = torch.arange(2, 10).expand(N, 8)
+    world = torch.arange(N).unsqueeze(1).expand(N, 8)
+    got = again.storage.get((time, world))
+    for key in KEYS:
+        assert torch.equal(got[key], played[key][:, 2:10])
+        assert torch.equal(got["next", key], played["next", key][:, 2:10])
+
+
+def test_stacks_are_looked_at_after_single_pictures_as_well(played) -> None:
+    first = filled(played, [8], stacked=KEYS)
+    again = filled(played, [], stacked=KEYS)
+    again.extend(first[:])
+    wrong = played[:, 8:10].clone()
+    wrong["pixels"][0, 1, 0, 0, 0] ^= 1
+    with pytest.raises(UserError, match="older pictures are not those"):
+        again.extend(wrong)
+
+
+def test_pictures_that_are_no_stacks_are_refused(played) -> None:
+    wrong = played.clone()
+    wrong["pixels"][1, 4, 0, 0, 0] ^= 1  # an older picture than the newest
+    with pytest.raises(UserError, match="older pictures are not those"):
+        filled(wrong, [8], stacked=KEYS)
+    wrong = played.clone()
+    wrong["next", "pixels_side"][0, 2, 0, 0, 3] ^= 1
+    with pytest.raises(UserError, match="pixels_side: its older pictures"):
+        filled(wrong, [8], stacked=KEYS)
+    wrong["pixels"] = wrong["pixels"].repeat(1, 1, 1, 1, 2)
+    with pytest.raises(UserError, match="18 channels"):
+        replay = filled(played, [4], stacked=KEYS)
+        replay.extend(wrong[:, 4:6])
+    with pytest.raises(UserError, match="a window needs 4; collect more first"):
+        filled(played, [3], stacked=KEYS).sample()
+    with pytest.raises(UserError, match="use at least 15"):
+        filled(played, [], steps=4, stacked=KEYS)
+
+
+def test_without_pictures_there_is_nothing_to_stack(played) -> None:
+    """A state's run with the option set, and a model that reads one camera alone."""
+    replay = filled(played.exclude(*KEYS, *(("next", key) for key in KEYS)), [9], stacked=KEYS)
+    assert "pixels" not in replay.sample().keys()  # noqa: SIM118
+    replay = filled(played.exclude("pixels", ("next", "pixels")), [9], stacked=KEYS)
+    assert replay.sample()["pixels_side"].shape == (64, WINDOW, 16, 16, 9)
+
+
+@pytest.mark.gpu
+@on_gpu
+def test_captured_batches_have_stacks(played) -> None:
+    replay = make_replay(
+        capacity=12 * N,
+        num_envs=N,
+        window=WINDOW,
+        batch_size=64,
+        device="cuda",
+        frame_stack=COUNT,
+        stacked=KEYS,
+    )
+    sampling, start = CapturedSampling(replay), 0
+    given = {
+        state.numpy().tobytes(): divmod(i, played.shape[1])
+        for i, state in enumerate(played["state"].flatten(0, 1))
+    }
+    for chunk in (9, 8, 8):
+        replay.extend(played[:, start : start + chunk].to("cuda"))
+        start += chunk
+        for _ in range(4):
+            for row in TensorDict(sampling().to_dict(), [64, WINDOW]).cpu().unbind(0):
+                world, time = given[row["state"][0].numpy().tobytes()]
+                expected = played[world, time : time + WINDOW]
+                for key in KEYS:
+                    assert torch.equal(row[key], expected[key])
+                    assert torch.equal(row["next", key], expected["next", key])
