@@ -283,9 +283,30 @@ def test_the_hand_is_seen_in_small_pictures() -> None:
     hand = full["segmentation"] == full["segmentation"].max()
     assert (thin["segmentation"] != full["segmentation"])[hand].float().mean() < 0.12
     assert (thin["pixels"].float() - full["pixels"].float()).abs().mean() < 2.0
-    assert (
-        sum(triangles["panda_meshes"]) < 3_000 and min(triangles["panda_meshes"][-4:]) >= 12
-    )  # two to a finger
+    assert sum(triangles["panda_meshes"]) < 3_000 and min(triangles["panda_meshes"][-2:]) >= 40  # the fingers
+    assert len(triangles["panda_meshes"]) < len(triangles["panda_meshes_full"])  # screws are left out
+
+
+@pytest.mark.parametrize(
+    ("size", "kept"),
+    [
+        ((0.003, 0.003, 0.003), False),  # a screw
+        ((0.02, 0.02, 0.02), False),  # less than half of 3 cm squared
+        ((0.022, 0.022, 0.005), True),
+        ((0.004, 0.004, 0.4), True),  # a rod is seen, thin as it is
+    ],
+)
+def test_shapes_that_cover_less_than_a_pixel_are_left_out(size: tuple[float, ...], kept: bool) -> None:
+    vertices = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)]) * np.array(size)
+    sides = [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)]
+    faces = np.array([corners for a, b, c, d in sides for corners in ((a, b, c), (a, c, d))])
+    piece = meshes.Piece(
+        vertices, vertices / np.linalg.norm(vertices - 0.1, axis=1, keepdims=True), faces, None
+    )
+    for cell, drawn in ((0.03, kept), (0.0, True)):
+        builder = newton.ModelBuilder()
+        meshes.draw(builder, builder.add_body(), [piece], cell)
+        assert builder.shape_count == int(drawn), cell
 
 
 @needs_meshes

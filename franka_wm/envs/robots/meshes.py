@@ -122,14 +122,18 @@ def take_visuals(root: ET.Element, urdf: Path) -> dict[str, list[Piece]]:
 def draw(builder: newton.ModelBuilder, body: int, pieces: list[Piece], cell: float) -> None:
     """Adds shapes that are only seen: no collisions, no mass; nothing smaller than ``cell`` [m].
 
-    Small shapes keep finer details, half of their middle side: fingers would vanish in cubes of their own size.
+    Small shapes keep finer details, half of their middle side: fingers would vanish in cubes of their own size. Those
+    that cover less than half of ``cell``², about a pixel, are left out: a shape costs more than its triangles do.
     """
     config = newton.ModelBuilder.ShapeConfig(
         density=0.0, has_shape_collision=False, has_particle_collision=False
     )
     for piece in pieces:
         if piece.texture is None:
-            piece = simplify(piece, min(cell, 0.5 * float(np.median(np.ptp(piece.vertices, axis=0)))))
+            _, middle, longest = np.sort(np.ptp(piece.vertices, axis=0))
+            if middle * longest < 0.5 * cell**2:
+                continue
+            piece = simplify(piece, min(cell, 0.5 * float(middle)))
         if not len(piece.faces):
             continue
         mesh = newton.Mesh(
