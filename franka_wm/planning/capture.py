@@ -3,16 +3,53 @@
 from __future__ import annotations
 
 from collections import OrderedDict
-from collections.abc import Callable, Hashable, Sequence
+from collections.abc import Callable, Hashable, Mapping, Sequence
+from types import FunctionType, MethodType
 from typing import Any, NamedTuple
 
 import torch
 from tensordict import TensorDict, TensorDictBase
+from torch import nn
 
 from franka_wm.errors import CaptureError
 
 Work = Callable[[TensorDictBase], TensorDict]
 """Entries in, entries out: tensors of fixed shapes, nothing read back by the host."""
+
+
+LOOKED_INTO = 4
+"""How deep :func:`settings` looks for attributes of attributes."""
+
+
+def settings(value: Any, depth: int = LOOKED_INTO) -> Hashable:
+    """What a graph of work with `value` depends on, for a `key`: another key, another graph.
+
+    Numbers and texts count by value, tensors by the memory they lie in, plain objects by the settings of their
+    attributes, everything else (models, functions, what lies deeper than `depth`) by identity.
+    """
+    if value is None or isinstance(value, bool | int | float | str):
+        return repr(value)  # a nan equals itself
+    if isinstance(value, torch.Tensor):
+        return value.data_ptr(), tuple(value.shape), value.dtype
+    if not depth or isinstance(value, nn.Module | TensorDictBase | FunctionType | MethodType | type):
+        return _itself(value)
+    if isinstance(value, Mapping):
+        return tuple(sorted((str(key), settings(one, depth - 1)) for key, one in value.items()))
+    if isinstance(value, list | tuple):
+        return tuple(settings(one, depth - 1) for one in value)
+    if hasattr(value, "__dict__"):
+        return type(value), tuple(
+            (name, settings(one, depth - 1)) for name, one in sorted(vars(value).items())
+        )
+    return _itself(value)
+
+
+def _itself(value: Any) -> Hashable:
+    try:
+        hash(value)
+    except TypeError:
+        return id(value)
+    return value
 
 
 class _Graph(NamedTuple):

@@ -12,7 +12,7 @@ from tensordict.nn import InteractionType, TensorDictModuleBase
 from tensordict.nn.probabilistic import interaction_type
 from torch import Tensor, nn
 
-from franka_wm.planning.capture import GraphCache
+from franka_wm.planning.capture import GraphCache, settings
 from franka_wm.planning.mppi import MPPI, Objective
 from franka_wm.planning.objectives import RewardPlusValue
 
@@ -55,8 +55,9 @@ class PlannerPolicy(TensorDictModuleBase):
 
     On CUDA the third decision of a kind (so many environments, exploring or not, these settings) is captured as
     a graph, which the later ones replay; see `franka_wm.planning.capture.GraphCache`. Then weights must be
-    changed in place, and planner, model and objective must not read values on the host. Settings of the planner
-    may be changed at any time; those of an objective need a new objective.
+    changed in place, and planner, model and objective must not read values on the host. Settings of planner and
+    objective may be changed at any time, at the price of another graph; a goal that changes with every decision is
+    best copied into the objective's tensor.
 
     Args:
         planner: MPPI or anything with its `plan`.
@@ -187,7 +188,7 @@ class PlannerPolicy(TensorDictModuleBase):
             decision = self._graphs(
                 lambda entries: self._decide(entries, explore),
                 inputs,
-                key=(modes, *sorted((name, repr(value)) for name, value in vars(self.planner).items())),
+                key=(modes, settings(self.planner), settings(self.objective)),
                 held=held,
             )
         else:

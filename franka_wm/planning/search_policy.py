@@ -9,7 +9,7 @@ from tensordict.nn import InteractionType, TensorDictModuleBase
 from tensordict.nn.probabilistic import interaction_type
 from torch import Tensor, nn
 
-from franka_wm.planning.capture import GraphCache
+from franka_wm.planning.capture import GraphCache, settings
 from franka_wm.planning.mcts import MCTS
 from franka_wm.planning.policy import captures
 from franka_wm.planning.tree import Recurrent
@@ -116,7 +116,7 @@ class SearchPolicy(TensorDictModuleBase):
             self._graphs(
                 lambda entries: self._decide(entries, explore),
                 inputs,
-                key=(modes, *sorted((name, repr(value)) for name, value in vars(self.search).items())),
+                key=(modes, settings(self.search)),
                 held=(self.search, self.encode, self.prediction, self.recurrent),
                 generators=() if self.generator is None else (self.generator,),
             )

@@ -1,6 +1,7 @@
 """Decisions as CUDA graphs: when one is captured, what it remembers, and, on a GPU, that it decides the same."""
 
 import copy
+import math
 import pickle
 from contextlib import contextmanager, nullcontext
 
@@ -11,7 +12,8 @@ from tensordict import TensorDict
 from franka_wm import models
 from franka_wm.errors import CaptureError
 from franka_wm.planning import CEM, MCTS, MPPI, PlannerPolicy, SearchPolicy, capture
-from franka_wm.planning.capture import GraphCache
+from franka_wm.planning.capture import GraphCache, settings
+from franka_wm.planning.objectives import ActionPenalty, GoalDistance, Sum
 
 on_gpu = pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
 
@@ -149,6 +151,62 @@ def test_a_policy_captures_anew_when_settings_mode_or_planner_change(recorded, m
         change()
         decide()
         assert len(recorded) == before + 1
+
+
+def test_a_policy_captures_anew_when_its_objective_changes(recorded, monkeypatch):
+    """Another goal, or another weight within a sum: the old graph would go on planning to the old one."""
+    model = small_model()
+    with torch.no_grad():
+        goals = model.encode(observation(2))
+    distance, penalty = GoalDistance(goals[0]), ActionPenalty(0.1)
+    policy = PlannerPolicy.for_model(
+        model, small(MPPI), objective=Sum([(1.0, distance), (1.0, penalty)]), explore=False
+    )
+    monkeypatch.setattr("franka_wm.planning.policy.captures", lambda wanted, observation: True)
+
+    seen = observation(4)
+
+    def decide():
+        for _ in range(3):
+            policy(seen.clone())
+        torch.manual_seed(0)
+        return policy(seen.clone())["action"]
+
+    first = decide()
+    assert torch.equal(decide(), first) and len(recorded) == 1
+    distance.goal_latent = goals[1]
+    assert not torch.equal(decide(), first) and len(recorded) == 2
+    penalty.weight = 10.0
+    decide()
+    assert len(recorded) == 3
+    distance.goal_latent = goals[0]
+    penalty.weight = 0.1
+    assert torch.equal(decide(), first) and len(recorded) == 3  # kept
+
+
+def test_settings_tell_what_a_graph_depends_on():
+    class Other:
+        def __init__(self, **values):
+            self.__dict__ |= values
+
+    tensor, module = torch.ones(2), torch.nn.Linear(1, 1)
+    values = {"a": 1, "b": [math.nan, "x"], "c": tensor, "d": module, "e": {"f": Other(g=module.forward)}}
+    assert settings(Other(**values)) == settings(Other(**values))
+    hash(settings(Other(**values)))
+    for change in (
+        {"a": 2},
+        {"b": [math.nan, "y"]},
+        {"c": tensor.clone()},
+        {"d": torch.nn.Linear(1, 1)},
+        {"e": {"f": Other(g=module.extra_repr)}},
+        {"h": 0},
+    ):
+        assert settings(Other(**values | change)) != settings(Other(**values))
+    tensor += 1  # read anew by every replay
+    assert settings(Other(**values)) == settings(Other(**values | {"c": tensor}))
+    ring = Other()
+    ring.ring = ring
+    hash(settings(ring))
 
 
 def test_no_capture_on_the_cpu_unless_asked_for(recorded):
