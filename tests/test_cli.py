@@ -71,6 +71,14 @@ def test_version_and_help(capsys: pytest.CaptureFixture[str]) -> None:
     assert all(f"franka-wm {verb}" in out for verb in cli.VERBS)
 
 
+def test_the_package_runs_as_a_module() -> None:
+    for arguments, status in ((["list"], 0), (["nothing"], 2)):
+        command = [sys.executable, "-m", "franka_wm", *arguments]
+        done = subprocess.run(command, capture_output=True, text=True, check=False)
+        assert done.returncode == status
+        assert ("panda_meshes" in done.stdout) == (status == 0)
+
+
 def test_a_verb_is_one_line_in_the_table(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -13,6 +13,7 @@ from franka_wm.errors import UserError
 from franka_wm.training import build
 from franka_wm.training.learner import PRECISIONS, SCHEDULES
 from franka_wm.training.loggers import check_loggers
+from franka_wm.training.room import planned_steps
 from franka_wm.training.spaces import Spaces
 from franka_wm.training.stages import check_pretrain
 
@@ -154,9 +155,7 @@ def _check_export(cfg: DictConfig) -> None:
     if not build.is_arm(cfg) or build.is_offline(cfg):
         raise UserError("export: only what a run gathers with the arm can be exported")
     check_export(build.plain(cfg))
-    c, t = cfg.collector, cfg.trainer
-    steps = max(c.seed_steps, 1) + -(-t.updates // t.updates_per_batch) * c.steps_per_batch
-    steps = min(steps, cfg.replay.capacity // c.num_envs)
+    steps = min(planned_steps(cfg), cfg.replay.capacity // cfg.collector.num_envs)
     if steps < cfg.env.episode_length and not cfg.env.terminate_on_success:
         raise UserError(
             f"export: each world will have gathered {steps} steps, no whole episode of {cfg.env.episode_length}; "

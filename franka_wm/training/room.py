@@ -1,10 +1,17 @@
-"""Whether a checkpoint takes the experience along: what does not fit on the disk must not cost the weights."""
+"""Whether experience fits: into memory, before a run starts; onto the disk, where it must not cost the weights."""
 
 from __future__ import annotations
 
 import shutil
 from pathlib import Path
 from typing import Any
+
+import torch
+from omegaconf import DictConfig
+from tensordict import TensorDictBase
+
+from franka_wm.data.stacks import StackStorage, newest
+from franka_wm.errors import UserError
 
 BETWEEN = 2e9
 """Up to so much experience [bytes] goes into checkpoints while a run goes on: writing tens of GB takes minutes."""
@@ -14,6 +21,49 @@ KEPT = 8e9
 
 SPARE = 5e8
 """What must stay free on the disk [bytes], for the weights and for what else a run writes."""
+
+
+def planned_steps(cfg: DictConfig) -> int:
+    """Steps that each world of a run will have made at its end."""
+    c, t = cfg.collector, cfg.trainer
+    return max(c.seed_steps, 1) + -(-t.updates // t.updates_per_batch) * c.steps_per_batch
+
+
+def check_memory(replay: Any, batch: TensorDictBase, cfg: DictConfig) -> None:
+    """That a replay has room for what a run will put into it, to be asked before its first ``batch``.
+
+    On CUDA all of ``replay.capacity`` is taken at once; elsewhere memory is taken as steps come.
+
+    Raises:
+        UserError: It has not; says how many steps would fit.
+    """
+    storage: Any = replay.storage
+    device = torch.device(storage.device)
+    kept = newest(batch, storage.stacked, storage.frame_stack) if isinstance(storage, StackStorage) else batch
+    per_step = kept.bytes() / kept.numel()
+    steps = cfg.replay.capacity
+    if device.type != "cuda":
+        steps = min(steps, cfg.collector.num_envs * planned_steps(cfg))
+    free = free_memory(device)
+    if free is not None and per_step * steps > free:
+        raise UserError(
+            f"replay.capacity={cfg.replay.capacity}: {per_step * steps / 1e9:.1f} GB of experience "
+            f"({per_step / 1e3:.1f} kB a step) do not fit into the {free / 1e9:.1f} GB that are free on {device}; "
+            f"at most replay.capacity={int(0.9 * free / per_step)} would, less what learning needs"
+        )
+
+
+def free_memory(device: torch.device) -> int | None:
+    """Bytes that can still be allocated on ``device``; ``None`` where the system does not tell."""
+    if device.type == "cuda":
+        cached = torch.cuda.memory_reserved(device) - torch.cuda.memory_allocated(device)
+        return torch.cuda.mem_get_info(device)[0] + cached
+    try:
+        lines = Path("/proc/meminfo").read_text().splitlines()
+    except OSError:  # not Linux
+        return None
+    kilobytes = next((line.split()[1] for line in lines if line.startswith("MemAvailable:")), None)
+    return None if kilobytes is None else 1024 * int(kilobytes)
 
 
 def held(replay: Any) -> int:

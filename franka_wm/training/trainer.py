@@ -20,7 +20,7 @@ from franka_wm.training.checkpoint import Checkpoint, save_checkpoint
 from franka_wm.training.learner import Learner
 from franka_wm.training.loggers import log_numbers
 from franka_wm.training.progress import Progress, say
-from franka_wm.training.room import held, left_out
+from franka_wm.training.room import check_memory, held, left_out
 from franka_wm.training.spaces import Spaces
 
 
@@ -213,7 +213,10 @@ class Trainer:
         self.env_steps += batch.numel()
         keys = [*self._keys, "action", "is_init", *self._extra]
         after = [("next", key) for key in (*self._keys, "reward", "terminated")]
-        self.replay.extend(batch.select(*keys, *after))
+        batch = batch.select(*keys, *after)
+        if len(self.replay) == 0:
+            check_memory(self.replay, batch, self.cfg)
+        self.replay.extend(batch)
 
     # -- what is kept and said ------------------------------------------------------------------------------
 

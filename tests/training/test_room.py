@@ -5,9 +5,12 @@ from types import SimpleNamespace
 
 import pytest
 import torch
+from omegaconf import OmegaConf
 from tensordict import TensorDict
 from torchrl.data import LazyTensorStorage, ReplayBuffer
 
+from franka_wm.data.replay import make_replay
+from franka_wm.errors import UserError
 from franka_wm.training import room
 
 
@@ -39,3 +42,44 @@ def test_left_out(
         assert said is None
     else:
         assert said is not None and why in said and "\n" not in said
+
+
+def test_a_replay_that_memory_cannot_hold_is_refused(monkeypatch) -> None:
+    """Before its first step, in one line that names what would fit; of stacked pictures only one each counts."""
+    pictures = {
+        "pixels": torch.zeros(4, 5, 8, 8, 9, dtype=torch.uint8),
+        "is_init": torch.ones(4, 5, 1, dtype=torch.bool),
+    }
+    batch = TensorDict({**pictures, "next": TensorDict({"pixels": pictures["pixels"]}, [4, 5])}, [4, 5])
+    cfg = OmegaConf.create(
+        {
+            "replay": {"capacity": 4000},
+            "collector": {"num_envs": 4, "seed_steps": 1000, "steps_per_batch": 2},
+            "trainer": {"updates": 0, "updates_per_batch": 1},
+        }
+    )
+    for stack, per_step in ((1, 2 * 8 * 8 * 9 + 1), (3, 2 * 8 * 8 * 3 + 1)):
+        replay = make_replay(
+            capacity=4000,
+            num_envs=4,
+            window=2,
+            batch_size=2,
+            device="cpu",
+            frame_stack=stack,
+            stacked=["pixels"],
+        )
+        monkeypatch.setattr(room, "free_memory", lambda device, most=4000 * per_step: most)
+        room.check_memory(replay, batch, cfg)
+        monkeypatch.setattr(room, "free_memory", lambda device, most=4000 * per_step - 1: most)
+        with pytest.raises(UserError, match=r"at most replay\.capacity=3599 would") as caught:
+            room.check_memory(replay, batch, cfg)
+        assert "\n" not in str(caught.value)
+    short = OmegaConf.merge(cfg, {"collector": {"seed_steps": 999}})
+    room.check_memory(replay, batch, short)  # it never fills what it may
+    monkeypatch.setattr(room, "free_memory", lambda device: None)  # not known: not refused
+    room.check_memory(replay, batch, cfg)
+
+
+def test_free_memory_is_that_of_the_machine() -> None:
+    free = room.free_memory(torch.device("cpu"))
+    assert free is None or 1e7 < free < 1e14
