@@ -54,8 +54,8 @@ class StackStorage(LazyTensorStorage):
         if not self.initialized:
             self.stacked = tuple(key for key in self.stacked if data.get(key, None) is not None)
         kept = newest(data, self.stacked, self.frame_stack)
-        if not self._checked:  # once: asking waits for the device
-            self._checked = check_stacks(data, self.stacked, self.frame_stack)
+        if not self._checked:  # once, and some: asking waits for the device, and compares copies
+            self._checked = check_stacks(data[:64], self.stacked, self.frame_stack)
         super().set(cursor, kept, set_cursor=set_cursor)
 
     def get(self, index: Any) -> Any:

@@ -115,7 +115,8 @@ class FrankaConfig:
         camera_fov_degrees: Vertical field of view [degrees].
         enable_shadows: Cast shadows in ``pixels`` (about half the rendering speed).
         enable_textures: Use mesh textures where the robot has them.
-        mesh_detail: Details of meshes smaller than this are not drawn [m]; 0 draws every triangle. ``None``: a pixel
+        mesh_detail: Details of meshes smaller than this are not drawn [m], nor shapes (middle times longest side) of
+            less than half its square; 0 draws every triangle. ``None``: a pixel
             and a half at the distance that the fixed cameras look at, at most 3 cm; 8 mm where no pictures are
             observed, or the wrist camera's are. ``robot="panda_meshes_full"`` always draws every triangle.
         solver: ``"mujoco"``, ``"featherstone"``, or ``"auto"``, which is ``"mujoco"`` on every device.

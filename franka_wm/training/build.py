@@ -361,8 +361,9 @@ def make_agent_policies(cfg: DictConfig, model: Any, env: Any, spaces: Spaces) -
 
 
 def frame_stack(cfg: DictConfig) -> int:
-    """Pictures in each observation of one."""
-    return int(cfg.env.get("frame_stack", 1)) if is_arm(cfg) else 1
+    """Pictures in each observation of one; one where the option is not a number, which the environment refuses."""
+    count = cfg.env.get("frame_stack", 1) if is_arm(cfg) else 1
+    return count if isinstance(count, int) and count > 0 else 1
 
 
 def make_replay_buffer(cfg: DictConfig, device: torch.device) -> ReplayBuffer:

@@ -88,9 +88,21 @@ def check(cfg: DictConfig) -> None:
     _check_at_steps(cfg)
     if not 0 <= cfg.collector.smoothness < 1:
         raise UserError(f"collector.smoothness={cfg.collector.smoothness}: must be at least 0 and below 1")
-    if cfg.replay.capacity < (steps := cfg.collector.num_envs * (window + build.frame_stack(cfg))):
+    before = build.frame_stack(cfg) - 1  # steps whose pictures a window's first stack needs
+    asked = f"windows have {window} steps" + (
+        f", and {before} before them for env.frame_stack" if before else ""
+    )
+    if cfg.replay.capacity < (steps := cfg.collector.num_envs * (window + before + 1)):
         raise UserError(
-            f"replay.capacity={cfg.replay.capacity}: must be at least {steps}, one window for every world"
+            f"replay.capacity={cfg.replay.capacity}: must be at least {steps} for collector.num_envs="
+            f"{cfg.collector.num_envs}: {asked}, and one more must fit"
+        )
+    c = cfg.collector
+    first = (-(-c.seed_steps // c.steps_per_batch) + 1) * c.steps_per_batch
+    if first < window + before and not build.is_offline(cfg):
+        raise UserError(
+            f"collector.seed_steps={c.seed_steps}: before the first update each world will have made {first} steps; "
+            f"{asked}: use at least collector.seed_steps={window + before}"
         )
     if cfg.replay.capacity < cfg.collector.num_envs * cfg.collector.steps_per_batch:
         raise UserError(f"replay.capacity={cfg.replay.capacity}: smaller than one batch of the collector")

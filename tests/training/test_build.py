@@ -166,6 +166,57 @@ def test_muzero_sees_ends_and_episodes_shorter_than_its_windows(composed) -> Non
         replay.sample()
 
 
+STACKED = (
+    "scale=smoke",
+    "device=cpu",
+    "env=reach_fixed_pixels",
+    "env.frame_stack=3",
+    "model=tdmpc2_pixels",
+    "env.substeps=1",
+)
+
+
+def test_a_run_keeps_each_picture_of_a_stack_once(composed, random_actions) -> None:
+    """And its model's batches have stacks; a run without has none to take apart."""
+    cfg = composed(*STACKED, "collector.num_envs=4", "env.image_size=16", "env.episode_length=6")
+    env = build.make_env(cfg)
+    root, steps = env.reset(seed=0), []
+    for action in random_actions(4, 20).unbind(1):
+        step, root = env.step_and_maybe_reset(root.clone().set("action", action))
+        steps.append(step.clone())
+    played = torch.stack(steps, 1)
+    replay = build.make_replay_buffer(cfg, torch.device("cpu"))
+    replay.extend(played)
+    assert replay[:]["pixels"].shape[-1] == replay[:]["next", "pixels"].shape[-1] == 3
+    assert replay.sample()["pixels"].shape[-1] == 9
+    time, world = torch.arange(2, 20).expand(4, 18), torch.arange(4).unsqueeze(1).expand(4, 18)
+    assert torch.equal(replay.storage.get((time, world))["pixels"], played["pixels"][:, 2:])
+    replay = build.make_replay_buffer(composed("collector.num_envs=4"), torch.device("cpu"))
+    replay.extend(played.select("state", "is_init"))
+    assert len(replay) == 80 and replay.sampler.before == 0
+
+
+def test_stacks_that_do_not_fit_are_refused_before_anything_is_built(composed) -> None:
+    check(composed(*STACKED))
+    check(composed(*STACKED, "export=lerobot", "trainer.updates=1000"))
+    for overrides, says in (
+        (("env.frame_stack=abc",), "frame_stack='abc': must be a whole number"),
+        (("env.frame_stack=null",), "frame_stack=None: must be a whole number"),
+        (("env.frame_stack=true",), "frame_stack=True: must be a whole number"),
+        (
+            ("env.frame_stack=64",),
+            r"windows have \d steps, and 63 before them for env\.frame_stack: use at least",
+        ),
+        (("collector.seed_steps=1", "collector.steps_per_batch=1"), r"use at least collector\.seed_steps="),
+        (
+            ("replay.capacity=40",),
+            r"must be at least 48 for collector\.num_envs=8: windows have 3 steps, and 2 before",
+        ),
+    ):
+        with pytest.raises(UserError, match=says):
+            check(composed(*STACKED, *overrides))
+
+
 def test_planner_and_model_that_do_not_exist(composed, small_env) -> None:
     with pytest.raises(UserError, match="planner"):
         build.make_planner(composed("planner.name=crystal_ball"), 7)

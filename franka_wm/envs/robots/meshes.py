@@ -122,8 +122,8 @@ def take_visuals(root: ET.Element, urdf: Path) -> dict[str, list[Piece]]:
 def draw(builder: newton.ModelBuilder, body: int, pieces: list[Piece], cell: float) -> None:
     """Adds shapes that are only seen: no collisions, no mass; nothing smaller than ``cell`` [m].
 
-    Small shapes keep finer details, half of their middle side: fingers would vanish in cubes of their own size. Those
-    that cover less than half of ``cell``², about a pixel, are left out: a shape costs more than its triangles do.
+    Small shapes keep finer details, half of their middle side: fingers would shrink in cubes of their own size. Those
+    that cover less than half of ``cell``², about a pixel, are left out: each shape costs time, however small.
     """
     config = newton.ModelBuilder.ShapeConfig(
         density=0.0, has_shape_collision=False, has_particle_collision=False

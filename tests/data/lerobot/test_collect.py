@@ -180,15 +180,22 @@ def replay_of(env, steps: int):
     policy = SmoothRandomPolicy(7, generator=torch.Generator().manual_seed(0))
     options = {"frames_per_batch": env.num_envs * steps, "total_frames": -1, "track_traj_ids": False}
     batch = next(iter(Collector(env, policy, **options)))
-    keys = [key for key in ("state", "joint_target", "pixels") if key in batch.keys()]  # noqa: SIM118
+    pictures = [key for key in batch.keys() if str(key).startswith(("pixels", "goal_pixels"))]  # noqa: SIM118
+    keys = [key for key in ("state", "joint_target", *pictures) if key in batch.keys()]  # noqa: SIM118
     return batch.select(*keys, "action", "is_init", *(("next", k) for k in (*keys, "reward", "terminated")))
 
 
 @pytest.mark.parametrize("frame_stack", [1, 3])
 def test_a_replay_comes_back_bit_for_bit(tmp_path, load, small_env, frame_stack: int) -> None:
     """Of stacks, the newest picture."""
-    observations = ("pixels", "state", "joint_target")
-    env = small_env(3, observations=observations, image_size=16, episode_length=7, frame_stack=frame_stack)
+    env = small_env(
+        3,
+        observations=("pixels", "goal_pixels", "state", "joint_target"),
+        cameras=("front", "side"),
+        image_size=16,
+        episode_length=7,
+        frame_stack=frame_stack,
+    )
     data = replay_of(env, 25)
     done = export_replay(
         data[:, 3:], config=env.config, out=tmp_path / "set", seed=9, policy="p", settings={}, workers=0
@@ -209,8 +216,11 @@ def test_a_replay_comes_back_bit_for_bit(tmp_path, load, small_env, frame_stack:
         for name, key in ((STATE, "state"), (ACTION, "action"), (TARGET, "joint_target")):
             assert np.array_equal(column(dataset, name)[rows], part[key].numpy())
         assert np.array_equal(column(dataset, REWARD)[rows], part["next", "reward"][:, 0].numpy())
-        pictures = [(dataset[j][FRONT].numpy() * 255).round() for j in range(7 * i, 7 * i + 7)]
-        assert np.array_equal(np.stack(pictures).transpose(0, 2, 3, 1), part["pixels"][..., -3:].numpy())
+        for camera, key in (("front", "pixels"), ("side", "pixels_side"), ("goal_side", "goal_pixels_side")):
+            pictures = [
+                (dataset[j][IMAGE_PREFIX + camera].numpy() * 255).round() for j in range(7 * i, 7 * i + 7)
+            ]
+            assert np.array_equal(np.stack(pictures).transpose(0, 2, 3, 1), part[key][..., -3:].numpy())
         assert np.array_equal(terminal.values[STATE][i], part["next", "state"][-1].numpy())
         assert np.array_equal(terminal.values[FRONT][i], part["next", "pixels"][-1][..., -3:].numpy())
     np.testing.assert_allclose(column(dataset, GOAL), np.tile(env.config.goal, (42, 1)), atol=1e-6)
