@@ -199,7 +199,8 @@ class Checkpoint:
         if difference is not None:
             raise UserError(
                 f"checkpoint {self.folder} holds a {self.model_name} that does not fit this "
-                f"{type(model).__name__}: {difference}; build the model from the checkpoint's config.yaml, or leave out the options that change it."
+                f"{type(model).__name__}: {difference}; build the model from the checkpoint's config.yaml, "
+                "or leave out the options that change it."
             )
         # Entries that are no tensors (TensorDictParams keeps its batch size there) are the model's own.
         model.load_state_dict({**model.state_dict(), **saved})
