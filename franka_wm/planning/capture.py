@@ -78,7 +78,9 @@ class GraphCache:
 
     def __init__(self, keep: int = 8) -> None:
         self.keep = keep
-        self._seen: dict[Hashable, int] = {}
+        self._seen: dict[
+            Hashable, tuple[int, tuple[Any, ...]]
+        ] = {}  # with what is held: its ids stay its own
         self._graphs: OrderedDict[Hashable, _Graph] = OrderedDict()
 
     def __call__(
@@ -111,11 +113,11 @@ class GraphCache:
         kind = (key, tuple(id(one) for one in held), shapes, _device(inputs))
         found = self._graphs.get(kind)
         if found is None:
-            seen = self._seen.get(kind, 0)
+            seen, _ = self._seen.get(kind, (0, ()))
             if seen < self.EAGER_CALLS:
                 if len(self._seen) > 64:  # kinds that came once and never again
                     self._seen.clear()
-                self._seen[kind] = seen + 1
+                self._seen[kind] = seen + 1, held
                 return _beside(work, inputs)
             found = self._graphs[kind] = _record(work, inputs, held, generators)
             del self._seen[kind]
