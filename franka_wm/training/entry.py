@@ -5,6 +5,7 @@ from __future__ import annotations
 import fcntl
 import functools
 import logging
+import re
 import sys
 import tempfile
 from collections.abc import Callable, Mapping
@@ -32,7 +33,7 @@ def run_command(main: Callable[[], Any]) -> None:
     arguments = sys.argv[1:]
     asks_hydra = any(a.startswith("-") and a not in ("-m", "--multirun") for a in arguments)
     if not asks_hydra:
-        sys.argv[1:] = arguments = with_scale(arguments)
+        sys.argv[1:] = arguments = with_folder(with_scale(arguments))
         problem = check_command(arguments)
         if problem is not None:
             fail(problem)
@@ -77,6 +78,19 @@ def with_scale(arguments: list[str]) -> list[str]:
     if not any(a.startswith("resume=") for a in arguments):
         say(f"scale={scale}, by the device; choose with scale=laptop, gpu or smoke")
     return [a for a in arguments if a != given] + [f"scale={scale}"]
+
+
+def with_folder(arguments: list[str]) -> list[str]:
+    """Names the folder of a resumed run after the run it goes on from, where no folder is given."""
+    resume = next((a.split("=", 1)[1] for a in arguments if a.startswith("resume=")), "")
+    chosen = any(a.startswith(("hydra.run.dir=", "hydra.sweep", "-m", "--multirun")) for a in arguments)
+    parts = Path(resume).parts
+    if "checkpoints" in parts:
+        parts = parts[: parts.index("checkpoints")]
+    name = re.sub(r"^\d\d-\d\d-\d\d-", "", parts[-1]) if parts else ""
+    if chosen or not re.fullmatch(r"[A-Za-z0-9][\w.-]*", name):
+        return arguments
+    return [*arguments, f"hydra.run.dir=outputs/${{now:%Y-%m-%d}}/${{now:%H-%M-%S}}-{name}"]
 
 
 def check_command(arguments: list[str]) -> str | None:
