@@ -403,6 +403,7 @@ def open_recorded(cfg: DictConfig, device: torch.device) -> tuple[Any, Any]:
         batch_size=cfg.replay.batch_size,
         device=device,
         keys=model_keys(cfg),
+        frame_stack=frame_stack(cfg),
     )
     if is_arm(cfg):  # what is learned will act there
         train.check(fps=cfg.env.fps, action_dim=ACTION_MODES[cfg.env.action_mode])

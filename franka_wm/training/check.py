@@ -54,11 +54,6 @@ def check(cfg: DictConfig) -> None:
         raise UserError(refuses)
     if not build.is_offline(cfg):
         build.actor(cfg)
-    elif build.frame_stack(cfg) > 1 and "pixels" in cfg.env.observations:
-        raise UserError(
-            f"env.frame_stack={cfg.env.frame_stack}: a dataset holds single pictures, and the model would be built for "
-            "them; use env.frame_stack=1"
-        )
     short = cfg.env.kind != "none" and cfg.env.episode_length < window
     if short and not build.looks_past_ends(cfg):
         raise UserError(

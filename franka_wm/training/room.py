@@ -10,6 +10,7 @@ import torch
 from omegaconf import DictConfig
 from tensordict import TensorDictBase
 
+from franka_wm.data.memory import free_memory
 from franka_wm.data.stacks import StackStorage, newest
 from franka_wm.errors import UserError
 
@@ -51,19 +52,6 @@ def check_memory(replay: Any, batch: TensorDictBase, cfg: DictConfig) -> None:
             f"({per_step / 1e3:.1f} kB a step) do not fit into the {free / 1e9:.1f} GB that are free on {device}; "
             f"at most replay.capacity={int(0.9 * free / per_step)} would, less what learning needs"
         )
-
-
-def free_memory(device: torch.device) -> int | None:
-    """Bytes that can still be allocated on ``device``; ``None`` where the system does not tell."""
-    if device.type == "cuda":
-        cached = torch.cuda.memory_reserved(device) - torch.cuda.memory_allocated(device)
-        return torch.cuda.mem_get_info(device)[0] + cached
-    try:
-        lines = Path("/proc/meminfo").read_text().splitlines()
-    except OSError:  # not Linux
-        return None
-    kilobytes = next((line.split()[1] for line in lines if line.startswith("MemAvailable:")), None)
-    return None if kilobytes is None else 1024 * int(kilobytes)
 
 
 def held(replay: Any) -> int:

@@ -269,9 +269,3 @@ def test_runs_of_before_an_option_was_there_go_on(composed) -> None:
     spaces = Spaces.of_env(env)
     policies = build.make_agent_policies(cfg, build.make_model(cfg, env), env, spaces)
     assert set(policies) == {"planner", "policy", "noop", "random", "oracle"}
-
-
-def test_stacked_frames_are_not_in_datasets(composed, tmp_path) -> None:
-    offline = ("dataset=lerobot", "trainer=offline", f"dataset.root={tmp_path}", "model=tdmpc2_pixels")
-    with pytest.raises(UserError, match=r"use env\.frame_stack=1"):
-        check(composed(*offline, "env=reach_fixed_pixels", "env.frame_stack=3"))

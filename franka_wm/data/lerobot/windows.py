@@ -16,6 +16,8 @@ from torch import Tensor
 from franka_wm.data.lerobot.cache import Cache, Say, open_cache
 from franka_wm.data.lerobot.mapping import FeatureMap, map_features
 from franka_wm.data.lerobot.source import find_dataset, read_source
+from franka_wm.data.memory import free_memory
+from franka_wm.data.stacks import CHANNELS
 from franka_wm.errors import UserError
 
 SPLITS = ("train", "validation", "all")
@@ -87,10 +89,12 @@ class RecordedWindows:
         split: ``"train"``, ``"validation"`` or ``"all"``.
         validation_fraction: Of each dataset's episodes, in [0, 1); at least one if it is above 0.
         seed: Draws the validation episodes and the windows.
+        frame_stack: Pictures in each observation under ``pixels`` and ``pixels_…``: the present one and those before
+            it in its episode, oldest first along the channels, the first one repeated (as ``env.frame_stack``).
 
     Attributes:
         observation_sizes: Vector key → size.
-        image_sizes: Picture key → (h, w, 3).
+        image_sizes: Picture key → (h, w, 3), or (h, w, 3 · ``frame_stack``).
         action_dim: A; 0 where actions are discrete.
         num_actions: Largest discrete action + 1; 0 where actions are continuous.
         episode_length: Transitions of the longest episode.
@@ -108,8 +112,9 @@ class RecordedWindows:
         split: str = "train",
         validation_fraction: float = 0.1,
         seed: int = 0,
+        frame_stack: int = 1,
     ):
-        for name, value in (("window", window), ("batch_size", batch_size)):
+        for name, value in (("window", window), ("batch_size", batch_size), ("frame_stack", frame_stack)):
             if isinstance(value, bool) or not isinstance(value, int) or value < 1:
                 raise UserError(f"{name}={value!r}: must be a whole number of at least 1")
         if split not in SPLITS:
@@ -125,7 +130,12 @@ class RecordedWindows:
         self.device = recording.device
         mapping = recording.mapping
         self.observation_sizes = {key: size for key, (_, size) in mapping.vectors.items()}
-        self.image_sizes = {key: shape for key, (_, shape) in mapping.images.items()}
+        self.frame_stack = frame_stack
+        self._stacked = [key for key in mapping.images if frame_stack > 1 and key.startswith("pixels")]
+        self.image_sizes = {
+            key: (*shape[:2], CHANNELS * frame_stack) if key in self._stacked else shape
+            for key, (_, shape) in mapping.images.items()
+        }
         self.action_dim = mapping.action[1]
         self.fps = recording.caches[0].fps
         self.notes = list(recording.notes)
@@ -205,7 +215,10 @@ class RecordedWindows:
         batch, h = indices.shape[0], self.window
         before, after = {}, {}
         for key in (*self.observation_sizes, *self.image_sizes):
-            values = self._gather(f"observation.{key}", rows)
+            if key in self._stacked:
+                values = self._stacks(f"observation.{key}", rows, self._first_rows[episode])
+            else:
+                values = self._gather(f"observation.{key}", rows)
             before[key], after[key] = values[:, :h], values[:, 1:]
         action = self._gather("action", rows[:, :h])
         if self._scale is not None:
@@ -238,6 +251,7 @@ class RecordedWindows:
             split=name,
             validation_fraction=self.validation_fraction,
             seed=self.seed,
+            frame_stack=self.frame_stack,
         )
 
     def validation(self) -> RecordedWindows | None:
@@ -326,6 +340,13 @@ class RecordedWindows:
     def _whole(self, name: str) -> np.ndarray:
         return np.concatenate([part.cpu().numpy() for part in self.recording.arrays[name]])
 
+    def _stacks(self, name: str, rows: Tensor, first: Tensor) -> Tensor:
+        """(B, T) rows of episodes that begin at ``first`` (B,) → (B, T, h, w, 3 · frame_stack)."""
+        earlier = rows[:, :1] + torch.arange(1 - self.frame_stack, 0, device=rows.device)
+        earlier = torch.maximum(earlier, first.unsqueeze(1))  # the first one stands for those before it
+        pictures, steps = self._gather(name, torch.cat((earlier, rows), 1)), rows.shape[1]
+        return torch.cat([pictures[:, k : k + steps] for k in range(self.frame_stack)], -1)
+
     def _gather(self, name: str, rows: Tensor) -> Tensor:
         """(B, T) rows → (B, T, …) on the device."""
         parts = self.recording.arrays[name]
@@ -361,6 +382,7 @@ def open_dataset(
     cache_dir: str | Path | None = None,
     in_memory: bool | None = None,
     workers: int | None = None,
+    frame_stack: int = 1,
     say: Say = print,
 ) -> RecordedWindows:
     """Opens one or several LeRobot v3 datasets for training.
@@ -384,6 +406,7 @@ def open_dataset(
         in_memory: Keep everything in the device's memory, else read from the disk's cache; ``None``: where it
             takes at most half of what is free.
         workers: Processes that decode; ``None``: all cores.
+        frame_stack: See :class:`RecordedWindows`.
         say: Takes lines for the terminal.
 
     Raises:
@@ -440,6 +463,7 @@ def open_dataset(
         split=split,
         validation_fraction=validation_fraction,
         seed=seed,
+        frame_stack=frame_stack,
     )
     where = f"in {device} memory" if in_memory else "read from the disk's cache"
     size = sum(c.nbytes for c in caches)
@@ -497,7 +521,10 @@ def _load(
     caches: Sequence[Cache], device: torch.device, in_memory: bool | None
 ) -> tuple[dict[str, list[Tensor]], bool]:
     if in_memory is None:
-        in_memory = sum(c.nbytes for c in caches) <= MEMORY_SHARE * _free_memory(device)
+        free = free_memory(device)
+        if free is None:  # the system does not tell: what it has in all
+            free = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+        in_memory = sum(c.nbytes for c in caches) <= MEMORY_SHARE * free
     arrays: dict[str, list[Tensor]] = {}
     for name in caches[0].arrays:
         parts = [torch.from_numpy(np.asarray(c.arrays[name])) for c in caches]
@@ -511,17 +538,6 @@ def _load(
             parts = [whole]
         arrays[name] = parts
     return arrays, in_memory
-
-
-def _free_memory(device: torch.device) -> float:
-    """Bytes."""
-    if device.type == "cuda":
-        return torch.cuda.mem_get_info(device)[0]
-    try:
-        facts = Path("/proc/meminfo").read_text().split("MemAvailable:")[1].split()
-        return 1024 * int(facts[0])
-    except (OSError, IndexError, ValueError):  # not Linux
-        return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
 
 
 def _split(dataset: np.ndarray, split: str, fraction: float, seed: int) -> np.ndarray:

@@ -9,6 +9,9 @@ import pytest
 import torch
 from tensordict import TensorDictBase
 
+from franka_wm.training import build
+from franka_wm.training.check import check
+
 KEYS = ["pixels", "state", "joint_target", "goal"]
 FLAGS = ["reward", "done", "terminated", "truncated", "success"]
 WINDOW = 3
@@ -47,6 +50,28 @@ def test_bit_for_bit(exact: Any, opened: Callable) -> None:
             assert mine[key].dtype == original[key].dtype, key
             assert torch.equal(mine[key], original[key]), key
     assert not theirs  # every window of the replay, the last action of each episode among them
+
+
+def test_a_run_gets_stacks_from_it(exact: Any, composed: Callable, tmp_path: Any) -> None:
+    """`env.frame_stack` with `dataset=lerobot`: what the model is built for is what batches hold."""
+    cfg = composed(
+        "scale=smoke",
+        "device=cpu",
+        "env=reach_fixed_pixels",
+        "env.frame_stack=3",
+        "model=tdmpc2_pixels",
+        "dataset=lerobot",
+        "trainer=offline",
+        f"dataset.root={exact.root}",
+        f"dataset.cache_dir={tmp_path}",
+        "dataset.workers=0",
+    )
+    check(cfg)
+    windows, _ = build.open_recorded(cfg, torch.device("cpu"))
+    assert windows.image_sizes == {"pixels": (64, 64, 9)}
+    batch = windows.sample()
+    assert batch["pixels"].shape[-1] == batch["next", "pixels"].shape[-1] == 9
+    assert torch.equal(batch["next", "pixels"][..., :-3], batch["pixels"][..., 3:])
 
 
 def test_what_the_replay_samples_can_be_sampled(exact: Any, opened: Callable) -> None:

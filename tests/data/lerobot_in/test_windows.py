@@ -46,6 +46,29 @@ def test_pictures_belong_to_their_rows(pictures: Path, foreign, opened: Callable
             assert np.array_equal(step["next", "pixels_side"], foreign.picture(episode, frame + 1, 1))
 
 
+@pytest.mark.parametrize("in_memory", [True, False])
+@pytest.mark.parametrize("window", [1, 3])
+def test_stacks_are_of_their_episode(
+    pictures: Path, foreign, opened: Callable, window: int, in_memory: bool
+) -> None:
+    """The pictures before, oldest first, back to the episode's first; two datasets, as one is cut into parts."""
+    windows = opened([pictures, pictures], window=window, frame_stack=3, in_memory=in_memory)
+    assert windows.image_sizes["pixels"][-1] == windows.image_sizes["pixels_side"][-1] == 9
+    assert windows.split("train").image_sizes == windows.image_sizes
+    seen = 0
+    for batch in windows.batches(7):
+        for step in batch.reshape(-1):
+            episode, frame = step["joints"].int().tolist()
+            for last, where in ((frame, step), (frame + 1, step["next"])):
+                for camera, key in enumerate(("pixels", "pixels_side")):
+                    stack = [foreign.picture(episode, max(0, last - back), camera) for back in (2, 1, 0)]
+                    assert np.array_equal(where[key], np.concatenate(stack, -1)), (episode, last, key)
+                    seen += 1
+    assert seen == 4 * window * len(windows)
+    with pytest.raises(UserError, match="frame_stack=0: must be a whole number of at least 1"):
+        opened(pictures, frame_stack=0)
+
+
 def test_video(video: Path, foreign, opened: Callable) -> None:
     """Every frame is closest to its own picture of all, and is what LeRobot's own reader gives."""
     from lerobot.datasets.lerobot_dataset import LeRobotDataset
