@@ -14,7 +14,9 @@ from franka_wm.planning.sampling import (
     refit,
     require_bounds,
     require_counts,
+    require_deviations,
     require_fraction,
+    require_samples,
     roll_prior,
     rollout,
     take,
@@ -73,15 +75,9 @@ class CEM:
             num_elites=num_elites,
             iterations=iterations,
         )
-        if not 0 <= num_policy_samples < num_samples:
-            raise ValueError(
-                f"num_policy_samples must be in [0, num_samples={num_samples}), got {num_policy_samples}"
-            )
-        if num_elites > num_samples:
-            raise ValueError(f"num_elites must not exceed num_samples={num_samples}, got {num_elites}")
+        require_samples(num_samples, num_policy_samples, num_elites)
         require_fraction(momentum=momentum)
-        if not 0.0 <= min_std <= std or not std > 0.0:
-            raise ValueError(f"need 0 <= min_std <= std and std > 0, got {min_std} and {std}")
+        require_deviations(std, min_std)
         require_bounds(low, high)
         self.action_dim, self.horizon, self.iterations = action_dim, horizon, iterations
         self.num_samples, self.num_policy_samples, self.num_elites = (

@@ -14,6 +14,7 @@ from franka_wm.planning.sampling import (
     gaussian_candidates,
     require_bounds,
     require_counts,
+    require_samples,
     roll_prior,
     rollout,
     warm_start,
@@ -72,10 +73,7 @@ class GradientPlanner:
         high: float = 1.0,
     ) -> None:
         require_counts(action_dim=action_dim, horizon=horizon, num_samples=num_samples, iterations=iterations)
-        if not 0 <= num_policy_samples < num_samples:
-            raise ValueError(
-                f"num_policy_samples must be in [0, num_samples={num_samples}), got {num_policy_samples}"
-            )
+        require_samples(num_samples, num_policy_samples)
         if not lr > 0.0:
             raise ValueError(f"lr must be positive, got {lr}")
         first, second = betas

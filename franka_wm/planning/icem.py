@@ -13,8 +13,10 @@ from franka_wm.planning.sampling import (
     refit,
     require_bounds,
     require_counts,
+    require_deviations,
     require_fraction,
     require_is_init,
+    require_samples,
     roll_prior,
     rollout,
     take,
@@ -125,12 +127,7 @@ class ICEM:
             num_elites=num_elites,
             iterations=iterations,
         )
-        if not 0 <= num_policy_samples < num_samples:
-            raise ValueError(
-                f"num_policy_samples must be in [0, num_samples={num_samples}), got {num_policy_samples}"
-            )
-        if num_elites > num_samples:
-            raise ValueError(f"num_elites must not exceed num_samples={num_samples}, got {num_elites}")
+        require_samples(num_samples, num_policy_samples, num_elites)
         if not noise_beta >= 0.0:
             raise ValueError(f"noise_beta must not be negative, got {noise_beta}")
         if not 0.0 <= reuse <= 1.0:
@@ -138,8 +135,7 @@ class ICEM:
         if not decay >= 1.0:
             raise ValueError(f"decay must be at least 1, got {decay}")
         require_fraction(momentum=momentum)
-        if not 0.0 <= min_std <= std or not std > 0.0:
-            raise ValueError(f"need 0 <= min_std <= std and std > 0, got {min_std} and {std}")
+        require_deviations(std, min_std)
         require_bounds(low, high)
         self.action_dim, self.horizon, self.iterations = action_dim, horizon, iterations
         self.num_samples, self.num_policy_samples, self.num_elites = (

@@ -13,6 +13,7 @@ from franka_wm.planning.sampling import (
     gaussian_candidates,
     require_bounds,
     require_counts,
+    require_samples,
     roll_prior,
     rollout,
     take,
@@ -81,12 +82,7 @@ class MPPI:
             num_elites=num_elites,
             iterations=iterations,
         )
-        if not 0 <= num_policy_samples <= num_samples:
-            raise ValueError(
-                f"num_policy_samples must be in [0, num_samples={num_samples}], got {num_policy_samples}"
-            )
-        if num_elites > num_samples:
-            raise ValueError(f"num_elites must not exceed num_samples={num_samples}, got {num_elites}")
+        require_samples(num_samples, num_policy_samples, num_elites, all_by_policy=True)
         if not 0.0 < min_std <= max_std:
             raise ValueError(f"need 0 < min_std <= max_std, got {min_std} and {max_std}")
         if not temperature > 0.0:

@@ -53,6 +53,29 @@ def require_fraction(**fractions: float) -> None:
             raise ValueError(f"{name} must be in [0, 1), got {value}")
 
 
+def require_samples(
+    num_samples: int, num_policy_samples: int, num_elites: int | None = None, *, all_by_policy: bool = False
+) -> None:
+    """Raises ValueError unless `num_samples` has room for the policy's candidates and the elites.
+
+    Args:
+        all_by_policy: whether the policy may make all of them.
+    """
+    if not 0 <= num_policy_samples <= num_samples - (not all_by_policy):
+        raise ValueError(
+            f"num_policy_samples must be in [0, num_samples={num_samples}{']' if all_by_policy else ')'}, "
+            f"got {num_policy_samples}"
+        )
+    if num_elites is not None and num_elites > num_samples:
+        raise ValueError(f"num_elites must not exceed num_samples={num_samples}, got {num_elites}")
+
+
+def require_deviations(std: float, min_std: float) -> None:
+    """Raises ValueError unless a search may start with `std` and end with `min_std`."""
+    if not 0.0 <= min_std <= std or not std > 0.0:
+        raise ValueError(f"need 0 <= min_std <= std and std > 0, got {min_std} and {std}")
+
+
 def require_bounds(low: float, high: float) -> None:
     """Raises ValueError unless `low` < `high`."""
     if not low < high:
