@@ -18,7 +18,7 @@ from omegaconf import OmegaConf
 
 from franka_wm.errors import FrankaError
 from franka_wm.training.checkpoint import latest_checkpoint, load_checkpoint
-from franka_wm.training.entry import check_command, with_folder, with_scale
+from franka_wm.training.entry import check_command, run_name, with_scale
 
 TRAIN = Path(__file__).resolve().parents[1] / "train.py"
 LENGTH = 20
@@ -310,18 +310,17 @@ def test_errors_are_one_line() -> None:
     [
         ("outputs/2026-01-02/03-04-05-reach_pixels-1", "reach_pixels-1"),
         ("outputs/2026-01-02/03-04-05-reach-1/checkpoints/latest", "reach-1"),
-        ("/tmp/mine/", "mine"),
-        ("odd=name", None),
-        ("", None),
+        ("outputs/2026-01-02/03-04-05-reach-1/checkpoints", "reach-1"),
+        ("/mnt/checkpoints/today/03-04-05-reach-0/", "reach-0"),
+        ("/tmp/größe", "größe"),
+        (".", "reach-7"),
+        (None, "reach-7"),
     ],
 )
-def test_a_resumed_run_s_folder_has_the_name_of_the_first(resume: str, name: str | None) -> None:
-    """And not that of the default environment, which Hydra would choose."""
-    arguments = [f"resume={resume}", "trainer.updates=3"]
-    added = with_folder(arguments)[2:]
-    if name is None:
-        assert added == []
-    else:
-        assert added == ["hydra.run.dir=outputs/${now:%Y-%m-%d}/${now:%H-%M-%S}-" + name]
-    assert with_folder([*arguments, "hydra.run.dir=x"]) == [*arguments, "hydra.run.dir=x"]
-    assert with_folder(["env=reach"]) == ["env=reach"]
+def test_a_resumed_run_s_folder_has_the_name_of_the_first(resume: str | None, name: str) -> None:
+    """And not that of the default environment."""
+    assert run_name(resume, "reach", 7) == name
+    cfg = OmegaConf.create(
+        {"resume": resume, "dir": "x-${run_name:${resume},reach,7}"}
+    )  # as conf/config.yaml asks
+    assert cfg.dir == f"x-{name}"

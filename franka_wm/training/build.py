@@ -361,9 +361,15 @@ def make_agent_policies(cfg: DictConfig, model: Any, env: Any, spaces: Spaces) -
 
 
 def frame_stack(cfg: DictConfig) -> int:
-    """Pictures in each observation of one; one where the option is not a number, which the environment refuses."""
-    count = cfg.env.get("frame_stack", 1) if is_arm(cfg) else 1
-    return count if isinstance(count, int) and count > 0 else 1
+    """Pictures in each observation of one, of the arm's or of recordings.
+
+    Raises:
+        UserError: It is no whole number of at least 1.
+    """
+    count = cfg.env.get("frame_stack", 1) if is_arm(cfg) or cfg.env.kind == "none" else 1
+    if isinstance(count, bool) or not isinstance(count, int) or count < 1:
+        raise UserError(f"env.frame_stack={count!r}: must be a whole number of at least 1")
+    return count
 
 
 def make_replay_buffer(cfg: DictConfig, device: torch.device) -> ReplayBuffer:

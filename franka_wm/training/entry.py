@@ -33,7 +33,7 @@ def run_command(main: Callable[[], Any]) -> None:
     arguments = sys.argv[1:]
     asks_hydra = any(a.startswith("-") and a not in ("-m", "--multirun") for a in arguments)
     if not asks_hydra:
-        sys.argv[1:] = arguments = with_folder(with_scale(arguments))
+        sys.argv[1:] = arguments = with_scale(arguments)
         problem = check_command(arguments)
         if problem is not None:
             fail(problem)
@@ -80,17 +80,18 @@ def with_scale(arguments: list[str]) -> list[str]:
     return [a for a in arguments if a != given] + [f"scale={scale}"]
 
 
-def with_folder(arguments: list[str]) -> list[str]:
-    """Names the folder of a resumed run after the run it goes on from, where no folder is given."""
-    resume = next((a.split("=", 1)[1] for a in arguments if a.startswith("resume=")), "")
-    chosen = any(a.startswith(("hydra.run.dir=", "hydra.sweep", "-m", "--multirun")) for a in arguments)
-    parts = Path(resume).parts
-    if "checkpoints" in parts:
-        parts = parts[: parts.index("checkpoints")]
+def run_name(resume: str | None, env: str, seed: Any) -> str:
+    """What a run's folder is called, after its time: as the run that it goes on from, else by environment and seed."""
+    parts = Path(resume or "").parts
+    if parts and parts[-1] == "checkpoints":
+        parts = parts[:-1]
+    elif len(parts) > 1 and parts[-2] == "checkpoints":
+        parts = parts[:-2]
     name = re.sub(r"^\d\d-\d\d-\d\d-", "", parts[-1]) if parts else ""
-    if chosen or not re.fullmatch(r"[A-Za-z0-9][\w.-]*", name):
-        return arguments
-    return [*arguments, f"hydra.run.dir=outputs/${{now:%Y-%m-%d}}/${{now:%H-%M-%S}}-{name}"]
+    return name.strip("/. ") or f"{env}-{seed}"
+
+
+OmegaConf.register_new_resolver("run_name", run_name, replace=True)  # for conf/config.yaml
 
 
 def check_command(arguments: list[str]) -> str | None:

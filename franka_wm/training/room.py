@@ -24,19 +24,25 @@ SPARE = 5e8
 """What must stay free on the disk [bytes], for the weights and for what else a run writes."""
 
 
-def planned_steps(cfg: DictConfig) -> int:
-    """Steps that each world of a run will have made at its end."""
+def planned_steps(cfg: DictConfig, updates: int = 0) -> int:
+    """Steps that each world of a run will make until its end, after so many ``updates``."""
     c, t = cfg.collector, cfg.trainer
-    return max(c.seed_steps, 1) + -(-t.updates // t.updates_per_batch) * c.steps_per_batch
+    return max(c.seed_steps, 1) + -(-max(t.updates - updates, 0) // t.updates_per_batch) * c.steps_per_batch
 
 
-def check_memory(replay: Any, batch: TensorDictBase, cfg: DictConfig) -> None:
-    """That a replay has room for what a run will put into it, to be asked before its first ``batch``.
+def fill(
+    replay: Any, batch: TensorDictBase, cfg: DictConfig, *, updates: int = 0, restored: bool = False
+) -> None:
+    """Extends an empty replay by its first ``batch``, if it has room for that and for what a run will add.
 
-    On CUDA all of ``replay.capacity`` is taken at once; elsewhere memory is taken as steps come.
+    On CUDA all of ``replay.capacity`` is taken at once; on the CPU memory is used as steps come.
+
+    Args:
+        updates: That were made already.
+        restored: ``batch`` is a checkpoint's, beside what the run will gather.
 
     Raises:
-        UserError: It has not; says how many steps would fit.
+        UserError: It has no room; says how many steps would fit.
     """
     storage: Any = replay.storage
     device = torch.device(storage.device)
@@ -44,7 +50,8 @@ def check_memory(replay: Any, batch: TensorDictBase, cfg: DictConfig) -> None:
     per_step = kept.bytes() / kept.numel()
     steps = cfg.replay.capacity
     if device.type != "cuda":
-        steps = min(steps, cfg.collector.num_envs * planned_steps(cfg))
+        ahead = cfg.collector.num_envs * planned_steps(cfg, updates)
+        steps = min(steps, ahead + (batch.numel() if restored else 0))
     free = free_memory(device)
     if free is not None and per_step * steps > free:
         raise UserError(
@@ -52,6 +59,15 @@ def check_memory(replay: Any, batch: TensorDictBase, cfg: DictConfig) -> None:
             f"({per_step / 1e3:.1f} kB a step) do not fit into the {free / 1e9:.1f} GB that are free on {device}; "
             f"at most replay.capacity={int(0.9 * free / per_step)} would, less what learning needs"
         )
+    try:
+        replay.extend(batch)
+    except RuntimeError as error:  # some systems refuse what is larger than all memory, used or not
+        if not isinstance(error, torch.OutOfMemoryError) and "can't allocate memory" not in str(error):
+            raise
+        raise UserError(
+            f"replay.capacity={cfg.replay.capacity}: {per_step * cfg.replay.capacity / 1e9:.1f} GB cannot be allocated "
+            f"on {device}; use a smaller replay.capacity"
+        ) from error
 
 
 def held(replay: Any) -> int:

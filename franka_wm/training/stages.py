@@ -6,6 +6,7 @@ can be gained by making them easier.
 
 from __future__ import annotations
 
+import gc
 from typing import TYPE_CHECKING, Any
 
 from franka_wm.errors import UserError
@@ -64,6 +65,8 @@ def pretrain(run: Run, env: Any, experience: Any, spaces: Spaces) -> None:
     trainer.fit()
     if trainer.interrupted:
         raise KeyboardInterrupt
+    del trainer
+    gc.collect()  # these hold one another, and the second stage needs the memory of the first one's replay
     cfg.model.encoder_from = str(run.folder.absolute() / FOLDER / "checkpoints" / "latest")
     say("second stage: dynamics on the frozen encoder")
 

@@ -20,7 +20,7 @@ from franka_wm.training.checkpoint import Checkpoint, save_checkpoint
 from franka_wm.training.learner import Learner
 from franka_wm.training.loggers import log_numbers
 from franka_wm.training.progress import Progress, say
-from franka_wm.training.room import check_memory, held, left_out
+from franka_wm.training.room import fill, held, left_out
 from franka_wm.training.spaces import Spaces
 
 
@@ -215,8 +215,9 @@ class Trainer:
         after = [("next", key) for key in (*self._keys, "reward", "terminated")]
         batch = batch.select(*keys, *after)
         if len(self.replay) == 0:
-            check_memory(self.replay, batch, self.cfg)
-        self.replay.extend(batch)
+            fill(self.replay, batch, self.cfg, updates=self.learner.updates)
+        else:
+            self.replay.extend(batch)
 
     # -- what is kept and said ------------------------------------------------------------------------------
 
@@ -312,7 +313,7 @@ class Trainer:
         self.rows = list((checkpoint.extra() or {}).get("rows", []))
         experience = None if self.env is None else checkpoint.replay(self.env.device)
         if experience is not None:
-            self.replay.extend(experience)
+            fill(self.replay, experience, self.cfg, updates=self.learner.updates, restored=True)
         checkpoint.restore_rng()
         if self.env is None:
             return

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import fcntl
+import gc
 import shutil
 import subprocess
 import sys
@@ -13,6 +14,7 @@ from typing import Any
 import pytest
 import torch
 from omegaconf import DictConfig
+from torchrl.data import LazyTensorStorage
 
 from franka_wm import models
 from franka_wm.errors import UserError
@@ -121,6 +123,29 @@ def test_two_stages(train) -> None:
     trainer.model.eval()
     with torch.no_grad():
         torch.testing.assert_close(again.encode(batch), trainer.model.encode(batch))
+
+
+def test_the_first_stage_leaves_no_replay_behind(composed, tmp_path: Path) -> None:
+    """Or the second could not have the memory."""
+    cfg = composed(
+        *SMALL,
+        "model=action_world_model",
+        "pretrain=jepa",
+        "pretrain.updates=4",
+        *FAMILIES["action_world_model"],
+    )
+    run = Run(cfg=cfg, folder=tmp_path)
+    env = build.make_env(cfg)
+    replay, spaces = run.build_experience(env)
+
+    def filled() -> int:
+        storages = [one for one in gc.get_objects() if isinstance(one, LazyTensorStorage)]
+        return sum(one.initialized for one in storages)
+
+    gc.collect()
+    before = filled()
+    pretrain(run, env, replay, spaces)
+    assert filled() == before
 
 
 def test_a_family_without_an_encoder_to_replace(composed) -> None:

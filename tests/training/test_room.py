@@ -69,15 +69,36 @@ def test_a_replay_that_memory_cannot_hold_is_refused(monkeypatch) -> None:
             stacked=["pixels"],
         )
         monkeypatch.setattr(room, "free_memory", lambda device, most=4000 * per_step: most)
-        room.check_memory(replay, batch, cfg)
+        room.fill(replay, batch, cfg)
+        replay.empty()
         monkeypatch.setattr(room, "free_memory", lambda device, most=4000 * per_step - 1: most)
         with pytest.raises(UserError, match=r"at most replay\.capacity=3599 would") as caught:
-            room.check_memory(replay, batch, cfg)
-        assert "\n" not in str(caught.value)
+            room.fill(replay, batch, cfg)
+        assert "\n" not in str(caught.value) and len(replay) == 0
     short = OmegaConf.merge(cfg, {"collector": {"seed_steps": 999}})
-    room.check_memory(replay, batch, short)  # it never fills what it may
+    room.fill(replay, batch, short)  # it never fills what it may
+    with pytest.raises(UserError, match="do not fit"):  # beside a checkpoint's
+        room.fill(replay, batch, short, restored=True)
+    longer = OmegaConf.merge(cfg, {"trainer": {"updates": 30}, "collector": {"seed_steps": 999}})
+    with pytest.raises(UserError, match="do not fit"):
+        room.fill(replay, batch, longer)
+    room.fill(replay, batch, longer, updates=30)  # made before
     monkeypatch.setattr(room, "free_memory", lambda device: None)  # not known: not refused
-    room.check_memory(replay, batch, cfg)
+    room.fill(replay, batch, cfg)
+
+
+def test_what_cannot_be_allocated_is_one_line_as_well(monkeypatch) -> None:
+    """Where free memory is not known, or what is asked for is more than the machine has in all."""
+    cfg = OmegaConf.create(
+        {
+            "replay": {"capacity": 10**14},
+            "collector": {"num_envs": 4, "seed_steps": 1, "steps_per_batch": 1},
+            "trainer": {"updates": 0, "updates_per_batch": 1},
+        }
+    )
+    replay = make_replay(capacity=10**14, num_envs=4, window=2, batch_size=2, device="cpu")
+    with pytest.raises(UserError, match=r"replay\.capacity=100000000000000: .* cannot be allocated on cpu"):
+        room.fill(replay, TensorDict({"x": torch.zeros(4, 5, 3)}, [4, 5]), cfg)
 
 
 def test_free_memory_is_that_of_the_machine() -> None:

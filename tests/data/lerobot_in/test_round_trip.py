@@ -54,11 +54,10 @@ def test_bit_for_bit(exact: Any, opened: Callable) -> None:
 
 def test_a_run_gets_stacks_from_it(exact: Any, composed: Callable, tmp_path: Any) -> None:
     """`env.frame_stack` with `dataset=lerobot`: what the model is built for is what batches hold."""
-    cfg = composed(
+    overrides = (
         "scale=smoke",
         "device=cpu",
         "env=reach_fixed_pixels",
-        "env.frame_stack=3",
         "model=tdmpc2_pixels",
         "dataset=lerobot",
         "trainer=offline",
@@ -66,12 +65,27 @@ def test_a_run_gets_stacks_from_it(exact: Any, composed: Callable, tmp_path: Any
         f"dataset.cache_dir={tmp_path}",
         "dataset.workers=0",
     )
+    cfg = composed(*overrides, "env.frame_stack=3")
     check(cfg)
-    windows, _ = build.open_recorded(cfg, torch.device("cpu"))
-    assert windows.image_sizes == {"pixels": (64, 64, 9)}
-    batch = windows.sample()
-    assert batch["pixels"].shape[-1] == batch["next", "pixels"].shape[-1] == 9
-    assert torch.equal(batch["next", "pixels"][..., :-3], batch["pixels"][..., 3:])
+    train, validation = build.open_recorded(cfg, torch.device("cpu"))
+    assert train.image_sizes == {"pixels": (64, 64, 9)} == validation.image_sizes
+    single = build.open_recorded(composed(*overrides, "env.frame_stack=1"), torch.device("cpu"))
+    for windows, alone in zip((train, validation), single, strict=True):
+        h = windows.window
+        per_episode = windows.episode_length - h + 1
+        assert len(windows) == len(alone) == per_episode * len(windows.episodes) > 0
+        for episode in range(len(windows.episodes)):
+            pieces = [alone.windows(torch.tensor([episode * per_episode + t]))[0] for t in range(per_episode)]
+            rest = pieces[-1]["next", "pixels"]  # the observation after the last action among them
+            seen = [*(piece["pixels"][0] for piece in pieces), *rest]
+            assert len(seen) == windows.episode_length + 1
+            for t in range(per_episode):
+                got = windows.windows(torch.tensor([episode * per_episode + t]))[0]
+                for k in range(h):
+                    for at, stack in ((t + k, got["pixels"][k]), (t + k + 1, got["next", "pixels"][k])):
+                        assert torch.equal(
+                            stack, torch.cat([seen[max(0, at - back)] for back in (2, 1, 0)], -1)
+                        )
 
 
 def test_what_the_replay_samples_can_be_sampled(exact: Any, opened: Callable) -> None:
