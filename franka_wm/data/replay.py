@@ -9,7 +9,7 @@ import torch
 from torchrl.data import LazyTensorStorage, ReplayBuffer
 from torchrl.data.replay_buffers import RoundRobinWriter, Sampler
 
-from franka_wm.data.stacks import StackStorage
+from franka_wm.data.stacks import BOUNDARY, StackStorage
 from franka_wm.errors import UserError
 
 
@@ -41,7 +41,7 @@ class WindowSampler(Sampler):
         writer: RoundRobinWriter,
         *,
         length: int,
-        boundary: str = "is_init",
+        boundary: str = BOUNDARY,
         oversample: int = 4,
         past_end: bool = False,
         before: int = 0,

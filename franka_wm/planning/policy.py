@@ -12,9 +12,10 @@ from tensordict.nn import InteractionType, TensorDictModuleBase
 from tensordict.nn.probabilistic import interaction_type
 from torch import Tensor, nn
 
-from franka_wm.planning.capture import GraphCache, settings
+from franka_wm.planning.capture import GraphCache
 from franka_wm.planning.mppi import MPPI, Objective
 from franka_wm.planning.objectives import RewardPlusValue
+from franka_wm.planning.settings import settings
 
 PRECISIONS = ("float32", "bfloat16")
 """How a model may compute while planning."""

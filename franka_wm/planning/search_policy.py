@@ -9,9 +9,10 @@ from tensordict.nn import InteractionType, TensorDictModuleBase
 from tensordict.nn.probabilistic import interaction_type
 from torch import Tensor, nn
 
-from franka_wm.planning.capture import GraphCache, settings
+from franka_wm.planning.capture import GraphCache
 from franka_wm.planning.mcts import MCTS
 from franka_wm.planning.policy import captures
+from franka_wm.planning.settings import settings
 from franka_wm.planning.tree import Recurrent
 
 

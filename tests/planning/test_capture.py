@@ -1,12 +1,9 @@
 """Decisions as CUDA graphs: when one is captured, what it remembers, and, on a GPU, that it decides the same."""
 
 import copy
-import math
 import pickle
 from contextlib import contextmanager, nullcontext
-from functools import partial
 
-import numpy as np
 import pytest
 import torch
 from tensordict import TensorDict
@@ -14,7 +11,7 @@ from tensordict import TensorDict
 from franka_wm import models
 from franka_wm.errors import CaptureError
 from franka_wm.planning import CEM, MCTS, MPPI, PlannerPolicy, SearchPolicy, capture
-from franka_wm.planning.capture import GraphCache, settings
+from franka_wm.planning.capture import GraphCache
 from franka_wm.planning.objectives import ActionPenalty, GoalDistance, Sum
 
 on_gpu = pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
@@ -186,78 +183,15 @@ def test_a_policy_captures_anew_when_its_objective_changes(recorded, monkeypatch
     assert torch.equal(decide(), first) and len(recorded) == 3  # kept
 
 
-class Other:
-    def __init__(self, **values):
-        self.__dict__ |= values
-
-
-class Slotted:
-    __slots__ = ("weight",)
-
-    def __init__(self, weight):
-        self.weight = weight
-
-
-class Module(torch.nn.Module):
-    def __init__(self, weight):
-        super().__init__()
-        self.weight = weight
-
-
-def test_settings_tell_what_a_graph_depends_on():
-    tensor, module, square = torch.ones(2), torch.nn.Linear(1, 1), torch.rand(2, 2)
-    values = {
-        "a": 1,
-        "b": [math.nan, "x"],
-        "c": tensor,
-        "d": module,
-        "e": {"f": Other(g=module.forward)},
-        "h": partial(max, 1, key=len),
-        "i": square,
-        "j": torch.tensor(1.0),  # a number that would become part of the graph
-        "k": Slotted(1.0),
-        "m": numbers(1.0),
-    }
-    same = settings(Other(**values))
-    assert settings(Other(**values)) == same and hash(settings(Other(**values))) == hash(same)
-    for change in (
-        {"a": 2},
-        {"b": [math.nan, "y"]},
-        {"c": tensor.clone()},
-        {"d": torch.nn.Linear(1, 1)},
-        {"e": {"f": Other(g=module.extra_repr)}},
-        {"h": partial(max, 2, key=len)},
-        {"h": partial(max, 1, key=repr)},
-        {"i": square.T},
-        {"j": torch.tensor(2.0)},
-        {"k": Slotted(2.0)},
-        {"m": numbers(1.0)},
-        {"n": 0},
-    ):
-        assert settings(Other(**values | change)) != same, change
-    tensor += 1  # read anew by every replay
-    assert settings(Other(**values)) == same
-    ring = Other()
-    ring.ring = ring
-    hash(settings(ring))
-    hash(settings(Other(x=torch.eye(2).to_sparse())))
-    objective = Module(1.0)
-    before = settings(objective)
-    objective.weight = 2.0
-    assert settings(objective) != before
-
-
-def test_what_has_no_settings_keeps_its_address():
-    """Arrays made one after the other lie where the one before lay, unless a key keeps that alive."""
-    keys = [settings(Other(goal=np.full(3, float(n)))) for n in range(5)]
-    assert len(set(keys)) == 5
+class Held:
+    """Something that a graph reads from."""
 
 
 def test_early_calls_count_for_their_objects_alone(recorded):
     """Others at the address of one that is gone have not been called yet."""
     cache = GraphCache()
     for n in range(6):
-        cache(double, numbers(n), held=(Other(),))
+        cache(double, numbers(n), held=(Held(),))
     assert not recorded
 
 

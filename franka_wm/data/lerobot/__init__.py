@@ -9,7 +9,7 @@ from typing import Any
 _PUBLIC = {
     "Schema": "schema",
     "schema_for": "schema",
-    "open_dataset": "windows",
+    "open_dataset": "opening",
     "DatasetWriter": "writer",
     "read_terminals": "terminal",
     "export_replay": "export",

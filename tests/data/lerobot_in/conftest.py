@@ -19,9 +19,10 @@ from torchrl.collectors import Collector
 from torchrl.data import ReplayBuffer
 
 from franka_wm.data.lerobot.episodes import EpisodeCutter
+from franka_wm.data.lerobot.opening import open_dataset
 from franka_wm.data.lerobot.provenance import describe
 from franka_wm.data.lerobot.schema import schema_for
-from franka_wm.data.lerobot.windows import RecordedWindows, open_dataset
+from franka_wm.data.lerobot.windows import RecordedWindows
 from franka_wm.data.lerobot.writer import DatasetWriter
 from franka_wm.data.policies import SmoothRandomPolicy
 from franka_wm.data.replay import make_replay

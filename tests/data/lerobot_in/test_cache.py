@@ -119,7 +119,7 @@ def test_a_worker_that_dies(
 KILLED = """
 import sys, time
 from franka_wm.data.lerobot import cache
-from franka_wm.data.lerobot.windows import open_dataset
+from franka_wm.data.lerobot.opening import open_dataset
 cache.ROWS_WORTH_A_PROCESS, cache.ROWS_PER_JOB = 0, 5
 start = cache._start_worker
 def told():
