@@ -209,7 +209,8 @@ class Run:
         from franka_wm.training.spaces import Spaces
 
         if not build.is_offline(self.cfg):
-            return build.make_replay_buffer(self.cfg, env.device), Spaces.of_env(env)
+            hindsight = build.make_hindsight(self.cfg, env)
+            return build.make_replay_buffer(self.cfg, env.device, hindsight), Spaces.of_env(env)
         windows, self.validation = build.open_recorded(self.cfg, self.device)
         spaces = Spaces(
             observation_sizes=dict(windows.observation_sizes),

@@ -12,6 +12,9 @@ from franka_wm.envs.config import IMAGES, NUM_JOINTS, STATE_DIM, FrankaConfig
 from franka_wm.envs.discretize import discrete_action_table
 from franka_wm.errors import UserError
 
+GOAL = "goal"
+"""Key of the goal's position. Read only where it is named: `state` holds the way to the goal already."""
+
 
 @dataclass(frozen=True)
 class Spaces:
@@ -32,18 +35,19 @@ class Spaces:
     episode_length: int = 50
 
     def only(self, keys: Sequence[str] | None, reader: str) -> Spaces:
-        """The same with the observations ``keys`` alone; with every vector if ``None``.
+        """The same with the observations ``keys`` alone; with every vector but the goal if ``None``.
 
         Raises:
             UserError: One of them is not there.
         """
         if keys is None:
-            if not self.observation_sizes:
+            vectors = {key: size for key, size in self.observation_sizes.items() if key != GOAL}
+            if not vectors:
                 raise UserError(
                     f"{reader} reads vectors, here are only {_list(self.image_sizes)}; add state to env.observations, "
                     "or choose model.observations"
                 )
-            return replace(self, image_sizes={})
+            return replace(self, observation_sizes=vectors, image_sizes={})
         there = [*self.observation_sizes, *self.image_sizes]
         for key in keys:
             if key not in there:
@@ -80,7 +84,8 @@ class Spaces:
         vectors = {"state": STATE_DIM, "joint_target": NUM_JOINTS}
         moves = discrete_action_table(config.action_dim).shape[0]
         return cls(
-            observation_sizes={key: size for key, size in vectors.items() if key in config.observations},
+            observation_sizes={key: size for key, size in vectors.items() if key in config.observations}
+            | {GOAL: 3},
             image_sizes=images,
             action_dim=0 if discrete else config.action_dim,
             num_actions=moves if discrete else 0,
@@ -93,7 +98,7 @@ class Spaces:
         vectors, images = {}, {}
         for key, spec in env.observation_spec.items():
             shape = spec.shape[1:]
-            if key in ("goal", "success", "is_init", "step_count", "episode_reward"):
+            if key in ("success", "is_init", "step_count", "episode_reward"):
                 continue
             if spec.dtype == torch.uint8 and len(shape) == 3:
                 images[key] = tuple(shape)

@@ -11,7 +11,7 @@ import torch
 from tensordict import TensorDictBase
 
 from franka_wm.envs import FrankaConfig, FrankaEnv
-from franka_wm.envs.tasks import Task, reach_reward
+from franka_wm.envs.tasks import Reach, Task, Track, reach_reward
 from franka_wm.errors import UserError
 
 N, LENGTH = 4, 8
@@ -181,3 +181,18 @@ def test_an_unknown_task_or_reward() -> None:
 def test_track_has_no_goal_picture() -> None:
     with pytest.raises(UserError, match="goal_pixels"):
         FrankaConfig(task="track", observations=("goal_pixels", "state"))
+
+
+def test_relabel_speaks_only_for_the_task_that_defines_it() -> None:
+    class Faster(Reach):
+        """Another reward: what Reach says of other goals is not true of it."""
+
+        def judge(self, sim) -> None:
+            raise AssertionError
+
+    class Told(Faster):
+        def relabel(self, transitions, goal):
+            return transitions
+
+    assert Reach.relabels() and Told.relabels()
+    assert not (Faster.relabels() or Track.relabels() or Task.relabels())

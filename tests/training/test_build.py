@@ -269,3 +269,43 @@ def test_runs_of_before_an_option_was_there_go_on(composed) -> None:
     spaces = Spaces.of_env(env)
     policies = build.make_agent_policies(cfg, build.make_model(cfg, env), env, spaces)
     assert set(policies) == {"planner", "policy", "noop", "random", "oracle"}
+
+
+@pytest.fixture
+def hindsight(composed):
+    def make(*overrides: str):
+        cfg = composed("scale=smoke", "device=cpu", *overrides)
+        return build.make_hindsight(cfg, build.make_env(cfg, num_envs=2))
+
+    return make
+
+
+def test_hindsight_is_used_where_goals_change_and_rewards_are_known(hindsight) -> None:
+    found = hindsight()
+    assert found is not None and found.share == 0.5 and found.episode_length == 50
+    assert hindsight("replay.hindsight=0") is None
+    assert hindsight("replay.hindsight=0.25").share == 0.25
+
+
+@pytest.mark.parametrize(
+    "overrides",
+    [
+        ["env=reach_fixed"],
+        ["env.task=track"],
+        ["env.reward=normalized"],
+        ["env.randomization.observation_noise=0.01"],
+        ["model=muzero", "planner=gumbel"],
+    ],
+)
+def test_elsewhere_hindsight_is_none_and_refused_where_it_is_asked_for(
+    overrides: list[str], hindsight
+) -> None:
+    assert hindsight(*overrides) is None
+    with pytest.raises(UserError, match=r"replay\.hindsight=0\.5: .*leave it at null"):
+        hindsight(*overrides, "replay.hindsight=0.5")
+
+
+@pytest.mark.parametrize("share", ["1.5", "-0.1", "true", "some"])
+def test_a_share_that_is_none_is_refused(share: str, hindsight) -> None:
+    with pytest.raises(UserError, match="must be a share from 0 to 1, or null"):
+        hindsight(f"replay.hindsight={share}")

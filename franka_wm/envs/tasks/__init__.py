@@ -7,9 +7,12 @@ known by :func:`register`; ``docs/tasks.md`` walks through an example.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import TYPE_CHECKING
 
+import torch
 import warp as wp
+from tensordict import TensorDictBase
 
 from franka_wm.envs.config import TASKS, FrankaConfig
 
@@ -42,6 +45,18 @@ class Task:
 
         ``next_true_state`` is ``next_state`` without observation noise."""
         raise NotImplementedError(f"{type(self).__name__} gives no reward")
+
+    relabel: Callable[[TensorDictBase, torch.Tensor], TensorDictBase] | None = None
+    """Recorded transitions as if the goal had been another, where the task can say so in torch: see `Reach.relabel`."""
+
+    @classmethod
+    def relabels(cls) -> bool:
+        """Whether ``relabel`` speaks for this task: a subclass that changes rewards or moves goals says so anew."""
+
+        def owner(name: str) -> int:
+            return next(i for i, one in enumerate(cls.__mro__) if name in vars(one))
+
+        return cls.relabel is not None and owner("relabel") <= min(owner("judge"), owner("advance"))
 
 
 def make_task(config: FrankaConfig) -> Task:
