@@ -32,7 +32,6 @@ class TDMPC2(nn.Module):
         `set_observation_statistics`; the default is the identity.
       * One backward pass serves model and policy, so the policy learns from the critic before this update
         instead of after it. Their gradients stay apart.
-      * The entropy bonus is the plain entropy of the squashed Gaussian.
       * All frames of a window are shifted alike, so that motion between them is kept; the paper shifts each.
 
     Args:
@@ -55,7 +54,9 @@ class TDMPC2(nn.Module):
         bins, value_low, value_high: two-hot code of rewards and values; the range is in symlog space.
         log_std_min, log_std_max: bounds of the policy's log standard deviation before squashing.
         rho: weight of unroll step t is rho^t.
-        consistency_coef, reward_coef, value_coef, entropy_coef: weights of the losses.
+        consistency_coef, reward_coef, value_coef: weights of the losses.
+        entropy_coef: weight, against scaled values, of `action_dim` times the entropy [nat] of the Gaussian
+            before squashing, as in the authors' code.
         tau: how far target Q-functions, and the policy loss's scale, move at each update.
         encoder_lr_scale: learning rate of the encoder relative to the rest.
         channels: of each convolution over pictures.
@@ -271,9 +272,8 @@ class TDMPC2(nn.Module):
         """Actions (..., action_dim) in [-1, 1] for z (..., latent_dim): a sample, or the mode."""
         return self.policy_head(z, deterministic=deterministic)
 
-    def policy_sample(self, z: Tensor) -> tuple[Tensor, Tensor]:
-        """A reparameterised action (..., action_dim) and its log-density (..., 1); its negative mean is the
-        entropy [nat]."""
+    def policy_sample(self, z: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """A reparameterised action (..., action_dim) and its log-densities (..., 1), see `GaussianPolicy.sample`."""
         return self.policy_head.sample(z)
 
     # ------------------------------------------------------------------ training
@@ -443,12 +443,15 @@ class TDMPC2(nn.Module):
         return reward + self.discount * torch.where(terminated, torch.zeros_like(bootstrap), bootstrap)
 
     def _policy_loss(self, z: Tensor, weight: Tensor) -> tuple[Tensor, Tensor]:
-        """Loss and mean entropy of the policy at detached latents z (H+1, B, D)."""
-        action, log_prob = self.policy_sample(z)
+        """Loss and mean entropy [nat] of the policy at detached latents z (H+1, B, D)."""
+        action, gaussian_log_prob, log_prob = self.policy_sample(z)
         q = self.q(z, action, weights="detached", reduce="pair_mean", dropout=self.training)
         if self.training:
             self.scale.update(q[0])
-        loss = -(weight * (self.scale(q) - self.entropy_coef * log_prob)).mean()
+        scaled_entropy = (
+            -self.action_dim * gaussian_log_prob
+        )  # not squashed: the bonus never pulls actions inwards
+        loss = -(weight * (self.scale(q) + self.entropy_coef * scaled_entropy)).mean()
         return loss, -log_prob.mean()
 
 
