@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from inspect import signature
 from typing import Any
 
 import torch
@@ -183,8 +184,13 @@ def make_model(cfg: DictConfig, surroundings: Any, device: torch.device | str | 
     sizes: dict[str, Any] = {"observation_sizes": spaces.observation_sizes}
     if spaces.image_sizes:
         sizes["image_sizes"] = spaces.image_sizes
+    known = {"reward_bounds": spaces.reward_bounds}
+    takes = signature(models.family(name)).parameters
+    further = {key: value for key, value in known.items() if key in takes}
     try:
-        model = models.make(name, **sizes, **actions, episode_length=spaces.episode_length, **values)
+        model = models.make(
+            name, **sizes, **actions, episode_length=spaces.episode_length, **further, **values
+        )
     except (TypeError, ValueError, ModuleNotFoundError) as error:
         raise UserError(f"model={name}: {error}") from error
     return model.to(device)

@@ -138,6 +138,24 @@ def test_first_predictions_of_reward_and_value_are_zero():
     assert model.value(z).abs().max() < 1e-5
 
 
+def test_the_range_of_values_follows_the_rewards_and_rebuilds():
+    model = small(reward_bounds=(-1.01, 0.0), discount=0.95)
+    assert -3.3 < model.two_hot.low < -3.0 and model.two_hot.high == -model.two_hot.low
+    again = small(discount=0.95, **model.rebuild_overrides())
+    assert torch.equal(again.two_hot.support, model.two_hot.support)
+    assert small().two_hot.low == -10.0
+
+
+def test_targets_outside_of_the_range_are_counted():
+    batch = windows(reward=-3.0)
+    batch["next", "terminated"][:] = True
+    batch["next", "reward"][:3] = -1.0
+    assert small().loss(batch)["target_outside"] == 0.0
+    assert (
+        small(value_low=-1.0).loss(batch)["target_outside"] == 0.5
+    )  # -1 is inside, -3 is not, as reward and target
+
+
 def test_the_model_losses_are_those_of_a_plain_unroll():
     """One step at a time, each weighed by rho to its power; targets are the rewards, as all steps terminate."""
     model, batch = small(rho=0.3).eval(), windows()
