@@ -12,6 +12,7 @@ from torchrl.data import ReplayBuffer
 
 from franka_wm import models, planning
 from franka_wm.data.policies import (
+    DiscreteOraclePolicy,
     DiscretePolicy,
     NoopPolicy,
     OraclePolicy,
@@ -310,7 +311,8 @@ def make_policies(
     """Every policy that can act or be compared, by name.
 
     ``planner`` and ``policy`` where the model has what they need; ``noop`` and ``random`` (smooth random:
-    first-order autoregressive); for the arm ``oracle``, inverse kinematics with true geometry. ``capture``,
+    first-order autoregressive); for the arm ``oracle``, inverse kinematics with true geometry, or a search over pairs
+    of moves. ``capture``,
     ``precision`` and ``compile``: of the planner's, see :class:`~franka_wm.planning.PlannerPolicy`.
     """
     policies: dict[str, Any] = {}
@@ -338,11 +340,12 @@ def make_scripted_policies(env: Any, *, seed: int = 0, smoothness: float = 0.7) 
         "noop": NoopPolicy(size),
         "random": SmoothRandomPolicy(size, smoothness=smoothness, generator=generator),
     }
-    if arm:
-        scripted["oracle"] = OraclePolicy(env.kinematics, env.config)
     if discrete:
         moves: Any = env.transform
         scripted = {name: DiscretePolicy(policy, moves.table) for name, policy in scripted.items()}
+        scripted["oracle"] = DiscreteOraclePolicy(env.kinematics, env.config, moves.table)
+    elif arm:
+        scripted["oracle"] = OraclePolicy(env.kinematics, env.config)
     return scripted
 
 
