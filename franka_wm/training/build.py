@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
+from inspect import signature
 from typing import Any
 
 import torch
@@ -12,6 +13,7 @@ from torchrl.data import ReplayBuffer
 from franka_wm import models, planning
 from franka_wm.data.hindsight import Hindsight
 from franka_wm.data.policies import (
+    DiscreteOraclePolicy,
     DiscretePolicy,
     NoopPolicy,
     OraclePolicy,
@@ -185,8 +187,13 @@ def make_model(cfg: DictConfig, surroundings: Any, device: torch.device | str | 
     sizes: dict[str, Any] = {"observation_sizes": spaces.observation_sizes}
     if spaces.image_sizes:
         sizes["image_sizes"] = spaces.image_sizes
+    known = {"reward_bounds": spaces.reward_bounds}
+    takes = signature(models.family(name)).parameters
+    further = {key: value for key, value in known.items() if key in takes}
     try:
-        model = models.make(name, **sizes, **actions, episode_length=spaces.episode_length, **values)
+        model = models.make(
+            name, **sizes, **actions, episode_length=spaces.episode_length, **further, **values
+        )
     except (TypeError, ValueError, ModuleNotFoundError) as error:
         raise UserError(f"model={name}: {error}") from error
     return model.to(device)
@@ -306,7 +313,8 @@ def make_policies(
     """Every policy that can act or be compared, by name.
 
     ``planner`` and ``policy`` where the model has what they need; ``noop`` and ``random`` (smooth random:
-    first-order autoregressive); for the arm ``oracle``, inverse kinematics with true geometry. ``capture``,
+    first-order autoregressive); for the arm ``oracle``, inverse kinematics with true geometry, or a search over pairs
+    of moves. ``capture``,
     ``precision`` and ``compile``: of the planner's, see :class:`~franka_wm.planning.PlannerPolicy`.
     """
     policies: dict[str, Any] = {}
@@ -334,11 +342,12 @@ def make_scripted_policies(env: Any, *, seed: int = 0, smoothness: float = 0.7) 
         "noop": NoopPolicy(size),
         "random": SmoothRandomPolicy(size, smoothness=smoothness, generator=generator),
     }
-    if arm:
-        scripted["oracle"] = OraclePolicy(env.kinematics, env.config)
     if discrete:
         moves: Any = env.transform
         scripted = {name: DiscretePolicy(policy, moves.table) for name, policy in scripted.items()}
+        scripted["oracle"] = DiscreteOraclePolicy(env.kinematics, env.config, moves.table)
+    elif arm:
+        scripted["oracle"] = OraclePolicy(env.kinematics, env.config)
     return scripted
 
 

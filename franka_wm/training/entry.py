@@ -218,6 +218,7 @@ class Run:
             action_dim=windows.action_dim,
             num_actions=windows.num_actions,
             episode_length=windows.episode_length,
+            reward_bounds=windows.reward_bounds,
         )
         return windows, spaces
 

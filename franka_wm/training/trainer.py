@@ -253,6 +253,11 @@ class Trainer:
         row |= progress.line(self.learner.updates, self.env_steps, text)
         if warning:
             say(f"  warning: {warning}")
+        if metrics.get("target_outside", 0.0) > 0.0:
+            say(
+                f"  warning: {100 * metrics['target_outside']:.2g} % of rewards and targets of values lie outside the "
+                "model's range and are clipped to it; widen model.value_low and model.value_high, or leave them at null"
+            )
         self.record(row)
 
     @torch.no_grad()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 
 import pytest
@@ -128,6 +129,8 @@ def test_environments_of_a_run(composed) -> None:
         ("planner.precision=float16", "float32, bfloat16"),
         ("planner.compile=maybe", "true or false"),
         ("replay.window=0", "window"),
+        (("model=muzero", "planner=gumbel", "replay.window=10"), "replay.window=11"),
+        (("model=muzero", "planner=gumbel", "scale=smoke", "model.n_step=3"), "replay.window=7"),
         ("replay.batch_size=-1", "batch_size"),
         ("trainer.updates=-1", "updates"),
         ("trainer.updates_per_batch=0", "updates_per_batch"),
@@ -148,12 +151,43 @@ def test_refused_before_anything_is_built(override: str | tuple[str, ...], named
     assert named in str(caught.value) and "\n" not in str(caught.value)
 
 
+@pytest.mark.parametrize("model", [["model=tdmpc2"], ["model=muzero", "planner=gumbel"]])
+@pytest.mark.parametrize("scale", ["laptop", "gpu"])
+def test_the_range_of_values_holds_the_returns_of_long_episodes(model, scale: str, composed) -> None:
+    """And is no wider than needed for short ones; a number given wins."""
+
+    def high(*overrides: str) -> tuple[float, float]:
+        cfg = composed(f"scale={scale}", *model, *overrides)
+        spaces = Spaces.of_config(
+            FrankaConfig.from_mapping(
+                {k: v for k, v in build.plain(cfg.env).items() if k not in ("kind", "urdf_path")}
+            ),
+            discrete=build.is_discrete(cfg),
+        )
+        assert Spaces.from_dict(spaces.as_dict()) == spaces
+        built = build.make_model(cfg, spaces, "cpu")
+        return built.two_hot.high, 1.0 / (1.0 - built.discount)
+
+    short, steps = high("env.episode_length=50")
+    assert math.log1p(1.01 * steps) < short < 3.3
+    long, steps = high("env.episode_length=1000")
+    assert math.log1p(1.01 * steps) < long and steps > 150
+    assert high("env.action_penalty=1.0")[0] > short
+    assert high("model.value_high=7.5")[0] == 7.5
+
+
+def test_spaces_of_an_older_checkpoint_know_no_bounds() -> None:
+    values = Spaces(observation_sizes={"state": 20}, action_dim=7, reward_bounds=(-1.0, 0.0)).as_dict()
+    del values["reward_bounds"]
+    assert Spaces.from_dict(values).reward_bounds is None
+
+
 def test_muzero_sees_ends_and_episodes_shorter_than_its_windows(composed) -> None:
     """Else its value targets could not reach further than the shortest episode is long."""
     episodes = TensorDict({"is_init": (torch.arange(80) % 8 == 0).expand(4, 80).unsqueeze(-1)}, [4, 80])
     cfg = composed("env=gym", "model=muzero", "planner=gumbel", "collector.num_envs=4")
     check(cfg)
-    assert build.window(cfg) == cfg.model.unroll + cfg.model.n_step > 8
+    assert build.window(cfg) == cfg.model.unroll + cfg.model.n_step + 1 > 8
     assert cfg.collector.seed_steps >= build.window(cfg)
     check(composed("env=gym", "model=muzero", "planner=gumbel", "env.episode_length=8"))
     replay = build.make_replay_buffer(cfg, torch.device("cpu"))

@@ -30,6 +30,14 @@ class Task:
     def __init__(self, config: FrankaConfig):
         self.config = config
 
+    @property
+    def reward_bounds(self) -> tuple[float, float] | None:
+        """The least and the largest reward of a step, from which models derive the range of their values.
+
+        ``None``: unknown. A class attribute is enough: ``reward_bounds = (-1.0, 0.0)``.
+        """
+        return None
+
     def reset(self, sim: Simulation, mask: wp.array) -> None:
         """Writes ``sim.warp.task_goal`` (N, 3), and ``sim.warp.goal_q`` (N, 7) if known, where ``mask`` (N,)."""
         raise NotImplementedError(f"{type(self).__name__} gives no goal")

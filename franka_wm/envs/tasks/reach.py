@@ -63,6 +63,16 @@ class Reach(Task):
         super().__init__(config)
         self._fixed: tuple[wp.array, wp.array] | None = None
 
+    @property
+    def reward_bounds(self) -> tuple[float, float] | None:
+        """Of :func:`reach_reward`; ``None`` where a subclass judges otherwise."""
+        if type(self).judge is not Reach.judge:
+            return None
+        least, largest = {"dense": (-1.0, 0.0), "sparse": (0.0, 1.0), "normalized": (-1.0, 1.0)}[
+            self.config.reward
+        ]
+        return least - self.config.action_penalty, largest
+
     def reset(self, sim: Simulation, mask: wp.array) -> None:
         self.choose(sim, mask, sim.warp.task_goal)
 
