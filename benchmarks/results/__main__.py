@@ -23,8 +23,11 @@ def overview(rows: Mapping[str, Row], place: Path) -> str:
         found = records.read(row, place)
         kind, reasons = state(row, found)
         have = f"{len(found)}/{len(row.seeds)}" if row.seeds else f"{len(found)}/1"
-        missed = [wanted for wanted, _, enough in render.verdicts(row, found) if not enough] if found else []
-        more = [*reasons, *(f"missed: {one}" for one in missed)]
+        judged = [] if kind in ("missing", "mixed") else render.verdicts(row, found)
+        more = [
+            *reasons,
+            *(f"missed: {wanted}, is {reached}" for wanted, reached, enough in judged if not enough),
+        ]
         lines.append(f"{name:24}{kind:9}{have:7}{'; '.join(more)}".rstrip())
     return "\n".join(lines)
 
@@ -46,7 +49,6 @@ def parse(arguments: list[str] | None) -> argparse.Namespace:
         description=benchmarks.results.__doc__,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    parser.add_argument("--results", type=Path, default=records.PLACE, help="folder of the rows' files")
     verbs = parser.add_subparsers(dest="verb")
     verbs.add_parser("list", help="which rows are fresh, stale, missing")
     verbs.add_parser("render", help="write docs/results.md and README's tables")
@@ -55,7 +57,7 @@ def parse(arguments: list[str] | None) -> argparse.Namespace:
     one.add_argument("--seeds", type=int, nargs="+", help="default: those of the row")
     one.add_argument("--jobs", type=int, default=1, help="runs at a time, on each device")
     one.add_argument("--device", nargs="+", default=[], help="of a row on a GPU: cuda:0 cuda:1 …")
-    one.add_argument("--threads", type=int, help="of a row on CPU cores, for each run; default: the row's")
+    one.add_argument("--threads", type=int, help="of each run; default: the row's, on a GPU torch's choice")
     one.add_argument("--out", type=Path, default=Path("outputs/results"), help="folder for the runs' folders")
     two = verbs.add_parser("collect", help="take a row's numbers from folders of finished runs")
     two.add_argument("row")
@@ -63,6 +65,8 @@ def parse(arguments: list[str] | None) -> argparse.Namespace:
     two.add_argument("--jobs", type=int, required=True, help="how many runs shared the GPU or the cores")
     for verb in (one, two):
         verb.add_argument("--commit", help="of the code, where there is no repository")
+    for verb in verbs.choices.values():
+        verb.add_argument("--results", type=Path, default=records.PLACE, help="folder of the rows' files")
     return parser.parse_args(arguments)
 
 
@@ -88,9 +92,10 @@ def main(arguments: list[str] | None = None) -> int:
                     record = records.record_run(row, path, jobs=chosen.jobs, commit=chosen.commit)
                 print(records.write(record, chosen.results))
         elif chosen.verb == "render":
+            records.prune(chosen.results)
             write_pages(rows, chosen.results)
         else:
-            print(overview(rows, chosen.results))
+            print(overview(rows, chosen.results if chosen.verb else records.PLACE))
     except FrankaError as error:
         failed.append(str(error))
     for line in failed:

@@ -153,6 +153,7 @@ def read(row: Row, place: Path = PLACE) -> list[dict[str, Any]]:
     found = []
     for path in (place / row.name).glob("*.json"):
         record = read_json(path)
+        assert record is not None  # it was listed
         code = read_json(place / CODE / f"{record['code']}.json")
         if code is None:
             raise UserError(f"{path}: its code, {CODE}/{record['code']}.json, is missing; measure it again")
@@ -175,6 +176,16 @@ def read_json(file: Path) -> dict[str, Any] | None:
     if not isinstance(found, dict):
         raise UserError(f"{file} holds no object; measure it again")
     return found
+
+
+def prune(place: Path = PLACE) -> None:
+    """Removes the code that no record names any more."""
+    named = {
+        (read_json(path) or {}).get("code") for path in place.glob("*/*.json") if path.parent.name != CODE
+    }
+    for path in (place / CODE).glob("*.json"):
+        if path.stem not in named:
+            path.unlink()
 
 
 def _made_with(versions: Mapping[str, Any], jobs: int, commit: str | None) -> dict[str, Any]:

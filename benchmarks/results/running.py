@@ -26,7 +26,8 @@ class Machine:
     Attributes:
         jobs: runs at a time, on each device.
         devices: of runs on GPUs, as ``device=`` takes them; empty: what train.py chooses.
-        threads: of each run on CPU cores, which it has to itself; ``None``: as many as the section says.
+        threads: of each run; on CPU cores it has these to itself. ``None``: as many as the section says, and as torch
+            chooses on a GPU.
         commit: of the code, where there is no repository.
     """
 
@@ -45,6 +46,8 @@ class Machine:
         if self.commit:
             environment["FRANKA_WM_COMMIT"] = self.commit
         if row.section.threads is None:
+            if self.threads:
+                environment["OMP_NUM_THREADS"] = str(self.threads)
             devices = [[f"device={device}"] for device in self.devices] or [[]]
             return [([], device, environment) for device in devices for _ in range(self.jobs)]
         threads = self.threads or row.section.threads

@@ -67,6 +67,7 @@ def read(names: Iterable[str]) -> dict[str, bytes]:
     return {name: (ROOT / name).read_bytes() for name in names if (ROOT / name).is_file()}
 
 
+@cache
 def code_hash(name: str, content: bytes) -> str:
     """Hash of what a file does: of Python, comments, docstrings and layout do not count."""
     if name.endswith(".py"):

@@ -210,6 +210,25 @@ def test_a_row_measured_with_another_command_is_refused(measured) -> None:
     assert state(row, records.read(row, place))[0] == "mixed"
 
 
+def test_times_are_those_of_runs_that_were_alone(make_run, tmp_path) -> None:
+    """Seed 100 shared the machine, seed 101 did not; with none alone the page says how many shared it."""
+    shared = records.record_run(ROW, make_run(100), jobs=3)
+    alone = records.record_run(ROW, make_run(101), jobs=1)
+    assert render.verdicts(ROW, [shared, alone])[0] == ("≤ 1 min of training", "31 s", True)
+    assert render.verdicts(ROW, [shared])[0][1] == "30 s, 3 runs at a time"
+
+
+def test_code_that_no_file_names_is_removed(measured, make_run) -> None:
+    place = measured({"seed": 100})
+    before = {path.name for path in (place / "code").iterdir()}
+    newer = make_run(101, versions={"source": {"train.py": "1"}})
+    records.write(records.record_run(ROW, newer, jobs=1), place)
+    (place / "reach" / "seed-100.json").unlink()
+    records.prune(place)
+    assert len(list((place / "code").iterdir())) == 1
+    assert not (place / "code" / before.pop()).exists()
+
+
 def test_rows_older_than_the_code_say_so(measured) -> None:
     old = {"versions": {"source": {"train.py": "000000000000", "gone.py": "1"}}}
     place = measured({"seed": 100, **old}, {"seed": 101, **old})
@@ -348,9 +367,9 @@ def test_a_row_is_run_and_collected(tmp_path, capsys) -> None:
 
 
 def test_commands(tmp_path, capsys) -> None:
-    assert main(["--results", str(tmp_path), "list"]) == 0
+    assert main(["list", "--results", str(tmp_path)]) == 0
     assert "reach-cpu" in capsys.readouterr().out
     assert main(["run", "no-such-row"]) == 1
-    assert main(["--results", str(tmp_path), "collect", "reach-cpu", str(tmp_path), "--jobs", "1"]) == 1
+    assert main(["collect", "reach-cpu", str(tmp_path), "--jobs", "1", "--results", str(tmp_path)]) == 1
     err = capsys.readouterr().err
     assert "no row 'no-such-row'; there are reach-cpu" in err and "finished" in err
