@@ -56,7 +56,9 @@ def test_evaluation_json(run) -> None:
     results = json.loads((run[0] / "evaluation.json").read_text())
     assert set(results) == {"planner", "policy", "noop", "random", "oracle"}
     for name, result in results.items():
-        assert set(result) == {"final_distance", "success", "return", "episodes"}, name
+        assert {"final_distance", "success", "return", "episodes", "success_once", "jerk"} <= set(result), (
+            name
+        )
         assert result["episodes"] == 4
         assert set(result["success"]) == {"0.05", "0.025", "0.01"}
         for interval in (result["final_distance"], result["return"], *result["success"].values()):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any
 
@@ -13,7 +13,6 @@ from torch import Tensor, nn
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from franka_wm.envs import FrankaEnv
-from franka_wm.errors import UserError
 from franka_wm.evaluation.intervals import bootstrap_mean, wilson
 
 THRESHOLDS = (0.05, 0.025, 0.01)
@@ -40,18 +39,47 @@ def begin(env: Any, seed: int) -> TensorDictBase:
     return env.reset()
 
 
+def _parts(policy: Any) -> list[Any]:
+    return list(policy.modules()) if isinstance(policy, nn.Module) else [policy]
+
+
 @contextmanager
 def seeded(seed: int, *policies: Any) -> Iterator[None]:
-    """Random numbers of torch, and of the policies' own generators, from ``seed``; torch's are put back after."""
+    """Random numbers of torch, and of the policies' own generators, from ``seed``; all are put back after."""
+    held = [
+        value
+        for policy in policies
+        for part in _parts(policy)
+        for value in getattr(part, "__dict__", {}).values()
+    ]
+    generators = [(value, value.get_state()) for value in held if isinstance(value, torch.Generator)]
     devices = list(range(torch.cuda.device_count())) if torch.cuda.is_initialized() else []
     with torch.random.fork_rng(devices=devices):
         torch.manual_seed(seed)
-        for policy in policies:
-            for module in policy.modules() if isinstance(policy, nn.Module) else (policy,):
-                for value in vars(module).values() if hasattr(module, "__dict__") else ():
-                    if isinstance(value, torch.Generator):
-                        value.manual_seed(seed)
+        for generator, _ in generators:
+            generator.manual_seed(seed)
+        try:
+            yield
+        finally:
+            for generator, state in generators:
+                generator.set_state(state)
+
+
+@contextmanager
+def evaluating(acting: Any) -> Iterator[None]:
+    """A model, or a policy and the model behind it, in evaluation mode; afterwards every part is in its own again.
+
+    Families may act differently in training mode: TD-MPC2 plans by two Q-functions drawn at random. What is evaluated
+    is one agent, whoever asks: the end of a run, the curves, the film, ``franka-wm evaluate``.
+    """
+    modes = [(part, part.training) for part in _parts(acting) if isinstance(part, nn.Module)]
+    for part, _ in modes:
+        part.training = False
+    try:
         yield
+    finally:
+        for part, training in modes:
+            part.training = training
 
 
 @torch.no_grad()
@@ -62,7 +90,7 @@ def play_episodes(
 
     Args:
         env: Its number of worlds is the number of episodes.
-        policy: Run without exploration.
+        policy: Run without exploration, its model in evaluation mode.
         seed: Of the episodes' poses and goals.
         video: Called before every step, to take a picture; after the last one the worlds have been reset.
 
@@ -85,7 +113,7 @@ def play_episodes(
     tensordict = begin(env, seed)
     if motion is not None:
         motion.start()
-    with set_exploration_type(ExplorationType.DETERMINISTIC):
+    with evaluating(policy), set_exploration_type(ExplorationType.DETERMINISTIC):
         for _ in range(env.config.episode_length):
             if video is not None:
                 video()
@@ -180,38 +208,6 @@ def summarize(episodes: TensorDictBase, *, thresholds: Sequence[float] = THRESHO
     }
 
 
-def evaluate_policies(
-    env: Any,
-    policies: Mapping[str, Policy],
-    *,
-    seed: int,
-    thorough: bool = False,
-    report: Callable[[str, dict[str, Any]], None] | None = None,
-) -> dict[str, dict[str, Any]]:
-    """Evaluates policies on the same episodes.
-
-    Args:
-        env: Its number of worlds is the number of episodes; at least 2, for the intervals.
-        policies: By name.
-        seed: The run's; the evaluation's own is derived from it.
-        thorough: Everything that :func:`summarize` knows, not the outcome alone.
-        report: Called with each name and summary as they come.
-
-    Raises:
-        UserError: Fewer than two worlds.
-    """
-    if env.num_envs < 2:
-        raise UserError(f"evaluation over {env.num_envs} episodes has no interval; use at least 2")
-    outcome = ("return", "length") if arm_of(env) is None else ("final_distance", "return")
-    results = {}
-    for name, policy in policies.items():
-        episodes = play_episodes(env, policy, seed=seed + EVALUATION_SEED)
-        results[name] = summarize(episodes if thorough else episodes.select(*outcome))
-        if report is not None:
-            report(name, results[name])
-    return results
-
-
 @torch.no_grad()
 def decision_times(
     env: Any, policy: Policy, *, seed: int = EVALUATION_SEED, decisions: int = 20, warm_up: int = 3
@@ -234,7 +230,7 @@ def decision_times(
 
     tensordict = begin(env, seed)
     times = []
-    with set_exploration_type(ExplorationType.DETERMINISTIC):
+    with evaluating(policy), set_exploration_type(ExplorationType.DETERMINISTIC):
         for k in range(warm_up + decisions):
             wait()
             started = time.perf_counter()

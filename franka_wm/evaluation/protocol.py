@@ -13,6 +13,7 @@ from tensordict import TensorDict
 from franka_wm.errors import UserError
 from franka_wm.evaluation.closed_loop import (
     EVALUATION_SEED,
+    THRESHOLDS,
     arm_of,
     decision_times,
     play_episodes,
@@ -38,7 +39,7 @@ def held_out_seeds(count: int) -> list[int]:
 
 @dataclass
 class Evaluation:
-    """What :func:`evaluate_agent` found.
+    """What :func:`evaluate_policies` found.
 
     Attributes:
         policies: Name → summary, the content of ``evaluation.json``; the same twice on a CPU.
@@ -71,31 +72,46 @@ def evaluate_agent(
     agent: Any,
     *,
     episodes: int = EPISODES,
-    seeds: Sequence[int] | None = None,
     policies: Mapping[str, Any] | None = None,
     timing: bool = True,
+    **options: Any,
+) -> Evaluation:
+    """:func:`evaluate_policies` of an agent of :func:`franka_wm.training.load.load_agent`, with its own policies."""
+    chosen = agent.policies if policies is None else policies
+    return evaluate_policies(agent.env, chosen, episodes=episodes, timing=timing, **options)
+
+
+def evaluate_policies(
+    env: Any,
+    policies: Mapping[str, Any],
+    *,
+    episodes: int | None = None,
+    seeds: Sequence[int] | None = None,
+    timing: bool = False,
     report: Callable[[str, dict[str, Any]], None] | None = None,
 ) -> Evaluation:
-    """Plays every policy over the same held-out episodes.
+    """Plays every policy over the same held-out episodes: while training, at its end, and in ``franka-wm evaluate``.
 
-    Twice on a CPU gives the same numbers (times excepted): worlds, planners and random policies are seeded anew
-    for each policy, and torch's random numbers are put back afterwards.
+    Twice on a CPU gives the same numbers (times excepted), whoever asks: worlds, planners and random policies are
+    seeded anew for each policy, and models are in evaluation mode. Random numbers and modes are put back afterwards.
 
     Args:
-        agent: Of :func:`franka_wm.training.load.load_agent`, or anything with ``env`` and ``policies``.
+        env: Evaluation worlds.
+        policies: By name.
         episodes: Per policy, at least 2; published numbers should have 100 or more. Played in rounds of as
-            many as ``agent.env`` has worlds; of the last round, the first worlds count.
+            many as the environment has worlds; of the last round, the first worlds count. One round if not given.
         seeds: One for each round; :func:`held_out_seeds` if not given.
-        policies: By name; the agent's, baselines included, if not given.
         timing: Also measure how long decisions take.
         report: Called with each name and summary as they come.
 
     Raises:
         UserError: Fewer than 2 episodes, or fewer seeds than rounds.
     """
+    episodes = env.num_envs if episodes is None else episodes
     if isinstance(episodes, bool) or not isinstance(episodes, int) or episodes < 2:
-        raise UserError(f"episodes={episodes!r}: must be a whole number of at least 2; 100 or more are usual")
-    env = agent.env
+        raise UserError(
+            f"episodes={episodes!r}: must be a whole number of at least 2, for the intervals; 100 or more are usual"
+        )
     rounds = math.ceil(episodes / env.num_envs)
     seeds = held_out_seeds(rounds) if seeds is None else list(seeds)
     if len(seeds) < rounds:
@@ -105,20 +121,43 @@ def evaluate_agent(
         )
     seeds = seeds[:rounds]
     evaluation = Evaluation({}, {}, seeds, worlds=env.num_envs)
-    for name, policy in (agent.policies if policies is None else policies).items():
+    for name, policy in policies.items():
         played = []
         for seed in seeds:
             with seeded(seed, policy):
                 played.append(play_episodes(env, policy, seed=seed).cpu())
         rows = cast(TensorDict, torch.cat(played)[:episodes])
         evaluation.episodes[name] = rows
-        evaluation.policies[name] = summarize(rows)
+        evaluation.policies[name] = summarize(rows, thresholds=thresholds(env))
         if timing:
             with seeded(seeds[0], policy):
                 evaluation.seconds[name] = float(decision_times(env, policy, seed=seeds[0]).median())
         if report is not None:
             report(name, evaluation.policies[name])
     return evaluation
+
+
+def thresholds(env: Any) -> list[float]:
+    """Distances that count as success [m]: those of every table, and the task's own; none where there is no goal."""
+    if arm_of(env) is None:
+        return []
+    return sorted({*THRESHOLDS, float(env.config.success_distance)}, reverse=True)
+
+
+def numbers_to_log(env: Any, policies: Mapping[str, Any]) -> dict[str, float]:
+    """A point of the learning curves: what :func:`evaluate_policies` finds now, as :func:`point` names it."""
+    return point(evaluate_policies(env, policies).policies, env)
+
+
+def point(policies: Mapping[str, Mapping[str, Any]], env: Any) -> dict[str, float]:
+    """Means of summaries by the names that they are logged and drawn with: ``eval/POLICY/QUANTITY``."""
+    numbers = {}
+    for name, summary in policies.items():
+        found = {"final_distance": summary.get("final_distance"), "return": summary["return"]}
+        if "success" in summary:
+            found["success"] = summary["success"][f"{env.config.success_distance:g}"]
+        numbers |= {f"eval/{name}/{key}": value["mean"] for key, value in found.items() if value is not None}
+    return numbers
 
 
 def describe(name: str, summary: Mapping[str, Any], env: Any) -> str:
