@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from typing import Any
+from typing import Any, cast
 
 import torch
 from tensordict import TensorDict, TensorDictBase
@@ -29,6 +29,12 @@ def arm_of(env: Any) -> FrankaEnv | None:
     while env is not None and not isinstance(env, FrankaEnv):
         env = getattr(env, "base_env", None)
     return env
+
+
+def reaches(env: Any) -> bool:
+    """Whether success is a small distance to the goal: of the arm, by its task."""
+    arm = arm_of(env)
+    return arm is not None and arm.simulation.task.goal_distance
 
 
 def begin(env: Any, seed: int) -> TensorDictBase:
@@ -84,7 +90,12 @@ def evaluating(acting: Any) -> Iterator[None]:
 
 @torch.no_grad()
 def play_episodes(
-    env: Any, policy: Policy, *, seed: int, video: Callable[[], None] | None = None
+    env: Any,
+    policy: Policy,
+    *,
+    seed: int,
+    episodes: int | None = None,
+    video: Callable[[], None] | None = None,
 ) -> TensorDict:
     """Plays one episode in every world and records how it went.
 
@@ -92,14 +103,16 @@ def play_episodes(
         env: Its number of worlds is the number of episodes.
         policy: Run without exploration, its model in evaluation mode.
         seed: Of the episodes' poses and goals.
+        episodes: Fewer than there are worlds: the first ones. Nothing is decided for the others.
         video: Called before every step, to take a picture; after the last one the worlds have been reset.
 
     Returns:
-        Batch size (N,), all float32, of each world's first episode up to its true last observation. ``return``
-        and ``length`` of any environment. Of the arm also:
+        Batch size (N,), or (episodes,), all float32, of each world's first episode up to its true last observation.
+        ``return`` and ``length`` of any environment. Of the arm also:
 
-        * ``final_distance`` and ``closest_distance``, tool to goal [m];
-        * ``success_once``, by the task's own measure, 0 or 1;
+        * ``success`` at the end and ``success_once`` at any step, as the task judges, 0 or 1;
+        * ``final_distance`` and ``closest_distance``, tool to goal [m], where success is to be near the goal;
+        * ``measures``, by name, at the end: the task's own (:meth:`~franka_wm.envs.tasks.Task.measures`);
         * ``path_length`` of the tool [m];
         * ``action_change``: mean over steps and components of the squared change of the action as the servo
           gets it, in units of the action;
@@ -110,6 +123,8 @@ def play_episodes(
     motion = None if arm is None else _Motion(arm)
     total, length = torch.zeros(n, device=device), torch.zeros(n, device=device)
     running = torch.ones(n, dtype=torch.bool, device=device)
+    count = n if episodes is None else min(episodes, n)
+    running[count:] = False
     tensordict = begin(env, seed)
     if motion is not None:
         motion.start()
@@ -117,7 +132,8 @@ def play_episodes(
         for _ in range(env.config.episode_length):
             if video is not None:
                 video()
-            tensordict, following = env.step_and_maybe_reset(policy(tensordict))
+            decided = policy(tensordict) if count == n else _decide_for_some(policy, tensordict, count)
+            tensordict, following = env.step_and_maybe_reset(decided)
             after = tensordict.get("next")
             total += running * after.get("reward").squeeze(-1)
             length += running
@@ -128,18 +144,31 @@ def play_episodes(
             if arm is None and not bool(running.any()):  # lives on the host: nothing waits for a device here
                 break
     out = {"return": total, "length": length}
-    return TensorDict(out if motion is None else motion.summary(length) | out, batch_size=[n])
+    played = TensorDict(out if motion is None else motion.summary(length) | out, batch_size=[n])
+    return cast(TensorDict, played[:count])
+
+
+def _decide_for_some(policy: Policy, tensordict: TensorDictBase, count: int) -> TensorDictBase:
+    """What the policy writes for the first ``count`` worlds, zeros for the others, which cost it nothing."""
+    decided = policy(cast(TensorDictBase, tensordict[:count]))
+    for key in getattr(policy, "out_keys", ["action"]):
+        some = decided.get(key)
+        every = some.new_zeros(tensordict.batch_size[0], *some.shape[1:])
+        every[:count] = some
+        tensordict.set(key, every)
+    return tensordict
 
 
 class _Motion:
-    """What the tool and the actions do over each world's first episode."""
+    """What the tool and the actions do over each world's first episode, and what the task says about it."""
 
     def __init__(self, arm: FrankaEnv):
         n, device = arm.num_envs, arm.device
-        self.arm = arm
+        self.arm, self.task = arm, arm.simulation.task
         self.distance, self.path, self.change, self.jerk = torch.zeros(4, n, device=device)
         self.closest = torch.full((n,), torch.inf, device=device)
-        self.once = torch.zeros(n, dtype=torch.bool, device=device)
+        self.success, self.once = torch.zeros(2, n, dtype=torch.bool, device=device)
+        self.measures: dict[str, Tensor] = {}
 
     def start(self) -> None:
         """After the reset."""
@@ -152,7 +181,11 @@ class _Motion:
         reached = sim.next_true_state[:, 17:20].norm(dim=-1)
         self.distance = torch.where(running, reached, self.distance)
         self.closest = torch.where(running, torch.minimum(reached, self.closest), self.closest)
-        self.once |= running & after.get("success").squeeze(-1)
+        succeeds = after.get("success").squeeze(-1)
+        self.success = torch.where(running, succeeds, self.success)
+        self.once |= running & succeeds
+        for name, value in self.task.measures(sim).items():
+            self.measures[name] = torch.where(running, value.float(), self.measures.get(name, 0.0))
         self._tools = [*self._tools[-3:], sim.next_true_state[:, 14:17].clone()]
         self.path += running * (self._tools[-1] - self._tools[-2]).norm(dim=-1)
         if len(self._tools) == 4:
@@ -163,12 +196,14 @@ class _Motion:
             self.change += running * (action - self._action).square().mean(-1)
         self._action = action
 
-    def summary(self, length: Tensor) -> dict[str, Tensor]:
+    def summary(self, length: Tensor) -> dict[str, Any]:
         changes, thirds = (length - 1).clamp_min(1), (length - 2).clamp_min(1)
+        near = {"final_distance": self.distance, "closest_distance": self.closest}
         return {
-            "final_distance": self.distance,
-            "closest_distance": self.closest,
+            **(near if self.task.goal_distance else {}),
+            "success": self.success.float(),
             "success_once": self.once.float(),
+            **({"measures": self.measures} if self.measures else {}),
             "path_length": self.path,
             "action_change": self.change / changes,
             "jerk": (self.jerk / thirds).sqrt() * self.arm.config.fps**3,
@@ -180,12 +215,13 @@ def summarize(episodes: TensorDictBase, *, thresholds: Sequence[float] = THRESHO
 
     Args:
         episodes: As :func:`play_episodes` gives them, or some of their entries.
-        thresholds: Distances that count as success [m].
+        thresholds: Distances that count as success [m], where there are distances.
 
     Returns:
-        What there is: ``final_distance`` [m], ``success`` (at the end) and ``success_once`` (at any step) by
-        threshold, ``return``, ``path_length``, ``action_change``, ``jerk``, ``length``, each with its
-        interval; and ``episodes``, the count.
+        What there is: ``final_distance`` [m]; ``success`` at the end and ``success_once`` at any step, by threshold
+        where there are distances, else one rate each, as the task judges; ``return``; ``measures`` of the task's own,
+        by name; ``path_length``, ``action_change``, ``jerk``, ``length``, each with its interval; and ``episodes``,
+        the count.
     """
     present = {str(name): episodes.get(name).cpu() for name in episodes.keys()}  # noqa: SIM118
     count = episodes.numel()
@@ -194,16 +230,20 @@ def summarize(episodes: TensorDictBase, *, thresholds: Sequence[float] = THRESHO
         return {name: bootstrap_mean(present[name]).as_dict() for name in names if name in present}
 
     def rates(name: str, distance: str) -> dict[str, Any]:
-        if distance not in present:
-            return {}
-        within = {f"{t:g}": int((present[distance] < t).sum()) for t in thresholds}
-        return {name: {t: wilson(hits, count).as_dict() for t, hits in within.items()}}
+        if distance in present:
+            within = {f"{t:g}": int((present[distance] < t).sum()) for t in thresholds}
+            return {name: {t: wilson(hits, count).as_dict() for t, hits in within.items()}}
+        return {name: wilson(int(present[name].sum()), count).as_dict()} if name in present else {}
 
+    own = present.get("measures", {})
+    own = {str(name): bootstrap_mean(own[name]).as_dict() for name in own.keys()}  # noqa: SIM118
     return {
         **means("final_distance"),
         **rates("success", "final_distance"),
         **rates("success_once", "closest_distance"),
-        **means("return", "path_length", "action_change", "jerk", "length"),
+        **means("return"),
+        **({"measures": own} if own else {}),
+        **means("path_length", "action_change", "jerk", "length"),
         "episodes": count,
     }
 

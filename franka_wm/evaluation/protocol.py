@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import math
+import platform
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any, cast
 
 import torch
@@ -17,11 +19,12 @@ from franka_wm.evaluation.closed_loop import (
     arm_of,
     decision_times,
     play_episodes,
+    reaches,
     seeded,
     summarize,
 )
-from franka_wm.evaluation.tables import motion_table, outcome_table
-from franka_wm.report.table import markdown
+from franka_wm.report.results import point
+from franka_wm.report.table import evaluation_tables, markdown
 
 EPISODES = 100
 """Episodes per policy, if not said otherwise."""
@@ -57,8 +60,7 @@ class Evaluation:
 
     def markdown(self) -> str:
         """The tables, and under them how they were measured."""
-        tables = [outcome_table(self.policies), motion_table(self.policies)]
-        parts = [markdown(table) for table in tables if table.rows]
+        parts = [markdown(table) for table in evaluation_tables(self.policies) if table.rows]
         count = next(iter(self.policies.values()))["episodes"]
         seeds = ", ".join(map(str, self.seeds))
         worlds = f" of {self.worlds} worlds" if self.worlds else ""
@@ -123,10 +125,11 @@ def evaluate_policies(
     evaluation = Evaluation({}, {}, seeds, worlds=env.num_envs)
     for name, policy in policies.items():
         played = []
-        for seed in seeds:
+        for k, seed in enumerate(seeds):
+            left = episodes - k * env.num_envs
             with seeded(seed, policy):
-                played.append(play_episodes(env, policy, seed=seed).cpu())
-        rows = cast(TensorDict, torch.cat(played)[:episodes])
+                played.append(play_episodes(env, policy, seed=seed, episodes=left).cpu())
+        rows = cast(TensorDict, torch.cat(played))
         evaluation.episodes[name] = rows
         evaluation.policies[name] = summarize(rows, thresholds=thresholds(env))
         if timing:
@@ -137,31 +140,73 @@ def evaluate_policies(
     return evaluation
 
 
+def protocol(
+    cfg: Any, env: Any, evaluation: Evaluation, *, by: str, counters: Mapping[str, float]
+) -> dict[str, Any]:
+    """How it was measured, for whoever reads the numbers later: ``protocol`` of ``evaluation.json``.
+
+    Args:
+        cfg: The run's configuration.
+        env: Evaluation worlds.
+        evaluation: What was found.
+        by: Who measured: :data:`~franka_wm.report.results.END` or :data:`~franka_wm.report.results.COMMAND`.
+        counters: Of the training: ``updates``, ``env_steps``, ``seconds``.
+    """
+    import franka_wm
+
+    arm = arm_of(env) is not None
+    return {
+        "by": by,
+        "task": str(cfg.env.task if arm else cfg.env.name),
+        "model": str(cfg.model.name),
+        **({"planner": str(cfg.planner.name)} if "planner" in evaluation.policies else {}),
+        "seed": int(cfg.seed),
+        **{name: counters[name] for name in ("updates", "env_steps") if name in counters},
+        **({"training_seconds": counters["seconds"]} if "seconds" in counters else {}),
+        "episodes": next(iter(evaluation.policies.values()))["episodes"],
+        "worlds": env.num_envs,
+        "seeds": ", ".join(map(str, evaluation.seeds)),
+        **({"success_distance": float(env.config.success_distance)} if reaches(env) else {}),
+        "intervals": INTERVALS,
+        "device": str(env.device),
+        "hardware": hardware(env.device),
+        "franka_wm": franka_wm.__version__,
+        "torch": torch.__version__,
+    }
+
+
+def hardware(device: torch.device) -> str:
+    """What computes: the GPU's name, or the processor's and the threads that torch uses."""
+    if device.type == "cuda":
+        return torch.cuda.get_device_name(device)
+    told = Path("/proc/cpuinfo")
+    lines = told.read_text().splitlines() if told.is_file() else []
+    name = next((line.partition(":")[2].strip() for line in lines if line.startswith("model name")), "")
+    threads = torch.get_num_threads()
+    return f"{name or platform.processor() or platform.machine()}, {threads} thread{'s' * (threads > 1)}"
+
+
 def thresholds(env: Any) -> list[float]:
-    """Distances that count as success [m]: those of every table, and the task's own; none where there is no goal."""
-    if arm_of(env) is None:
-        return []
-    return sorted({*THRESHOLDS, float(env.config.success_distance)}, reverse=True)
+    """Distances that count as success [m]: those of every table, and the environment's own; none without a goal."""
+    return sorted({*THRESHOLDS, float(env.config.success_distance)}, reverse=True) if reaches(env) else []
 
 
-def numbers_to_log(env: Any, policies: Mapping[str, Any]) -> dict[str, float]:
-    """A point of the learning curves: what :func:`evaluate_policies` finds now, as :func:`point` names it."""
-    return point(evaluate_policies(env, policies).policies, env)
+def numbers_to_log(env: Any, policies: Mapping[str, Any], *, episodes: int | None = None) -> dict[str, float]:
+    """A point of the learning curves: what :func:`evaluate_policies` finds now, as :func:`point` names it.
+
+    Args:
+        env: Evaluation worlds, those of the run's end.
+        policies: That have curves.
+        episodes: The first so many of those that the run's end plays; all if not given or more than there are.
+    """
+    episodes = env.num_envs if episodes is None else min(episodes, env.num_envs)
+    found = evaluate_policies(env, policies, episodes=episodes).policies
+    return point(found, success_distance=env.config.success_distance if reaches(env) else None)
 
 
-def point(policies: Mapping[str, Mapping[str, Any]], env: Any) -> dict[str, float]:
-    """Means of summaries by the names that they are logged and drawn with: ``eval/POLICY/QUANTITY``."""
-    numbers = {}
-    for name, summary in policies.items():
-        found = {"final_distance": summary.get("final_distance"), "return": summary["return"]}
-        if "success" in summary:
-            found["success"] = summary["success"][f"{env.config.success_distance:g}"]
-        numbers |= {f"eval/{name}/{key}": value["mean"] for key, value in found.items() if value is not None}
-    return numbers
-
-
-def describe(name: str, summary: Mapping[str, Any], env: Any) -> str:
+def describe(name: str, summary: Mapping[str, Any]) -> str:
     """One line about a policy as its numbers come."""
-    if arm_of(env) is None:
-        return f"  {name}: return {summary['return']['mean']:.2f}"
-    return f"  {name}: final distance {100 * summary['final_distance']['mean']:.2f} cm"
+    if "final_distance" in summary:
+        return f"  {name}: final distance {100 * summary['final_distance']['mean']:.2f} cm"
+    success = f"success {100 * summary['success']['mean']:.0f} %, " if "success" in summary else ""
+    return f"  {name}: {success}return {summary['return']['mean']:.2f}"

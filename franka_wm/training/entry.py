@@ -265,7 +265,8 @@ class Run:
         from franka_wm.evaluation.protocol import numbers_to_log
 
         chosen = {name: policies[name] for name in self.cfg.evaluation.during if name in policies}
-        return lambda: numbers_to_log(env, chosen)
+        episodes = self.cfg.evaluation.get("during_episodes")  # checkpoints of earlier versions have none
+        return lambda: numbers_to_log(env, chosen, episodes=episodes)
 
 
 def start(cfg: DictConfig) -> Run:

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+import torch
 import warp as wp
 
 from franka_wm.envs.config import TASKS, FrankaConfig
@@ -23,6 +24,10 @@ class Task:
     Args:
         config: The environment's.
     """
+
+    goal_distance = False
+    """Whether success is to have the tool near ``task_goal``. Then evaluation reports the distance, and success within
+    several distances; of other tasks it reports what ``judge`` writes into ``success``."""
 
     def __init__(self, config: FrankaConfig):
         self.config = config
@@ -42,6 +47,14 @@ class Task:
 
         ``next_true_state`` is ``next_state`` without observation noise."""
         raise NotImplementedError(f"{type(self).__name__} gives no reward")
+
+    def measures(self, sim: Simulation) -> dict[str, torch.Tensor]:
+        """What else evaluation reports, by names with their units: (N,) each, after a step; the episode's last counts.
+
+        Computed with torch, outside the captured step, from ``sim.next_true_state`` (N, 20): finished worlds have
+        been reset already.
+        """
+        return {}
 
 
 def make_task(config: FrankaConfig) -> Task:
