@@ -27,6 +27,10 @@ class Task:
         config: The environment's.
     """
 
+    goal_distance = False
+    """Whether success is to have the tool near ``task_goal``. Then evaluation reports the distance, and success within
+    several distances; of other tasks it reports what ``judge`` writes into ``success``."""
+
     def __init__(self, config: FrankaConfig):
         self.config = config
 
@@ -65,6 +69,14 @@ class Task:
             return next(i for i, one in enumerate(cls.__mro__) if name in vars(one))
 
         return cls.relabel is not None and owner("relabel") <= min(owner("judge"), owner("advance"))
+
+    def measures(self, sim: Simulation) -> dict[str, torch.Tensor]:
+        """What else evaluation reports, by names with their units: (N,) each, after a step; the episode's last counts.
+
+        Computed with torch, outside the captured step, from ``sim.next_true_state`` (N, 20): finished worlds have
+        been reset already.
+        """
+        return {}
 
 
 def make_task(config: FrankaConfig) -> Task:

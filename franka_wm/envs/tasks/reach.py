@@ -59,6 +59,8 @@ class Reach(Task):
     every world and episode. **Reward**: :func:`reach_reward`. **Success**: tool within ``success_distance``.
     """
 
+    goal_distance = True
+
     def __init__(self, config: FrankaConfig):
         super().__init__(config)
         self._fixed: tuple[wp.array, wp.array] | None = None
