@@ -2,6 +2,7 @@
 # Every target sets up .venv first if it has to; the second time that costs nothing.
 #
 #   make train ARGS="env=reach_fixed seed=3"     Hydra overrides go into ARGS
+#   make results ROW=reach-cpu                   measure one row of docs/results.md again
 #   make clean setup PYTHON=/opt/python3.12      choose the interpreter yourself
 
 SHELL := /bin/bash
@@ -10,11 +11,12 @@ SHELL := /bin/bash
 
 ARGS ?=
 PYTHON ?=
+ROW ?=
 VENV := .venv
 STAMP := $(VENV)/.installed
 BIN := $(VENV)/bin
 
-.PHONY: help setup train test lint format lock clean
+.PHONY: help setup train test results lint format lock clean
 
 help: ## show the targets
 	@grep -hE '^[a-z]+:.*## ' $(firstword $(MAKEFILE_LIST)) | sed -E 's/:[^#]*## /\t/' | \
@@ -33,6 +35,12 @@ train: $(STAMP) ## train, plan and evaluate; Hydra overrides in ARGS="..."
 # Two processes with a thread each: tests are small, and torch's threads would wait for each other.
 test: $(STAMP) ## run the tests; pytest options in ARGS="..."
 	@OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 2 --dist loadfile $(ARGS)
+
+# Numbers come from the files in docs/results/, which runs wrote: benchmarks/results/rows.yaml declares them.
+results: $(STAMP) ## which results are older than the code; ROW=name measures one again
+	@if [[ -n "$(ROW)" ]]; then $(BIN)/python -m benchmarks.results run $(ROW) $(ARGS); fi
+	@$(BIN)/python -m benchmarks.results render
+	@$(BIN)/python -m benchmarks.results list
 
 lint: $(STAMP) ## ruff check, ruff format --check, pyright
 	@$(BIN)/ruff check .

@@ -3,31 +3,17 @@
 from __future__ import annotations
 
 import json
-import os
-import platform
 import time
 from collections.abc import Callable
-from pathlib import Path
+from datetime import UTC, datetime
 from typing import Any
 
 import torch
 
+from franka_wm.report import source, written_whole
+from franka_wm.report.versions import versions
 
-def machine() -> dict[str, Any]:
-    """Processor, cores, GPU and versions."""
-    import newton
-    import tensordict
-    import torchrl
-    import warp
-
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
-    return {
-        "gpu": torch.cuda.get_device_name() if torch.cuda.is_available() else None,
-        "cpu": platform.processor() or platform.machine(),
-        "cores": cores,
-        "python": platform.python_version(),
-        "versions": {m.__name__: m.__version__ for m in (torch, torchrl, tensordict, warp, newton)},
-    }
+source.snapshot()
 
 
 def synchronize() -> None:
@@ -87,14 +73,15 @@ def table(rows: list[dict[str, Any]]) -> str:
 
 
 def publish(name: str, rows: list[dict[str, Any]], out: str | None) -> None:
-    """Prints the machine and the table; writes ``out`` as JSON if given."""
-    facts = machine()
-    print(f"\n{name}: {facts['gpu'] or facts['cpu']}, {facts['cores']} cores, torch {facts['versions']['torch']}, "
-          f"newton {facts['versions']['newton']}\n")  # fmt: skip
+    """Prints the machine and the table; writes ``out`` as JSON if given, with the machine, versions and code."""
+    made = versions("cuda" if torch.cuda.is_available() else "cpu")
+    where = made["processor"] if made["device"] == "cpu" else made["device"]
+    print(f"\n{name}: {where}, {made['cores']} cores, torch {made['torch']}, newton {made['newton']}\n")
     print(table(rows), flush=True)
     if out:
-        path = Path(out)
-        path.parent.mkdir(parents=True, exist_ok=True)
-        temporary = path.with_suffix(".writing")
-        temporary.write_text(json.dumps({"benchmark": name, "machine": facts, "rows": rows}, indent=2) + "\n")
-        temporary.replace(path)
+        made |= {
+            "started": datetime.now(UTC).isoformat(timespec="seconds"),
+            "source": source.source(),
+        }
+        with written_whole(out) as path:
+            path.write_text(json.dumps({"benchmark": name, "machine": made, "rows": rows}, indent=2) + "\n")

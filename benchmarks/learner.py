@@ -1,6 +1,6 @@
 """TD-MPC2 updates per second: loss, backward, clipping, Adam, target networks; replay sampling beside it.
 
-    python benchmarks/learner.py                 the sizes of the reference library, and the published one
+    python benchmarks/learner.py                 small sizes, and the published one
 
 On CUDA the update is one captured graph, and sampling another, as in training.
 """
@@ -24,8 +24,6 @@ SIZES = {  # latent, encoder, hidden, batch
     "512/512, batch 64": (512, 256, 512, 64),
     "512/512, batch 256 (paper)": (512, 256, 512, 256),
 }
-REFERENCE = {"128/256, batch 32": 25.0, "512/512, batch 64": 3.8}
-"""Updates/s that the reference library's TD-MPC2 was measured at, on 2 CPU cores."""
 
 
 def experience(worlds: int, steps: int, device: torch.device) -> TensorDict:
@@ -96,7 +94,6 @@ def main() -> None:
                 "parameters": f"{sum(p.numel() for p in one.model.parameters()) / 1e6:.2f} M",
                 "update [1/s]": alone,
                 "sample + update [1/s]": sampled,
-                "reference, 2 CPU cores [1/s]": REFERENCE.get(name, "–"),
             }
         )
         print(rows[-1], flush=True)

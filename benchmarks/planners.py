@@ -37,8 +37,6 @@ SIZES = {  # latent, encoder, hidden
     "paper": ("TD-MPC2 512/512 (paper)", (512, 256, 512)),
     "lewm": ("LeWorldModel (paper)", None),
 }
-REFERENCE_SECONDS = 1.39
-"""One plan of MPPI, 512 × 6 × 3, for one environment of the reference library, on 2 CPU cores."""
 
 
 def make_planner(name: str) -> Any:
@@ -135,9 +133,6 @@ def main() -> None:
                             "time per call [ms]": 1e3 / calls,
                             "control rate [Hz]": calls,
                             "decisions [1/s]": calls * envs,
-                            "reference / ours": REFERENCE_SECONDS * calls
-                            if envs == 1 and name == "mppi" and size != "lewm"
-                            else "–",
                         }
                     )
                     print(rows[-1], flush=True)

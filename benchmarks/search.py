@@ -20,8 +20,6 @@ from franka_wm.envs import resolve_device
 from franka_wm.planning import MCTS, SearchPolicy
 
 MOVES = 15
-REFERENCE_MILLISECONDS = 4.3
-"""One move of 50 simulations for one environment of the reference library, compiled, on 2 CPU cores."""
 
 
 def main() -> None:
@@ -64,7 +62,6 @@ def main() -> None:
                         "ms/decision": 1e3 / decisions,
                         "ms/move": 1e3 / decisions / envs,
                         "moves [1/s]": decisions * envs,
-                        "reference / ours": REFERENCE_MILLISECONDS * decisions * envs / 1e3,
                     }
                 )
                 print(rows[-1], flush=True)

@@ -1,15 +1,16 @@
-"""What a result was made with: packages, machine, commit."""
+"""What a result was made with: packages, machine, commit, code."""
 
 import json
 import os
 import platform
 import subprocess
+from datetime import UTC, datetime
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
 import franka_wm
-from franka_wm.report import written_whole
+from franka_wm.report import source, written_whole
 
 PACKAGES = ("torch", "torchrl", "tensordict", "newton", "warp-lang", "mujoco-warp", "lerobot", "numpy")
 
@@ -21,8 +22,8 @@ def versions(device: Any = None) -> dict[str, Any]:
         device: torch device of the run; its name is taken along.
 
     Returns:
-        Texts and numbers that JSON can hold. A package that is not installed, and the commit outside of a
-        repository, are left out.
+        Texts and numbers that JSON can hold. A package that is not installed is left out. Outside of a repository the
+        commit is that of the environment variable ``FRANKA_WM_COMMIT``, and left out without one.
     """
     found: dict[str, Any] = {"franka_wm": franka_wm.__version__, "python": platform.python_version()}
     for name in PACKAGES:
@@ -32,9 +33,12 @@ def versions(device: Any = None) -> dict[str, Any]:
             continue
     found["system"] = platform.platform(terse=True)
     found["processors"] = os.cpu_count() or 0
+    found["processor"] = processor()
+    found["cores"] = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
     if device is not None:
         import torch
 
+        found["threads"] = torch.get_num_threads()
         device = torch.device(device)
         found["device"] = torch.cuda.get_device_name(device) if device.type == "cuda" else str(device)
     commit = _commit()
@@ -44,22 +48,52 @@ def versions(device: Any = None) -> dict[str, Any]:
 
 
 def write_versions(folder: str | Path, device: Any = None) -> Path:
-    """Write ``versions.json`` into a run's folder.
+    """Write ``versions.json`` into a run's folder as the run starts, with the time of day.
 
     Raises:
         UserError: it cannot be written.
     """
-    path = Path(folder) / "versions.json"
+    source.snapshot()
+    return _write(Path(folder), versions(device) | {"started": _now().isoformat(timespec="seconds")})
+
+
+def complete_versions(folder: str | Path) -> Path:
+    """Add to ``versions.json``, as the run ends, what it took [s] and the hashes of the code that it has imported.
+
+    Raises:
+        UserError: it cannot be written.
+    """
+    found = json.loads((Path(folder) / "versions.json").read_text())
+    taken = (_now() - datetime.fromisoformat(found["started"])).total_seconds()
+    return _write(Path(folder), found | {"seconds": round(taken), "source": source.source()})
+
+
+def processor() -> str:
+    """The processor's name, as its maker writes it."""
+    try:
+        lines = Path("/proc/cpuinfo").read_text().splitlines()
+    except OSError:  # not Linux
+        lines = []
+    named = (line.split(":", 1)[1].strip() for line in lines if line.startswith("model name"))
+    return next(named, platform.processor() or platform.machine())
+
+
+def _now() -> datetime:
+    return datetime.now(UTC)
+
+
+def _write(folder: Path, found: dict[str, Any]) -> Path:
+    path = folder / "versions.json"
     with written_whole(path) as temporary:
-        temporary.write_text(json.dumps(versions(device), indent=2) + "\n")
+        temporary.write_text(json.dumps(found, indent=2) + "\n")
     return path
 
 
 def _commit() -> str | None:
-    """The checkout's commit, with a ``+`` where files differ from it; None outside of a repository."""
-    top = Path(franka_wm.__file__).resolve().parents[1]
-    if not (top / ".git").exists():  # installed elsewhere: a repository further up is not ours
-        return None
+    """The checkout's commit, with a ``+`` where files differ from it; None if there is no telling."""
+    top = source.ROOT
+    if not (top / ".git").exists():  # a copy, or installed elsewhere: a repository further up is not ours
+        return os.environ.get("FRANKA_WM_COMMIT")
 
     def git(*arguments: str) -> str:
         return subprocess.run(

@@ -209,7 +209,8 @@ class Run:
         from franka_wm.training.spaces import Spaces
 
         if not build.is_offline(self.cfg):
-            return build.make_replay_buffer(self.cfg, env.device), Spaces.of_env(env)
+            hindsight = build.make_hindsight(self.cfg, env)
+            return build.make_replay_buffer(self.cfg, env.device, hindsight), Spaces.of_env(env)
         windows, self.validation = build.open_recorded(self.cfg, self.device)
         spaces = Spaces(
             observation_sizes=dict(windows.observation_sizes),
@@ -217,6 +218,7 @@ class Run:
             action_dim=windows.action_dim,
             num_actions=windows.num_actions,
             episode_length=windows.episode_length,
+            reward_bounds=windows.reward_bounds,
         )
         return windows, spaces
 
@@ -369,11 +371,13 @@ def export_experience(run: Run, trainer: Any) -> None:
 
 def finish(run: Run, trainer: Any) -> None:
     """Closes the loggers, writes the run's page, exports, says the last line; exits with 130 after Ctrl-C."""
+    from franka_wm.report.versions import complete_versions
     from franka_wm.training.loggers import close_loggers
 
     interrupted = trainer.interrupted
     close_loggers(run.loggers)
     if not interrupted:
+        complete_versions(run.folder)
         from franka_wm.report.page import write_page
 
         say(f"page:    {write_page(run.folder)}")

@@ -7,10 +7,12 @@ known by :func:`register`; ``docs/tasks.md`` walks through an example.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 import torch
 import warp as wp
+from tensordict import TensorDictBase
 
 from franka_wm.envs.config import TASKS, FrankaConfig
 
@@ -25,12 +27,25 @@ class Task:
         config: The environment's.
     """
 
-    goal_distance = False
-    """Whether success is to have the tool near ``task_goal``. Then evaluation reports the distance, and success within
-    several distances; of other tasks it reports what ``judge`` writes into ``success``."""
-
     def __init__(self, config: FrankaConfig):
         self.config = config
+
+    @property
+    def reward_bounds(self) -> tuple[float, float] | None:
+        """The least and the largest reward of a step, from which models derive the range of their values.
+
+        ``None``: unknown. A class attribute is enough: ``reward_bounds = (-1.0, 0.0)``.
+        """
+        return None
+
+    @property
+    def goal_distance(self) -> bool:
+        """Whether success is to have the tool near ``task_goal``.
+
+        Then evaluation reports the distance, and success within several distances, and else what ``judge`` writes into
+        ``success``. A class attribute is enough.
+        """
+        return False
 
     def reset(self, sim: Simulation, mask: wp.array) -> None:
         """Writes ``sim.warp.task_goal`` (N, 3), and ``sim.warp.goal_q`` (N, 7) if known, where ``mask`` (N,)."""
@@ -55,6 +70,18 @@ class Task:
         been reset already.
         """
         return {}
+
+    relabel: Callable[[TensorDictBase, torch.Tensor], TensorDictBase] | None = None
+    """Recorded transitions as if the goal had been another, where the task can say so in torch: see `Reach.relabel`."""
+
+    @classmethod
+    def relabels(cls) -> bool:
+        """Whether ``relabel`` speaks for this task: a subclass that changes rewards or moves goals says so anew."""
+
+        def owner(name: str) -> int:
+            return next(i for i, one in enumerate(cls.__mro__) if name in vars(one))
+
+        return cls.relabel is not None and owner("relabel") <= min(owner("judge"), owner("advance"))
 
 
 def make_task(config: FrankaConfig) -> Task:

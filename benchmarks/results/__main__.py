@@ -1,0 +1,107 @@
+"""The command line; see the package's docstring."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Mapping
+from pathlib import Path
+
+import benchmarks.results
+from benchmarks.results import records, render, running
+from benchmarks.results.rows import Row, choose, load_rows
+from benchmarks.results.state import state
+from franka_wm.errors import FrankaError
+from franka_wm.report import written_whole
+from franka_wm.report.source import ROOT
+
+
+def overview(rows: Mapping[str, Row], place: Path) -> str:
+    """A line for each row: its state, how many seeds it has, and why it is not fresh."""
+    lines = []
+    for name, row in rows.items():
+        found = records.read(row, place)
+        kind, reasons = state(row, found)
+        have = f"{len(found)}/{len(row.seeds)}" if row.seeds else f"{len(found)}/1"
+        judged = [] if kind in ("missing", "mixed") else render.verdicts(row, found)
+        more = [
+            *reasons,
+            *(f"missed: {wanted}, is {reached}" for wanted, reached, enough in judged if not enough),
+        ]
+        lines.append(f"{name:24}{kind:9}{have:7}{'; '.join(more)}".rstrip())
+    return "\n".join(lines)
+
+
+def write_pages(rows: Mapping[str, Row], place: Path) -> None:
+    """docs/results.md and README's tables."""
+    readme = ROOT / "README.md"
+    for path, text in (
+        (ROOT / "docs" / "results.md", render.page(rows, place)),
+        (readme, render.with_tables(readme.read_text(), render.readme_tables(rows, place))),
+    ):
+        with written_whole(path) as temporary:
+            temporary.write_text(text)
+
+
+def parse(arguments: list[str] | None) -> argparse.Namespace:
+    parser = argparse.ArgumentParser(
+        prog="python -m benchmarks.results",
+        description=benchmarks.results.__doc__,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    verbs = parser.add_subparsers(dest="verb")
+    verbs.add_parser("list", help="which rows are fresh, stale, missing")
+    verbs.add_parser("render", help="write docs/results.md and README's tables")
+    one = verbs.add_parser("run", help="run a row's seeds")
+    one.add_argument("row")
+    one.add_argument("--seeds", type=int, nargs="+", help="default: those of the row")
+    one.add_argument("--jobs", type=int, default=1, help="runs at a time, on each device")
+    one.add_argument("--device", nargs="+", default=[], help="of a row on a GPU: cuda:0 cuda:1 …")
+    one.add_argument("--threads", type=int, help="of each run; default: the row's, on a GPU torch's choice")
+    one.add_argument("--out", type=Path, default=Path("outputs/results"), help="folder for the runs' folders")
+    two = verbs.add_parser("collect", help="take a row's numbers from folders of finished runs")
+    two.add_argument("row")
+    two.add_argument("runs", type=Path, nargs="+", help="folders; of a benchmark, the file of its --out")
+    two.add_argument("--jobs", type=int, required=True, help="how many runs shared the GPU or the cores")
+    for verb in (one, two):
+        verb.add_argument("--commit", help="of the code, where there is no repository")
+    for verb in verbs.choices.values():
+        verb.add_argument("--results", type=Path, default=records.PLACE, help="folder of the rows' files")
+    return parser.parse_args(arguments)
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Exit status: 0, or 1 if something failed."""
+    chosen = parse(arguments)
+    failed: list[str] = []
+    try:
+        rows = load_rows()
+        if chosen.verb == "run":
+            row = choose(rows, chosen.row)
+            machine = running.Machine(
+                jobs=chosen.jobs, devices=chosen.device, threads=chosen.threads, commit=chosen.commit
+            )
+            out = chosen.out.absolute()
+            failed = running.run(row, machine, seeds=chosen.seeds or row.seeds, out=out, place=chosen.results)
+        elif chosen.verb == "collect":
+            row = choose(rows, chosen.row)
+            for path in chosen.runs:
+                if row.script is not None:
+                    record = records.record_benchmark(row, path, commit=chosen.commit)
+                else:
+                    record = records.record_run(row, path, jobs=chosen.jobs, commit=chosen.commit)
+                print(records.write(record, chosen.results))
+        elif chosen.verb == "render":
+            records.prune(chosen.results)
+            write_pages(rows, chosen.results)
+        else:
+            print(overview(rows, chosen.results if chosen.verb else records.PLACE))
+    except FrankaError as error:
+        failed.append(str(error))
+    for line in failed:
+        print(f"error: {line}", file=sys.stderr)
+    return 1 if failed else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,210 @@
+"""What one run measured, as a small JSON file: docs/results/ROW/seed-S.json, or run.json of a benchmark.
+
+The code and configuration that it was measured with are those of all seeds, as a rule. They stand once in
+docs/results/code/HASH.json, which the files name.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import shlex
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from benchmarks.results.rows import Row
+from franka_wm.errors import UserError
+from franka_wm.report import written_whole
+from franka_wm.report.results import read_result
+from franka_wm.report.run import SAME_BUT, read_config
+from franka_wm.report.source import ROOT
+from franka_wm.report.versions import PACKAGES
+
+PLACE = ROOT / "docs" / "results"
+CODE = "code"
+FREE = (
+    "seed",
+    "device",
+    "logger",
+    "evaluation.video_episodes",
+    "trainer.checkpoint_replay",
+)
+"""Arguments that a run may have beside its row's, or lack: they change none of its numbers."""
+
+
+def record_run(row: Row, folder: Path, *, jobs: int, commit: str | None = None) -> dict[str, Any]:
+    """What a finished run of ``train.py`` left in its folder.
+
+    Args:
+        row: The row that it is a seed of.
+        folder: The run's.
+        jobs: How many runs shared the machine: its GPU, or its cores.
+        commit: Of the code, where the run could not tell.
+
+    Raises:
+        UserError: It did not finish, was resumed, is not a run of this row, or ran on another kind of machine.
+    """
+    versions = read_json(folder / "versions.json")
+    config = read_config(folder)
+    if not versions or "source" not in versions or not (folder / "evaluation.json").is_file():
+        raise UserError(f"{folder}: not the folder of a run that finished; results need the whole run")
+    if config.get("resume"):
+        raise UserError(f"{folder}: a run that was resumed; results need runs in one piece")
+    typed = overrides(folder)
+    check_arguments(row, typed, folder)
+    check_machine(row, versions, folder)
+    found = read_result(folder / "evaluation.json")
+    kept = {name: value for name, value in config.items() if name not in SAME_BUT}
+    return {
+        "row": row.name,
+        "seed": config["seed"],
+        "command": shlex.join(["python", "train.py", *typed]),
+        **_made_with(versions, jobs, commit),
+        "training": _training(folder) | {"command_seconds": versions["seconds"]},
+        "protocol": found.protocol,
+        "policies": found.policies,
+        "code": {"files": versions["source"], "config": kept},
+    }
+
+
+def record_benchmark(row: Row, file: Path, *, commit: str | None = None) -> dict[str, Any]:
+    """What a benchmark wrote with ``--out``.
+
+    Raises:
+        UserError: The file is not one of a benchmark.
+    """
+    found = read_json(file)
+    if not found or not {"machine", "rows"} <= set(found) or "source" not in found["machine"]:
+        raise UserError(f"{file}: not what a benchmark wrote with --out")
+    check_machine(row, found["machine"], file)
+    return {
+        "row": row.name,
+        "command": shlex.join(row.command),
+        **_made_with(found["machine"], 1, commit),
+        "rows": found["rows"],
+        "code": {"files": found["machine"]["source"], "config": {}},
+    }
+
+
+def check_arguments(row: Row, typed: Sequence[str], where: Any) -> None:
+    """Refuses a run whose command is not the row's.
+
+    Raises:
+        UserError: It says which arguments differ.
+    """
+    wanted, given = (
+        {a for a in some if a.split("=", 1)[0] not in FREE} for some in (map(str, row.words), map(str, typed))
+    )
+    if wanted != given:
+        apart = [f"without {a}" for a in sorted(wanted - given)] + [
+            f"with {a}" for a in sorted(given - wanted)
+        ]
+        raise UserError(f"{where}: not a run of {row.name}, started {', '.join(apart)}")
+
+
+def check_machine(row: Row, versions: Mapping[str, Any], where: Any) -> None:
+    """Refuses numbers of a GPU for a row of CPU cores, and the other way round.
+
+    Raises:
+        UserError: It says what the row is of.
+    """
+    on_cpu, cores = versions["device"] == "cpu", row.section.threads
+    if cores is None and on_cpu:
+        raise UserError(f"{where}: ran on a CPU, and {row.name} is measured on a GPU")
+    if cores is not None and not (on_cpu and versions["threads"] <= cores):
+        ran = f"with {versions['threads']} threads" if on_cpu else f"on {versions['device']}"
+        raise UserError(f"{where}: ran {ran}, and {row.name} is measured with {cores} threads on CPU cores")
+
+
+def overrides(folder: Path) -> list[str]:
+    """What was typed after ``train.py``, as Hydra keeps it.
+
+    Raises:
+        UserError: It is not there.
+    """
+    file = folder / ".hydra" / "overrides.yaml"
+    if not file.is_file():
+        raise UserError(f"{file} is missing; results need the whole folder of a run")
+    return [str(one) for one in yaml.safe_load(file.read_text())]
+
+
+def write(record: Mapping[str, Any], place: Path = PLACE) -> Path:
+    """The record as a file of its row, and its code beside the rows; whole or not at all."""
+    code = json.dumps(record["code"], indent=1, sort_keys=True) + "\n"
+    key = hashlib.sha256(code.encode()).hexdigest()[:12]
+    name = f"seed-{record['seed']}" if "seed" in record else "run"
+    path = place / record["row"] / f"{name}.json"
+    with written_whole(place / CODE / f"{key}.json") as temporary:
+        temporary.write_text(code)
+    with written_whole(path) as temporary:
+        temporary.write_text(json.dumps({**record, "code": key}, indent=1) + "\n")
+    return path
+
+
+def read(row: Row, place: Path = PLACE) -> list[dict[str, Any]]:
+    """The row's records by seed, each with its code; none if it was not measured.
+
+    Raises:
+        UserError: A file that is damaged.
+    """
+    found = []
+    for path in (place / row.name).glob("*.json"):
+        record = read_json(path)
+        assert record is not None  # it was listed
+        code = read_json(place / CODE / f"{record['code']}.json")
+        if code is None:
+            raise UserError(f"{path}: its code, {CODE}/{record['code']}.json, is missing; measure it again")
+        found.append(record | {"code": code})
+    return sorted(found, key=lambda record: record.get("seed", 0))
+
+
+def read_json(file: Path) -> dict[str, Any] | None:
+    """The object in a file; ``None`` if there is no file.
+
+    Raises:
+        UserError: There is something else in it.
+    """
+    if not file.is_file():
+        return None
+    try:
+        found = json.loads(file.read_text())
+    except (OSError, ValueError) as error:
+        raise UserError(f"{file} cannot be read ({error}); measure it again") from error
+    if not isinstance(found, dict):
+        raise UserError(f"{file} holds no object; measure it again")
+    return found
+
+
+def prune(place: Path = PLACE) -> None:
+    """Removes the code that no record names any more."""
+    named = {
+        (read_json(path) or {}).get("code") for path in place.glob("*/*.json") if path.parent.name != CODE
+    }
+    for path in (place / CODE).glob("*.json"):
+        if path.stem not in named:
+            path.unlink()
+
+
+def _made_with(versions: Mapping[str, Any], jobs: int, commit: str | None) -> dict[str, Any]:
+    gpu = versions.get("device", "cpu") != "cpu"
+    machine = {"processor": versions["processor"], "cores": versions["cores"], "threads": versions["threads"]}
+    return {
+        "commit": versions.get("commit") or commit,
+        "date": versions["started"][:10],
+        "machine": machine | {"gpu": versions["device"] if gpu else None, "jobs": jobs},
+        "versions": {name: versions[name] for name in ("python", *PACKAGES) if name in versions},
+    }
+
+
+def _training(folder: Path) -> dict[str, float]:
+    """Counters of the run and, where it had one, its first stage."""
+    found = read_json(folder / "checkpoints" / "latest" / "counters.json")
+    first = read_json(folder / "pretrained" / "checkpoints" / "latest" / "counters.json")
+    if found is None:
+        raise UserError(f"{folder}: no checkpoint; results need the whole folder of a run")
+    if first is not None:
+        found |= {f"pretraining_{name}": value for name, value in first.items()}
+    return found

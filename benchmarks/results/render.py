@@ -1,0 +1,327 @@
+"""docs/results.md and README's tables, from the files in docs/results/ alone."""
+
+from __future__ import annotations
+
+import shlex
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from benchmarks.results.records import PLACE, read
+from benchmarks.results.rows import Row
+from benchmarks.results.state import Record, numbers, state
+from franka_wm.errors import UserError
+
+BEGIN, END = "<!-- results: written by `make results` -->", "<!-- end of results -->"
+HEAD = """# Results
+
+Written by `make results` from the files in [results/](results), which the runs wrote themselves; nothing is typed by
+hand. `benchmarks/results/rows.yaml` declares the rows. `make results ROW=name` measures one again.
+
+`a (b – c)` over several seeds is their mean, lowest and highest. For one seed `b – c` is the 95 % interval over its
+episodes: bootstrap for distances and returns, Wilson for rates. Episodes are held out: training never sees their seeds.
+*Doing nothing* and *random smooth* motion are what a policy must beat; *inverse kinematics* knows the true geometry.
+"""
+POLICIES = {
+    "planner": "planner",
+    "policy": "policy alone",
+    "noop": "doing nothing",
+    "random": "random smooth",
+    "oracle": "inverse kinematics",
+}
+
+
+@dataclass(frozen=True)
+class Metric:
+    """A column: its title, where a policy's summary holds it, and how it is printed."""
+
+    title: str
+    find: Callable[[Mapping[str, Any]], Mapping[str, float]]
+    factor: float
+    digits: int
+
+    def of(self, record: Record, policy: str, bound: str = "mean") -> float:
+        return self.factor * self.find(record["policies"][policy])[bound]
+
+    def show(self, *values: float) -> str:
+        first, *others = (f"{value:.{self.digits}f}" for value in values)
+        return f"{first} ({' – '.join(others)})" if others else first
+
+
+def _within(distance: str) -> Callable[[Mapping[str, Any]], Mapping[str, float]]:
+    return lambda summary: summary["success"][distance]
+
+
+DISTANCE = Metric("final distance [cm]", lambda summary: summary["final_distance"], 100, 2)
+WITHIN = {
+    cm: Metric(f"within {cm} cm [%]", _within(m), 100, 0)
+    for cm, m in (("5", "0.05"), ("2.5", "0.025"), ("1", "0.01"))
+}
+RETURN = Metric("return", lambda summary: summary["return"], 1, 0)
+
+
+def columns(records: Sequence[Record]) -> list[Metric]:
+    """Distances of the arm, returns of other environments."""
+    arm = all("final_distance" in summary for record in records for summary in record["policies"].values())
+    return [DISTANCE, *WITHIN.values()] if arm else [RETURN]
+
+
+# -- what was wanted ----------------------------------------------------------------------------------------
+
+
+def verdicts(row: Row, records: Sequence[Record]) -> list[tuple[str, str, bool]]:
+    """For each thing wanted: what, what was reached, and whether that is enough."""
+    found = []
+    for name, wanted in row.wanted.items():
+        policy = acting(records[0]["policies"])
+        if name == "minutes":
+            slowest = max(timed(records), key=seconds)
+            shared = slowest["machine"]["jobs"]
+            reached = duration(seconds(slowest)) + (f", {shared} runs at a time" if shared > 1 else "")
+            found.append((f"≤ {wanted:g} min of training", reached, seconds(slowest) <= 60 * wanted))
+        elif name == "distance_cm":
+            mean = _mean([DISTANCE.of(record, policy) for record in records])
+            found.append((f"≤ {wanted:g} cm on average", f"{mean:.2f} cm", mean <= wanted))
+        elif name == "return":
+            mean = _mean([RETURN.of(record, policy) for record in records])
+            found.append((f"return ≥ {wanted:g} on average", f"{mean:.0f}", mean >= wanted))
+        elif name == "planner_no_worse":
+            ours, alone = (
+                _mean([DISTANCE.of(record, one) for record in records]) for one in ("planner", "policy")
+            )
+            found.append(("planner no worse than policy", f"{ours:.2f} and {alone:.2f} cm", ours <= alone))
+        else:
+            cm = name.removeprefix("within_").removesuffix("cm")
+            worst = min(WITHIN[cm].of(record, policy) for record in records)
+            found.append(
+                (f"worst seed ≥ {wanted:g} % within {cm} cm", f"{worst:.1f} %", worst >= wanted - 1e-9)
+            )
+    return found
+
+
+def seconds(record: Record) -> float:
+    """Training, of both stages where there are two."""
+    training = record["training"]
+    return training["seconds"] + training.get("pretraining_seconds", 0)
+
+
+def timed(records: Sequence[Record]) -> Sequence[Record]:
+    """The runs whose times count: those that had the machine to themselves, if there are any."""
+    return [record for record in records if record["machine"]["jobs"] == 1] or records
+
+
+def acting(policies: Mapping[str, Any]) -> str:
+    """The policy that a run is about."""
+    return next((name for name in ("planner", "policy") if name in policies), next(iter(policies)))
+
+
+def duration(*values: float) -> str:
+    """``42 s`` or ``8.1 min``, with bounds if given."""
+    minutes = values[0] >= 120
+    first, *others = (f"{value / 60:.1f}" if minutes else f"{value:.0f}" for value in values)
+    return (f"{first} ({' – '.join(others)})" if others else first) + (" min" if minutes else " s")
+
+
+# -- the page -----------------------------------------------------------------------------------------------
+
+
+def page(rows: Mapping[str, Row], place: Path = PLACE) -> str:
+    """The content of docs/results.md."""
+    measured = {name: read(row, place) for name, row in rows.items()}
+    states = {name: state(row, measured[name]) for name, row in rows.items()}
+    single = [n for n, row in rows.items() if row.script is None and len(measured[n]) == 1]
+    parts = [HEAD]
+    sections = list({id(row.section): row.section for row in rows.values()}.values())
+    for section in sections:
+        here = [n for n, row in rows.items() if row.section is section and measured[n] and n not in single]
+        if here:
+            parts += [f"## {section.title}\n", *([section.text + "\n"] if section.text else [])]
+            parts += [part(rows[name], measured[name], states[name]) for name in here]
+    if single:
+        parts.append("## Single seeds\n\nOne run each: another seed may end elsewhere.\n")
+        parts += [part(rows[name], measured[name], states[name]) for name in single]
+    missing = [row for name, row in rows.items() if not measured[name]]
+    if missing:
+        parts.append("## Not measured yet\n")
+        parts += [f"- {row.section.title}, {row.title}: `make results ROW={row.name}`" for row in missing]
+        parts.append("")
+    return "\n".join(parts)
+
+
+def part(row: Row, records: Sequence[Record], judged: tuple[str, list[str]]) -> str:
+    """One row of the page."""
+    kind, reasons = judged
+    lines = [f"### {row.title}" + (f": {row.model}" if row.model else ""), ""]
+    if row.text:
+        lines += [row.text, ""]
+    lines += ["```bash", _command(row, records), "```", ""]
+    if kind == "mixed":
+        return "\n".join(
+            [*lines, "Not shown, its runs do not belong together: " + "; ".join(reasons) + ".", ""]
+        )
+    lines += [_provenance(row, records), ""]
+    if kind == "stale":
+        lines += [f"**Measured before changes of** {', '.join(f'`{reason}`' for reason in reasons)}.", ""]
+    if kind == "part":
+        lines += [f"{'; '.join(reasons).capitalize()}.", ""]
+    if row.script is not None:
+        return "\n".join([*lines, table(list(records[0]["rows"][0]), _cells(records[0]["rows"])), ""])
+    if judgement := verdicts(row, records):
+        cells = [[wanted, reached, "yes" if enough else "**no**"] for wanted, reached, enough in judgement]
+        lines += [table(["wanted", "measured", "reached"], cells), ""]
+    lines += [_over_seeds(records), ""]
+    if len(records) > 1:
+        lines += ["<details><summary>Every seed</summary>", "", _each_seed(records), "", "</details>", ""]
+    return "\n".join(lines)
+
+
+def _over_seeds(records: Sequence[Record]) -> str:
+    """A line for each policy."""
+    cells = []
+    for policy in records[0]["policies"]:
+        line = [POLICIES.get(policy, policy)]
+        for metric in columns(records):
+            if len(records) == 1:
+                line.append(_one_seed(records[0], policy, metric))
+            else:
+                each = [metric.of(record, policy) for record in records]
+                line.append(metric.show(_mean(each), min(each), max(each)))
+        cells.append(line)
+    return table(["policy", *(metric.title for metric in columns(records))], cells)
+
+
+def _one_seed(record: Record, policy: str, metric: Metric) -> str:
+    return metric.show(*(metric.of(record, policy, bound) for bound in ("mean", "low", "high")))
+
+
+def _each_seed(records: Sequence[Record]) -> str:
+    """A line for each seed: what acts, with its intervals."""
+    policy = acting(records[0]["policies"])
+    cells = []
+    for record in records:
+        line = [_one_seed(record, policy, metric) for metric in columns(records)]
+        cells.append(
+            [str(record["seed"]), *line, duration(seconds(record)), str(record["commit"]), record["date"]]
+        )
+    titles = [metric.title for metric in columns(records)]
+    return table(["seed", *titles, "training", "commit", "date"], cells)
+
+
+def _command(row: Row, records: Sequence[Record]) -> str:
+    """What to type; for several seeds in a loop."""
+    if row.script is not None:
+        return shlex.join(row.command)
+    seeds = " ".join(str(record["seed"]) for record in records)
+    if len(records) == 1:
+        return f"{shlex.join(row.command)} seed={seeds}"
+    return f"for seed in {seeds}; do\n  {shlex.join(row.command)} seed=$seed\ndone"
+
+
+def _provenance(row: Row, records: Sequence[Record]) -> str:
+    """Machine, versions, commit, date; of runs also seeds, episodes and what training took."""
+    machines = "; ".join(dict.fromkeys(machine(record) for record in records))
+    commits = ", ".join(dict.fromkeys(str(record["commit"]) for record in records))
+    dates = " – ".join(dict.fromkeys(f(record["date"] for record in records) for f in (min, max)))
+    made = records[0]["versions"]
+    with_what = f"{machines}; torch {made['torch']}, Newton {made['newton']}; commit {commits}, {dates}."
+    if row.script is not None:
+        return with_what
+    times = [seconds(record) for record in timed(records)]
+    commands = [record["training"]["command_seconds"] for record in timed(records)]
+    spread = (_mean(times), min(times), max(times)) if len(times) > 1 else (times[0],)
+    whole = duration(_mean(commands))
+    training = records[0]["training"]
+    episodes = next(iter(records[0]["policies"].values()))["episodes"]
+    seeds = numbers([record["seed"] for record in records])
+    return (
+        f"Seed{'s' * (len(records) > 1)} {seeds}, {episodes} episodes each. {training['updates']:,.0f} updates, "
+        f"{training['env_steps']:,.0f} steps; training {duration(*spread)}, the whole command {whole}. "
+        + with_what
+    )
+
+
+def machine(record: Record) -> str:
+    """The machine of a run, and how many runs shared it."""
+    made = record["machine"]
+    text = made["gpu"] or f"{made['processor']}, {made['threads']} thread{'s' * (made['threads'] > 1)}"
+    return text + (f", {made['jobs']} runs at a time" if made["jobs"] > 1 else "")
+
+
+def table(titles: Sequence[str], cells: Sequence[Sequence[str]]) -> str:
+    """Markdown."""
+    lines = ["| " + " | ".join(titles) + " |", "|---" * len(titles) + "|"]
+    return "\n".join([*lines, *("| " + " | ".join(line) + " |" for line in cells)])
+
+
+def _cells(rows: Sequence[Mapping[str, Any]], names: Sequence[str] | None = None) -> list[list[str]]:
+    def cell(value: Any) -> str:
+        if isinstance(value, float) and value != value:
+            return "–"
+        if isinstance(value, float):
+            return f"{value:,.0f}" if abs(value) >= 100 else f"{value:.3g}"
+        return str(value)
+
+    return [[cell(row[name]) for name in names or row] for row in rows]
+
+
+def _mean(values: Sequence[float]) -> float:
+    return sum(values) / len(values)
+
+
+# -- README -------------------------------------------------------------------------------------------------
+
+
+def readme_tables(rows: Mapping[str, Row], place: Path = PLACE) -> str:
+    """README's part: the arm, other environments, speed; rows of several seeds that belong together."""
+    arm, others, speed = [], [], []
+    aged = False
+    for row in rows.values():
+        records = read(row, place) if row.readme else []
+        kind, _ = state(row, records)
+        if kind in ("missing", "mixed") or (row.script is None and len(records) < 2):
+            continue
+        mark = "¹" if kind == "stale" else ""
+        aged = aged or kind == "stale"
+        if isinstance(row.readme, list):
+            titles = ["machine", *row.readme]
+            cells = [[machine(records[0]) + mark, *line] for line in _cells(records[0]["rows"], row.readme)]
+            speed += [table(titles, cells), ""]
+            continue
+        policy = acting(records[0]["policies"])
+        where, runs = row.section.title, f"{len(records)} seeds"
+        who = f"{row.title}{mark}"
+        if columns(records) == [RETURN]:
+            values = [RETURN.of(record, policy) for record in records]
+            reached = RETURN.show(_mean(values), min(values), max(values))
+            others.append([who, row.model, f"{where}, {runs}", reached, f"{row.wanted.get('return', '–')}"])
+            continue
+        times = _mean([seconds(record) for record in timed(records)])
+        distance = _mean([DISTANCE.of(record, policy) for record in records])
+        worst = min(WITHIN["5"].of(record, policy) for record in records)
+        nothing = _mean([DISTANCE.of(record, "noop") for record in records])
+        found = [duration(times), f"{distance:.1f} cm", f"{worst:.0f} %", f"{nothing:.0f} cm"]
+        arm.append([who, row.model, f"{where}, {runs}", *found])
+    parts = []
+    if arm:
+        titles = ["task", "model, planner", "machine", "training", "final distance"]
+        parts += [table([*titles, "within 5 cm, worst seed", "doing nothing"], arm), ""]
+    if others:
+        parts += [table(["other environments", "model, planner", "machine", "return", "wanted"], others), ""]
+    if speed:
+        parts += ["Environment steps per second, resets included, through TorchRL's `Collector`:", "", *speed]
+    if aged:
+        parts += ["¹ Measured before changes of the code; docs/results.md names them.", ""]
+    return "\n".join(parts or ["Not measured yet.", ""])
+
+
+def with_tables(readme: str, tables: str) -> str:
+    """README with its tables in their place.
+
+    Raises:
+        UserError: The place is not marked.
+    """
+    if readme.count(BEGIN) != 1 or readme.count(END) != 1:
+        raise UserError(f"README.md needs the lines {BEGIN} and {END} once each, around its tables")
+    before, rest = readme.split(BEGIN)
+    return f"{before}{BEGIN}\n\n{tables}\n{END}{rest.split(END)[1]}"

@@ -1,0 +1,132 @@
+"""Runs of a row as processes of their own, some at a time, and their files in docs/results/."""
+
+from __future__ import annotations
+
+import os
+import shlex
+import subprocess
+import sys
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from datetime import datetime
+from pathlib import Path
+from queue import Queue
+
+from benchmarks.results.records import PLACE, record_benchmark, record_run, write
+from benchmarks.results.rows import Row
+from franka_wm.errors import UserError
+from franka_wm.report.source import ROOT
+
+
+@dataclass(frozen=True)
+class Machine:
+    """Where the runs go.
+
+    Attributes:
+        jobs: runs at a time, on each device.
+        devices: of runs on GPUs, as ``device=`` takes them; empty: what train.py chooses.
+        threads: of each run; on CPU cores it has these to itself. ``None``: as many as the section says, and as torch
+            chooses on a GPU.
+        commit: of the code, where there is no repository.
+    """
+
+    jobs: int = 1
+    devices: Sequence[str] = ()
+    threads: int | None = None
+    commit: str | None = None
+
+    def slots(self, row: Row) -> list[tuple[list[str], list[str], dict[str, str]]]:
+        """For each run at a time: what stands before its command, after it, and in its environment.
+
+        Raises:
+            UserError: There are too few cores for so many runs.
+        """
+        environment = {"PYTHONPATH": str(ROOT)}
+        if self.commit:
+            environment["FRANKA_WM_COMMIT"] = self.commit
+        if row.section.threads is None:
+            if self.threads:
+                environment["OMP_NUM_THREADS"] = str(self.threads)
+            devices = [[f"device={device}"] for device in self.devices] or [[]]
+            return [([], device, environment) for device in devices for _ in range(self.jobs)]
+        threads = self.threads or row.section.threads
+        cores = sorted(os.sched_getaffinity(0))
+        if threads * self.jobs > len(cores):
+            raise UserError(
+                f"--jobs {self.jobs} with {threads} threads each need {threads * self.jobs} cores, and there are "
+                f"{len(cores)}; use fewer, or times would not be those of {threads} cores"
+            )
+        environment |= {"OMP_NUM_THREADS": str(threads), "CUDA_VISIBLE_DEVICES": ""}
+        own = [cores[k * threads : (k + 1) * threads] for k in range(self.jobs)]
+        return [(["taskset", "-c", ",".join(map(str, some))], [], environment) for some in own]
+
+
+def run(row: Row, machine: Machine, *, seeds: Sequence[int], out: Path, place: Path = PLACE) -> list[str]:
+    """Runs a row and writes its files; returns what failed, a line for each.
+
+    Args:
+        row: What to run.
+        machine: Where.
+        seeds: Of ``train.py``; a benchmark has none.
+        out: Folder for the runs' own folders and what they print.
+        place: Folder of the results.
+
+    Raises:
+        UserError: Before anything runs.
+    """
+    slots: Queue[tuple[list[str], list[str], dict[str, str]]] = Queue()
+    for slot in machine.slots(row):
+        slots.put(slot)
+    jobs = min(machine.jobs, len(seeds) or 1)
+    folder = out / row.name / datetime.now().strftime("%Y-%m-%d_%H-%M-%S")
+    folder.mkdir(parents=True)
+
+    def one(seed: int) -> str | None:
+        before, after, environment = slot = slots.get()
+        try:
+            target = folder / f"seed-{seed}"
+            command = [
+                sys.executable,
+                "train.py",
+                *row.words,
+                *after,
+                f"seed={seed}",
+                f"hydra.run.dir={target}",
+            ]
+            failure = _call([*before, *command], environment, folder / f"seed-{seed}.log")
+            if failure is None:
+                print(write(record_run(row, target, jobs=jobs), place), flush=True)
+            return failure
+        except UserError as error:
+            return str(error)
+        finally:
+            slots.put(slot)
+
+    if row.script is not None:
+        before, _, environment = slots.get()
+        command = [sys.executable, *row.command[1:], "--out", str(folder / "run.json")]
+        failure = _call([*before, *command], environment, folder / "run.log")
+        if failure is None:
+            print(write(record_benchmark(row, folder / "run.json"), place), flush=True)
+        return [failure] if failure else []
+    with ThreadPoolExecutor(slots.qsize()) as pool:
+        return [failure for failure in pool.map(one, seeds) if failure]
+
+
+def _call(command: Sequence[str], environment: dict[str, str], log: Path) -> str | None:
+    """Runs a command from the top of the repository, what it prints into a file; its last line if it fails."""
+    print(f"{shlex.join(command)}   > {log}", flush=True)
+    with log.open("w") as file:
+        done = subprocess.run(
+            command,
+            cwd=ROOT,
+            env=os.environ | environment,
+            stdout=file,
+            stderr=subprocess.STDOUT,
+            check=False,
+        )
+    if done.returncode == 0:
+        return None
+    last = (log.read_text().strip().splitlines() or ["nothing printed"])[-1]
+    return f"exit status {done.returncode}, {log}: {last}"

@@ -1,0 +1,109 @@
+"""Whether a row's files belong together, and to the code as it is now."""
+
+from __future__ import annotations
+
+import shlex
+from collections.abc import Mapping, Sequence
+from functools import cache
+from typing import Any
+
+from benchmarks.results.records import check_arguments
+from benchmarks.results.rows import Row
+from franka_wm.errors import FrankaError
+from franka_wm.report.run import SAME_BUT
+from franka_wm.report.source import ROOT, differing
+
+Record = Mapping[str, Any]
+
+
+def state(row: Row, records: Sequence[Record]) -> tuple[str, list[str]]:
+    """One of ``missing``, ``mixed``, ``stale``, ``part`` (seeds are missing) and ``fresh``, with the reasons."""
+    if not records:
+        return "missing", []
+    if reasons := mixed(row, records):
+        return "mixed", reasons
+    if reasons := stale(records):
+        return "stale", reasons
+    missing = sorted(set(row.seeds) - {record["seed"] for record in records}) if row.seeds else []
+    return ("part", [f"seeds {numbers(missing)} are missing"]) if missing else ("fresh", [])
+
+
+def mixed(row: Row, records: Sequence[Record]) -> list[str]:
+    """Why these records are not one row: another command than the row's, or other code, packages or configuration."""
+    reasons = []
+    for record in records:
+        where = f"seed {record['seed']}" if "seed" in record else "it"
+        try:
+            words = shlex.split(record["command"])
+            check_arguments(row, words[2:], where)
+            if words[1] != row.command[1]:
+                reasons.append(f"{where} ran {words[1]}")
+        except FrankaError as error:
+            reasons.append(str(error))
+    first = records[0]
+    for record in records[1:]:
+        files, others = first["code"]["files"], record["code"]["files"]
+        names = [name for name in files if files[name] != others.get(name, files[name])]
+        names += [
+            f"{name} {value}"
+            for name, value in record["versions"].items()
+            if first["versions"].get(name) != value
+        ]
+        names += changes(first["code"]["config"], record["code"]["config"])
+        if names:
+            reasons.append(f"seeds {first['seed']} and {record['seed']} differ in {', '.join(names)}")
+    return reasons
+
+
+def stale(records: Sequence[Record]) -> list[str]:
+    """What has changed since: files by name, values of the configuration that the command now makes."""
+    files: dict[str, str] = {}
+    for record in records:
+        files |= record["code"]["files"]
+    now = None
+    if records[0]["code"]["config"]:
+        now = composed(tuple(shlex.split(records[0]["command"])[2:]))
+    if isinstance(now, str):
+        return [*differing(files), f"its command, which is refused now: {now}"]
+    return differing(files) + ([] if now is None else changes(records[0]["code"]["config"], now))
+
+
+@cache
+def composed(typed: tuple[str, ...]) -> dict[str, Any] | str:
+    """The configuration of a command, as it is now, without what repetitions differ in; or why there is none."""
+    from hydra import compose, initialize_config_dir
+    from hydra.core.global_hydra import GlobalHydra
+    from hydra.errors import HydraException
+    from omegaconf import OmegaConf
+    from omegaconf.errors import OmegaConfBaseException
+
+    import franka_wm.training.entry  # noqa: F401  # registers what conf/config.yaml resolves
+
+    try:
+        with initialize_config_dir(str(ROOT / "conf"), version_base="1.3"):
+            cfg = compose("config", overrides=list(typed))
+        found = OmegaConf.to_container(cfg, resolve=True)
+    except (HydraException, OmegaConfBaseException) as error:
+        return str(error).splitlines()[0]
+    finally:
+        GlobalHydra.instance().clear()
+    assert isinstance(found, dict)
+    return {str(name): value for name, value in found.items() if name not in SAME_BUT}
+
+
+def changes(before: Any, after: Any, name: str = "") -> list[str]:
+    """Values of a configuration that differ: ``trainer.lr 0.001 → 0.0003``."""
+    if isinstance(before, Mapping) and isinstance(after, Mapping):
+        return [
+            found
+            for key in dict.fromkeys([*before, *after])
+            for found in changes(before.get(key, "–"), after.get(key, "–"), f"{name}.{key}" if name else key)
+        ]
+    return [] if before == after else [f"{name} {before} → {after}"]
+
+
+def numbers(seeds: Sequence[int]) -> str:
+    """``100 – 109`` for what follows one another, otherwise one by one."""
+    if len(seeds) > 2 and list(seeds) == list(range(seeds[0], seeds[-1] + 1)):
+        return f"{seeds[0]} – {seeds[-1]}"
+    return ", ".join(map(str, seeds))

@@ -1,0 +1,377 @@
+"""Rows of docs/results.md: from a run's folder to its file, from files to the page."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+
+from benchmarks.results import records, render, running
+from benchmarks.results.__main__ import main, overview
+from benchmarks.results.rows import Row, Section, load_rows
+from benchmarks.results.state import composed, state
+from franka_wm.errors import UserError
+from franka_wm.report import source
+
+CPU = Section(title="Two CPU cores", arguments="scale=smoke device=cpu", threads=2)
+ROW = Row(
+    name="reach",
+    section=CPU,
+    title="One fixed goal",
+    model="TD-MPC2, MPPI",
+    arguments="env=reach_fixed",
+    seeds=(100, 101),
+    wanted={"minutes": 1, "distance_cm": 1.5, "within_5cm": 90},
+    readme=True,
+)
+TYPED = ["scale=smoke", "device=cpu", "env=reach_fixed"]
+
+
+def interval(mean: float) -> dict[str, float]:
+    return {"mean": mean, "low": mean / 2, "high": min(1.0, 2 * mean)}
+
+
+def policy(distance: float, within: float) -> dict[str, Any]:
+    success = {d: interval(within) for d in ("0.05", "0.025", "0.01")}
+    return {
+        "final_distance": interval(distance),
+        "success": success,
+        "return": interval(0.5),
+        "episodes": 128,
+    }
+
+
+@pytest.fixture
+def make_run(tmp_path: Path) -> Callable[..., Path]:
+    """A finished run's folder: ``make_run(seed, distance, within, typed=…, versions=…, config=…)``."""
+
+    def make(
+        seed: int,
+        distance: float = 0.01,
+        within: float = 1.0,
+        *,
+        typed: list[str] = TYPED,
+        versions: dict[str, Any] | None = None,
+        config: dict[str, Any] | None = None,
+        protocol: dict[str, Any] | None = None,
+    ) -> Path:
+        run = tmp_path / "runs" / str(seed)
+        (run / ".hydra").mkdir(parents=True)
+        (run / "checkpoints" / "latest").mkdir(parents=True)
+        (run / ".hydra" / "overrides.yaml").write_text(yaml.safe_dump([*typed, f"seed={seed}"]))
+        now = composed((*TYPED, f"seed={seed}"))
+        assert isinstance(now, dict)
+        (run / "config.yaml").write_text(
+            yaml.safe_dump(now | {"seed": seed, "device": "cpu"} | (config or {}))
+        )
+        policies = {"planner": policy(distance, within), "noop": policy(0.25, 0.0)}
+        found = {"protocol": protocol or {}, "policies": policies}
+        (run / "evaluation.json").write_text(json.dumps(found))
+        counters = {"env_steps": 200, "updates": 30, "seconds": 30.0 + seed - 100}
+        (run / "checkpoints" / "latest" / "counters.json").write_text(json.dumps(counters))
+        made = {
+            "python": "3.12.1", "torch": "2.11.0", "newton": "1.8.0", "processor": "a processor", "cores": 2,
+            "threads": 2, "device": "cpu", "commit": "0123456789ab", "started": "2026-01-02T03:04:05+00:00",
+            "seconds": 40, "source": {n: source.code_hash(n, c) for n, c in source.read(["train.py"]).items()},
+        }  # fmt: skip
+        (run / "versions.json").write_text(json.dumps(made | (versions or {})))
+        return run
+
+    return make
+
+
+@pytest.fixture
+def measured(make_run: Callable[..., Path], tmp_path: Path) -> Callable[..., Path]:
+    """The results folder of runs, given as for ``make_run``."""
+
+    def make(*runs: dict[str, Any]) -> Path:
+        place = tmp_path / "results"
+        for one in runs:
+            records.write(records.record_run(ROW, make_run(**one), jobs=1), place)
+        return place
+
+    return make
+
+
+def test_a_record_holds_what_the_run_wrote(make_run) -> None:
+    run = make_run(100, 0.01, protocol={"episodes": 128})
+    record = records.record_run(ROW, run, jobs=3)
+    assert record["policies"] == json.loads((run / "evaluation.json").read_text())["policies"]
+    assert record["protocol"] == {"episodes": 128}
+    assert record["command"] == "python train.py scale=smoke device=cpu env=reach_fixed seed=100"
+    assert (record["seed"], record["commit"], record["date"]) == (100, "0123456789ab", "2026-01-02")
+    machine = {"processor": "a processor", "cores": 2, "threads": 2, "gpu": None, "jobs": 3}
+    assert record["machine"] == machine
+    assert record["training"] == {"env_steps": 200, "updates": 30, "seconds": 30.0, "command_seconds": 40}
+
+
+def test_a_run_whose_evaluation_is_of_an_older_form_is_refused(make_run) -> None:
+    run = make_run(100, 0.01)
+    (run / "evaluation.json").write_text(json.dumps({"planner": policy(0.01, 1.0)}))
+    with pytest.raises(UserError, match="older form"):
+        records.record_run(ROW, run, jobs=1)
+
+
+def test_both_stages_count(make_run, tmp_path) -> None:
+    run = make_run(100)
+    first = run / "pretrained" / "checkpoints" / "latest"
+    first.mkdir(parents=True)
+    (first / "counters.json").write_text(json.dumps({"updates": 10, "seconds": 60.0}))
+    assert render.seconds(records.record_run(ROW, run, jobs=1)) == 90
+
+
+@pytest.mark.parametrize(
+    ("given", "says"),
+    [
+        ({"typed": [*TYPED, "trainer.lr=1"]}, "not a run of reach, started with trainer.lr=1"),
+        ({"typed": TYPED[:2]}, "started without env=reach_fixed"),
+        ({"config": {"resume": "outputs/before"}}, "resumed"),
+        ({"versions": {"device": "NVIDIA H200"}}, "on NVIDIA H200, and reach is measured with 2 threads"),
+        ({"versions": {"threads": 4}}, "with 4 threads"),
+    ],
+)
+def test_another_run_is_refused(make_run, given, says) -> None:
+    with pytest.raises(UserError, match=says):
+        records.record_run(ROW, make_run(100, **given), jobs=1)
+
+
+def test_a_run_that_did_not_finish_is_refused(make_run) -> None:
+    run = make_run(100)
+    versions = json.loads((run / "versions.json").read_text())
+    del versions["source"]
+    (run / "versions.json").write_text(json.dumps(versions))
+    with pytest.raises(UserError, match="finished"):
+        records.record_run(ROW, run, jobs=1)
+
+
+def test_arguments_that_change_no_number_may_differ(make_run) -> None:
+    typed = [*TYPED, "logger=none", "evaluation.video_episodes=0"]
+    assert "logger=none" in records.record_run(ROW, make_run(100, typed=typed), jobs=1)["command"]
+
+
+# -- the page -----------------------------------------------------------------------------------------------
+
+
+def test_the_page_tells_mean_worst_and_what_was_wanted(measured) -> None:
+    place = measured(
+        {"seed": 100, "distance": 0.01, "within": 1.0}, {"seed": 101, "distance": 0.03, "within": 0.8}
+    )
+    assert state(ROW, records.read(ROW, place)) == ("fresh", [])
+    text = render.page({"reach": ROW}, place)
+    assert (
+        "for seed in 100 101; do\n  python train.py scale=smoke device=cpu env=reach_fixed seed=$seed" in text
+    )
+    assert "| planner | 2.00 (1.00 – 3.00) | 90 (80 – 100) |" in text
+    assert "| ≤ 1 min of training | 31 s | yes |" in text
+    assert "| ≤ 1.5 cm on average | 2.00 cm | **no** |" in text
+    assert "| worst seed ≥ 90 % within 5 cm | 80.0 % | **no** |" in text
+    assert "| 101 | 3.00 (1.50 – 6.00) | 80 (40 – 100) |" in text
+    assert "a processor, 2 threads; torch 2.11.0" in text and "commit 0123456789ab, 2026-01-02" in text
+    readme = render.readme_tables({"reach": ROW}, place)
+    line = "| One fixed goal | TD-MPC2, MPPI | Two CPU cores, 2 seeds | 30 s | 2.0 cm | 80 % | 25 cm |"
+    assert line in readme
+    assert "missed: ≤ 1.5 cm" in overview({"reach": ROW}, place)
+
+
+def test_single_seeds_stand_below_and_not_in_the_readme(measured) -> None:
+    place = measured({"seed": 100})
+    text = render.page({"reach": ROW}, place)
+    assert "## Two CPU cores" not in text
+    assert text.index("## Single seeds") < text.index("### One fixed goal")
+    assert "| planner | 1.00 (0.50 – 2.00) |" in text  # the interval over its episodes
+    assert "Seeds 101 are missing" in text
+    assert "One fixed goal" not in render.readme_tables({"reach": ROW}, place)
+
+
+@pytest.mark.parametrize(
+    ("given", "says"),
+    [
+        ({"versions": {"source": {"train.py": "000000000000"}}}, "seeds 100 and 101 differ in train.py"),
+        ({"versions": {"torch": "2.11.1"}}, "differ in torch 2.11.1"),
+        ({"config": {"scale": "other"}}, "differ in scale smoke → other"),
+    ],
+)
+def test_a_row_of_mixed_versions_is_refused(measured, given, says) -> None:
+    place = measured({"seed": 100}, {"seed": 101, **given})
+    kind, reasons = state(ROW, records.read(ROW, place))
+    assert kind == "mixed" and says in reasons[0]
+    text = render.page({"reach": ROW}, place)
+    assert says in text and "| planner |" not in text
+    assert "One fixed goal" not in render.readme_tables({"reach": ROW}, place)
+
+
+def test_a_row_measured_with_another_command_is_refused(measured) -> None:
+    from dataclasses import replace
+
+    place = measured({"seed": 100}, {"seed": 101})
+    row = replace(ROW, arguments="env=reach_fixed trainer.lr=0.1")
+    assert state(row, records.read(row, place))[0] == "mixed"
+
+
+def test_times_are_those_of_runs_that_were_alone(make_run, tmp_path) -> None:
+    """Seed 100 shared the machine, seed 101 did not; with none alone the page says how many shared it."""
+    shared = records.record_run(ROW, make_run(100), jobs=3)
+    alone = records.record_run(ROW, make_run(101), jobs=1)
+    assert render.verdicts(ROW, [shared, alone])[0] == ("≤ 1 min of training", "31 s", True)
+    assert render.verdicts(ROW, [shared])[0][1] == "30 s, 3 runs at a time"
+
+
+def test_code_that_no_file_names_is_removed(measured, make_run) -> None:
+    place = measured({"seed": 100})
+    before = {path.name for path in (place / "code").iterdir()}
+    newer = make_run(101, versions={"source": {"train.py": "1"}})
+    records.write(records.record_run(ROW, newer, jobs=1), place)
+    (place / "reach" / "seed-100.json").unlink()
+    records.prune(place)
+    assert len(list((place / "code").iterdir())) == 1
+    assert not (place / "code" / before.pop()).exists()
+
+
+def test_rows_older_than_the_code_say_so(measured) -> None:
+    old = {"versions": {"source": {"train.py": "000000000000", "gone.py": "1"}}}
+    place = measured({"seed": 100, **old}, {"seed": 101, **old})
+    assert state(ROW, records.read(ROW, place)) == ("stale", ["gone.py", "train.py"])
+    text = render.page({"reach": ROW}, place)
+    assert "**Measured before changes of** `gone.py`, `train.py`." in text and "| planner |" in text
+    assert "One fixed goal¹" in render.readme_tables({"reach": ROW}, place)
+
+
+def test_rows_older_than_the_configuration_say_so(measured) -> None:
+    old = {"config": {"scale": "other"}}
+    place = measured({"seed": 100, **old}, {"seed": 101, **old})
+    assert state(ROW, records.read(ROW, place)) == ("stale", ["scale other → smoke"])
+
+
+def test_what_is_not_measured_is_named_and_left_out_of_the_readme(tmp_path) -> None:
+    text = render.page({"reach": ROW}, tmp_path)
+    assert "## Not measured yet" in text and "`make results ROW=reach`" in text
+    assert render.readme_tables({"reach": ROW}, tmp_path) == "Not measured yet.\n"
+
+
+def test_a_benchmark(tmp_path) -> None:
+    row = Row(
+        name="speed",
+        section=Section(title="Speed", threads=2),
+        title="The learner",
+        script="benchmarks/learner.py",
+        arguments="--precision float32",
+        readme=["batch", "updates"],
+    )
+    made = {
+        "python": "3", "torch": "2.11.0", "newton": "1.8.0", "processor": "p", "cores": 2, "threads": 2,
+        "device": "cpu", "started": "2026-01-02T03:04:05+00:00", "source": {},
+    }  # fmt: skip
+    file = tmp_path / "out.json"
+    found = {"machine": made, "rows": [{"batch": "32", "updates": 1234.5, "other": float("nan")}]}
+    file.write_text(json.dumps(found))
+    records.write(records.record_benchmark(row, file, commit="abc"), tmp_path)
+    text = render.page({"speed": row}, tmp_path)
+    assert "python benchmarks/learner.py --precision float32" in text
+    assert "| 32 | 1,234 | – |" in text and "commit abc" in text
+    assert "| p, 2 threads | 32 | 1,234 |" in render.readme_tables({"speed": row}, tmp_path)
+    file.write_text("{}")
+    with pytest.raises(UserError, match="not what a benchmark wrote"):
+        records.record_benchmark(row, file)
+
+
+# -- the declared rows and the committed pages --------------------------------------------------------------
+
+
+def test_every_declared_command_composes() -> None:
+    for row in load_rows().values():
+        if row.script is None:
+            assert isinstance(composed(tuple(row.words)), dict), (row.name, composed(tuple(row.words)))
+        else:
+            assert (source.ROOT / row.script).is_file()
+
+
+@pytest.mark.parametrize(
+    ("entry", "says"),
+    [
+        ("{section: b, title: t, seeds: [0, 1]}", "section must be one of a"),
+        ("{section: a, title: t, seed: 0}", "no entry seed"),
+        ("{section: a, title: t}", "needs either seeds"),
+        ("{section: a, title: t, seeds: [0, 1], wanted: {speed: 3}}", "wanted has no speed"),
+    ],
+)
+def test_a_wrong_declaration_is_one_line(tmp_path, entry, says) -> None:
+    file = tmp_path / "rows.yaml"
+    file.write_text(f"sections: {{a: {{title: A}}}}\nrows:\n  one: {entry}\n")
+    with pytest.raises(UserError, match=says):
+        load_rows(file)
+
+
+def test_committed_pages_are_what_the_files_say() -> None:
+    """Nobody edits them by hand; after changes of code or files `make results` writes them anew."""
+    rows = load_rows()
+    assert (source.ROOT / "docs" / "results.md").read_text() == render.page(rows), "run `make results`"
+    readme = (source.ROOT / "README.md").read_text()
+    assert readme == render.with_tables(readme, render.readme_tables(rows)), "run `make results`"
+
+
+def test_readme_without_its_place_is_refused() -> None:
+    with pytest.raises(UserError, match="needs the lines"):
+        render.with_tables("# a readme", "tables")
+
+
+# -- running ------------------------------------------------------------------------------------------------
+
+
+def test_runs_on_cores_have_them_alone() -> None:
+    import os
+
+    with pytest.raises(UserError, match="cores"):
+        running.Machine(jobs=len(os.sched_getaffinity(0)) + 1, threads=1).slots(ROW)
+    ((before, after, environment),) = running.Machine(threads=1).slots(ROW)
+    assert before[:2] == ["taskset", "-c"] and len(before[2].split(",")) == 1 and not after
+    assert environment["OMP_NUM_THREADS"] == "1"
+
+
+def test_runs_on_gpus_are_spread_over_them() -> None:
+    from dataclasses import replace
+
+    row = replace(ROW, section=Section(title="One GPU", arguments="scale=gpu"))
+    slots = running.Machine(jobs=2, devices=("cuda:0", "cuda:1"), commit="abc").slots(row)
+    assert [after for _, after, _ in slots] == [["device=cuda:0"]] * 2 + [["device=cuda:1"]] * 2
+    assert all(environment["FRANKA_WM_COMMIT"] == "abc" for _, _, environment in slots)
+    assert all("OMP_NUM_THREADS" not in environment for _, _, environment in slots)
+
+
+def test_a_run_that_fails_is_told_and_leaves_no_file(tmp_path) -> None:
+    from dataclasses import replace
+
+    row = replace(ROW, arguments="env=reach_fixed trainer.updates=-1")
+    failed = running.run(
+        row, running.Machine(threads=1), seeds=[100], out=tmp_path / "out", place=tmp_path / "place"
+    )
+    assert len(failed) == 1 and "trainer.updates" in failed[0]
+    assert not (tmp_path / "place").exists()
+
+
+@pytest.mark.slow
+def test_a_row_is_run_and_collected(tmp_path, capsys) -> None:
+    from dataclasses import replace
+
+    words = "env=reach_fixed evaluation.episodes=2 evaluation.video_episodes=0 logger=none"
+    row = replace(ROW, arguments=words, seeds=(100,))
+    place = tmp_path / "place"
+    assert running.run(row, running.Machine(threads=1), seeds=[100], out=tmp_path / "out", place=place) == []
+    (record,) = records.read(row, place)
+    assert state(row, [record]) == ("fresh", [])
+    files = record["code"]["files"]
+    assert {"train.py", "franka_wm/models/tdmpc2.py", "franka_wm/envs/robots/fr3.urdf"} <= set(files)
+    assert "franka_wm/models/lewm.py" not in files  # never imported
+    assert record["training"]["updates"] == 30 and record["policies"]["planner"]["episodes"] == 2
+
+
+def test_commands(tmp_path, capsys) -> None:
+    assert main(["list", "--results", str(tmp_path)]) == 0
+    assert "reach-cpu" in capsys.readouterr().out
+    assert main(["run", "no-such-row"]) == 1
+    assert main(["collect", "reach-cpu", str(tmp_path), "--jobs", "1", "--results", str(tmp_path)]) == 1
+    err = capsys.readouterr().err
+    assert "no row 'no-such-row'; there are reach-cpu" in err and "finished" in err
