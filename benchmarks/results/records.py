@@ -18,7 +18,8 @@ import yaml
 from benchmarks.results.rows import Row
 from franka_wm.errors import UserError
 from franka_wm.report import written_whole
-from franka_wm.report.run import SAME_BUT, read_config, split_evaluation
+from franka_wm.report.results import read_result
+from franka_wm.report.run import SAME_BUT, read_config
 from franka_wm.report.source import ROOT
 from franka_wm.report.versions import PACKAGES
 
@@ -29,7 +30,6 @@ FREE = (
     "device",
     "logger",
     "evaluation.video_episodes",
-    "evaluation.thorough",
     "trainer.checkpoint_replay",
 )
 """Arguments that a run may have beside its row's, or lack: they change none of its numbers."""
@@ -56,7 +56,7 @@ def record_run(row: Row, folder: Path, *, jobs: int, commit: str | None = None) 
     typed = overrides(folder)
     check_arguments(row, typed, folder)
     check_machine(row, versions, folder)
-    policies, extras = split_evaluation(read_json(folder / "evaluation.json") or {}, source=folder)
+    found = read_result(folder / "evaluation.json")
     kept = {name: value for name, value in config.items() if name not in SAME_BUT}
     return {
         "row": row.name,
@@ -64,8 +64,8 @@ def record_run(row: Row, folder: Path, *, jobs: int, commit: str | None = None) 
         "command": shlex.join(["python", "train.py", *typed]),
         **_made_with(versions, jobs, commit),
         "training": _training(folder) | {"command_seconds": versions["seconds"]},
-        "protocol": extras.get("protocol"),
-        "policies": policies,
+        "protocol": found.protocol,
+        "policies": found.policies,
         "code": {"files": versions["source"], "config": kept},
     }
 
