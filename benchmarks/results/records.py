@@ -18,7 +18,7 @@ import yaml
 from benchmarks.results.rows import Row
 from franka_wm.errors import UserError
 from franka_wm.report import written_whole
-from franka_wm.report.run import SAME_BUT, read_config, split_evaluation
+from franka_wm.report.run import SAME_BUT, read_config
 from franka_wm.report.source import ROOT
 from franka_wm.report.versions import PACKAGES
 
@@ -47,26 +47,28 @@ def record_run(row: Row, folder: Path, *, jobs: int, commit: str | None = None) 
     Raises:
         UserError: It did not finish, was resumed, is not a run of this row, or ran on another kind of machine.
     """
-    versions = read_json(folder / "versions.json")
+    versions, finished, found = (
+        read_json(folder / f"{name}.json") for name in ("versions", "finished", "evaluation")
+    )
     config = read_config(folder)
-    if not versions or "source" not in versions or not (folder / "evaluation.json").is_file():
+    if not versions or not finished or not found:
         raise UserError(f"{folder}: not the folder of a run that finished; results need the whole run")
     if config.get("resume"):
         raise UserError(f"{folder}: a run that was resumed; results need runs in one piece")
     typed = overrides(folder)
     check_arguments(row, typed, folder)
     check_machine(row, versions, folder)
-    policies, extras = split_evaluation(read_json(folder / "evaluation.json") or {}, source=folder)
+    policies = found.get("policies", found)  # earlier versions wrote the policies alone
     kept = {name: value for name, value in config.items() if name not in SAME_BUT}
     return {
         "row": row.name,
         "seed": config["seed"],
         "command": shlex.join(["python", "train.py", *typed]),
         **_made_with(versions, jobs, commit),
-        "training": _training(folder) | {"command_seconds": versions["seconds"]},
-        "protocol": extras.get("protocol"),
+        "training": _training(folder) | {"command_seconds": finished["seconds"]},
+        "protocol": found.get("protocol"),
         "policies": policies,
-        "code": {"files": versions["source"], "config": kept},
+        "code": {"files": finished["source"], "config": kept},
     }
 
 
