@@ -48,7 +48,20 @@ def main(cfg: DictConfig) -> None:
         trainer.restore(run.checkpoint)
     trainer.fit()
     if not trainer.interrupted and policies:
-        evaluate_and_report(run.cfg, run.folder, judge, policies, rows=trainer.rows, log_video=run.log_video)
+        evaluate_and_report(
+            run.cfg,
+            run.folder,
+            judge,
+            policies,
+            rows=trainer.rows,
+            counters={
+                "updates": trainer.learner.updates,
+                "env_steps": trainer.env_steps,
+                "seconds": trainer.seconds,
+            },
+            log=trainer.record,
+            log_video=run.log_video,
+        )
     finish(run, trainer)
 
 

@@ -32,7 +32,10 @@ def judge_height(
 
 
 class RaiseTool(Task):
-    """The reward is minus what is missing to the height [m]; a success is to be above it."""
+    """The reward is minus what is missing to the height [m]; a success is to be above it.
+
+    That, the return and the height at the end are what tables and curves of a run show.
+    """
 
     def __init__(self, config: FrankaConfig):
         super().__init__(config)
@@ -44,6 +47,9 @@ class RaiseTool(Task):
         w = sim.warp
         inputs = [w.next_true_state, HEIGHT, w.reward, w.success]
         wp.launch(judge_height, sim.num_envs, inputs, device=sim.device)
+
+    def measures(self, sim):
+        return {"height [m]": sim.next_true_state[:, 16]}
 
 
 register("raise_tool", RaiseTool)

@@ -17,6 +17,7 @@ from hydra.core.global_hydra import GlobalHydra
 from omegaconf import OmegaConf
 
 from franka_wm.errors import FrankaError
+from franka_wm.report.run import read_run
 from franka_wm.training.checkpoint import latest_checkpoint, load_checkpoint
 from franka_wm.training.entry import check_command, run_name, with_scale
 
@@ -53,10 +54,18 @@ def test_what_it_says(run) -> None:
 
 
 def test_evaluation_json(run) -> None:
-    results = json.loads((run[0] / "evaluation.json").read_text())
+    found = json.loads((run[0] / "evaluation.json").read_text())
+    assert set(found) == {"protocol", "policies"}
+    told, results = found["protocol"], found["policies"]
+    assert (told["by"], told["task"], told["model"]) == ("the end of training", "reach", "tdmpc2")
+    assert (told["planner"], told["seed"], told["episodes"], told["device"]) == ("mppi", 0, 4, "cpu")
+    assert (told["updates"], told["env_steps"]) == (30, 8 * (10 + 15)) and told["training_seconds"] > 0
+    assert told["hardware"].endswith(("thread", "threads")) and told["franka_wm"] and told["seeds"]
     assert set(results) == {"planner", "policy", "noop", "random", "oracle"}
     for name, result in results.items():
-        assert set(result) == {"final_distance", "success", "return", "episodes"}, name
+        assert {"final_distance", "success", "return", "episodes", "success_once", "jerk"} <= set(result), (
+            name
+        )
         assert result["episodes"] == 4
         assert set(result["success"]) == {"0.05", "0.025", "0.01"}
         for interval in (result["final_distance"], result["return"], *result["success"].values()):
@@ -64,6 +73,25 @@ def test_evaluation_json(run) -> None:
             assert interval["low"] <= interval["mean"] <= interval["high"]
         assert -LENGTH * 1.01 <= result["return"]["mean"] <= 0
     assert results["oracle"]["final_distance"]["mean"] < 0.05 < results["noop"]["final_distance"]["mean"]
+
+
+def test_the_curves_end_with_the_table(run) -> None:
+    """Planner and policy, in files, on the page, and in the picture, which is drawn from the same rows."""
+    folder = run[0]
+    policies = json.loads((folder / "evaluation.json").read_text())["policies"]
+    last = read_run(folder).rows[-1]
+    for name in ("planner", "policy"):
+        table = {
+            "final_distance": policies[name]["final_distance"]["mean"],
+            "success": policies[name]["success"]["0.05"]["mean"],
+            "return": policies[name]["return"]["mean"],
+        }
+        for quantity, value in table.items():
+            assert last[f"eval/{name}/{quantity}"] == value
+            lines = (folder / "csv" / "scalars" / "eval" / name / f"{quantity}.csv").read_text().splitlines()
+            step, logged = map(float, lines[-1].split(","))
+            assert step == last["updates"] == 30 and logged == pytest.approx(value)
+    assert (last["env_steps"], last["time_s"] > 0) == (8 * (10 + 15), True)
 
 
 def test_what_it_leaves(run) -> None:

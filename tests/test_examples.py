@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import subprocess
 import sys
@@ -61,6 +62,11 @@ def test_add(arguments: tuple[str, ...], root: Path, tmp_path: Path) -> None:
     out = run(root, "train.py", *RUN, *arguments, f"hydra.run.dir={tmp_path}/run")
     assert (tmp_path / "run" / "evaluation.json").is_file()
     assert "planner" in out
+    told = json.loads((tmp_path / "run" / "evaluation.json").read_text())
+    own = "env.task=raise_tool" in arguments
+    assert ("height [m]" in out) is own and ("final distance [cm]" in out) is not own
+    assert told["protocol"]["task"] == ("raise_tool" if own else "reach")
+    assert ("final_distance" in told["policies"]["planner"]) is not own
 
 
 def test_a_plugin_that_is_not_there(root: Path, tmp_path: Path) -> None:

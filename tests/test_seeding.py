@@ -8,7 +8,9 @@ def test_the_same_purpose_and_seed_give_the_same_number_in_every_process():
 
 
 def test_purposes_seeds_and_parts_are_told_apart():
-    asked = [(p, s, *more) for p in ("a", "b") for s in range(50) for more in ((), (1,), ("1x",), (1, 2), (12,))]
+    asked = [
+        (p, s, *more) for p in ("a", "b") for s in range(50) for more in ((), (1,), ("1x",), (1, 2), (12,))
+    ]
     assert len({derive_seed(*one) for one in asked}) == len(asked)
 
 

@@ -8,7 +8,7 @@ import torch
 from tensordict import TensorDictBase
 from torchrl.data import ReplayBuffer
 
-from franka_wm.data.replay import WindowSampler
+from franka_wm.data.replay import WindowReplay, WindowSampler, newest_step
 from franka_wm.data.stacks import StackStorage
 
 
@@ -56,6 +56,7 @@ class CapturedSampling:
         assert self._graph is not None and self._batch is not None
         self._choices.fill_(span * data.shape[1])
         self._oldest.fill_(oldest)
+        self._newest.fill_(newest_step(self.replay))
         self._graph.replay()
         if self._crossing is not None:
             sampler.record_missing(self._crossing)
@@ -70,6 +71,7 @@ class CapturedSampling:
         assert size is not None
         self._choices = torch.ones((), dtype=torch.float64, device=device)
         self._oldest = torch.zeros((), dtype=torch.int64, device=device)
+        self._newest = torch.zeros((), dtype=torch.int64, device=device)
         graph = torch.cuda.CUDAGraph()
         with torch.cuda.graph(graph, capture_error_mode="thread_local"):
             self._draw(data, sampler, size)
@@ -83,4 +85,6 @@ class CapturedSampling:
         time, world, crossing = sampler.choose(data, draw, self._oldest, size)
         storage = self.replay.storage
         self._batch = storage.windows(time, world) if isinstance(storage, StackStorage) else data[time, world]
+        if isinstance(self.replay, WindowReplay) and self.replay.hindsight is not None:
+            self.replay.hindsight(self._batch, data, time, world, self._newest)
         self._crossing = crossing

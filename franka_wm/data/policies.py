@@ -89,9 +89,7 @@ class OraclePolicy(TensorDictModuleBase):
         self.config = config
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        target = tensordict.get("joint_target", None)
-        if target is None:
-            raise UserError("the oracle reads joint_target; add it to the environment's observations")
+        target = _joint_target(tensordict)
         goal, c, k = tensordict.get("goal"), self.config, self.kinematics
         if c.action_mode == "ee_delta":
             action = (goal - k.forward(target)) / c.ee_scale
@@ -100,6 +98,60 @@ class OraclePolicy(TensorDictModuleBase):
         else:
             action = (k.solve(goal, target) - target) / c.action_scale
         return tensordict.set("action", action.clamp(-1.0, 1.0))
+
+
+def _joint_target(tensordict: TensorDictBase) -> torch.Tensor:
+    target = tensordict.get("joint_target", None)
+    if target is None:
+        raise UserError("the oracle reads joint_target; add it to the environment's observations")
+    return target
+
+
+class DiscreteOraclePolicy(TensorDictModuleBase):
+    """The oracle for numbered moves: the first of the two moves after which the tool is nearest to the goal.
+
+    All pairs of moves are tried with the true geometry, on the tool's position where the servo's targets put it. A
+    tenth of the distance after the first move counts as well, so that arriving is not put off. On ``env=reach`` it ends
+    0.8 cm from the goal; the move nearest to the continuous oracle's action, 2.6 cm.
+
+    Args:
+        kinematics: The arm's.
+        config: The environment's: what an action means.
+        table: The moves, (M, A).
+    """
+
+    in_keys = ["joint_target", "goal"]  # pyright: ignore[reportAssignmentType]
+    out_keys = ["action"]  # pyright: ignore[reportAssignmentType]
+
+    def __init__(self, kinematics: Kinematics, config: FrankaConfig, table: torch.Tensor):
+        super().__init__()
+        self.kinematics = kinematics
+        self.config = config
+        self.table = table
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        target, goal = _joint_target(tensordict), tensordict.get("goal")
+        if self.config.action_mode == "ee_delta":
+            target = self.kinematics.forward(target)  # tool positions stand for targets: moves shift them
+        once = self._moved(target)  # (N, M, 7 or 3)
+        twice = self._moved(once)  # (N, M, M, 7 or 3)
+        soon = (self._tool(once) - goal[..., None, :]).norm(dim=-1)
+        late = (self._tool(twice) - goal[..., None, None, :]).norm(dim=-1).amin(-1)
+        return tensordict.set("action", (late + 0.1 * soon).argmin(-1))
+
+    def _moved(self, target: torch.Tensor) -> torch.Tensor:
+        """Targets (..., 7), or tool positions (..., 3), after each move: (..., M, 7 or 3)."""
+        c, k, target = self.config, self.kinematics, target.unsqueeze(-2)
+        if c.action_mode == "ee_delta":
+            return target + c.ee_scale * self.table
+        if c.action_mode == "joint_position":
+            return (k.lower + 0.5 * (self.table + 1.0) * (k.upper - k.lower)).expand(
+                *target.shape[:-2], -1, -1
+            )
+        return torch.clamp(target + c.action_scale * self.table, k.lower, k.upper)
+
+    def _tool(self, target: torch.Tensor) -> torch.Tensor:
+        return target if self.config.action_mode == "ee_delta" else self.kinematics.forward(target)
 
 
 class DiscretePolicy(TensorDictModuleBase):

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, cast
 
 import torch
 from torchrl.data import LazyTensorStorage, ReplayBuffer
 from torchrl.data.replay_buffers import RoundRobinWriter, Sampler
 
+from franka_wm.data.hindsight import Hindsight
 from franka_wm.data.stacks import BOUNDARY, StackStorage
 from franka_wm.errors import UserError
 
@@ -148,6 +149,32 @@ class WindowSampler(Sampler):
     def load_state_dict(self, state_dict: dict[str, Any]) -> None: ...
 
 
+class WindowReplay(ReplayBuffer):
+    """A replay buffer of windows, a share of which gets goals in hindsight where that is asked for.
+
+    Args:
+        hindsight: Relabels each batch in place; ``None``: batches are as they were recorded.
+        options: Of TorchRL's buffer.
+    """
+
+    def __init__(self, *, hindsight: Hindsight | None = None, **options: Any):
+        super().__init__(**options)
+        self.hindsight = hindsight
+
+    def sample(self, batch_size: int | None = None, return_info: bool = False) -> Any:
+        batch, info = super().sample(batch_size, return_info=True)
+        if self.hindsight is not None:
+            (time, world), storage = info["index"], cast(Any, self.storage)
+            self.hindsight(batch, storage._storage, time, world, newest_step(self))
+        return (batch, info) if return_info else batch
+
+
+def newest_step(replay: ReplayBuffer) -> int:
+    """Time of the step that was written last, in a storage of (time, worlds)."""
+    cursor: int = replay.writer._cursor  # type: ignore[union-attr]
+    return (cursor - 1) % replay.storage._storage.shape[0]  # type: ignore[union-attr]
+
+
 def make_replay(
     *,
     capacity: int,
@@ -158,7 +185,8 @@ def make_replay(
     past_end: bool = False,
     frame_stack: int = 1,
     stacked: Sequence[str] = (),
-) -> ReplayBuffer:
+    hindsight: Hindsight | None = None,
+) -> WindowReplay:
     """A buffer of (time, worlds) that is extended with the collector's (worlds, time) batches.
 
     Args:
@@ -171,6 +199,7 @@ def make_replay(
         frame_stack: Pictures in each observation under ``stacked``, as ``env.frame_stack``: each is kept once, and
             samples have stacks again.
         stacked: Keys of such observations.
+        hindsight: Relabels a share of each batch with goals that were reached later.
 
     Returns:
         A ``ReplayBuffer`` whose samples have batch size (batch_size, window).
@@ -187,7 +216,8 @@ def make_replay(
         if before
         else LazyTensorStorage(steps * num_envs, ndim=2, device=device)
     )
-    return ReplayBuffer(
+    return WindowReplay(
+        hindsight=hindsight,
         storage=storage,
         sampler=WindowSampler(writer, length=window, past_end=past_end, before=before),
         writer=writer,

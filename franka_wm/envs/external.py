@@ -74,6 +74,8 @@ class ExternalEnv(TransformedEnv):
         UserError: The extra is not installed, or there is no such environment or observation.
     """
 
+    reward_bounds = None  # of a step: neither library says them
+
     def __init__(
         self,
         config: ExternalConfig,

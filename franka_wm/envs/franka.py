@@ -342,6 +342,11 @@ class FrankaEnv(EnvBase):
         return STATE_DIM
 
     @property
+    def reward_bounds(self) -> tuple[float, float] | None:
+        """The least and the largest reward of a step; ``None`` where the task does not say."""
+        return self.simulation.task.reward_bounds
+
+    @property
     def goal(self) -> torch.Tensor:
         """(N, 3) [m]."""
         return self.simulation.goal.clone()

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from typing import Any
+from typing import Any, cast
 
 import torch
 from tensordict import TensorDict, TensorDictBase
@@ -13,7 +13,6 @@ from torch import Tensor, nn
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from franka_wm.envs import FrankaEnv
-from franka_wm.errors import UserError
 from franka_wm.evaluation.intervals import bootstrap_mean, wilson
 
 THRESHOLDS = (0.05, 0.025, 0.01)
@@ -32,6 +31,12 @@ def arm_of(env: Any) -> FrankaEnv | None:
     return env
 
 
+def reaches(env: Any) -> bool:
+    """Whether success is a small distance to the goal: of the arm, by its task."""
+    arm = arm_of(env)
+    return arm is not None and arm.simulation.task.goal_distance
+
+
 def begin(env: Any, seed: int) -> TensorDictBase:
     """The first observations of the episodes that ``seed`` names; the same whenever it is asked for."""
     if arm_of(env) is not None:
@@ -40,38 +45,74 @@ def begin(env: Any, seed: int) -> TensorDictBase:
     return env.reset()
 
 
+def _parts(policy: Any) -> list[Any]:
+    return list(policy.modules()) if isinstance(policy, nn.Module) else [policy]
+
+
 @contextmanager
 def seeded(seed: int, *policies: Any) -> Iterator[None]:
-    """Random numbers of torch, and of the policies' own generators, from ``seed``; torch's are put back after."""
+    """Random numbers of torch, and of the policies' own generators, from ``seed``; all are put back after."""
+    held = [
+        value
+        for policy in policies
+        for part in _parts(policy)
+        for value in getattr(part, "__dict__", {}).values()
+    ]
+    generators = [(value, value.get_state()) for value in held if isinstance(value, torch.Generator)]
     devices = list(range(torch.cuda.device_count())) if torch.cuda.is_initialized() else []
     with torch.random.fork_rng(devices=devices):
         torch.manual_seed(seed)
-        for policy in policies:
-            for module in policy.modules() if isinstance(policy, nn.Module) else (policy,):
-                for value in vars(module).values() if hasattr(module, "__dict__") else ():
-                    if isinstance(value, torch.Generator):
-                        value.manual_seed(seed)
+        for generator, _ in generators:
+            generator.manual_seed(seed)
+        try:
+            yield
+        finally:
+            for generator, state in generators:
+                generator.set_state(state)
+
+
+@contextmanager
+def evaluating(acting: Any) -> Iterator[None]:
+    """A model, or a policy and the model behind it, in evaluation mode; afterwards every part is in its own again.
+
+    Families may act differently in training mode: TD-MPC2 plans by two Q-functions drawn at random. What is evaluated
+    is one agent, whoever asks: the end of a run, the curves, the film, ``franka-wm evaluate``.
+    """
+    modes = [(part, part.training) for part in _parts(acting) if isinstance(part, nn.Module)]
+    for part, _ in modes:
+        part.training = False
+    try:
         yield
+    finally:
+        for part, training in modes:
+            part.training = training
 
 
 @torch.no_grad()
 def play_episodes(
-    env: Any, policy: Policy, *, seed: int, video: Callable[[], None] | None = None
+    env: Any,
+    policy: Policy,
+    *,
+    seed: int,
+    episodes: int | None = None,
+    video: Callable[[], None] | None = None,
 ) -> TensorDict:
     """Plays one episode in every world and records how it went.
 
     Args:
         env: Its number of worlds is the number of episodes.
-        policy: Run without exploration.
+        policy: Run without exploration, its model in evaluation mode.
         seed: Of the episodes' poses and goals.
+        episodes: Fewer than there are worlds: the first ones. Nothing is decided for the others.
         video: Called before every step, to take a picture; after the last one the worlds have been reset.
 
     Returns:
-        Batch size (N,), all float32, of each world's first episode up to its true last observation. ``return``
-        and ``length`` of any environment. Of the arm also:
+        Batch size (N,), or (episodes,), all float32, of each world's first episode up to its true last observation.
+        ``return`` and ``length`` of any environment. Of the arm also:
 
-        * ``final_distance`` and ``closest_distance``, tool to goal [m];
-        * ``success_once``, by the task's own measure, 0 or 1;
+        * ``success`` at the end and ``success_once`` at any step, as the task judges, 0 or 1;
+        * ``final_distance`` and ``closest_distance``, tool to goal [m], where success is to be near the goal;
+        * ``measures``, by name, at the end: the task's own (:meth:`~franka_wm.envs.tasks.Task.measures`);
         * ``path_length`` of the tool [m];
         * ``action_change``: mean over steps and components of the squared change of the action as the servo
           gets it, in units of the action;
@@ -82,14 +123,17 @@ def play_episodes(
     motion = None if arm is None else _Motion(arm)
     total, length = torch.zeros(n, device=device), torch.zeros(n, device=device)
     running = torch.ones(n, dtype=torch.bool, device=device)
+    count = n if episodes is None else min(episodes, n)
+    running[count:] = False
     tensordict = begin(env, seed)
     if motion is not None:
         motion.start()
-    with set_exploration_type(ExplorationType.DETERMINISTIC):
+    with evaluating(policy), set_exploration_type(ExplorationType.DETERMINISTIC):
         for _ in range(env.config.episode_length):
             if video is not None:
                 video()
-            tensordict, following = env.step_and_maybe_reset(policy(tensordict))
+            decided = policy(tensordict) if count == n else _decide_for_some(policy, tensordict, count)
+            tensordict, following = env.step_and_maybe_reset(decided)
             after = tensordict.get("next")
             total += running * after.get("reward").squeeze(-1)
             length += running
@@ -100,18 +144,31 @@ def play_episodes(
             if arm is None and not bool(running.any()):  # lives on the host: nothing waits for a device here
                 break
     out = {"return": total, "length": length}
-    return TensorDict(out if motion is None else motion.summary(length) | out, batch_size=[n])
+    played = TensorDict(out if motion is None else motion.summary(length) | out, batch_size=[n])
+    return cast(TensorDict, played[:count])
+
+
+def _decide_for_some(policy: Policy, tensordict: TensorDictBase, count: int) -> TensorDictBase:
+    """What the policy writes for the first ``count`` worlds, zeros for the others, which cost it nothing."""
+    decided = policy(cast(TensorDictBase, tensordict[:count]))
+    for key in getattr(policy, "out_keys", ["action"]):
+        some = decided.get(key)
+        every = some.new_zeros(tensordict.batch_size[0], *some.shape[1:])
+        every[:count] = some
+        tensordict.set(key, every)
+    return tensordict
 
 
 class _Motion:
-    """What the tool and the actions do over each world's first episode."""
+    """What the tool and the actions do over each world's first episode, and what the task says about it."""
 
     def __init__(self, arm: FrankaEnv):
         n, device = arm.num_envs, arm.device
-        self.arm = arm
+        self.arm, self.task = arm, arm.simulation.task
         self.distance, self.path, self.change, self.jerk = torch.zeros(4, n, device=device)
         self.closest = torch.full((n,), torch.inf, device=device)
-        self.once = torch.zeros(n, dtype=torch.bool, device=device)
+        self.success, self.once = torch.zeros(2, n, dtype=torch.bool, device=device)
+        self.measures: dict[str, Tensor] = {}
 
     def start(self) -> None:
         """After the reset."""
@@ -124,7 +181,11 @@ class _Motion:
         reached = sim.next_true_state[:, 17:20].norm(dim=-1)
         self.distance = torch.where(running, reached, self.distance)
         self.closest = torch.where(running, torch.minimum(reached, self.closest), self.closest)
-        self.once |= running & after.get("success").squeeze(-1)
+        succeeds = after.get("success").squeeze(-1)
+        self.success = torch.where(running, succeeds, self.success)
+        self.once |= running & succeeds
+        for name, value in self.task.measures(sim).items():
+            self.measures[name] = torch.where(running, value.float(), self.measures.get(name, 0.0))
         self._tools = [*self._tools[-3:], sim.next_true_state[:, 14:17].clone()]
         self.path += running * (self._tools[-1] - self._tools[-2]).norm(dim=-1)
         if len(self._tools) == 4:
@@ -135,12 +196,14 @@ class _Motion:
             self.change += running * (action - self._action).square().mean(-1)
         self._action = action
 
-    def summary(self, length: Tensor) -> dict[str, Tensor]:
+    def summary(self, length: Tensor) -> dict[str, Any]:
         changes, thirds = (length - 1).clamp_min(1), (length - 2).clamp_min(1)
+        near = {"final_distance": self.distance, "closest_distance": self.closest}
         return {
-            "final_distance": self.distance,
-            "closest_distance": self.closest,
+            **(near if self.task.goal_distance else {}),
+            "success": self.success.float(),
             "success_once": self.once.float(),
+            **({"measures": self.measures} if self.measures else {}),
             "path_length": self.path,
             "action_change": self.change / changes,
             "jerk": (self.jerk / thirds).sqrt() * self.arm.config.fps**3,
@@ -152,12 +215,13 @@ def summarize(episodes: TensorDictBase, *, thresholds: Sequence[float] = THRESHO
 
     Args:
         episodes: As :func:`play_episodes` gives them, or some of their entries.
-        thresholds: Distances that count as success [m].
+        thresholds: Distances that count as success [m], where there are distances.
 
     Returns:
-        What there is: ``final_distance`` [m], ``success`` (at the end) and ``success_once`` (at any step) by
-        threshold, ``return``, ``path_length``, ``action_change``, ``jerk``, ``length``, each with its
-        interval; and ``episodes``, the count.
+        What there is: ``final_distance`` [m]; ``success`` at the end and ``success_once`` at any step, by threshold
+        where there are distances, else one rate each, as the task judges; ``return``; ``measures`` of the task's own,
+        by name; ``path_length``, ``action_change``, ``jerk``, ``length``, each with its interval; and ``episodes``,
+        the count.
     """
     present = {str(name): episodes.get(name).cpu() for name in episodes.keys()}  # noqa: SIM118
     count = episodes.numel()
@@ -166,50 +230,22 @@ def summarize(episodes: TensorDictBase, *, thresholds: Sequence[float] = THRESHO
         return {name: bootstrap_mean(present[name]).as_dict() for name in names if name in present}
 
     def rates(name: str, distance: str) -> dict[str, Any]:
-        if distance not in present:
-            return {}
-        within = {f"{t:g}": int((present[distance] < t).sum()) for t in thresholds}
-        return {name: {t: wilson(hits, count).as_dict() for t, hits in within.items()}}
+        if distance in present:
+            within = {f"{t:g}": int((present[distance] < t).sum()) for t in thresholds}
+            return {name: {t: wilson(hits, count).as_dict() for t, hits in within.items()}}
+        return {name: wilson(int(present[name].sum()), count).as_dict()} if name in present else {}
 
+    own = present.get("measures", {})
+    own = {str(name): bootstrap_mean(own[name]).as_dict() for name in own.keys()}  # noqa: SIM118
     return {
         **means("final_distance"),
         **rates("success", "final_distance"),
         **rates("success_once", "closest_distance"),
-        **means("return", "path_length", "action_change", "jerk", "length"),
+        **means("return"),
+        **({"measures": own} if own else {}),
+        **means("path_length", "action_change", "jerk", "length"),
         "episodes": count,
     }
-
-
-def evaluate_policies(
-    env: Any,
-    policies: Mapping[str, Policy],
-    *,
-    seed: int,
-    thorough: bool = False,
-    report: Callable[[str, dict[str, Any]], None] | None = None,
-) -> dict[str, dict[str, Any]]:
-    """Evaluates policies on the same episodes.
-
-    Args:
-        env: Its number of worlds is the number of episodes; at least 2, for the intervals.
-        policies: By name.
-        seed: The run's; the evaluation's own is derived from it.
-        thorough: Everything that :func:`summarize` knows, not the outcome alone.
-        report: Called with each name and summary as they come.
-
-    Raises:
-        UserError: Fewer than two worlds.
-    """
-    if env.num_envs < 2:
-        raise UserError(f"evaluation over {env.num_envs} episodes has no interval; use at least 2")
-    outcome = ("return", "length") if arm_of(env) is None else ("final_distance", "return")
-    results = {}
-    for name, policy in policies.items():
-        episodes = play_episodes(env, policy, seed=seed + EVALUATION_SEED)
-        results[name] = summarize(episodes if thorough else episodes.select(*outcome))
-        if report is not None:
-            report(name, results[name])
-    return results
 
 
 @torch.no_grad()
@@ -234,7 +270,7 @@ def decision_times(
 
     tensordict = begin(env, seed)
     times = []
-    with set_exploration_type(ExplorationType.DETERMINISTIC):
+    with evaluating(policy), set_exploration_type(ExplorationType.DETERMINISTIC):
         for k in range(warm_up + decisions):
             wait()
             started = time.perf_counter()

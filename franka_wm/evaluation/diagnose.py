@@ -10,7 +10,7 @@ import torch
 from tensordict import TensorDict
 from torch import Tensor
 
-from franka_wm.evaluation.closed_loop import arm_of, begin, seeded
+from franka_wm.evaluation.closed_loop import arm_of, begin, reaches, seeded
 from franka_wm.evaluation.decoder import (
     SIZES,
     Decoder,
@@ -60,12 +60,14 @@ class Held:
         latents: (E, T + 1, Z).
         valid: (E, T + 1) bool.
         pictures: (P, T, S, S, 3) uint8 of the first P episodes, or ``None``.
+        reaches: Whether success is a small distance to the goal.
     """
 
     episodes: TensorDict
     latents: Tensor
     valid: Tensor
     pictures: Tensor | None
+    reaches: bool = False
 
 
 def hold_out(agent: Any, *, pictures: bool = True, seed: int = ROLLOUT_SEED) -> Held:
@@ -84,7 +86,7 @@ def hold_out(agent: Any, *, pictures: bool = True, seed: int = ROLLOUT_SEED) -> 
     episodes = cast(TensorDict, episodes[:EPISODES])
     with torch.no_grad():
         latents = encode_episodes(model, episodes)
-    return Held(episodes, latents, encoded_validly(episodes), seen)
+    return Held(episodes, latents, encoded_validly(episodes), seen, reaches(env))
 
 
 def picture_size(model: Any) -> int:
@@ -134,7 +136,7 @@ def representation(held: Held, model: Any) -> tuple[dict[str, Any], dict[str, An
     seen = spectrum(embedded)
     plane = principal_components(embedded.cpu().numpy())
     every = max(1, len(embedded) // POINTS)
-    if "physical" in held.episodes.keys():  # noqa: SIM118
+    if held.reaches:
         quantity, label = (
             held.episodes.get("physical")[..., 17:20].norm(dim=-1)[use],
             "distance to the goal [m]",
@@ -176,7 +178,7 @@ def calibration(agent: Any, *, episodes: int = 32) -> dict[str, Any]:
         values = model.value(latents)
     use = played.get("valid")[:, :length]
     result = value_calibration(values[use].squeeze(-1), returns[use].squeeze(-1))
-    if arm_of(env) is not None:
+    if reaches(env):
         distance = played.get("physical")[:, :length, 17:20].norm(dim=-1)[use].cpu()
         episode = torch.arange(use.shape[0], device=use.device).unsqueeze(1).expand_as(use)[use].cpu()
         groups = torch.stack((episode, episode), -1)

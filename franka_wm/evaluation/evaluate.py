@@ -2,36 +2,30 @@
 
 from __future__ import annotations
 
-import json
-import math
 import os
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import torch
-
 from franka_wm.errors import UserError
 from franka_wm.evaluation import diagnose
-from franka_wm.evaluation.closed_loop import arm_of
 from franka_wm.evaluation.decoder import Imagined
 from franka_wm.evaluation.open_loop import NothingToPredictError
-from franka_wm.evaluation.protocol import EPISODES, INTERVALS, Evaluation, describe, evaluate_agent
+from franka_wm.evaluation.protocol import EPISODES, Evaluation, describe, evaluate_agent, protocol
 from franka_wm.evaluation.robustness import check_shiftable, note, robustness
 from franka_wm.evaluation.tables import (
     horizon_table,
     interval,
-    motion_table,
     number,
-    outcome_table,
     probe_table,
     robustness_table,
     terminal,
     timing_table,
 )
 from franka_wm.report import written_whole
-from franka_wm.report.table import Table, markdown
+from franka_wm.report.results import COMMAND, to_json
+from franka_wm.report.table import Table, evaluation_tables, markdown
 
 WORLDS = 256
 """Simulated at once, at most; more episodes are played in rounds."""
@@ -140,22 +134,21 @@ def run(options: Options) -> dict[str, Any]:
     check_folder(options.out)
     console = Console(width=120)
     with announced(f"loading {options.checkpoint} and building {min(options.episodes, WORLDS)} worlds"):
-        agent = load_agent(
-            options.checkpoint, num_envs=min(options.episodes, WORLDS), device=options.device, seed=0
-        )
+        agent = load_agent(options.checkpoint, num_envs=min(options.episodes, WORLDS), device=options.device)
     if options.robustness:
         check_shiftable(agent)
-    results: dict[str, Any] = {"protocol": protocol(options, agent)}
     say(f"{options.episodes} held-out episodes for each of {', '.join(agent.policies)} …")
     evaluation = evaluate_agent(
-        agent, episodes=options.episodes, report=lambda name, r: say(describe(name, r, agent.env))
+        agent, episodes=options.episodes, report=lambda name, r: say(describe(name, r))
     )
-    results["protocol"]["seeds"] = ", ".join(map(str, evaluation.seeds))
-    results["policies"] = evaluation.policies
-    console.print(terminal(outcome_table(evaluation.policies)))
-    motion = motion_table(evaluation.policies)
-    if motion.rows:
-        console.print(terminal(motion))
+    described = protocol(agent.cfg, agent.env, evaluation, by=COMMAND, counters=agent.counters)
+    results = {
+        "protocol": {"checkpoint": options.checkpoint, **described},
+        "policies": evaluation.policies,
+    }
+    for table in evaluation_tables(evaluation.policies):
+        if table.rows:
+            console.print(terminal(table))
     console.print(terminal(timing_table(evaluation.seconds, evaluation.worlds)))
     imagined = None
     if options.open_loop or options.probes:
@@ -189,28 +182,6 @@ def check_folder(folder: Path) -> None:
         raise UserError(f"evaluate: out={folder}: {there} is a file; give a folder for the results")
     if not os.access(there, os.W_OK | os.X_OK):
         raise UserError(f"evaluate: out={folder}: {there} may not be written to; give another folder")
-
-
-def protocol(options: Options, agent: Any) -> dict[str, Any]:
-    """How it was measured, for whoever reads the numbers later."""
-    import franka_wm
-
-    return {
-        "checkpoint": options.checkpoint,
-        "model": str(agent.cfg.model.name),
-        "environment": "franka" if arm_of(agent.env) is not None else str(agent.cfg.env.name),
-        "episodes": options.episodes,
-        "worlds": agent.env.num_envs,
-        "intervals": INTERVALS,
-        "device": str(agent.env.device),
-        "franka_wm": franka_wm.__version__,
-        "torch": torch.__version__,
-        **{
-            f"trained {name}": agent.counters[name]
-            for name in ("updates", "env_steps")
-            if name in agent.counters
-        },
-    }
 
 
 def _look_ahead(
@@ -247,7 +218,7 @@ def _shift(agent: Any, options: Options, results: dict[str, Any], say: Say) -> N
     say("the same in shifted worlds …")
 
     def told(case: str, found: Mapping[str, Any]) -> None:
-        parts = (f"{p} {100 * r['final_distance']['mean']:.2f} cm {r['verdict']}" for p, r in found.items())
+        parts = (f"{describe(p, r).strip()} {r['verdict']}" for p, r in found.items())
         say(f"  {case}: {'   '.join(parts)}")
 
     episodes = min(options.episodes, WORLDS)
@@ -334,16 +305,3 @@ def _write(
     ):
         with written_whole(folder / name) as path:
             path.write_text(content)
-
-
-def to_json(value: Any) -> str:
-    """JSON; what is not a finite number becomes null, since JSON has no word for it."""
-
-    def clean(x: Any) -> Any:
-        if isinstance(x, Mapping):
-            return {str(key): clean(one) for key, one in x.items()}
-        if isinstance(x, (list, tuple)):
-            return [clean(one) for one in x]
-        return None if isinstance(x, float) and not math.isfinite(x) else x
-
-    return json.dumps(clean(value), indent=1, allow_nan=False, ensure_ascii=False) + "\n"

@@ -10,9 +10,10 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
+from franka_wm.evaluation.closed_loop import evaluating
 from franka_wm.evaluation.intervals import bootstrap_mean
 from franka_wm.evaluation.open_loop import correlation
-from franka_wm.evaluation.rollouts import embedding, evaluating
+from franka_wm.evaluation.rollouts import embedding
 from franka_wm.evaluation.spectrum import latent_statistics
 
 SAMPLES = 512

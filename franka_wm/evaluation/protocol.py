@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import math
+import platform
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any, cast
 
 import torch
@@ -13,14 +15,16 @@ from tensordict import TensorDict
 from franka_wm.errors import UserError
 from franka_wm.evaluation.closed_loop import (
     EVALUATION_SEED,
+    THRESHOLDS,
     arm_of,
     decision_times,
     play_episodes,
+    reaches,
     seeded,
     summarize,
 )
-from franka_wm.evaluation.tables import motion_table, outcome_table
-from franka_wm.report.table import markdown
+from franka_wm.report.results import point
+from franka_wm.report.table import evaluation_tables, markdown
 
 EPISODES = 100
 """Episodes per policy, if not said otherwise."""
@@ -38,7 +42,7 @@ def held_out_seeds(count: int) -> list[int]:
 
 @dataclass
 class Evaluation:
-    """What :func:`evaluate_agent` found.
+    """What :func:`evaluate_policies` found.
 
     Attributes:
         policies: Name → summary, the content of ``evaluation.json``; the same twice on a CPU.
@@ -56,8 +60,7 @@ class Evaluation:
 
     def markdown(self) -> str:
         """The tables, and under them how they were measured."""
-        tables = [outcome_table(self.policies), motion_table(self.policies)]
-        parts = [markdown(table) for table in tables if table.rows]
+        parts = [markdown(table) for table in evaluation_tables(self.policies) if table.rows]
         count = next(iter(self.policies.values()))["episodes"]
         seeds = ", ".join(map(str, self.seeds))
         worlds = f" of {self.worlds} worlds" if self.worlds else ""
@@ -71,31 +74,46 @@ def evaluate_agent(
     agent: Any,
     *,
     episodes: int = EPISODES,
-    seeds: Sequence[int] | None = None,
     policies: Mapping[str, Any] | None = None,
     timing: bool = True,
+    **options: Any,
+) -> Evaluation:
+    """:func:`evaluate_policies` of an agent of :func:`franka_wm.training.load.load_agent`, with its own policies."""
+    chosen = agent.policies if policies is None else policies
+    return evaluate_policies(agent.env, chosen, episodes=episodes, timing=timing, **options)
+
+
+def evaluate_policies(
+    env: Any,
+    policies: Mapping[str, Any],
+    *,
+    episodes: int | None = None,
+    seeds: Sequence[int] | None = None,
+    timing: bool = False,
     report: Callable[[str, dict[str, Any]], None] | None = None,
 ) -> Evaluation:
-    """Plays every policy over the same held-out episodes.
+    """Plays every policy over the same held-out episodes: while training, at its end, and in ``franka-wm evaluate``.
 
-    Twice on a CPU gives the same numbers (times excepted): worlds, planners and random policies are seeded anew
-    for each policy, and torch's random numbers are put back afterwards.
+    Twice on a CPU gives the same numbers (times excepted), whoever asks: worlds, planners and random policies are
+    seeded anew for each policy, and models are in evaluation mode. Random numbers and modes are put back afterwards.
 
     Args:
-        agent: Of :func:`franka_wm.training.load.load_agent`, or anything with ``env`` and ``policies``.
+        env: Evaluation worlds.
+        policies: By name.
         episodes: Per policy, at least 2; published numbers should have 100 or more. Played in rounds of as
-            many as ``agent.env`` has worlds; of the last round, the first worlds count.
+            many as the environment has worlds; of the last round, the first worlds count. One round if not given.
         seeds: One for each round; :func:`held_out_seeds` if not given.
-        policies: By name; the agent's, baselines included, if not given.
         timing: Also measure how long decisions take.
         report: Called with each name and summary as they come.
 
     Raises:
         UserError: Fewer than 2 episodes, or fewer seeds than rounds.
     """
+    episodes = env.num_envs if episodes is None else episodes
     if isinstance(episodes, bool) or not isinstance(episodes, int) or episodes < 2:
-        raise UserError(f"episodes={episodes!r}: must be a whole number of at least 2; 100 or more are usual")
-    env = agent.env
+        raise UserError(
+            f"episodes={episodes!r}: must be a whole number of at least 2, for the intervals; 100 or more are usual"
+        )
     rounds = math.ceil(episodes / env.num_envs)
     seeds = held_out_seeds(rounds) if seeds is None else list(seeds)
     if len(seeds) < rounds:
@@ -105,14 +123,15 @@ def evaluate_agent(
         )
     seeds = seeds[:rounds]
     evaluation = Evaluation({}, {}, seeds, worlds=env.num_envs)
-    for name, policy in (agent.policies if policies is None else policies).items():
+    for name, policy in policies.items():
         played = []
-        for seed in seeds:
+        for k, seed in enumerate(seeds):
+            left = episodes - k * env.num_envs
             with seeded(seed, policy):
-                played.append(play_episodes(env, policy, seed=seed).cpu())
-        rows = cast(TensorDict, torch.cat(played)[:episodes])
+                played.append(play_episodes(env, policy, seed=seed, episodes=left).cpu())
+        rows = cast(TensorDict, torch.cat(played))
         evaluation.episodes[name] = rows
-        evaluation.policies[name] = summarize(rows)
+        evaluation.policies[name] = summarize(rows, thresholds=thresholds(env))
         if timing:
             with seeded(seeds[0], policy):
                 evaluation.seconds[name] = float(decision_times(env, policy, seed=seeds[0]).median())
@@ -121,8 +140,73 @@ def evaluate_agent(
     return evaluation
 
 
-def describe(name: str, summary: Mapping[str, Any], env: Any) -> str:
+def protocol(
+    cfg: Any, env: Any, evaluation: Evaluation, *, by: str, counters: Mapping[str, float]
+) -> dict[str, Any]:
+    """How it was measured, for whoever reads the numbers later: ``protocol`` of ``evaluation.json``.
+
+    Args:
+        cfg: The run's configuration.
+        env: Evaluation worlds.
+        evaluation: What was found.
+        by: Who measured: :data:`~franka_wm.report.results.END` or :data:`~franka_wm.report.results.COMMAND`.
+        counters: Of the training: ``updates``, ``env_steps``, ``seconds``.
+    """
+    import franka_wm
+
+    arm = arm_of(env) is not None
+    return {
+        "by": by,
+        "task": str(cfg.env.task if arm else cfg.env.name),
+        "model": str(cfg.model.name),
+        **({"planner": str(cfg.planner.name)} if "planner" in evaluation.policies else {}),
+        "seed": int(cfg.seed),
+        **{name: counters[name] for name in ("updates", "env_steps") if name in counters},
+        **({"training_seconds": counters["seconds"]} if "seconds" in counters else {}),
+        "episodes": next(iter(evaluation.policies.values()))["episodes"],
+        "worlds": env.num_envs,
+        "seeds": ", ".join(map(str, evaluation.seeds)),
+        **({"success_distance": float(env.config.success_distance)} if reaches(env) else {}),
+        "intervals": INTERVALS,
+        "device": str(env.device),
+        "hardware": hardware(env.device),
+        "franka_wm": franka_wm.__version__,
+        "torch": torch.__version__,
+    }
+
+
+def hardware(device: torch.device) -> str:
+    """What computes: the GPU's name, or the processor's and the threads that torch uses."""
+    if device.type == "cuda":
+        return torch.cuda.get_device_name(device)
+    told = Path("/proc/cpuinfo")
+    lines = told.read_text().splitlines() if told.is_file() else []
+    name = next((line.partition(":")[2].strip() for line in lines if line.startswith("model name")), "")
+    threads = torch.get_num_threads()
+    return f"{name or platform.processor() or platform.machine()}, {threads} thread{'s' * (threads > 1)}"
+
+
+def thresholds(env: Any) -> list[float]:
+    """Distances that count as success [m]: those of every table, and the environment's own; none without a goal."""
+    return sorted({*THRESHOLDS, float(env.config.success_distance)}, reverse=True) if reaches(env) else []
+
+
+def numbers_to_log(env: Any, policies: Mapping[str, Any], *, episodes: int | None = None) -> dict[str, float]:
+    """A point of the learning curves: what :func:`evaluate_policies` finds now, as :func:`point` names it.
+
+    Args:
+        env: Evaluation worlds, those of the run's end.
+        policies: That have curves.
+        episodes: The first so many of those that the run's end plays; all if not given or more than there are.
+    """
+    episodes = env.num_envs if episodes is None else min(episodes, env.num_envs)
+    found = evaluate_policies(env, policies, episodes=episodes).policies
+    return point(found, success_distance=env.config.success_distance if reaches(env) else None)
+
+
+def describe(name: str, summary: Mapping[str, Any]) -> str:
     """One line about a policy as its numbers come."""
-    if arm_of(env) is None:
-        return f"  {name}: return {summary['return']['mean']:.2f}"
-    return f"  {name}: final distance {100 * summary['final_distance']['mean']:.2f} cm"
+    if "final_distance" in summary:
+        return f"  {name}: final distance {100 * summary['final_distance']['mean']:.2f} cm"
+    success = f"success {100 * summary['success']['mean']:.0f} %, " if "success" in summary else ""
+    return f"  {name}: {success}return {summary['return']['mean']:.2f}"

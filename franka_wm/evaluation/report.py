@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -11,11 +10,13 @@ import torch
 from omegaconf import DictConfig
 
 from franka_wm.envs.camera import project
-from franka_wm.evaluation.closed_loop import EVALUATION_SEED, arm_of, evaluate_policies, play_episodes
-from franka_wm.evaluation.tables import motion_table, outcome_table, terminal
+from franka_wm.evaluation.closed_loop import arm_of, play_episodes, reaches, seeded
+from franka_wm.evaluation.protocol import describe, evaluate_policies, held_out_seeds, protocol
+from franka_wm.evaluation.tables import terminal
 from franka_wm.report import written_whole
-from franka_wm.report.curves import plot_learning_curves
-from franka_wm.report.table import markdown
+from franka_wm.report.curves import axis, plot_learning_curves
+from franka_wm.report.results import END, Result, last_row, to_json
+from franka_wm.report.table import evaluation_tables
 from franka_wm.report.video import draw_marker, tile_frames, write_png, write_video
 
 
@@ -26,54 +27,61 @@ def evaluate_and_report(
     policies: Mapping[str, Any],
     *,
     rows: Sequence[Mapping[str, float]],
+    counters: Mapping[str, float],
     say: Any = print,
+    log: Callable[[Mapping[str, float]], Any] | None = None,
     log_video: Callable[[str, torch.Tensor, int], None] | None = None,
-) -> dict[str, dict[str, Any]]:
-    """Evaluates every policy on the same unseen episodes and writes what a run leaves behind.
+) -> dict[str, Any]:
+    """Evaluates every policy on the same held-out episodes and writes what a run leaves behind.
 
     Writes ``evaluation.json``, ``evaluation.md``, ``curves.png`` and, of the arm, ``video.mp4`` and ``last_frame.png``
-    into ``folder``, and prints the table; ``log_video`` is given the film, too. Policies may be any; the
-    table shows what there is.
+    into ``folder``, and prints the table. Policies may be any; the table shows what there is.
+
+    Args:
+        cfg: The run's configuration.
+        folder: Of the run.
+        env: Evaluation worlds; as many episodes.
+        policies: By name.
+        rows: What training logged.
+        counters: ``updates``, ``env_steps``, ``seconds`` of the training.
+        log: Called with the numbers of the curves' last point, which are those of the table.
+        log_video: Called with name, film and frames per second.
+
+    Returns:
+        The content of ``evaluation.json``.
     """
     from rich.console import Console
 
-    say(f"evaluating over {env.num_envs} episodes that training never saw …")
-    results = evaluate_policies(
-        env,
-        policies,
-        seed=cfg.seed,
-        thorough=bool(cfg.evaluation.get("thorough", False)),
-        report=lambda name, r: say(_line(name, r)),
-    )
-    tables = [table for table in (outcome_table(results), motion_table(results)) if table.rows]
+    say(f"evaluating over {env.num_envs} held-out episodes …")
+    found = evaluate_policies(env, policies, report=lambda name, r: say(describe(name, r)))
+    results = {
+        "protocol": protocol(cfg, env, found, by=END, counters=counters),
+        "policies": found.policies,
+    }
     with written_whole(folder / "evaluation.json") as path:
-        path.write_text(json.dumps(results, indent=2) + "\n")
+        path.write_text(to_json(results))
     with written_whole(folder / "evaluation.md") as path:
-        path.write_text("\n".join(map(markdown, tables)))
+        path.write_text(found.markdown())
+    last = last_row([Result(path, **results)], cfg.evaluation.during)
+    drawn = [*rows, last]
+    if log is not None and last:
+        log({name: value for name, value in last.items() if name.startswith("eval/")})
     arm = arm_of(env)
-    if rows:
-        mark = None if arm is None else arm.config.success_distance
-        plot_learning_curves(rows, folder / "curves.png", success_distance=mark)
+    if x := axis(drawn):
+        mark = arm.config.success_distance if arm is not None and reaches(env) else None
+        plot_learning_curves(drawn, folder / "curves.png", x=x, success_distance=mark)
     if cfg.evaluation.video_episodes and arm is not None:
         name = acting(policies)
         frames = film(cfg, folder, policies[name])
         if log_video is not None:
             log_video(f"eval/{name}", frames, round(arm.config.fps))
-    console = Console(width=120)
-    for table in tables:
-        console.print(terminal(table))
+    Console(width=120).print(terminal(evaluation_tables(found.policies)[0]))
     return results
 
 
 def acting(policies: Mapping[str, Any]) -> str:
     """The policy that a run is about: the planner, the policy where there is none, else whatever comes first."""
     return next((name for name in ("planner", "policy") if name in policies), next(iter(policies)))
-
-
-def _line(name: str, result: Mapping[str, Any]) -> str:
-    if "final_distance" in result:
-        return f"  {name}: final distance {result['final_distance']['mean']:.4f} m"
-    return f"  {name}: return {result['return']['mean']:.2f}"
 
 
 def film(cfg: DictConfig, folder: Path, policy: Any) -> torch.Tensor:
@@ -91,7 +99,9 @@ def film(cfg: DictConfig, folder: Path, policy: Any) -> torch.Tensor:
         marks = project(arm.goal, arm.config, size)
         frames.append(draw_marker(view.cpu(), marks.cpu(), radius=size / 32))
 
-    play_episodes(env, policy, seed=cfg.seed + EVALUATION_SEED, video=picture)
+    seed = held_out_seeds(1)[0]  # the first of the episodes that the table is about
+    with seeded(seed, policy):
+        play_episodes(env, policy, seed=seed, video=picture)
     film = tile_frames(torch.stack(frames))
     write_video(film, folder / "video.mp4", fps=round(arm.config.fps))
     write_png(film[-1], folder / "last_frame.png")

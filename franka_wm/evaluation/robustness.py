@@ -6,7 +6,6 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
-import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
@@ -87,9 +86,10 @@ def robustness(
         report: Called with each shift's name and results as they come.
 
     Returns:
-        Shift → policy → ``final_distance`` [m] and ``success`` (at the task's distance), with 95 % intervals
+        Shift → policy → ``final_distance`` [m] and ``success`` at the end, as the task judges, with 95 % intervals
         (bootstrap, Wilson); ``change`` of the final distance [m], paired by episode, with its bootstrap interval
-        (``None`` for :data:`UNSHIFTED`); ``verdict``, of :func:`verdict` (empty for :data:`UNSHIFTED`).
+        (``None`` for :data:`UNSHIFTED`); ``verdict``, of :func:`verdict` (empty for :data:`UNSHIFTED`). Of tasks whose
+        success is no distance: ``return`` and ``return_change`` instead of the distances.
 
     Raises:
         UserError: Not the arm, fewer than 2 episodes, or no such policy.
@@ -160,12 +160,28 @@ def verdict(distance: Tensor, unshifted: Tensor, *, success_distance: float) -> 
         interval of that change, paired by episode, leaves out 0. ``breaks``: worse, and less than half of the
         unshifted successes are left. ``holds``: none of these was seen.
     """
-    if float((unshifted < WORKS_AT).double().mean()) < WORKS_SHARE:
-        return "never worked"
-    now, before = distance < success_distance, unshifted < success_distance
     grown = bootstrap_mean(distance - unshifted)
+    return verdict_of_success(
+        distance < success_distance,
+        unshifted < success_distance,
+        works=unshifted < WORKS_AT,
+        further=grown.low > 0 and grown.mean > LEAST_DISTANCE,
+    )
+
+
+def verdict_of_success(
+    now: Tensor, before: Tensor, *, works: Tensor | None = None, further: bool = False
+) -> str:
+    """:func:`verdict` for tasks whose success is no distance: by the rate of success alone.
+
+    Args:
+        now, before: (E,) bool, success of the same episodes in the shifted world and in that of training.
+        works: (E,) bool, episodes in which the unshifted policy counts as working; ``before`` if not given.
+        further: Something else is worse.
+    """
+    if float((before if works is None else works).double().mean()) < WORKS_SHARE:
+        return "never worked"
     lost = bootstrap_mean(before.double() - now.double())
-    further = grown.low > 0 and grown.mean > LEAST_DISTANCE
     rarer = lost.low > 0 and lost.mean > LEAST_SUCCESS
     if not (further or rarer):
         return "holds"
@@ -178,12 +194,19 @@ def _chosen(policies: Mapping[str, Any]) -> list[str]:
 
 
 def _compared(played: TensorDictBase, before: TensorDictBase, success_distance: float) -> dict[str, Any]:
-    distance, unshifted = played.get("final_distance"), before.get("final_distance")
-    hits = int((distance < success_distance).sum())
+    reaches = "final_distance" in played.keys()  # noqa: SIM118
+    what, change = ("final_distance", "change") if reaches else ("return", "return_change")
+    value, unshifted = played.get(what), before.get(what)
+    now, then = played.get("success").bool(), before.get("success").bool()
+    told = (
+        verdict(value, unshifted, success_distance=success_distance)
+        if reaches
+        else verdict_of_success(now, then)
+    )
     same = played is before
     return {
-        "final_distance": bootstrap_mean(distance).as_dict(),
-        "success": wilson(hits, torch.numel(distance)).as_dict(),
-        "change": None if same else bootstrap_mean(distance - unshifted).as_dict(),
-        "verdict": "" if same else verdict(distance, unshifted, success_distance=success_distance),
+        what: bootstrap_mean(value).as_dict(),
+        "success": wilson(int(now.sum()), now.numel()).as_dict(),
+        change: None if same else bootstrap_mean(value - unshifted).as_dict(),
+        "verdict": "" if same else told,
     }

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
 from typing import Any, cast
 
 import torch
@@ -12,7 +11,7 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
-from franka_wm.evaluation.closed_loop import EVALUATION_SEED, arm_of, begin, seeded
+from franka_wm.evaluation.closed_loop import EVALUATION_SEED, arm_of, begin, evaluating, seeded
 
 ROLLOUT_SEED = EVALUATION_SEED + 500_000
 """Episodes of the diagnostics: neither those of training nor those of the closed loop."""
@@ -67,7 +66,7 @@ def gather_episodes(
 
     Args:
         env: E worlds.
-        policy: Run without exploration.
+        policy: Run without exploration, its model in evaluation mode.
         seed: Of the episodes and of all random numbers: the same call gives the same numbers on a CPU.
         steps: T, at most an episode's length; that if not given.
         keys: Observations to keep.
@@ -85,7 +84,7 @@ def gather_episodes(
     length = longest if steps is None else min(steps, longest)
     rows, seen = [], []
     running = torch.ones(env.num_envs, dtype=torch.bool, device=env.device)
-    with seeded(seed, policy), set_exploration_type(ExplorationType.DETERMINISTIC):
+    with seeded(seed, policy), evaluating(policy), set_exploration_type(ExplorationType.DETERMINISTIC):
         tensordict = begin(env, seed)
         for _ in range(length):
             row: dict[Any, Tensor] = {"valid": running.clone()}
@@ -105,18 +104,6 @@ def gather_episodes(
             rows.append(TensorDict(row, batch_size=[env.num_envs], device=env.device))
             tensordict = following
     return cast(TensorDict, torch.stack(rows, 1)), (torch.stack(seen, 1) if seen else None)
-
-
-@contextmanager
-def evaluating(model: Any) -> Iterator[None]:
-    """The model in evaluation mode; afterwards every part is in the mode that it was in before."""
-    modes = [(module, module.training) for module in model.modules()]
-    model.eval()
-    try:
-        yield
-    finally:
-        for module, training in modes:
-            module.training = training
 
 
 @torch.no_grad()

@@ -1,4 +1,4 @@
-"""Tables of an evaluation; they show what there is."""
+"""Tables of what ``franka-wm evaluate`` finds beside the outcome; that is of :mod:`franka_wm.report.table`."""
 
 from __future__ import annotations
 
@@ -11,11 +11,6 @@ from franka_wm.report.table import Table
 
 if TYPE_CHECKING:
     from rich.table import Table as RichTable
-
-# {policy: summary}, as evaluation.json holds it.
-type Policies = Mapping[str, Mapping[str, Any]]
-# Title, path of the entry in a summary, factor to the title's unit, digits.
-type Column = tuple[str, Sequence[str], float, int]
 
 
 def terminal(table: Table, title: str | None = None) -> RichTable:
@@ -41,32 +36,6 @@ def interval(value: Mapping[str, float], scale: float = 1.0, digits: int = 2) ->
 def number(value: float | None, digits: int = 2) -> str:
     """A number, or a dash for what is not defined."""
     return "–" if value is None or math.isnan(value) else f"{value:.{digits}f}"
-
-
-def outcome_table(policies: Policies) -> Table:
-    """How episodes ended: distance, success, return; of other environments return and length."""
-    distances = _distances(policies, "success")
-    columns: list[Column] = [("final distance [cm]", ("final_distance",), 100, 2)]
-    columns += [(f"success at {centimetres(d)} [%]", ("success", d), 100, 0) for d in distances]
-    columns.append(("return", ("return",), 1, 2))
-    if not distances:
-        columns.append(("length [steps]", ("length",), 1, 1))
-    return _table(policies, columns, count=True)
-
-
-def motion_table(policies: Policies) -> Table:
-    """How it went on the way: success at any step, the tool's path, smoothness. No rows where none was measured."""
-    distances = _distances(policies, "success_once")
-    columns: list[Column] = [
-        (f"once at {centimetres(d)} [%]", ("success_once", d), 100, 0) for d in distances
-    ]
-    columns += [
-        ("path [cm]", ("path_length",), 100, 1),
-        ("change of action²", ("action_change",), 1, 3),
-        ("jerk [m/s³]", ("jerk",), 1, 1),
-    ]
-    table = _table(policies, columns)
-    return table if len(table.header) > 1 else Table(table.header, [])
 
 
 def timing_table(seconds: Mapping[str, float], worlds: int) -> Table:
@@ -98,34 +67,15 @@ def robustness_table(
     results: Mapping[str, Mapping[str, Mapping[str, Any]]], success_distance: float
 ) -> Table:
     """What breaks under which shift, of :func:`franka_wm.evaluation.robustness.robustness`."""
-    success = f"success at {centimetres(success_distance)} [%]"
-    header = ["shift", "policy", "final distance [cm]", "change [cm]", success, "verdict"]
+    reaches = any("final_distance" in r for policies in results.values() for r in policies.values())
+    if reaches:
+        what, change, scale = ["final distance [cm]", "change [cm]"], ("final_distance", "change"), 100
+        success = f"success at {centimetres(success_distance)} [%]"
+    else:
+        what, change, scale, success = ["return", "change"], ("return", "return_change"), 1, "success [%]"
     rows = []
     for shift, policies in results.items():
         for policy, r in policies.items():
-            change = "" if r["change"] is None else interval(r["change"], 100)
-            cells = [interval(r["final_distance"], 100), change, interval(r["success"], 100, 0)]
-            rows.append([shift, policy_name(policy), *cells, r["verdict"]])
-    return Table(header, rows)
-
-
-def _distances(policies: Policies, name: str) -> list[str]:
-    """Thresholds of a rate, largest first: the order in which they get harder."""
-    found = {d for summary in policies.values() for d in summary.get(name, {})}
-    return sorted(found, key=float, reverse=True)
-
-
-def _find(summary: Any, path: Sequence[str]) -> Any:
-    for step in path:
-        summary = summary.get(step) if isinstance(summary, Mapping) else None
-    return summary
-
-
-def _table(policies: Policies, columns: Sequence[Column], *, count: bool = False) -> Table:
-    used = [c for c in columns if any(_find(summary, c[1]) is not None for summary in policies.values())]
-    rows = []
-    for policy, summary in policies.items():
-        found = [(_find(summary, path), scale, digits) for _, path, scale, digits in used]
-        cells = ["–" if value is None else interval(value, scale, digits) for value, scale, digits in found]
-        rows.append([policy_name(policy), *cells, *([str(summary["episodes"])] if count else [])])
-    return Table(["policy", *[name for name, *_ in used], *(["episodes"] if count else [])], rows)
+            cells = ["" if r[name] is None else interval(r[name], scale) for name in change]
+            rows.append([shift, policy_name(policy), *cells, interval(r["success"], 100, 0), r["verdict"]])
+    return Table(["shift", "policy", *what, success, "verdict"], rows)

@@ -9,7 +9,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from franka_wm.models.groups import decay_groups
-from franka_wm.models.parts import NormedLinear, SimNorm, TwoHotSymlog, initialize, mlp
+from franka_wm.models.parts import NormedLinear, SimNorm, TwoHotSymlog, initialize, mlp, value_range
 from franka_wm.models.pixel_encoder import PixelEncoder
 from franka_wm.models.vectors import copy_statistics
 from franka_wm.models.vision import RandomShift, check_image_sizes, check_pictures
@@ -55,7 +55,9 @@ class MuZero(nn.Module):
         random_shift: pixels by which pictures are shifted at most, in each direction.
         unroll: moves, K.
         n_step: rewards in a value target before the stored value of the search takes over, or the model's own.
-        bins, value_low, value_high: two-hot code of rewards and values; the range is in symlog space.
+        bins, value_low, value_high: two-hot code of rewards and values; the range is in symlog space. None:
+            derived from `reward_bounds` and the discount, see `value_range`.
+        reward_bounds: the least and the largest reward of a step; None: unknown.
         reward_coef, value_coef, policy_coef, consistency_coef: weights of the losses.
         fresh_values: value targets end in the model's value of now instead of in what the search found when it
             acted: half of MuZero Reanalyse (Schrittwieser et al., arXiv:2104.06294), whose policy targets are
@@ -92,8 +94,9 @@ class MuZero(nn.Module):
         unroll: int = 5,
         n_step: int = 5,
         bins: int = 101,
-        value_low: float = -10.0,
-        value_high: float = 10.0,
+        value_low: float | None = None,
+        value_high: float | None = None,
+        reward_bounds: tuple[float, float] | None = None,
         reward_coef: float = 1.0,
         value_coef: float = 0.25,
         policy_coef: float = 1.0,
@@ -153,15 +156,29 @@ class MuZero(nn.Module):
             nn.init.zeros_(head.bias)
         self.projector = mlp(latent_dim, (projector_dim,), projector_dim)
         self.predictor = mlp(projector_dim, (projector_dim // 2,), projector_dim)
-        self.two_hot = TwoHotSymlog(bins, value_low, value_high)
+        self.two_hot = TwoHotSymlog(bins, *value_range(value_low, value_high, reward_bounds, self.discount))
         self.register_buffer("moves", torch.arange(num_actions), persistent=False)
         self.register_buffer("observation_mean", torch.zeros(observation_dim))
         self.register_buffer("observation_std", torch.ones(observation_dim))
 
     @property
     def window(self) -> int:
-        """Transitions of a window for which every unroll from its first step has full value targets."""
-        return self.unroll + self.n_step
+        """Transitions of a window in which the values of all K + 1 steps have full targets.
+
+        The last one, of step K, sums n rewards and ends in the search's value of step K + n.
+        """
+        return self.unroll + self.n_step + 1
+
+    @staticmethod
+    def refusal(settings: Mapping[str, Any], window: int) -> str | None:
+        """Why a run with these options (``conf/model``) cannot learn from windows of so many transitions."""
+        unroll, n_step = settings.get("unroll", 5), settings.get("n_step", 5)
+        if not (isinstance(unroll, int) and isinstance(n_step, int)) or window >= unroll + n_step + 1:
+            return None  # what is no number, the constructor refuses
+        return (
+            f"windows have {window} transitions; with model.unroll={unroll} and model.n_step={n_step} the value of "
+            f"the last step reaches over {unroll + n_step + 1}: use replay.window={unroll + n_step + 1}"
+        )
 
     # ------------------------------------------------------------------ what a search and a policy use
 
@@ -183,6 +200,10 @@ class MuZero(nn.Module):
         """Observations with keys `observation_sizes`, each (..., size), and `image_sizes`, each
         (..., height, width, C) uint8 -> latents (..., latent_dim)."""
         return self._encode({key: observation.get(key) for key in self.observation_keys})
+
+    def rebuild_overrides(self) -> dict[str, Any]:
+        """Constructor arguments that replace those which depend on the environment: JSON-able."""
+        return self.two_hot.rebuild()
 
     def next(self, z: Tensor, action: Tensor) -> Tensor:
         """Latents (..., latent_dim) and moves (...) int64 -> next latents (..., latent_dim)."""
@@ -238,7 +259,8 @@ class MuZero(nn.Module):
         Returns:
             batch size []: `loss` to differentiate, and detached: `loss_reward`, `loss_value`, `loss_policy`,
             `loss_consistency`, `value_mean`, `value_target_mean`, `policy_entropy` [nat], `search_entropy`
-            [nat], `reward_error` (mean absolute), `latent_norm`.
+            [nat], `reward_error` (mean absolute), `latent_norm`, `target_outside` (share of rewards and targets of
+            values that the two-hot code clamps).
 
         Raises:
             ValueError: another batch size, windows shorter than `unroll`, or no entries of a search.
@@ -333,6 +355,7 @@ class MuZero(nn.Module):
                 "search_entropy": -torch.xlogy(wanted, wanted).sum(-1).mean(),
                 "reward_error": (error * known[:, :-1]).sum() / known[:, :-1].sum(),
                 "latent_norm": predicted[:, 0].norm(dim=-1).mean(),
+                "target_outside": self.two_hot.outside(reward_target, value_target),
             }
         return TensorDict({"loss": loss, **metrics}, batch_size=[])
 

@@ -142,6 +142,42 @@ def mlp(
     return network
 
 
+PUBLISHED_RANGE = 10.0
+"""Of two-hot codes, to both sides of zero in symlog space: rewards and values from -22,025 to 22,025."""
+
+
+def value_range(
+    low: float | None,
+    high: float | None,
+    reward_bounds: tuple[float, float] | None,
+    discount: float,
+) -> tuple[float, float]:
+    """The range of a two-hot code of rewards and values, in symlog space.
+
+    A number given for an end is that end. Where rewards are bounded, discounted returns are by max |reward| / (1 -
+    discount), and so are single rewards and bootstrapped targets: the code reaches 5 % further, since its outermost
+    points are reached by certain predictions alone. It reaches as far to the other side, so that a head
+    which starts at zero first predicts zero. Otherwise the range is the published one, ±10.
+
+    Args:
+        low, high: the ends, None: derived.
+        reward_bounds: the least and the largest reward of a step; None: unknown.
+        discount: per step, in [0, 1]; at 1 returns have no bound.
+
+    Raises:
+        ValueError: bounds that are not finite or in the wrong order.
+    """
+    limit = PUBLISHED_RANGE
+    if reward_bounds is not None:
+        least, largest = reward_bounds
+        if not (math.isfinite(least) and math.isfinite(largest) and least <= largest):
+            raise ValueError(f"reward_bounds must be two finite numbers in order, got {reward_bounds}")
+        size = max(abs(least), abs(largest))
+        if size > 0.0 and discount < 1.0:
+            limit = 1.05 * math.log1p(size / (1.0 - discount))
+    return -limit if low is None else low, limit if high is None else high
+
+
 class TwoHotSymlog(nn.Module):
     """Scalars as a categorical distribution over `bins` equidistant points of symlog space.
 
@@ -164,6 +200,10 @@ class TwoHotSymlog(nn.Module):
         self.bins, self.low, self.high = bins, float(low), float(high)
         self.register_buffer("support", torch.linspace(low, high, bins), persistent=False)
 
+    def rebuild(self) -> dict[str, float]:
+        """Constructor arguments of a model that make its code this one, wherever the range came from."""
+        return {"value_low": self.low, "value_high": self.high}
+
     def encode(self, x: Tensor) -> Tensor:
         """Scalars (..., 1) -> probabilities (..., bins)."""
         position = (symlog(x).clamp(self.low, self.high) - self.low) * (
@@ -172,6 +212,11 @@ class TwoHotSymlog(nn.Module):
         # A triangle of width one bin is the two-hot code: no scatter, so it fuses and needs no index tensor.
         index = torch.arange(self.bins, device=x.device, dtype=position.dtype)
         return (1.0 - (position - index).abs()).clamp_min(0.0)
+
+    def outside(self, *targets: Tensor) -> Tensor:
+        """The share () of targets, of any shapes, beyond the range: `encode` clamps them."""
+        beyond = [(symlog(x) < self.low) | (symlog(x) > self.high) for x in targets]
+        return torch.cat([one.flatten() for one in beyond]).float().mean()
 
     def decode(self, logits: Tensor) -> Tensor:
         """Logits (..., bins) -> expected value (..., 1), the expectation taken in symlog space."""
@@ -326,10 +371,10 @@ class GaussianPolicy(nn.Module):
         mean, log_std = self.distribution(z)
         return torch.tanh(mean if deterministic else mean + log_std.exp() * torch.randn_like(mean))
 
-    def sample(self, z: Tensor) -> tuple[Tensor, Tensor]:
-        """A reparameterised action (..., action_dim) and its log-density (..., 1) after squashing.
+    def sample(self, z: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """A reparameterised action (..., action_dim) and its log-densities (..., 1), before and after squashing.
 
-        The negative log-density, averaged, estimates the policy's entropy [nat].
+        Averaged and negated they estimate the Gaussian's entropy [nat] and that of the policy, its actions'.
         """
         mean, log_std = self.distribution(z)
         noise = torch.randn_like(mean)
@@ -337,7 +382,8 @@ class GaussianPolicy(nn.Module):
         log_prob = -0.5 * (noise.square() + math.log(2.0 * math.pi)) - log_std
         # log(1 - tanh(u)^2), in the form that stays exact where tanh saturates
         log_slope = 2.0 * (math.log(2.0) - raw - F.softplus(-2.0 * raw))
-        return torch.tanh(raw), (log_prob - log_slope).sum(-1, keepdim=True)
+        before = log_prob.sum(-1, keepdim=True)
+        return torch.tanh(raw), before, before - log_slope.sum(-1, keepdim=True)
 
 
 class RunningScale(nn.Module):

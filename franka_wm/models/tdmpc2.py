@@ -9,7 +9,15 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from franka_wm.models.parts import Ensemble, GaussianPolicy, RunningScale, SimNorm, TwoHotSymlog, mlp
+from franka_wm.models.parts import (
+    Ensemble,
+    GaussianPolicy,
+    RunningScale,
+    SimNorm,
+    TwoHotSymlog,
+    mlp,
+    value_range,
+)
 from franka_wm.models.pixel_encoder import PixelEncoder
 from franka_wm.models.streams import beside
 from franka_wm.models.vectors import copy_statistics
@@ -32,7 +40,6 @@ class TDMPC2(nn.Module):
         `set_observation_statistics`; the default is the identity.
       * One backward pass serves model and policy, so the policy learns from the critic before this update
         instead of after it. Their gradients stay apart.
-      * The entropy bonus is the plain entropy of the squashed Gaussian.
       * All frames of a window are shifted alike, so that motion between them is kept; the paper shifts each.
 
     Args:
@@ -52,10 +59,14 @@ class TDMPC2(nn.Module):
         value_members: how many of them `value` averages in evaluation mode, always the first; None: all. The
             paper averages two drawn at random, at two fifths of the cost of all.
         dropout: on the first layer of each Q-function.
-        bins, value_low, value_high: two-hot code of rewards and values; the range is in symlog space.
+        bins, value_low, value_high: two-hot code of rewards and values; the range is in symlog space. None:
+            derived from `reward_bounds` and the discount, see `value_range`.
+        reward_bounds: the least and the largest reward of a step; None: unknown.
         log_std_min, log_std_max: bounds of the policy's log standard deviation before squashing.
         rho: weight of unroll step t is rho^t.
-        consistency_coef, reward_coef, value_coef, entropy_coef: weights of the losses.
+        consistency_coef, reward_coef, value_coef: weights of the losses.
+        entropy_coef: weight, against scaled values, of `action_dim` times the entropy [nat] of the Gaussian
+            before squashing, as in the authors' code.
         tau: how far target Q-functions, and the policy loss's scale, move at each update.
         encoder_lr_scale: learning rate of the encoder relative to the rest.
         channels: of each convolution over pictures.
@@ -90,8 +101,9 @@ class TDMPC2(nn.Module):
         value_members: int | None = None,
         dropout: float = 0.01,
         bins: int = 101,
-        value_low: float = -10.0,
-        value_high: float = 10.0,
+        value_low: float | None = None,
+        value_high: float | None = None,
+        reward_bounds: tuple[float, float] | None = None,
         log_std_min: float = -10.0,
         log_std_max: float = 2.0,
         rho: float = 0.5,
@@ -182,7 +194,7 @@ class TDMPC2(nn.Module):
             log_std_min=log_std_min,
             log_std_max=log_std_max,
         )
-        self.two_hot = TwoHotSymlog(bins, value_low, value_high)
+        self.two_hot = TwoHotSymlog(bins, *value_range(value_low, value_high, reward_bounds, self.discount))
         self.scale = RunningScale(tau)
         self.register_buffer("observation_mean", torch.zeros(observation_dim))
         self.register_buffer("observation_std", torch.ones(observation_dim))
@@ -217,9 +229,10 @@ class TDMPC2(nn.Module):
         return self._encode(vectors, pictures)
 
     def rebuild_overrides(self) -> dict[str, Any]:
-        """Constructor arguments that replace those which read other files, so that the model's own weights
-        rebuild it: JSON-able."""
-        return self.encoder.rebuild() if isinstance(self.encoder, PixelEncoder) else {}
+        """Constructor arguments that replace those which read other files or depend on the environment, so that the
+        model's own weights rebuild it: JSON-able."""
+        encoder = self.encoder.rebuild() if isinstance(self.encoder, PixelEncoder) else {}
+        return encoder | self.two_hot.rebuild()
 
     def next(self, z: Tensor, action: Tensor) -> Tensor:
         """Latents (..., latent_dim) and actions (..., action_dim) -> next latents (..., latent_dim)."""
@@ -271,9 +284,8 @@ class TDMPC2(nn.Module):
         """Actions (..., action_dim) in [-1, 1] for z (..., latent_dim): a sample, or the mode."""
         return self.policy_head(z, deterministic=deterministic)
 
-    def policy_sample(self, z: Tensor) -> tuple[Tensor, Tensor]:
-        """A reparameterised action (..., action_dim) and its log-density (..., 1); its negative mean is the
-        entropy [nat]."""
+    def policy_sample(self, z: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """A reparameterised action (..., action_dim) and its log-densities (..., 1), see `GaussianPolicy.sample`."""
         return self.policy_head.sample(z)
 
     # ------------------------------------------------------------------ training
@@ -304,7 +316,8 @@ class TDMPC2(nn.Module):
         Returns:
             batch size []: `loss` to differentiate, and detached: `loss_consistency`, `loss_reward`,
             `loss_value`, `loss_policy`, `q_mean`, `q_target_mean`, `policy_entropy` [nat], `policy_scale`,
-            `latent_norm`, `reward_error` (mean absolute).
+            `latent_norm`, `reward_error` (mean absolute), `target_outside` (share of rewards and targets of
+            values that the two-hot code clamps).
 
         Raises:
             ValueError: the batch size is not [B, H].
@@ -343,7 +356,7 @@ class TDMPC2(nn.Module):
             + policy_loss
         )
         with torch.no_grad():
-            q_mean, q_target_mean, latent_norm, reward_error = call["_metrics"](
+            q_mean, q_target_mean, latent_norm, reward_error, outside = call["_metrics"](
                 q_logits.detach(), reward_logits.detach(), target, encoded.detach(), reward
             )
         metrics = {
@@ -357,6 +370,7 @@ class TDMPC2(nn.Module):
             "policy_scale": self.scale.value.clone(),
             "latent_norm": latent_norm,
             "reward_error": reward_error,
+            "target_outside": outside,
         }
         return TensorDict({"loss": total, **metrics}, batch_size=[])
 
@@ -431,10 +445,11 @@ class TDMPC2(nn.Module):
 
     def _metrics(
         self, q_logits: Tensor, reward_logits: Tensor, target: Tensor, encoded: Tensor, reward: Tensor
-    ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """Mean values, targets and norm of latents, and the mean absolute error of rewards."""
-        error = (self.two_hot.decode(reward_logits) - reward).abs().mean()
-        return self.two_hot.decode(q_logits).mean(), target.mean(), encoded.norm(dim=-1).mean(), error
+    ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+        """Means of values, targets, norms of latents and errors of rewards; the share of targets outside."""
+        q_mean, error = self.two_hot.decode(q_logits).mean(), self.two_hot.decode(reward_logits) - reward
+        outside = self.two_hot.outside(reward, target)
+        return q_mean, target.mean(), encoded.norm(dim=-1).mean(), error.abs().mean(), outside
 
     def _td_target(self, after: Tensor, reward: Tensor, terminated: Tensor) -> Tensor:
         """One-step targets (H, B, 1) from encoded next latents (H, B, D): r + γ min of two target Qs."""
@@ -443,12 +458,15 @@ class TDMPC2(nn.Module):
         return reward + self.discount * torch.where(terminated, torch.zeros_like(bootstrap), bootstrap)
 
     def _policy_loss(self, z: Tensor, weight: Tensor) -> tuple[Tensor, Tensor]:
-        """Loss and mean entropy of the policy at detached latents z (H+1, B, D)."""
-        action, log_prob = self.policy_sample(z)
+        """Loss and mean entropy [nat] of the policy at detached latents z (H+1, B, D)."""
+        action, gaussian_log_prob, log_prob = self.policy_sample(z)
         q = self.q(z, action, weights="detached", reduce="pair_mean", dropout=self.training)
         if self.training:
             self.scale.update(q[0])
-        loss = -(weight * (self.scale(q) - self.entropy_coef * log_prob)).mean()
+        scaled_entropy = (
+            -self.action_dim * gaussian_log_prob
+        )  # not squashed: the bonus never pulls actions inwards
+        loss = -(weight * (self.scale(q) + self.entropy_coef * scaled_entropy)).mean()
         return loss, -log_prob.mean()
 
 

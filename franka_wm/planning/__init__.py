@@ -4,6 +4,7 @@ Nothing here knows a model family: models enter as callables.
 """
 
 from franka_wm.planning.cem import CEM
+from franka_wm.planning.exploration import ExploringPolicy
 from franka_wm.planning.gradient import GradientPlanner
 from franka_wm.planning.icem import ICEM
 from franka_wm.planning.mcts import MCTS
@@ -26,6 +27,7 @@ __all__ = [
     "MCTS",
     "MPPI",
     "ActionPenalty",
+    "ExploringPolicy",
     "GoalDistance",
     "GoalImage",
     "GradientPlanner",

@@ -9,7 +9,7 @@ from typing import Any
 from franka_wm.errors import UserError
 from franka_wm.report import style
 from franka_wm.report.bars import bars_figure
-from franka_wm.report.curves import seeds_figure
+from franka_wm.report.curves import panels, seeds_figure
 from franka_wm.report.document import (
     Section,
     cards,
@@ -21,16 +21,15 @@ from franka_wm.report.document import (
     write_document,
 )
 from franka_wm.report.horizon import horizon_figure
+from franka_wm.report.outcome import SHOWN
 from franka_wm.report.page import split_arguments, wants_help
 from franka_wm.report.run import RunFiles, but_for_the_seed, read_run
-from franka_wm.report.sections import SHOWN
 from franka_wm.report.spectra import spectrum_figure
 from franka_wm.report.table import Table, evaluation_tables, html, is_interval
 
 FILE = "compare.html"
 
 MISSING = "–"
-QUANTITIES = ("final_distance", "success", "return")
 
 
 def compare_page(runs: Sequence[RunFiles]) -> str:
@@ -157,18 +156,31 @@ def _results(runs: Mapping[str, RunFiles]) -> str:
                 "Shorter is better; whiskers are 95 % intervals over episodes.",
             )
         body += text + cards(drawn)
-    return body + (folded("Baselines", rest) if rest else "")
+    return body + (folded("Baselines", rest) if rest else "") + _measured(runs)
+
+
+def _measured(runs: Mapping[str, RunFiles]) -> str:
+    """By whom, where a run was measured more than once: shown is what rests on most episodes."""
+    if all(len(run.results) < 2 for run in runs.values()):
+        return ""
+    rows = [
+        [name, run.results[0].told, "; ".join(one.told for one in run.results[1:]) or MISSING]
+        for name, run in runs.items()
+        if run.results
+    ]
+    return scrolling(html(Table(["run", "measured by", "also measured by"], rows), kind="texts"))
 
 
 def _curves(groups: Mapping[str, Mapping[str, RunFiles]]) -> str:
     rows = {name: [run.rows for run in group.values()] for name, group in groups.items()}
     logged = [row for runs in rows.values() for one in runs for row in one]
-    x = next((key for key in ("env_steps", "updates") if all(key in row for row in logged)), None)
-    if not logged or x is None:
+    axes = [key for key in ("env_steps", "updates") if all(key in row for row in logged)]
+    x = next((key for key in axes if any(row[key] for row in logged)), None)  # recorded data makes no steps
+    if x is None:
         return ""
     found = {key for row in logged for key in row}
     drawn = []
-    for key in [_best(found, quantity) for quantity in QUANTITIES] + ["loss"]:
+    for key in [_best(found, panel) for panel in panels(logged)] + ["loss"]:
         if key in found:
             who = "" if key.count("/") < 2 else f"Of {style.policy_name(key.split('/')[1])}. "
             many = any(len(group) > 1 for group in groups.values())

@@ -33,8 +33,17 @@ QUANTITIES = {
     "success": ("successful episodes [%]", 100.0),
     "return": ("return of an episode", 1.0),
 }
-PANELS = (*QUANTITIES, "losses", "gradients")
-"""What `panel_figure` draws."""
+
+
+def panels(rows: Rows) -> list[str]:
+    """What `panel_figure` draws of these rows: quantities, a task's own measures among them, losses, gradients."""
+    evaluated = {_leaf(key) for row in rows for key in row if key.startswith("eval/")}
+    return [*QUANTITIES, *sorted(evaluated - QUANTITIES.keys()), "losses", "gradients"]
+
+
+def axis(rows: Rows) -> str | None:
+    """What rows are drawn against: environment steps, or updates where training makes none; None for no rows."""
+    return next((key for key in ("env_steps", "updates") if any(row.get(key) for row in rows)), None)
 
 
 def plot_learning_curves(
@@ -46,11 +55,11 @@ def plot_learning_curves(
     title: str | None = None,
     theme: Theme = LIGHT,
 ) -> Path:
-    """Draw the logged rows of a run into one figure: distance, success rate, losses.
+    """Draw the logged rows of a run into one figure: distance, or return where there is none, success rate, losses.
 
     A row holds what was logged at one moment; rows need not hold the same keys. Drawn are `…/final_distance`
-    [m], `…/success` [0 … 1] (`eval/planner/…`, `eval/policy/…`, `train/…`) and every `loss_…` or `…/loss_…`.
-    Values that are not finite leave a gap. A panel without data says so.
+    [m] or `…/return`, `…/success` [0 … 1] (`eval/planner/…`, `eval/policy/…`, `train/…`) and every `loss_…` or
+    `…/loss_…`. Values that are not finite leave a gap. A panel without data says so.
 
     Args:
         rows: in any order.
@@ -68,10 +77,13 @@ def plot_learning_curves(
     """
     check_format(path)
     placed = _placed(rows, x)
-    figure, (distance, success, losses) = new_figure(
+    figure, (first_axes, success, losses) = new_figure(
         columns=3, width=4.0, height=3.8, theme=theme, sharex=True
     )
-    _draw_quantity(distance, placed, x, "final_distance", success_distance, theme)
+    first = "final_distance" if _keys(placed, "final_distance") or not _keys(placed, "return") else "return"
+    _draw_quantity(
+        first_axes, placed, x, first, success_distance if first == "final_distance" else None, theme
+    )
     _draw_quantity(success, placed, x, "success", None, theme)
     _draw_values(losses, placed, x, _loss_keys(placed), "losses", theme)
     title_figure(figure, title, theme=theme)
@@ -86,14 +98,14 @@ def panel_figure(
     success_distance: float | None = 0.05,
     theme: Theme = LIGHT,
 ) -> "Figure | None":
-    """One of `PANELS` of a run as a figure of its own; None where no row holds anything for it.
+    """One of `panels` of a run as a figure of its own; None where no row holds anything for it.
 
     Raises:
         UserError: no row has the key `x`.
     """
     placed = _placed(rows, x)
     figure, (axes,) = new_figure(theme=theme)
-    if panel in QUANTITIES:
+    if panel not in ("losses", "gradients"):
         if not _keys(placed, panel):
             return None
         mark = success_distance if panel == "final_distance" else None
@@ -194,7 +206,7 @@ def seeds_figure(
 def _draw_quantity(
     axes: "Axes", rows: Rows, x: str, leaf: str, success_distance: float | None, theme: Theme
 ) -> None:
-    title, scale = QUANTITIES[leaf]
+    title, scale = QUANTITIES.get(leaf, (leaf.replace("_", " "), 1.0))
     keys = _keys(rows, leaf)
     for key in keys:
         _draw_policy(axes, rows, x, key, scale, theme)

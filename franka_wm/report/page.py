@@ -10,8 +10,9 @@ from pathlib import Path
 from franka_wm import __version__
 from franka_wm.errors import UserError
 from franka_wm.report.document import document, write_document
+from franka_wm.report.outcome import headline
 from franka_wm.report.run import RunFiles, read_run
-from franka_wm.report.sections import headline, sections
+from franka_wm.report.sections import sections, warnings
 
 FILE = "report.html"
 
@@ -23,7 +24,7 @@ def page(run: RunFiles) -> str:
     return document(
         run.name,
         subtitle=" · ".join(known) or "an evaluation",
-        above=headline(run),
+        above=headline(run, warnings(run)),
         sections=sections(run),
         below=f"Written by franka_wm {escape(__version__)}.",
     )

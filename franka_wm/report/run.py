@@ -3,33 +3,20 @@
     config.yaml             what was run
     .hydra/overrides.yaml   what was typed after ``train.py``
     versions.json           packages and machine, as `franka_wm.report.versions` writes them
-    evaluation.json         results; see below
+    evaluation.json         results, as :mod:`franka_wm.report.results` describes them
     checkpoints/…           counters and the logged rows; without a checkpoint, rows come from ``csv/``
     video.mp4, last_frame.png, imagined.mp4, imagined.png, masks.png    pictures
-    evaluation/             what ``franka-wm evaluate`` wrote: evaluation.json, timing.json and pictures; they stand
-                            for those above, which training wrote, since they rest on more episodes
-
-``evaluation.json`` is an object whose entries are policies (``planner``, ``noop``, …), or one with those under
-``policies``. A policy holds numbers and intervals (``{"mean", "low", "high"}``). Beside the policies there may be
-
-    open_loop     {"curves": {name: {"mean": [H], "low": [H], "high": [H]}}, "steps": [H], "unit": text,
-                   "rank_correlation": number or interval}
-    probes        {quantity: {probe: R² or interval or null}}
-    spectrum      {"singular_values": [D], "effective_rank", "rankme", "feature_std", "mean_cosine", …, "warning"}
-    latents       {"points": [[x, y], …], "quantity": [N], "label": text, "explained": [2]}
-    calibration   {"predicted": [B], "true": [B], "low": [B], "high": [B], "count": [B]}
-    robustness    {change: {policy: {metric: number or interval}}}
-    health        {name: number}, and "warnings": [text]
-    protocol      {name: text or number}: how it was evaluated
+    evaluation/             what ``franka-wm evaluate`` wrote: evaluation.json, timing.json and pictures. Of two
+                            evaluation.json the one with more episodes is shown first, and the other is named
 
 ``timing.json`` holds {policy: {"seconds_per_decision", "worlds"}}.
 
-A number that is not known is null. All of them are optional; `franka_wm.report.page` shows what there is.
+All of them are optional; `franka_wm.report.page` shows what there is.
 """
 
 import json
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -39,21 +26,10 @@ from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from franka_wm.errors import UserError
+from franka_wm.report.results import Result, last_row, read_object, results
 
 SAME_BUT = ("seed", "device", "resume")
 """Runs whose configurations differ in these alone are repetitions of one another."""
-
-EXTRAS = (
-    "open_loop",
-    "probes",
-    "spectrum",
-    "latents",
-    "calibration",
-    "robustness",
-    "health",
-    "protocol",
-)
-"""Entries of ``evaluation.json`` that are not policies."""
 
 PICTURES = ("video.mp4", "last_frame.png", "imagined.mp4", "imagined.png", "masks.png")
 
@@ -67,9 +43,8 @@ class RunFiles:
         config: resolved configuration.
         overrides: typed after ``train.py``.
         versions: of packages and machine.
-        policies: name -> numbers and intervals.
-        extras: entries of `EXTRAS`.
-        rows: logged while training.
+        results: of the run's end and of ``franka-wm evaluate``; the one with most episodes, which is shown, first.
+        rows: logged while training, and what its end found.
         counters: of the checkpoint: ``updates``, ``env_steps``, ``seconds``.
         pictures: name -> path, of `PICTURES`.
         timing: policy -> ``seconds_per_decision``, ``worlds``.
@@ -79,12 +54,21 @@ class RunFiles:
     config: Mapping[str, Any] = field(default_factory=dict)
     overrides: list[str] = field(default_factory=list)
     versions: Mapping[str, Any] = field(default_factory=dict)
-    policies: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
-    extras: Mapping[str, Any] = field(default_factory=dict)
+    results: Sequence[Result] = ()
     rows: list[dict[str, float]] = field(default_factory=list)
     counters: Mapping[str, float] = field(default_factory=dict)
     pictures: Mapping[str, Path] = field(default_factory=dict)
     timing: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
+
+    @property
+    def policies(self) -> Mapping[str, Mapping[str, Any]]:
+        """Of the result that is shown: name -> numbers and intervals."""
+        return self.results[0].policies if self.results else {}
+
+    @property
+    def extras(self) -> Mapping[str, Any]:
+        """What was found beside the policies, by whichever looked."""
+        return {name: value for one in reversed(self.results) for name, value in one.extras.items()}
 
     @property
     def name(self) -> str:
@@ -124,26 +108,28 @@ def read_run(folder: str | Path) -> RunFiles:
     if not run.is_dir():
         raise UserError(f"{run} is not a folder; give the folder of a run, as train.py prints it last.")
     config = _yaml(run / "config.yaml")
-    # The command's own evaluation first; then what the end of training found.
+    # The command's own files first; then what the end of training left.
     places = [place for place in (run / "evaluation", run) if place.is_dir()]
-    source = next((p / "evaluation.json" for p in places if (p / "evaluation.json").is_file()), None)
-    evaluation = None if source is None else _json(source)
-    timing = next((found for place in places if (found := _json(place / "timing.json"))), {})
-    if config is None and evaluation is None:
+    found = results(run)
+    timing = next((one for place in places if (one := _json(place / "timing.json"))), {})
+    if config is None and not found:
         raise UserError(
             f"{run} holds neither config.yaml nor evaluation.json; give the folder of a run, "
             "as train.py prints it last."
         )
     rows, counters, version = _history(run)
     versions = _json(run / "versions.json") or ({"franka_wm": version} if version else {})
-    policies, extras = split_evaluation(evaluation or {}, source=source or run)
+    end = last_row(found, ((config or {}).get("evaluation") or {}).get("during") or ())
+    numbers = end.keys() - {"env_steps", "time_s"}
+    # A logger's files hold it already; a checkpoint was saved before.
+    if end and not any(numbers <= row.keys() and row["updates"] == end["updates"] for row in rows):
+        rows.append(end)
     return RunFiles(
         folder=run.resolve(),
         config=config or {},
         overrides=[str(one) for one in _yaml(run / ".hydra" / "overrides.yaml") or []],
         versions=versions,
-        policies=policies,
-        extras=extras,
+        results=found,
         rows=rows,
         counters=counters,
         pictures={name: p / name for p in reversed(places) for name in PICTURES if (p / name).is_file()},
@@ -166,38 +152,11 @@ def but_for_the_seed(config: Mapping[str, Any]) -> str:
     return json.dumps(kept, sort_keys=True, default=str) if kept else ""
 
 
-def split_evaluation(
-    evaluation: Mapping[str, Any], *, source: str | Path = "evaluation.json"
-) -> tuple[dict[str, Mapping[str, Any]], dict[str, Any]]:
-    """The policies of an ``evaluation.json``, and the entries of `EXTRAS`; see the module's docstring.
-
-    Raises:
-        UserError: an entry that is neither.
-    """
-    extras = {name: evaluation[name] for name in EXTRAS if evaluation.get(name)}
-    policies = evaluation.get("policies")
-    if policies is None:
-        policies = {name: value for name, value in evaluation.items() if name not in EXTRAS}
-        # Whatever else stands beside the policies is not one: a policy was played, so it has a return.
-        policies = {name: v for name, v in policies.items() if isinstance(v, Mapping) and "return" in v}
-    if not isinstance(policies, Mapping) or not all(isinstance(v, Mapping) for v in policies.values()):
-        raise UserError(f"{source}: `policies` must hold an object for each policy; evaluate the run again.")
-    return dict(policies), extras
-
-
 # -- files -----------------------------------------------------------------------------------------------
 
 
 def _json(path: Path) -> Any:
-    if not path.is_file():
-        return None
-    try:
-        found = json.loads(path.read_text())
-    except (OSError, ValueError) as error:
-        raise UserError(f"{path} cannot be read ({error}); remove it or evaluate the run again.") from error
-    if not isinstance(found, dict):
-        raise UserError(f"{path} holds no object; remove it or evaluate the run again.")
-    return found
+    return read_object(path) if path.is_file() else None
 
 
 def _yaml(path: Path) -> Any:

@@ -11,7 +11,7 @@ from omegaconf import OmegaConf
 from franka_wm.report import style
 from franka_wm.report.bars import bars_figure
 from franka_wm.report.calibration import calibration_figure
-from franka_wm.report.curves import PANELS, panel_figure
+from franka_wm.report.curves import axis, panel_figure, panels
 from franka_wm.report.document import (
     Section,
     card,
@@ -23,17 +23,14 @@ from franka_wm.report.document import (
     picture,
     scrolling,
     sparkline,
-    tiles,
     video,
-    warning,
 )
 from franka_wm.report.horizon import horizon_figure
+from franka_wm.report.outcome import number, plain, result
+from franka_wm.report.results import COMMAND, END
 from franka_wm.report.run import RunFiles
 from franka_wm.report.spectra import latent_figure, spectrum_figure
-from franka_wm.report.table import Table, evaluation_tables, html, is_interval, nested_table
-
-SHOWN = ("planner", "policy")
-"""Whose results stand at the top of the page, the first that there is."""
+from franka_wm.report.table import html, is_interval, nested_table
 
 
 def sections(run: RunFiles) -> list[Section]:
@@ -55,22 +52,6 @@ def sections(run: RunFiles) -> list[Section]:
     return [Section(key, title, body) for key, title, make in parts if (body := make(run))]
 
 
-def headline(run: RunFiles) -> str:
-    """Warnings, and the numbers one looks for first."""
-    values: list[tuple[str, str, str]] = []
-    shown = next((name for name in SHOWN if name in run.policies), None)
-    if shown is not None:
-        values += _outcome(run.policies[shown], style.policy_name(shown))
-    for name, key, write in (
-        ("environment steps", "env_steps", _count),
-        ("updates", "updates", _count),
-        ("training", "seconds", _duration),
-    ):
-        if key in run.counters:
-            values.append((name, write(float(run.counters[key])), ""))
-    return "".join(map(warning, warnings(run))) + (tiles(values) if values else "")
-
-
 def warnings(run: RunFiles) -> list[str]:
     """What evaluation found wrong, in its words."""
     spectrum, found = run.extras.get("spectrum") or {}, run.extras.get("health") or {}
@@ -78,62 +59,8 @@ def warnings(run: RunFiles) -> list[str]:
     return list(dict.fromkeys(str(text) for text in texts if text))
 
 
-def result(run: RunFiles) -> str:
-    if not run.policies:
-        return ""
-    outcome, motion = evaluation_tables(run.policies)
-    pictures = []
-    success = _success(run.policies)
-    if success:
-        groups = {
-            style.centimetres(distance): {
-                style.policy_name(policy): rates[distance]
-                for policy, rates in success.items()
-                if distance in rates
-            }
-            for distance in sorted({d for rates in success.values() for d in rates}, key=float, reverse=True)
-        }
-        colours = {style.policy_name(name): style.policy_colour(name) for name in run.policies}
-        pictures.append(
-            chart(
-                bars_figure(
-                    groups, label="successful episodes [%]", scale=100, limits=(0, 100), colours=colours
-                ),
-                "share of episodes that ended within 5, 2.5 and 1 cm of the goal",
-                "Share of episodes that ended this close to the goal; whiskers are 95 % intervals.",
-            )
-        )
-    for key, label, scale, note in (
-        ("final_distance", "final distance to the goal [cm]", 100.0, "Shorter is better."),
-        ("return", "return of an episode", 1.0, "Further to the right is better."),
-    ):
-        values = {
-            style.policy_name(name): {"": one[key]}
-            for name, one in run.policies.items()
-            if is_interval(one.get(key))
-        }
-        if values:
-            colours = {style.policy_name(name): style.policy_colour(name) for name in run.policies}
-            drawn = bars_figure(values, label=label, scale=scale, colours=colours)
-            pictures.append(chart(drawn, f"{label} of every policy", note))
-            break  # the return says the same where there is a distance
-    protocol = run.extras.get("protocol") or {}
-    described = facts((name.replace("_", " "), _plain(value)) for name, value in protocol.items())
-    tables = scrolling(html(outcome)) + cards(*pictures)
-    if motion.rows:
-        tables += "<h3>On the way</h3>" + scrolling(html(motion))
-    if run.timing:
-        rows = [
-            [style.policy_name(name), f"{1000 * one['seconds_per_decision']:.2f}", f"{one['worlds']:g}"]
-            for name, one in run.timing.items()
-        ]
-        header = ["policy", "one decision for all worlds [ms]", "worlds"]
-        tables += folded("Time per decision", scrolling(html(Table(header, rows))))
-    return tables + (folded("How it was evaluated", described) if described else "")
-
-
 def curves(run: RunFiles) -> str:
-    x = next((key for key in ("env_steps", "updates") if any(key in row for row in run.rows)), None)
+    x = axis(run.rows)
     if x is None:
         return ""
     success = (run.config.get("env") or {}).get("success_distance")
@@ -142,9 +69,16 @@ def curves(run: RunFiles) -> str:
             panel_figure(run.rows, panel, x=x, success_distance=success),
             f"{panel.replace('_', ' ')} while training",
         )
-        for panel in PANELS
+        for panel in panels(run.rows)
     )
-    return cards(*drawn)
+    end = next((one for one in run.results if one.protocol.get("by") == END), None)
+    last = ""
+    if end is not None:
+        fewer = (run.config.get("evaluation") or {}).get("during_episodes") or end.episodes
+        fewer = min(int(fewer), end.episodes)
+        before = f"; those before are over {fewer} of these" if fewer < end.episodes else ""
+        last = f"<p>The last points are what the end of training measured over {end.episodes} episodes{before}.</p>"
+    return last + cards(*drawn)
 
 
 def videos(run: RunFiles) -> str:
@@ -299,7 +233,7 @@ def health(run: RunFiles) -> str:
     if logged:
         rows = "".join(
             f'<tr><th scope="row">{key}</th><td>{sparkline(values, key + " while training")}</td>'
-            f"<td>{_number(values[-1])}</td><td>{_range(values)}</td></tr>"
+            f"<td>{number(values[-1])}</td><td>{_range(values)}</td></tr>"
             for key, values in sorted(logged.items())
         )
         head = (
@@ -324,8 +258,8 @@ def what(run: RunFiles) -> str:
         ("device", config.get("device")),
         ("scale", config.get("scale")),
     ]
-    told = facts((name, _plain(value)) for name, value in rows if value is not None)
-    used = facts((name.replace("_", " "), _plain(value)) for name, value in run.versions.items())
+    told = facts((name, plain(value)) for name, value in rows if value is not None)
+    used = facts((name.replace("_", " "), plain(value)) for name, value in run.versions.items())
     text = told + (f"<h3>Made with</h3>{used}" if used else "")
     if config:
         text += folded(
@@ -358,39 +292,6 @@ def reproduce(run: RunFiles) -> str:
 # -- texts -----------------------------------------------------------------------------------------------
 
 
-def _outcome(values: Mapping[str, Any], who: str) -> list[tuple[str, str, str]]:
-    out = []
-    distance = values.get("final_distance") or {}
-    if is_interval(distance) and None not in distance.values():
-        digits = 0 if distance["mean"] >= 0.1 else 2  # [m]; shown in cm
-        mean, low, high = (f"{100 * distance[k]:.{digits}f}" for k in ("mean", "low", "high"))
-        out.append(("final distance", f"{mean} cm", f"{low} – {high}, {who}"))
-    rates = _success({who: values}).get(who, {})
-    if rates:
-        widest = max(rates, key=float)
-        rate = rates[widest]
-        out.append(
-            (
-                f"success at {style.centimetres(widest)}",
-                f"{100 * rate['mean']:.0f} %",
-                f"{100 * rate['low']:.0f} – {100 * rate['high']:.0f}, {values.get('episodes', '?')} episodes",
-            )
-        )
-    return out
-
-
-def _success(policies: Mapping[str, Mapping[str, Any]]) -> dict[str, dict[str, Any]]:
-    """policy -> distance [m] -> interval, of the rates at the end of an episode."""
-    out = {}
-    for policy, values in policies.items():
-        rates = values.get("success_end", values.get("success"))
-        if isinstance(rates, Mapping):
-            kept = {d: rate for d, rate in rates.items() if is_interval(rate)}
-            if kept and not is_interval(rates):
-                out[policy] = kept
-    return out
-
-
 def _scalars(values: Mapping[str, Any]) -> dict[str, Any]:
     """Numbers and intervals among the entries; curves and texts are shown elsewhere."""
     return {k: v for k, v in values.items() if isinstance(v, (int, float)) or is_interval(v)}
@@ -398,31 +299,13 @@ def _scalars(values: Mapping[str, Any]) -> dict[str, Any]:
 
 def _numbers(values: Mapping[str, Any]) -> str:
     """Names and numbers on a card."""
-    rows = [(name.replace("_", " ").replace("/", " / "), _plain(value)) for name, value in values.items()]
+    rows = [(name.replace("_", " ").replace("/", " / "), plain(value)) for name, value in values.items()]
     return card(facts(rows)) if rows else ""
-
-
-def _plain(value: Any) -> str:
-    if is_interval(value):
-        return f"{_number(value['mean'])} ({_number(value['low'])} – {_number(value['high'])})"
-    if isinstance(value, bool):
-        return "yes" if value else "no"
-    if isinstance(value, float):
-        return _number(value)
-    if isinstance(value, Mapping):
-        return ", ".join(f"{name} {_plain(one)}" for name, one in value.items())
-    if isinstance(value, (list, tuple)):
-        return ", ".join(map(_plain, value))
-    return "–" if value is None else str(value)
-
-
-def _number(value: float | None) -> str:
-    return f"{value:.4g}" if value is not None and math.isfinite(value) else "not finite"
 
 
 def _range(values: list[float]) -> str:
     finite = [v for v in values if math.isfinite(v)]
-    return f"{_number(min(finite))} – {_number(max(finite))}" if finite else "–"
+    return f"{number(min(finite))} – {number(max(finite))}" if finite else "–"
 
 
 def _least(groups: Mapping[str, Mapping[str, Any]]) -> float:
@@ -435,23 +318,10 @@ def _least(groups: Mapping[str, Mapping[str, Any]]) -> float:
     return max(-1.0, low)
 
 
-def _count(number: float) -> str:
-    for size, suffix in ((1e9, " G"), (1e6, " M"), (1e3, " k")):
-        if number >= size:
-            return f"{number / size:.3g}{suffix}"
-    return f"{number:.0f}"
-
-
-def _duration(seconds: float) -> str:
-    if seconds < 90:
-        return f"{seconds:.0f} s"
-    return f"{seconds / 60:.0f} min" if seconds < 5400 else f"{seconds / 3600:.1f} h"
-
-
 def _episodes(run: RunFiles) -> str:
     """As many as it was evaluated over by the command, if it was."""
-    episodes = (run.extras.get("protocol") or {}).get("episodes")
-    return f" episodes={episodes}" if isinstance(episodes, int) else ""
+    episodes = [one.episodes for one in run.results if one.protocol.get("by") == COMMAND]
+    return f" episodes={episodes[0]}" if episodes else ""
 
 
 def _near(folder: Path) -> Path:

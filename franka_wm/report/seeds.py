@@ -1,38 +1,25 @@
 """Several runs in one table: the mean over seeds, and the lowest and highest."""
 
-import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from franka_wm.errors import UserError
+from franka_wm.report.results import Result, results
 from franka_wm.report.run import but_for_the_seed, read_config
-
-COLUMNS = (
-    ("return", lambda r: r["return"]["mean"], 2),
-    ("final distance [cm]", lambda r: 100 * r["final_distance"]["mean"], 2),
-    ("within 5 cm [%]", lambda r: 100 * r["success"]["0.05"]["mean"], 0),
-    ("within 2.5 cm [%]", lambda r: 100 * r["success"]["0.025"]["mean"], 0),
-    ("within 1 cm [%]", lambda r: 100 * r["success"]["0.01"]["mean"], 0),
-)
+from franka_wm.report.style import centimetres
 
 
-def read_evaluation(run: str | Path) -> dict[str, Any]:
-    """The ``evaluation.json`` of a run's folder.
+def read_evaluation(run: str | Path) -> Result:
+    """What was measured of a run: of several results the one with most episodes.
 
     Raises:
-        UserError: There is none, or it is not one.
+        UserError: There is none, or it cannot be read.
     """
-    path = Path(run) / "evaluation.json"
-    try:
-        found = json.loads(path.read_text())
-        return found.get("policies", found)  # as training leaves it, or as `franka-wm evaluate` does
-    except FileNotFoundError as error:
-        raise UserError(f"{run}: no evaluation.json; give folders of runs that were finished") from error
-    except (OSError, json.JSONDecodeError) as error:
-        raise UserError(
-            f"{path}: cannot be read ({error}); give folders of runs that were finished"
-        ) from error
+    found = results(run)
+    if not found:
+        raise UserError(f"{run}: no evaluation.json; give folders of runs that were finished")
+    return found[0]
 
 
 def runs_of(folder: str | Path) -> list[Path]:
@@ -54,22 +41,41 @@ def runs_of(folder: str | Path) -> list[Path]:
 def seeds_table(evaluations: Sequence[Mapping[str, Any]]) -> str:
     """Markdown: one row per policy, `mean over runs (lowest – highest)` in every cell."""
     policies = [p for p in evaluations[0] if all(p in e for e in evaluations)]
-    # Other environments than the arm have returns alone; of the arm, distances say more.
-    reaches = all("final_distance" in e[p] for e in evaluations for p in policies)
-    columns = COLUMNS[1:] if reaches else COLUMNS[:1]
+    columns = _columns(evaluations[0][policies[0]])
     lines = [
-        "| policy | " + " | ".join(name for name, _, _ in columns) + " |",
+        "| policy | " + " | ".join(name for name, *_ in columns) + " |",
         "|---|" + "---:|" * len(columns),
     ]
     for policy in policies:
         cells = []
-        for _, value, digits in columns:
-            values = [value(e[policy]) for e in evaluations]
+        for _, path, scale, digits in columns:
+            values = [scale * _mean(e[policy], path) for e in evaluations]
             low, high = min(values), max(values)
             mean = f"{sum(values) / len(values):.{digits}f}"
             cells.append(mean if len(values) == 1 else f"{mean} ({low:.{digits}f} – {high:.{digits}f})")
         lines.append(f"| {policy} | " + " | ".join(cells) + " |")
     return "\n".join(lines)
+
+
+def _columns(summary: Mapping[str, Any]) -> list[tuple[str, tuple[str, ...], float, int]]:
+    """Title, path, factor to the title's unit and digits of what is shown of a summary.
+
+    Distances, and success within them, where the task has them, else success as it judges, return, its own measures.
+    """
+    success = summary.get("success") or {}
+    if "final_distance" in summary:
+        within = sorted(success, key=float, reverse=True)
+        rates = [(f"within {centimetres(d)} [%]", ("success", d), 100.0, 0) for d in within]
+        return [("final distance [cm]", ("final_distance",), 100.0, 2), *rates]
+    rates = [("success [%]", ("success",), 100.0, 0)] if success else []
+    own = [(name, ("measures", name), 1.0, 3) for name in summary.get("measures") or {}]
+    return [*rates, ("return", ("return",), 1.0, 2), *own]
+
+
+def _mean(summary: Any, path: Sequence[str]) -> float:
+    for name in path:
+        summary = summary[name]
+    return summary["mean"]
 
 
 def summary(arguments: list[str]) -> None:
@@ -81,17 +87,20 @@ def summary(arguments: list[str]) -> None:
         raise UserError(
             "summary needs folders of runs: franka-wm summary outputs/RUN outputs/RUN …, or multirun/SWEEP"
         )
-    groups: dict[str, dict[Path, dict[str, Any]]] = {}
+    groups: dict[str, dict[Path, Result]] = {}
     for folder in arguments:
         for run in runs_of(folder):
             groups.setdefault(but_for_the_seed(read_config(run)), {})[run] = read_evaluation(run)
     for group in groups.values():
-        evaluations = list(group.values())
-        first = next(iter(evaluations[0].values()))
-        runs = f"{len(evaluations)} run{'s' * (len(evaluations) > 1)}"
+        found = list(group.values())
+        counts = sorted({one.episodes for one in found})
+        runs = f"{len(found)} run{'s' * (len(found) > 1)}"
         if len(groups) > 1:
             runs += f" ({', '.join(run.name for run in group)})"
-        print(f"{runs} of {first['episodes']} episodes each: mean over runs (lowest – highest run)\n")
-        print(seeds_table(evaluations))
+        episodes = f"{counts[0]}" if len(counts) == 1 else f"{counts[0]} to {counts[-1]}"
+        print(f"{runs} of {episodes} episodes each: mean over runs (lowest – highest run)")
+        by = sorted({str(one.protocol.get("by", one.path)) for one in found})
+        print(f"measured by {' and '.join(by)}; of a run measured twice, what rests on more episodes\n")
+        print(seeds_table([one.policies for one in found]))
         if len(groups) > 1:
             print()

@@ -21,10 +21,12 @@ if TYPE_CHECKING:
     from rich.table import Table as RichTable
 
 # {policy: {"final_distance": interval, "success": {distance: interval}, "return": interval, "episodes": n}},
-# where an interval is {"mean", "low", "high"}; a policy may hold more numbers and intervals.
+# where an interval is {"mean", "low", "high"}; a policy may hold more numbers and intervals. Of tasks whose success is
+# not a distance to a goal there is none, "success" is one interval, and "measures" holds those of the task's own.
 type Evaluation = Mapping[str, Mapping[str, Any]]
 
 REQUIRED = ("final_distance", "success", "return", "episodes")
+OUTCOME = (*REQUIRED, "measures")
 
 # key -> (title, factor to that unit, digits). Keys of rates by distance have the distance after them.
 TITLES: dict[str, tuple[str, float, int]] = {
@@ -71,7 +73,7 @@ def evaluation_tables(evaluation: Evaluation) -> tuple[Table, Table]:
     """
     tables = []
     for outcome in (True, False):
-        header, rows = _cells(evaluation, strict=False, keep=lambda name, o=outcome: (name in REQUIRED) is o)
+        header, rows = _cells(evaluation, strict=False, keep=lambda name, o=outcome: (name in OUTCOME) is o)
         named = [[policy_name(policy), *cells] for policy, cells in rows] if len(header) > 1 else []
         tables.append(Table(header, named))
     return tables[0], tables[1]
@@ -285,8 +287,8 @@ def _cells(
     evaluation: Evaluation, *, strict: bool = True, keep: Callable[[str], bool] = lambda name: True
 ) -> tuple[list[str], list[tuple[str, list[str]]]]:
     """Column titles, and the cells of every policy without its name."""
-    arm = any("final_distance" in result for result in evaluation.values())
-    required = REQUIRED if arm else REQUIRED[2:]  # other environments have no goal to be away from
+    reaches = any("final_distance" in result for result in evaluation.values())
+    required = REQUIRED if reaches else REQUIRED[2:]  # elsewhere there is no goal to be away from
     flat = {}
     for policy, result in evaluation.items():
         for name in required if strict else ():
@@ -334,6 +336,7 @@ def _title(path: tuple[str, ...]) -> str:
         return title.format(centimetres(path[1]))
     if title and len(path) == 1:
         return title.replace(" at {}", "").replace(" within {}", "")
+    path = path[1:] if path[0] == "measures" else path
     return " / ".join(part.replace("_", " ") for part in path)
 
 

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
+from inspect import signature
 from typing import Any
 
 import torch
@@ -10,7 +11,9 @@ from omegaconf import DictConfig, OmegaConf
 from torchrl.data import ReplayBuffer
 
 from franka_wm import models, planning
+from franka_wm.data.hindsight import Hindsight
 from franka_wm.data.policies import (
+    DiscreteOraclePolicy,
     DiscretePolicy,
     NoopPolicy,
     OraclePolicy,
@@ -24,6 +27,7 @@ from franka_wm.envs.discretize import DiscreteActions
 from franka_wm.errors import UserError
 from franka_wm.planning import ModelPolicy, PlannerPolicy, registry
 from franka_wm.planning.policy import PRECISIONS
+from franka_wm.training.progress import say
 from franka_wm.training.spaces import Spaces
 
 ACTORS = {"policy": "policy", "planner": "planner", "smooth": "random", "noop": "noop", "ik": "oracle"}
@@ -183,8 +187,13 @@ def make_model(cfg: DictConfig, surroundings: Any, device: torch.device | str | 
     sizes: dict[str, Any] = {"observation_sizes": spaces.observation_sizes}
     if spaces.image_sizes:
         sizes["image_sizes"] = spaces.image_sizes
+    known = {"reward_bounds": spaces.reward_bounds}
+    takes = signature(models.family(name)).parameters
+    further = {key: value for key, value in known.items() if key in takes}
     try:
-        model = models.make(name, **sizes, **actions, episode_length=spaces.episode_length, **values)
+        model = models.make(
+            name, **sizes, **actions, episode_length=spaces.episode_length, **further, **values
+        )
     except (TypeError, ValueError, ModuleNotFoundError) as error:
         raise UserError(f"model={name}: {error}") from error
     return model.to(device)
@@ -304,7 +313,8 @@ def make_policies(
     """Every policy that can act or be compared, by name.
 
     ``planner`` and ``policy`` where the model has what they need; ``noop`` and ``random`` (smooth random:
-    first-order autoregressive); for the arm ``oracle``, inverse kinematics with true geometry. ``capture``,
+    first-order autoregressive); for the arm ``oracle``, inverse kinematics with true geometry, or a search over pairs
+    of moves. ``capture``,
     ``precision`` and ``compile``: of the planner's, see :class:`~franka_wm.planning.PlannerPolicy`.
     """
     policies: dict[str, Any] = {}
@@ -332,11 +342,12 @@ def make_scripted_policies(env: Any, *, seed: int = 0, smoothness: float = 0.7) 
         "noop": NoopPolicy(size),
         "random": SmoothRandomPolicy(size, smoothness=smoothness, generator=generator),
     }
-    if arm:
-        scripted["oracle"] = OraclePolicy(env.kinematics, env.config)
     if discrete:
         moves: Any = env.transform
         scripted = {name: DiscretePolicy(policy, moves.table) for name, policy in scripted.items()}
+        scripted["oracle"] = DiscreteOraclePolicy(env.kinematics, env.config, moves.table)
+    elif arm:
+        scripted["oracle"] = OraclePolicy(env.kinematics, env.config)
     return scripted
 
 
@@ -357,6 +368,26 @@ def make_agent_policies(cfg: DictConfig, model: Any, env: Any, spaces: Spaces) -
     )
 
 
+def explore(cfg: DictConfig, policies: Mapping[str, Any], name: str) -> Any:
+    """The policy that gathers experience, with the exploration that ``cfg.collector`` asks for.
+
+    Raises:
+        UserError: A value out of range, or one that this policy cannot have.
+    """
+    noise, worlds = cfg.collector.get("noise", 0.0), cfg.collector.get("planner_worlds", 0)
+    if isinstance(noise, bool) or not isinstance(noise, int | float) or not 0.0 <= noise <= 2.0:
+        raise UserError(f"collector.noise={noise!r}: must be a number from 0 to 2, in units of the action")
+    if isinstance(worlds, bool) or not isinstance(worlds, int) or not 0 <= worlds <= cfg.collector.num_envs:
+        raise UserError(
+            f"collector.planner_worlds={worlds!r}: must be a whole number of at most collector.num_envs"
+        )
+    if name != "policy" or not (noise or worlds):
+        return policies[name]
+    return planning.ExploringPolicy(
+        policies[name], noise=noise, planner=policies.get("planner"), planner_worlds=worlds
+    )
+
+
 # -- experience ---------------------------------------------------------------------------------------------
 
 
@@ -372,8 +403,72 @@ def frame_stack(cfg: DictConfig) -> int:
     return count
 
 
-def make_replay_buffer(cfg: DictConfig, device: torch.device) -> ReplayBuffer:
-    """The replay buffer that ``cfg.replay`` describes; it keeps each picture of a stack once."""
+HINDSIGHT = 0.5
+"""Share of windows that ``replay.hindsight=null`` relabels, where that can be done."""
+
+
+def make_hindsight(cfg: DictConfig, env: Any) -> Hindsight | None:
+    """Goals in hindsight for the share of windows that ``cfg.replay.hindsight`` asks for; ``None``: for none.
+
+    Raises:
+        UserError: The share is none, or it is asked for where goals cannot be exchanged.
+    """
+    share = cfg.replay.get("hindsight", 0.0)
+    given = share is not None
+    if given and (isinstance(share, bool) or not isinstance(share, int | float) or not 0.0 <= share <= 1.0):
+        raise UserError(f"replay.hindsight={share!r}: must be a share from 0 to 1, or null")
+    if share == 0:
+        return None
+    why = no_hindsight(cfg, env)
+    if why is not None:
+        if given:
+            raise UserError(f"replay.hindsight={share}: {why}; leave it at null")
+        return None
+    arm = _arm(env)
+    assert arm is not None and arm.simulation.task.relabel is not None
+    share = share if given else HINDSIGHT
+    say(f"hindsight: {100 * share:.0f} % of the windows get a goal that their episode reached later")
+    return Hindsight(
+        arm.simulation.task.relabel, achieved, share=share, episode_length=arm.config.episode_length
+    )
+
+
+def no_hindsight(cfg: DictConfig, env: Any) -> str | None:
+    """Why windows cannot be given other goals, or gain nothing from them; ``None``: they can."""
+    arm = _arm(env)
+    if arm is None or is_discrete(cfg):
+        return "only the arm with continuous actions has goals to exchange"
+    config, keys = arm.config, model_keys(cfg)
+    if not arm.simulation.task.relabels():
+        return f"env.task={config.task} does not say what another goal changes (Task.relabel)"
+    if config.reward == "normalized" or config.randomization.observation_noise:
+        return "rewards of another goal are exact without observation noise and with reward=dense or sparse alone"
+    if config.goal_sampling == "fixed":
+        return "there is one goal (env.goal_sampling=fixed)"
+    if "state" not in config.observations:
+        return "it reads where the tool was from state; add it to env.observations"
+    if keys is not None and not {"state", "goal"} & set(keys):
+        return f"model={cfg.model.name} does not read where the goal is"
+    if config.show_goal or any("goal_pixels" in key for key in keys or ()):
+        return "images show the recorded goal"
+    return None
+
+
+def _arm(env: Any) -> FrankaEnv | None:
+    while env is not None and not isinstance(env, FrankaEnv):
+        env = getattr(env, "base_env", None)
+    return env
+
+
+def achieved(state: torch.Tensor) -> torch.Tensor:
+    """Place of the tool [m]: (…, 20) → (…, 3)."""
+    return state[..., 14:17]
+
+
+def make_replay_buffer(
+    cfg: DictConfig, device: torch.device, hindsight: Hindsight | None = None
+) -> ReplayBuffer:
+    """The replay buffer that ``cfg.replay`` describes; it keeps each image of a stack once."""
     pictures = ["pixels", *(f"pixels_{camera}" for camera in cfg.env.get("cameras", []))]
     return make_replay(
         capacity=cfg.replay.capacity,
@@ -384,6 +479,7 @@ def make_replay_buffer(cfg: DictConfig, device: torch.device) -> ReplayBuffer:
         past_end=looks_past_ends(cfg),
         frame_stack=frame_stack(cfg),
         stacked=pictures if frame_stack(cfg) > 1 else (),
+        hindsight=hindsight,
     )
 
 

@@ -24,6 +24,7 @@ def check(cfg: DictConfig) -> None:
     """What can be refused before anything is built."""
     resolve_device(cfg.device)
     window = build.window(cfg)
+    during = cfg.evaluation.get("during_episodes")  # checkpoints of earlier versions have none
     numbers: Mapping[str, tuple[Any, float]] = {
         "collector.num_envs": (cfg.collector.num_envs, 1),
         "collector.steps_per_batch": (cfg.collector.steps_per_batch, 1),
@@ -35,6 +36,7 @@ def check(cfg: DictConfig) -> None:
         "trainer.updates_per_batch": (cfg.trainer.updates_per_batch, 1),
         "trainer.warmup": (build.schedule(cfg)[1], 0),
         "evaluation.episodes": (cfg.evaluation.episodes, 2),
+        **({"evaluation.during_episodes": (during, 2)} if during is not None else {}),
         "evaluation.video_episodes": (cfg.evaluation.video_episodes, 0),
         "evaluation.video_size": (cfg.evaluation.video_size, 16),
     }

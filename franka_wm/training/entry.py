@@ -209,7 +209,8 @@ class Run:
         from franka_wm.training.spaces import Spaces
 
         if not build.is_offline(self.cfg):
-            return build.make_replay_buffer(self.cfg, env.device), Spaces.of_env(env)
+            hindsight = build.make_hindsight(self.cfg, env)
+            return build.make_replay_buffer(self.cfg, env.device, hindsight), Spaces.of_env(env)
         windows, self.validation = build.open_recorded(self.cfg, self.device)
         spaces = Spaces(
             observation_sizes=dict(windows.observation_sizes),
@@ -217,6 +218,7 @@ class Run:
             action_dim=windows.action_dim,
             num_actions=windows.num_actions,
             episode_length=windows.episode_length,
+            reward_bounds=windows.reward_bounds,
         )
         return windows, spaces
 
@@ -262,23 +264,11 @@ class Run:
         self, env: Any, policies: Mapping[str, Any]
     ) -> Callable[[], dict[str, float]]:
         """A function that plays the policies of ``evaluation.during`` and returns numbers to log."""
-        from franka_wm.evaluation.closed_loop import EVALUATION_SEED, play_episodes
+        from franka_wm.evaluation.protocol import numbers_to_log
 
-        names = [name for name in self.cfg.evaluation.during if name in policies]
-
-        def evaluate() -> dict[str, float]:
-            numbers = {}
-            for name in names:
-                episodes = play_episodes(env, policies[name], seed=self.cfg.seed + EVALUATION_SEED)
-                distance = episodes.get("final_distance", None)
-                if distance is not None:
-                    reached = distance < env.config.success_distance
-                    numbers[f"eval/{name}/final_distance"] = float(distance.mean())
-                    numbers[f"eval/{name}/success"] = float(reached.float().mean())
-                numbers[f"eval/{name}/return"] = float(episodes.get("return").mean())
-            return numbers
-
-        return evaluate
+        chosen = {name: policies[name] for name in self.cfg.evaluation.during if name in policies}
+        episodes = self.cfg.evaluation.get("during_episodes")  # checkpoints of earlier versions have none
+        return lambda: numbers_to_log(env, chosen, episodes=episodes)
 
 
 def start(cfg: DictConfig) -> Run:

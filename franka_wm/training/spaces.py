@@ -1,4 +1,4 @@
-"""What a model must know of its surroundings: sizes of observations and actions, length of an episode."""
+"""What a model must know of its surroundings: sizes of observations and actions, length of episodes, rewards."""
 
 from __future__ import annotations
 
@@ -10,7 +10,11 @@ import torch
 
 from franka_wm.envs.config import IMAGES, NUM_JOINTS, STATE_DIM, FrankaConfig
 from franka_wm.envs.discretize import discrete_action_table
+from franka_wm.envs.tasks import make_task
 from franka_wm.errors import UserError
+
+GOAL = "goal"
+"""Key of the goal's position. Read only where it is named: `state` holds the way to the goal already."""
 
 
 @dataclass(frozen=True)
@@ -23,6 +27,7 @@ class Spaces:
         action_dim: Size of a continuous action; 0 where actions are numbers of moves.
         num_actions: How many moves there are; 0 where actions are continuous.
         episode_length: Steps, at most.
+        reward_bounds: The least and the largest reward of a step; ``None`` where unknown.
     """
 
     observation_sizes: Mapping[str, int] = field(default_factory=dict)
@@ -30,20 +35,22 @@ class Spaces:
     action_dim: int = 0
     num_actions: int = 0
     episode_length: int = 50
+    reward_bounds: tuple[float, float] | None = None
 
     def only(self, keys: Sequence[str] | None, reader: str) -> Spaces:
-        """The same with the observations ``keys`` alone; with every vector if ``None``.
+        """The same with the observations ``keys`` alone; with every vector but the goal if ``None``.
 
         Raises:
             UserError: One of them is not there.
         """
         if keys is None:
-            if not self.observation_sizes:
+            vectors = {key: size for key, size in self.observation_sizes.items() if key != GOAL}
+            if not vectors:
                 raise UserError(
                     f"{reader} reads vectors, here are only {_list(self.image_sizes)}; add state to env.observations, "
                     "or choose model.observations"
                 )
-            return replace(self, image_sizes={})
+            return replace(self, observation_sizes=vectors, image_sizes={})
         there = [*self.observation_sizes, *self.image_sizes]
         for key in keys:
             if key not in there:
@@ -64,9 +71,14 @@ class Spaces:
 
     @classmethod
     def from_dict(cls, values: Mapping[str, Any]) -> Spaces:
-        """Inverse of :meth:`as_dict`."""
+        """Inverse of :meth:`as_dict`; what an older version did not save has its default."""
         images = {key: (size[0], size[1], size[2]) for key, size in values["image_sizes"].items()}
-        return replace(cls(**values), image_sizes=images)
+        bounds = values.get("reward_bounds")
+        return replace(
+            cls(**values),
+            image_sizes=images,
+            reward_bounds=None if bounds is None else (bounds[0], bounds[1]),
+        )
 
     @classmethod
     def of_config(cls, config: FrankaConfig, *, discrete: bool = False) -> Spaces:
@@ -80,11 +92,13 @@ class Spaces:
         vectors = {"state": STATE_DIM, "joint_target": NUM_JOINTS}
         moves = discrete_action_table(config.action_dim).shape[0]
         return cls(
-            observation_sizes={key: size for key, size in vectors.items() if key in config.observations},
+            observation_sizes={key: size for key, size in vectors.items() if key in config.observations}
+            | {GOAL: 3},
             image_sizes=images,
             action_dim=0 if discrete else config.action_dim,
             num_actions=moves if discrete else 0,
             episode_length=config.episode_length,
+            reward_bounds=make_task(config).reward_bounds,
         )
 
     @classmethod
@@ -93,7 +107,7 @@ class Spaces:
         vectors, images = {}, {}
         for key, spec in env.observation_spec.items():
             shape = spec.shape[1:]
-            if key in ("goal", "success", "is_init", "step_count", "episode_reward"):
+            if key in ("success", "is_init", "step_count", "episode_reward"):
                 continue
             if spec.dtype == torch.uint8 and len(shape) == 3:
                 images[key] = tuple(shape)
@@ -107,6 +121,7 @@ class Spaces:
             action_dim=0 if discrete else action.shape[-1],
             num_actions=int(action.n) if discrete else 0,
             episode_length=env.config.episode_length,
+            reward_bounds=env.reward_bounds,
         )
 
 

@@ -16,6 +16,7 @@ from tensordict.nn import TensorDictModuleBase
 from torchrl.collectors import Collector
 
 from franka_wm.data.captured import CapturedSampling
+from franka_wm.training.build import explore
 from franka_wm.training.checkpoint import Checkpoint, save_checkpoint
 from franka_wm.training.learner import Learner
 from franka_wm.training.loggers import log_numbers
@@ -125,9 +126,14 @@ class Trainer:
         self._keys = list(getattr(self.model, "observation_keys", self._vectors))
         if cfg.export.kind != "none":  # a dataset is for other models, too
             self._keys = [*self.spaces.observation_sizes, *self.spaces.image_sizes]
+        if getattr(replay, "hindsight", None) is not None:  # it reads where the tool was
+            self._keys = list(dict.fromkeys([*self._keys, "state"]))
         self._extra = list(getattr(self.model, "replay_keys", ()))
         # What the acting policy writes for the loss, a random one does not: then the actor fills the replay, too.
-        self._acting = ActingPolicy(policies, actor if self._extra else "random") if policies else None
+        self._acting = None
+        if policies:
+            exploring = {actor: explore(cfg, policies, actor)}
+            self._acting = ActingPolicy({**policies, **exploring}, actor if self._extra else "random")
         self._collector: Collector | None = None
         self._experience: Iterator[TensorDictBase] | None = None
 
@@ -247,6 +253,11 @@ class Trainer:
         row |= progress.line(self.learner.updates, self.env_steps, text)
         if warning:
             say(f"  warning: {warning}")
+        if metrics.get("target_outside", 0.0) > 0.0:
+            say(
+                f"  warning: {100 * metrics['target_outside']:.2g} % of rewards and targets of values lie outside the "
+                "model's range and are clipped to it; widen model.value_low and model.value_high, or leave them at null"
+            )
         self.record(row)
 
     @torch.no_grad()

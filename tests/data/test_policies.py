@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from typing import Any
+
 import pytest
 import torch
 from tensordict import TensorDict
 
-from franka_wm.data.policies import NoopPolicy, OraclePolicy, SmoothRandomPolicy
+from franka_wm.data.policies import DiscretePolicy, NoopPolicy, OraclePolicy, SmoothRandomPolicy
 from franka_wm.envs import FrankaEnv
 from franka_wm.errors import UserError
 from franka_wm.training import build
@@ -67,6 +70,48 @@ def test_oracle_reaches_every_goal(env: FrankaEnv) -> None:
     assert start.mean() > 0.1
     assert observation["state"][:, 17:].norm(dim=-1).max() < 0.01
     assert observation["success"].all()
+
+
+@pytest.fixture(scope="module")
+def moving(composed) -> Callable[..., Any]:
+    """The reach preset with numbered moves, as train.py builds it for MuZero."""
+
+    def make(**changes: Any) -> Any:
+        cfg = composed("env=reach", "device=cpu", "model=muzero", "planner=gumbel")
+        return build.make_env(cfg, num_envs=16, **changes)
+
+    return make
+
+
+def final_distance(env: Any, policy: Any, steps: int) -> torch.Tensor:
+    observation = env.reset(seed=0)
+    for _ in range(steps):
+        observation = env.step(policy(observation))["next"]
+    return observation["state"][:, 17:].norm(dim=-1)
+
+
+def test_the_oracle_with_numbered_moves_is_better_than_the_nearest_row_of_the_table(moving) -> None:
+    env = moving()
+    reached = final_distance(env, build.make_scripted_policies(env)["oracle"], 40)
+    rounded = DiscretePolicy(OraclePolicy(env.kinematics, env.config), env.transform.table)
+    assert reached.mean() < 0.01 and reached.max() < 0.025
+    assert reached.mean() < 0.6 * final_distance(env, rounded, 40).mean()
+
+
+def test_the_oracle_with_moves_of_the_tool_ends_where_no_move_helps(moving) -> None:
+    env = moving(action_mode="ee_delta")
+    reached = final_distance(env, build.make_scripted_policies(env)["oracle"], 30)
+    assert reached.max() < 0.06  # of a grid of 5 cm, 4.3 cm to the farthest point
+
+
+def test_the_oracle_with_moves_to_poses_takes_the_best(moving) -> None:
+    """There, a move is a pose, whatever was before."""
+    env = moving(action_mode="joint_position")
+    observation, k = env.reset(seed=0), env.kinematics
+    move = build.make_scripted_policies(env)["oracle"](observation)["action"]
+    poses = k.lower + (env.transform.table + 1) / 2 * (k.upper - k.lower)
+    distances = (k.forward(poses) - observation["goal"].unsqueeze(1)).norm(dim=-1)
+    assert torch.equal(move, distances.argmin(1))
 
 
 def test_oracle_needs_the_targets() -> None:

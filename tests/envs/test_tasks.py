@@ -11,7 +11,7 @@ import torch
 from tensordict import TensorDictBase
 
 from franka_wm.envs import FrankaConfig, FrankaEnv
-from franka_wm.envs.tasks import Task, reach_reward
+from franka_wm.envs.tasks import Reach, Task, Track, reach_reward
 from franka_wm.errors import UserError
 
 N, LENGTH = 4, 8
@@ -54,6 +54,9 @@ def test_rewards_equal_those_in_torch(small_env, random_actions, kind: str) -> N
     distance = data["next", "state"][..., 17:].norm(dim=-1, keepdim=True)
     assert torch.equal(data["next", "success"], distance < 0.3)
     assert 0 < data["next", "success"].float().mean() < 1
+    least, largest = env.reward_bounds
+    assert least <= data["next", "reward"].min() and data["next", "reward"].max() <= largest
+    assert largest - least <= 2.1
     effort = 0.1 * actions.clamp(-1, 1).square().mean(-1, keepdim=True)
     value = data["next", "reward"] + effort
     if kind == "sparse":
@@ -62,6 +65,19 @@ def test_rewards_equal_those_in_torch(small_env, random_actions, kind: str) -> N
         torch.testing.assert_close(
             value, (1 - distance / initial.clamp_min(0.3)).clamp_min(-1), atol=1e-5, rtol=0
         )
+
+
+def test_a_subclass_that_judges_otherwise_has_no_bounds_but_its_own() -> None:
+    class Doubled(Reach):
+        def judge(self, sim) -> None: ...
+
+    class Bounded(Doubled):
+        reward_bounds = (-2.0, 0.0)
+
+    config = FrankaConfig()
+    assert Reach(config).reward_bounds == Track(config).reward_bounds == (-1.01, 0.0)
+    assert Doubled(config).reward_bounds is None and Task(config).reward_bounds is None
+    assert Bounded(config).reward_bounds == (-2.0, 0.0)
 
 
 # -- track -----------------------------------------------------------------------------------------------
@@ -181,3 +197,18 @@ def test_an_unknown_task_or_reward() -> None:
 def test_track_has_no_goal_picture() -> None:
     with pytest.raises(UserError, match="goal_pixels"):
         FrankaConfig(task="track", observations=("goal_pixels", "state"))
+
+
+def test_relabel_speaks_only_for_the_task_that_defines_it() -> None:
+    class Faster(Reach):
+        """Another reward: what Reach says of other goals is not true of it."""
+
+        def judge(self, sim) -> None:
+            raise AssertionError
+
+    class Told(Faster):
+        def relabel(self, transitions, goal):
+            return transitions
+
+    assert Reach.relabels() and Told.relabels()
+    assert not (Faster.relabels() or Track.relabels() or Task.relabels())

@@ -5,16 +5,18 @@ from __future__ import annotations
 import pytest
 import torch
 from tensordict import TensorDict
+from tensordict.nn import TensorDictModule
 
 from franka_wm.data.policies import NoopPolicy, OraclePolicy, SmoothRandomPolicy
 from franka_wm.envs import FrankaEnv
 from franka_wm.errors import UserError
 from franka_wm.evaluation.closed_loop import (
     EVALUATION_SEED,
-    evaluate_policies,
+    evaluating,
     play_episodes,
     summarize,
 )
+from franka_wm.evaluation.protocol import evaluate_policies
 
 LENGTH = 6
 
@@ -107,9 +109,8 @@ def test_policies_play_the_same_episodes(env: FrankaEnv) -> None:
     results = evaluate_policies(
         env,
         {"a": NoopPolicy(), "oracle": oracle, "b": NoopPolicy()},
-        seed=0,
         report=lambda name, r: told.append(name),
-    )
+    ).policies
     assert told == ["a", "oracle", "b"]
     assert results["a"] == results["b"]
     assert results["oracle"]["final_distance"]["mean"] < 0.5 * results["a"]["final_distance"]["mean"]
@@ -117,4 +118,31 @@ def test_policies_play_the_same_episodes(env: FrankaEnv) -> None:
 
 def test_one_episode_has_no_interval(small_env) -> None:
     with pytest.raises(UserError, match="at least 2"):
-        evaluate_policies(small_env(1), {"noop": NoopPolicy()}, seed=0)
+        evaluate_policies(small_env(1), {"noop": NoopPolicy()})
+
+
+class Moody(torch.nn.Module):
+    """Behind a policy: pushes one way in training mode, another in evaluation mode; a part of it is frozen."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.frozen = torch.nn.Linear(1, 1).eval()
+
+    def forward(self, is_init: torch.Tensor) -> torch.Tensor:
+        return torch.full((is_init.shape[0], 7), 0.5 if self.training else -0.5)
+
+
+def test_what_is_evaluated_is_in_evaluation_mode_and_goes_on_training_after(env: FrankaEnv) -> None:
+    model = Moody()
+    policy = TensorDictModule(model, ["is_init"], ["action"])
+    modes = [part.training for part in policy.modules()]
+    assert any(modes) and not all(modes)
+    training = play_episodes(env, policy, seed=3)
+    assert [part.training for part in policy.modules()] == modes
+    policy.eval()
+    assert torch.equal(play_episodes(env, policy, seed=3)["final_distance"], training["final_distance"])
+    policy.train()
+    with pytest.raises(ZeroDivisionError), evaluating(policy):
+        assert not model.training
+        raise ZeroDivisionError
+    assert model.training

@@ -14,10 +14,10 @@ from franka_wm.envs.external import ExternalConfig, ExternalEnv
 from franka_wm.evaluation.closed_loop import (
     arm_of,
     decision_times,
-    evaluate_policies,
     play_episodes,
     summarize,
 )
+from franka_wm.evaluation.protocol import evaluate_policies
 
 LENGTH = 8
 
@@ -76,14 +76,6 @@ def test_the_thorough_summary() -> None:
     assert "jerk" not in summary
 
 
-def test_a_run_s_end_says_the_outcome_alone_unless_asked(env) -> None:
-    short = evaluate_policies(env, {"noop": NoopPolicy()}, seed=0)["noop"]
-    assert set(short) == {"final_distance", "success", "return", "episodes"}
-    long = evaluate_policies(env, {"noop": NoopPolicy()}, seed=0, thorough=True)["noop"]
-    assert {"success_once", "path_length", "action_change", "jerk", "length"} <= set(long)
-    assert all(long[name] == short[name] for name in short)
-
-
 def test_numbered_moves_are_measured_as_the_servo_gets_them(small_env) -> None:
     arm = small_env(2, episode_length=4)
     env = TransformedFrankaEnv(arm, DiscreteActions())
@@ -120,5 +112,5 @@ def test_another_library_s_environment() -> None:
     assert (episodes["return"] == episodes["length"]).all()  # CartPole pays 1 for every step
     assert (episodes["length"] < 15).all()  # pushed over
     assert torch.equal(play_episodes(env, push, seed=1)["return"], episodes["return"])
-    assert set(evaluate_policies(env, {"push": push}, seed=0)["push"]) == {"return", "length", "episodes"}
+    assert set(evaluate_policies(env, {"push": push}).policies["push"]) == {"return", "length", "episodes"}
     env.close()

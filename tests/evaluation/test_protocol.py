@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -11,7 +12,7 @@ import torch
 from franka_wm.data.policies import NoopPolicy, SmoothRandomPolicy
 from franka_wm.errors import UserError
 from franka_wm.evaluation.closed_loop import seeded, summarize
-from franka_wm.evaluation.protocol import evaluate_agent, held_out_seeds
+from franka_wm.evaluation.protocol import evaluate_agent, held_out_seeds, numbers_to_log
 from franka_wm.evaluation.robustness import SHIFTS, UNSHIFTED, Shift, note, robustness, verdict
 from franka_wm.evaluation.rollouts import (
     discounted_returns,
@@ -43,6 +44,18 @@ def test_an_agent_loaded_anew_gives_the_same_numbers(agent, run_folder: Path) ->
     assert evaluate_agent(again, episodes=6, timing=False).policies == expected.policies
 
 
+def test_one_planner_whoever_asks(run_folder: Path) -> None:
+    """The end of a run, its curves and ``franka-wm evaluate`` play the same agent: equal to the last bit."""
+    table = json.loads((run_folder / "evaluation.json").read_text())["policies"]
+    again = load_agent(run_folder, num_envs=2, device="cpu", seed=5)
+    assert evaluate_agent(again, episodes=2, timing=False).policies == table
+    again.model.train()  # as it is while training
+    told = numbers_to_log(again.env, {"planner": again.policies["planner"]})
+    assert told["eval/planner/final_distance"] == table["planner"]["final_distance"]["mean"]
+    assert told["eval/planner/success"] == table["planner"]["success"]["0.05"]["mean"]
+    assert told["eval/planner/return"] == table["planner"]["return"]["mean"]
+
+
 def test_torch_s_own_random_numbers_are_left_alone(agent) -> None:
     torch.manual_seed(1)
     expected = torch.rand(3)
@@ -61,6 +74,23 @@ def test_more_episodes_than_worlds_are_played_in_rounds(agent) -> None:
     one = evaluate_agent(agent, episodes=6, seeds=[held_out_seeds(2)[1]], policies=noop, timing=False)
     assert torch.equal(one.episodes["noop"]["final_distance"], rows["final_distance"][6:12])
     assert summarize(rows) == evaluation.policies["noop"]
+
+
+def test_fewer_episodes_than_worlds_are_the_first_and_only_they_are_decided_for(agent) -> None:
+    """While training: planning takes its time. A policy that carries entries along (plans) keeps its own."""
+    planner = agent.policies["planner"]
+    asked = []
+    handle = planner.register_forward_pre_hook(lambda module, inputs: asked.append(inputs[0].batch_size[0]))
+    few = evaluate_agent(agent, episodes=2, policies={"planner": planner}, timing=False)
+    handle.remove()
+    assert set(asked) == {2} and len(asked) == agent.env.config.episode_length
+    alone = load_agent(agent.folder, num_envs=2, device="cpu")
+    same = evaluate_agent(alone, episodes=2, policies={"planner": alone.policies["planner"]}, timing=False)
+    assert few.policies == same.policies and few.policies["planner"]["episodes"] == 2
+    noop = {"noop": agent.policies["noop"]}
+    every, some = (evaluate_agent(agent, episodes=n, policies=noop, timing=False) for n in (6, 4))
+    assert (every.episodes["noop"][:4] == some.episodes["noop"]).all()
+    assert "eval/noop/success" in numbers_to_log(agent.env, noop, episodes=500)  # more than there are: all
 
 
 def test_what_cannot_be_evaluated(agent) -> None:
@@ -85,6 +115,9 @@ def test_every_generator_inside_a_policy_is_seeded() -> None:
         with seeded(4, outer):
             draws.append(torch.randn(3, generator=hidden.generator))
     assert torch.equal(*draws)
+    # Outside it goes on as if nothing had been drawn.
+    expected = torch.randn(3, generator=torch.Generator().manual_seed(9))
+    assert torch.equal(torch.randn(3, generator=hidden.generator), expected)
 
 
 # -- held-out episodes -------------------------------------------------------------------------------------

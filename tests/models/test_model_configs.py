@@ -15,6 +15,7 @@ NOT_IN_FILES = {
     "observation_sizes",
     "action_dim",
     "episode_length",
+    "reward_bounds",
     "encoder_architecture",
     "huggingface_config",
 }

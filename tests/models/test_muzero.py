@@ -194,6 +194,17 @@ def test_value_targets_in_numbers():
     assert model.value_targets(reward, over, value).flatten().tolist() == [9.5, 13.5, 5.0, 4.0]
 
 
+def test_a_window_holds_the_whole_target_of_the_last_step():
+    """Unroll 3, n_step 2: the value of step 3 sums the rewards of steps 3 and 4 and ends in the search of step 5."""
+    model = small()
+    batch = windows(4, model.window)
+    reward, value = batch["next", "reward"], batch["search_value"]
+    last = model.value_targets(reward, batch["next", "terminated"], value)[:, model.unroll]
+    torch.testing.assert_close(last, reward[:, 3] + 0.9 * reward[:, 4] + 0.81 * value[:, 5])
+    assert model.window == 6 and MuZero.refusal(SMALL, 6) is None
+    assert "replay.window=6" in str(MuZero.refusal(SMALL, 5))
+
+
 @pytest.mark.parametrize("ends", [False, True])
 @pytest.mark.parametrize("held", [1, 3, 5])
 def test_the_losses_are_those_of_a_plain_unroll(ends, held):
@@ -289,6 +300,23 @@ def test_weights_scale_the_loss_of_their_window():
     first, second = (model.loss(batch[b : b + 1])["loss"] for b in range(2))
     batch["weight"] = torch.tensor([2.0, 0.5]).view(2, 1, 1).expand(2, 5, 1)
     torch.testing.assert_close(model.loss(batch)["loss"], (2.0 * first + 0.5 * second) / 2)
+
+
+def test_the_range_of_values_follows_the_rewards_and_rebuilds():
+    model = small(reward_bounds=(0.0, 1.0), discount=0.95)
+    assert 3.0 < model.two_hot.high < 3.3 and model.two_hot.low == -model.two_hot.high
+    again = small(discount=0.95, **model.rebuild_overrides())
+    assert torch.equal(again.two_hot.support, model.two_hot.support)
+    assert small(reward_bounds=(0.0, 1.0), discount=1.0).two_hot.high == 10.0
+
+
+def test_targets_outside_of_the_range_are_counted():
+    """A reward of 3 in each step: all three rewards, and the sums of two that the four value targets hold."""
+    batch = windows()
+    batch["next", "reward"][:], batch["search_value"][:] = 3.0, 0.0
+    assert small().loss(batch)["target_outside"] == 0.0
+    assert small(value_high=1.5).loss(batch)["target_outside"] == pytest.approx(3 / 7)  # symexp(1.5) = 3.48
+    assert small(value_high=1.0).loss(batch)["target_outside"] == 1.0
 
 
 # ------------------------------------------------------------------ gradients

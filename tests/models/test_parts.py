@@ -13,6 +13,7 @@ from franka_wm.models.parts import (
     mlp,
     symexp,
     symlog,
+    value_range,
 )
 
 
@@ -59,6 +60,38 @@ def test_two_hot_clamps_what_is_out_of_range():
     code = TwoHotSymlog(bins=11, low=-1.0, high=1.0)
     p = code.encode(torch.tensor([[-1e6], [1e6]]))
     assert p[0, 0] == 1 and p[1, -1] == 1
+
+
+def test_two_hot_counts_what_is_out_of_range():
+    code = TwoHotSymlog(bins=11, low=-1.0, high=2.0)  # from -1.72 to 6.39
+    assert code.outside(torch.tensor([-1.7, 0.0, 6.3])) == 0.0
+    assert code.outside(torch.tensor([[-1.8, 0.0]]), torch.tensor([6.5, 6.3])) == 0.5
+
+
+@pytest.mark.parametrize(("least", "largest"), [(-1.01, 0.0), (-0.01, 1.0), (2.0, 3.0), (0.0, 1e6)])
+@pytest.mark.parametrize("discount", [0.0, 0.95, 0.995])
+def test_the_derived_range_holds_every_reward_return_and_bootstrapped_target(least, largest, discount):
+    low, high = value_range(None, None, (least, largest), discount)
+    code = TwoHotSymlog(101, low, high)
+    rewards = torch.tensor([least, largest])
+    returns = rewards / (1.0 - discount)
+    ends = torch.tensor([symexp(torch.tensor(low)), symexp(torch.tensor(high))])
+    assert code.outside(rewards, returns, torch.zeros(1), rewards + discount * ends) == 0.0
+    size = returns.abs().max().log1p().item()
+    assert high == -low and size < high < 1.1 * size  # and no further than a few points
+
+
+def test_the_range_of_rewards_without_bounds_is_the_published_one_and_numbers_win():
+    bounds = (-1.01, 0.0)
+    assert value_range(None, None, None, 0.95) == (-10.0, 10.0)
+    assert value_range(None, None, bounds, 1.0) == (-10.0, 10.0)  # returns have no bound
+    assert value_range(None, None, (0.0, 0.0), 0.95) == (-10.0, 10.0)
+    assert value_range(-4.0, 3.0, bounds, 0.95) == (-4.0, 3.0)
+    low, high = value_range(-4.0, None, bounds, 0.95)
+    assert low == -4.0 and 3.0 < high < 3.3
+    for wrong in ((0.0, -1.0), (float("nan"), 0.0), (0.0, float("inf"))):
+        with pytest.raises(ValueError, match="reward_bounds"):
+            value_range(None, None, wrong, 0.95)
 
 
 def test_two_hot_gradient_is_softmax_minus_target():
@@ -147,7 +180,10 @@ def test_log_prob_of_the_squashed_gaussian_is_a_density():
         normal, torch.distributions.transforms.TanhTransform(cache_size=1)
     )
     torch.manual_seed(1)
-    action, log_prob = policy.sample(z)
+    action, before, log_prob = policy.sample(z)
+    torch.testing.assert_close(
+        before, normal.log_prob(action.atanh()).sum(-1, keepdim=True), rtol=1e-3, atol=1e-3
+    )
     torch.testing.assert_close(
         log_prob, reference.log_prob(action).sum(-1, keepdim=True), rtol=1e-3, atol=1e-3
     )
@@ -158,7 +194,7 @@ def test_policy_is_bounded_and_finite_even_when_saturated():
     with torch.no_grad():
         policy.network[-1].bias.fill_(40.0)  # type: ignore[union-attr]
     z = torch.randn(6, 3, requires_grad=True)
-    action, log_prob = policy.sample(z)
+    action, _, log_prob = policy.sample(z)
     log_prob.sum().backward()
     assert (action.abs() <= 1).all() and torch.isfinite(log_prob).all()
     assert torch.isfinite(policy.network[-1].bias.grad).all()  # type: ignore[union-attr,arg-type]

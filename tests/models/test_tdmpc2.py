@@ -95,8 +95,9 @@ def test_every_part_takes_any_leading_dimensions(leading):
     z, action = model.encode(observation), torch.rand(*leading, 2)
     assert z.shape == model.next(z, action).shape == (*leading, 32)
     assert model.reward(z, action).shape == model.q(z, action).shape == model.value(z).shape == (*leading, 1)
-    sample, log_prob = model.policy_sample(z)
-    assert model.policy(z).shape == sample.shape == (*leading, 2) and log_prob.shape == (*leading, 1)
+    sample, *log_probs = model.policy_sample(z)
+    assert model.policy(z).shape == sample.shape == (*leading, 2)
+    assert [log_prob.shape for log_prob in log_probs] == [(*leading, 1)] * 2
 
 
 def test_latents_of_encoder_and_dynamics_are_simplices_alike():
@@ -135,6 +136,74 @@ def test_first_predictions_of_reward_and_value_are_zero():
     z = model.encode(windows())
     assert model.reward(z, torch.rand(6, 3, 2)).abs().max() < 1e-5
     assert model.value(z).abs().max() < 1e-5
+
+
+def test_the_range_of_values_follows_the_rewards_and_rebuilds():
+    model = small(reward_bounds=(-1.01, 0.0), discount=0.95)
+    assert -3.3 < model.two_hot.low < -3.0 and model.two_hot.high == -model.two_hot.low
+    again = small(discount=0.95, **model.rebuild_overrides())
+    assert torch.equal(again.two_hot.support, model.two_hot.support)
+    assert small().two_hot.low == -10.0
+
+
+def test_targets_outside_of_the_range_are_counted():
+    batch = windows(reward=-3.0)
+    batch["next", "terminated"][:] = True
+    batch["next", "reward"][:3] = -1.0
+    assert small().loss(batch)["target_outside"] == 0.0
+    assert (
+        small(value_low=-1.0).loss(batch)["target_outside"] == 0.5
+    )  # -1 is inside, -3 is not, as reward and target
+
+
+def test_the_model_losses_are_those_of_a_plain_unroll():
+    """One step at a time, each weighed by rho to its power; targets are the rewards, as all steps terminate."""
+    model, batch = small(rho=0.3).eval(), windows()
+    randomise(model)
+    batch["next", "terminated"][:] = True
+    losses = model.loss(batch)
+    z = model.encode(batch[:, 0])
+    consistency = reward = value = torch.zeros(())
+    for t in range(3):
+        x = torch.cat((z, batch["action"][:, t]), -1)
+        earned = batch["next", "reward"][:, t]
+        reward = reward + 0.3**t * model.two_hot.loss(model.reward_head(x), earned).mean() / 3
+        value = value + 0.3**t * model.two_hot.loss(model.q_ensemble(x), earned).mean() / 3
+        z = model.next(z, batch["action"][:, t])
+        consistency = consistency + 0.3**t * (z - model.encode(batch["next"][:, t])).square().mean() / 3
+    torch.testing.assert_close(losses["loss_consistency"], consistency.detach())
+    torch.testing.assert_close(losses["loss_reward"], reward.detach())
+    torch.testing.assert_close(losses["loss_value"], value.detach())
+    total = 20 * consistency + 0.1 * reward + 0.1 * value + losses["loss_policy"]
+    torch.testing.assert_close(losses["loss"], total)
+
+
+def test_the_policy_loss_is_the_published_one():
+    """-Σ ρ^t (Q / scale + coefficient · A · entropy of the Gaussian before squashing), over four latents."""
+    model = small(entropy_coef=0.25, rho=0.3).eval()
+    randomise(model)
+    model.scale.value.fill_(4.0)
+    with torch.no_grad():
+        model.policy_head.network[-1].weight.normal_(std=0.1)  # type: ignore[union-attr,operator]
+    batch, handed = windows(), []
+
+    def policy_loss(z, weight):
+        handed.append(z)
+        torch.manual_seed(1)
+        return model._policy_loss(z, weight)
+
+    losses = model.loss(batch, parts={"_policy_loss": policy_loss})
+    mean, log_std = model.policy_head.distribution(handed[0])  # (4, 6, 2)
+    torch.manual_seed(1)
+    raw = mean + log_std.exp() * torch.randn_like(mean)
+    members = torch.rand(5).topk(2).indices
+    x = torch.cat((handed[0], raw.tanh()), -1)
+    q = model.two_hot.decode(model.q_ensemble(x, members=members)).mean(0)
+    log_prob = torch.distributions.Normal(mean, log_std.exp()).log_prob(raw).sum(-1, keepdim=True)
+    wanted = -(0.3 ** torch.arange(4.0) * (q / 4.0 + 0.25 * 2 * -log_prob).mean((1, 2))).mean()
+    torch.testing.assert_close(losses["loss_policy"], wanted.detach())
+    squashed = log_prob - (1 - raw.tanh().square()).log().sum(-1, keepdim=True)
+    torch.testing.assert_close(losses["policy_entropy"], -squashed.mean().detach(), rtol=1e-3, atol=1e-3)
 
 
 def test_one_backward_keeps_policy_and_model_gradients_apart():

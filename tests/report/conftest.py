@@ -10,6 +10,7 @@ from typing import Any
 import pytest
 import torch
 
+from franka_wm.report.results import END
 from franka_wm.report.video import write_png, write_video
 
 
@@ -75,8 +76,15 @@ def make_run(tmp_path: Path) -> Callable[..., Path]:
         )
         (run / ".hydra" / "overrides.yaml").write_text(f"- env=reach_fixed\n- seed={seed}\n- 'note=a b'\n")
         policies = {"planner": policy(distance), "noop": policy(0.25, 0.0)}
+        protocol = {
+            "by": END,
+            "updates": 300,
+            "env_steps": 3000,
+            "training_seconds": 30.0,
+            "success_distance": 0.05,
+        }
         (run / "evaluation.json").write_text(
-            json.dumps(policies if more is None else {"policies": policies, **more})
+            json.dumps({"protocol": protocol, "policies": policies, **(more or {})})
         )
         if rows:
             for key, values in {

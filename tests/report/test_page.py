@@ -14,7 +14,8 @@ from franka_wm.errors import UserError
 from franka_wm.report import document
 from franka_wm.report.compare import compare_page, differences, repetitions, unique_names
 from franka_wm.report.page import page, write_page
-from franka_wm.report.run import csv_rows, read_run, split_evaluation
+from franka_wm.report.results import COMMAND
+from franka_wm.report.run import csv_rows, read_run
 from franka_wm.report.versions import versions, write_versions
 from tests.report.conftest import extras, policy
 
@@ -129,18 +130,63 @@ def test_the_page_says_how_to_do_it_again(make_run) -> None:
     assert f"franka-wm report {run}" in text
 
 
-def test_the_commands_evaluation_stands_for_that_of_training(make_run) -> None:
-    run = make_run(distance=0.5)
+@pytest.mark.parametrize("episodes", [2, 128])
+def test_of_two_results_the_one_with_more_episodes_is_shown_and_the_other_named(
+    episodes: int, make_run, capsys
+) -> None:
+    """A small one of the command does not replace what the end of training found over 100."""
+    run, other = make_run(distance=0.5), make_run("other")
     (run / "evaluation").mkdir()
-    better = {"policies": {"planner": policy(0.03)}, "protocol": {"episodes": 128}}
-    (run / "evaluation" / "evaluation.json").write_text(json.dumps(better))
+    theirs = {"planner": policy(0.03) | {"episodes": episodes}}
+    result = {"policies": theirs, "protocol": {"by": COMMAND}, "probes": {"joints": {"ridge": 0.91}}}
+    (run / "evaluation" / "evaluation.json").write_text(json.dumps(result))
     timing = {"planner": {"seconds_per_decision": 0.0123, "worlds": 64}}
     (run / "evaluation" / "timing.json").write_text(json.dumps(timing))
     found = read_run(run)
-    assert found.policies["planner"]["final_distance"]["mean"] == 0.03
-    assert "noop" not in found.policies
-    text = Reader(page(found)).text
-    assert "12.30" in text and "64" in text and "128" in text
+    shown = 0.03 if episodes == 128 else 0.5
+    assert found.policies["planner"]["final_distance"]["mean"] == shown
+    assert found.extras == {"probes": {"joints": {"ridge": 0.91}}}  # the command alone looks for them
+    command, end = f"franka-wm evaluate, {episodes} episodes", "the end of training, 100 episodes"
+    first, second = (command, end) if episodes == 128 else (end, command)
+    reader = Reader(page(found))
+    assert "12.30" in reader.text and "64" in reader.text
+    assert f"Measured by {first}" in reader.text and f"Also measured, by {second}" in reader.text
+    assert f"episodes={episodes} robustness=true" in reader.text or not found.counters
+    text = Reader(compare_page([found, read_run(other)])).text
+    assert f"{100 * shown:.2f}" in text and first in text and second in text
+    cli.main(["summary", str(run)])
+    said = capsys.readouterr().out
+    assert f"1 run of {max(episodes, 100)} episodes" in said and f"measured by {first.split(',')[0]};" in said
+
+
+def test_the_curves_last_point_is_the_end_of_training(make_run) -> None:
+    """Once: a logger's files hold it already, a checkpoint's rows do not."""
+    run = make_run(rows=False)
+    config = (run / "config.yaml").read_text()
+    (run / "config.yaml").write_text(config + "evaluation: {during: [planner], during_episodes: 16}\n")
+    last = {
+        "eval/planner/final_distance": 0.02,
+        "eval/planner/success": 0.5,
+        "eval/planner/return": -2.0,
+        "updates": 300,
+        "env_steps": 3000,
+        "time_s": 30.0,
+    }
+    assert read_run(run).rows == [last]
+    text = Reader(page(read_run(run))).text
+    assert "The last points are what the end of training measured over 100 episodes" in text
+    assert "over 16 of these" in text
+    for name, value in last.items():
+        if name.startswith("eval/"):
+            path = run / "csv" / "scalars" / f"{name}.csv"
+            path.parent.mkdir(parents=True, exist_ok=True)
+            path.write_text(f"200,9.0\n300,{value}\n")
+    rows = read_run(run).rows
+    assert [row["updates"] for row in rows] == [200, 300]
+    (run / "evaluation" / "x").mkdir(parents=True)
+    many = {"policies": {"planner": policy(0.9) | {"episodes": 500}}, "protocol": {"by": COMMAND}}
+    (run / "evaluation" / "evaluation.json").write_text(json.dumps(many))
+    assert read_run(run).rows == rows  # of other episodes
 
 
 def test_a_checkpoints_rows_and_counters_are_read(make_run) -> None:
@@ -246,14 +292,16 @@ def test_rows_of_csv_files_are_put_together_by_step(make_run) -> None:
     assert [row["updates"] for row in rows] == [100, 200, 300]
 
 
-def test_policies_are_told_from_what_stands_beside_them() -> None:
-    more = extras()
-    for evaluation in ({"planner": policy(0.1), **more}, {"policies": {"planner": policy(0.1)}, **more}):
-        policies, rest = split_evaluation(evaluation)
-        assert list(policies) == ["planner"] and rest == more
-    assert split_evaluation({"planner": policy(0.1), "later": {"x": 1}})[0].keys() == {"planner"}
+def test_results_of_an_older_form_are_refused_in_one_line(make_run, capsys) -> None:
+    run = make_run()
+    for old in ({"planner": policy(0.1)}, {"policies": {"planner": policy(0.1)}}):
+        (run / "evaluation.json").write_text(json.dumps(old))
+        assert cli.main(["report", str(run)]) == 1
+        said = capsys.readouterr().err
+        assert said.count("\n") == 1 and "evaluation.json is of an older form" in said and "evaluate" in said
+    (run / "evaluation.json").write_text('{"protocol": {}, "policies": {"planner": 1}}')
     with pytest.raises(UserError, match="an object for each policy"):
-        split_evaluation({"policies": [1]})
+        read_run(run)
 
 
 def test_versions_are_written_and_shown(make_run) -> None:

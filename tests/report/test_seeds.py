@@ -5,6 +5,7 @@ import json
 import pytest
 
 from franka_wm.errors import UserError
+from franka_wm.report.results import END
 from franka_wm.report.seeds import read_evaluation, runs_of, seeds_table, summary
 
 
@@ -20,6 +21,11 @@ def evaluation(distance: float, success: float) -> dict:
     }
 
 
+def written(distance: float, success: float) -> str:
+    """An ``evaluation.json``."""
+    return json.dumps({"protocol": {"by": END}, "policies": evaluation(distance, success)})
+
+
 def test_mean_and_range_over_runs():
     table = seeds_table([evaluation(0.01, 1.0), evaluation(0.03, 0.5)])
     assert "| planner | 2.00 (1.00 – 3.00) | 75 (50 – 100) |" in table
@@ -28,7 +34,7 @@ def test_mean_and_range_over_runs():
 def test_summary_reads_folders(tmp_path, capsys):
     for k, distance in enumerate((0.01, 0.02)):
         (tmp_path / str(k)).mkdir()
-        (tmp_path / str(k) / "evaluation.json").write_text(json.dumps(evaluation(distance, 1.0)))
+        (tmp_path / str(k) / "evaluation.json").write_text(written(distance, 1.0))
     summary([str(tmp_path / "0"), str(tmp_path / "1")])
     assert "2 runs of 64 episodes" in (out := capsys.readouterr().out) and "1.50" in out
 
@@ -50,7 +56,7 @@ def test_a_sweep_stands_for_its_runs(tmp_path, capsys):
         summary([str(tmp_path)])
     for k in (10, 9, 2):
         (tmp_path / f"{k}-reach").mkdir()
-        (tmp_path / f"{k}-reach" / "evaluation.json").write_text(json.dumps(evaluation(k / 100, 1.0)))
+        (tmp_path / f"{k}-reach" / "evaluation.json").write_text(written(k / 100, 1.0))
     (tmp_path / "figures").mkdir()
     assert [path.name for path in runs_of(tmp_path)] == ["2-reach", "9-reach", "10-reach"]
     summary([str(tmp_path)])
@@ -64,7 +70,7 @@ def test_runs_of_different_tasks_are_not_averaged(tmp_path, capsys):
     for k, (task, seed) in enumerate([("reach", 0), ("reach_fixed", 0), ("reach", 1)]):
         run = tmp_path / f"{k}-{task}"
         run.mkdir()
-        (run / "evaluation.json").write_text(json.dumps(evaluation((k + 1) / 100, 1.0)))
+        (run / "evaluation.json").write_text(written((k + 1) / 100, 1.0))
         (run / "config.yaml").write_text(f"seed: {seed}\nenv: {{task: {task}}}\n")
     (tmp_path / "multirun.yaml").touch()
     summary([str(tmp_path)])

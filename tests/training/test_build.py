@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 
 import pytest
@@ -128,6 +129,8 @@ def test_environments_of_a_run(composed) -> None:
         ("planner.precision=float16", "float32, bfloat16"),
         ("planner.compile=maybe", "true or false"),
         ("replay.window=0", "window"),
+        (("model=muzero", "planner=gumbel", "replay.window=10"), "replay.window=11"),
+        (("model=muzero", "planner=gumbel", "scale=smoke", "model.n_step=3"), "replay.window=7"),
         ("replay.batch_size=-1", "batch_size"),
         ("trainer.updates=-1", "updates"),
         ("trainer.updates_per_batch=0", "updates_per_batch"),
@@ -148,12 +151,43 @@ def test_refused_before_anything_is_built(override: str | tuple[str, ...], named
     assert named in str(caught.value) and "\n" not in str(caught.value)
 
 
+@pytest.mark.parametrize("model", [["model=tdmpc2"], ["model=muzero", "planner=gumbel"]])
+@pytest.mark.parametrize("scale", ["laptop", "gpu"])
+def test_the_range_of_values_holds_the_returns_of_long_episodes(model, scale: str, composed) -> None:
+    """And is no wider than needed for short ones; a number given wins."""
+
+    def high(*overrides: str) -> tuple[float, float]:
+        cfg = composed(f"scale={scale}", *model, *overrides)
+        spaces = Spaces.of_config(
+            FrankaConfig.from_mapping(
+                {k: v for k, v in build.plain(cfg.env).items() if k not in ("kind", "urdf_path")}
+            ),
+            discrete=build.is_discrete(cfg),
+        )
+        assert Spaces.from_dict(spaces.as_dict()) == spaces
+        built = build.make_model(cfg, spaces, "cpu")
+        return built.two_hot.high, 1.0 / (1.0 - built.discount)
+
+    short, steps = high("env.episode_length=50")
+    assert math.log1p(1.01 * steps) < short < 3.3
+    long, steps = high("env.episode_length=1000")
+    assert math.log1p(1.01 * steps) < long and steps > 150
+    assert high("env.action_penalty=1.0")[0] > short
+    assert high("model.value_high=7.5")[0] == 7.5
+
+
+def test_spaces_of_an_older_checkpoint_know_no_bounds() -> None:
+    values = Spaces(observation_sizes={"state": 20}, action_dim=7, reward_bounds=(-1.0, 0.0)).as_dict()
+    del values["reward_bounds"]
+    assert Spaces.from_dict(values).reward_bounds is None
+
+
 def test_muzero_sees_ends_and_episodes_shorter_than_its_windows(composed) -> None:
     """Else its value targets could not reach further than the shortest episode is long."""
     episodes = TensorDict({"is_init": (torch.arange(80) % 8 == 0).expand(4, 80).unsqueeze(-1)}, [4, 80])
     cfg = composed("env=gym", "model=muzero", "planner=gumbel", "collector.num_envs=4")
     check(cfg)
-    assert build.window(cfg) == cfg.model.unroll + cfg.model.n_step > 8
+    assert build.window(cfg) == cfg.model.unroll + cfg.model.n_step + 1 > 8
     assert cfg.collector.seed_steps >= build.window(cfg)
     check(composed("env=gym", "model=muzero", "planner=gumbel", "env.episode_length=8"))
     replay = build.make_replay_buffer(cfg, torch.device("cpu"))
@@ -269,3 +303,43 @@ def test_runs_of_before_an_option_was_there_go_on(composed) -> None:
     spaces = Spaces.of_env(env)
     policies = build.make_agent_policies(cfg, build.make_model(cfg, env), env, spaces)
     assert set(policies) == {"planner", "policy", "noop", "random", "oracle"}
+
+
+@pytest.fixture
+def hindsight(composed):
+    def make(*overrides: str):
+        cfg = composed("scale=smoke", "device=cpu", *overrides)
+        return build.make_hindsight(cfg, build.make_env(cfg, num_envs=2))
+
+    return make
+
+
+def test_hindsight_is_used_where_goals_change_and_rewards_are_known(hindsight) -> None:
+    found = hindsight()
+    assert found is not None and found.share == 0.5 and found.episode_length == 50
+    assert hindsight("replay.hindsight=0") is None
+    assert hindsight("replay.hindsight=0.25").share == 0.25
+
+
+@pytest.mark.parametrize(
+    "overrides",
+    [
+        ["env=reach_fixed"],
+        ["env.task=track"],
+        ["env.reward=normalized"],
+        ["env.randomization.observation_noise=0.01"],
+        ["model=muzero", "planner=gumbel"],
+    ],
+)
+def test_elsewhere_hindsight_is_none_and_refused_where_it_is_asked_for(
+    overrides: list[str], hindsight
+) -> None:
+    assert hindsight(*overrides) is None
+    with pytest.raises(UserError, match=r"replay\.hindsight=0\.5: .*leave it at null"):
+        hindsight(*overrides, "replay.hindsight=0.5")
+
+
+@pytest.mark.parametrize("share", ["1.5", "-0.1", "true", "some"])
+def test_a_share_that_is_none_is_refused(share: str, hindsight) -> None:
+    with pytest.raises(UserError, match="must be a share from 0 to 1, or null"):
+        hindsight(f"replay.hindsight={share}")

@@ -88,7 +88,18 @@ def test_a_run(make: Make) -> None:
     assert row["updates"] == 20 and row["env_steps"] == trainer.env_steps
     assert {"loss", "train/episodes", "updates_per_s", "time_s"} <= set(row)
     checkpoint = load_checkpoint(latest_checkpoint(trainer.folder))
+    # The range of values is saved: another reward does not change it when the weights come back.
+    assert checkpoint.config.model.value_high == trainer.model.two_hot.high < 4.0
     assert checkpoint.counters["updates"] == 20 and checkpoint.counters["env_steps"] == trainer.env_steps
+
+
+@pytest.mark.parametrize("low", [None, -0.01])
+def test_targets_outside_of_the_range_are_said(make: Make, cfg: DictConfig, monkeypatch, capsys, low) -> None:
+    monkeypatch.setitem(cfg.model, "value_low", low)
+    make().fit()
+    said = [line for line in capsys.readouterr().out.splitlines() if "outside" in line]
+    assert bool(said) == (low is not None)
+    assert all("model.value_low" in line for line in said)
 
 
 def test_observations_are_standardized_by_the_seed_data(make: Make) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
@@ -254,6 +255,15 @@ class RecordedWindows:
             return self.split("validation")
         except NoWindows:
             return None
+
+    @property
+    def reward_bounds(self) -> tuple[float, float] | None:
+        """The least and the largest reward in all of the data; ``None`` where there are none, or not all are finite."""
+        rewards = self.recording.arrays.get("next.reward")
+        if rewards is None:
+            return None
+        least, largest = min(float(r.min()) for r in rewards), max(float(r.max()) for r in rewards)
+        return (least, largest) if math.isfinite(least) and math.isfinite(largest) else None
 
     def statistics(self) -> dict[str, Moments]:
         """Mean, deviation, least and largest of each vector observation and of ``action``, over this split.

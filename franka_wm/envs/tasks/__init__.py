@@ -7,9 +7,12 @@ known by :func:`register`; ``docs/tasks.md`` walks through an example.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import TYPE_CHECKING
 
+import torch
 import warp as wp
+from tensordict import TensorDictBase
 
 from franka_wm.envs.config import TASKS, FrankaConfig
 
@@ -24,8 +27,20 @@ class Task:
         config: The environment's.
     """
 
+    goal_distance = False
+    """Whether success is to have the tool near ``task_goal``. Then evaluation reports the distance, and success within
+    several distances; of other tasks it reports what ``judge`` writes into ``success``."""
+
     def __init__(self, config: FrankaConfig):
         self.config = config
+
+    @property
+    def reward_bounds(self) -> tuple[float, float] | None:
+        """The least and the largest reward of a step, from which models derive the range of their values.
+
+        ``None``: unknown. A class attribute is enough: ``reward_bounds = (-1.0, 0.0)``.
+        """
+        return None
 
     def reset(self, sim: Simulation, mask: wp.array) -> None:
         """Writes ``sim.warp.task_goal`` (N, 3), and ``sim.warp.goal_q`` (N, 7) if known, where ``mask`` (N,)."""
@@ -42,6 +57,26 @@ class Task:
 
         ``next_true_state`` is ``next_state`` without observation noise."""
         raise NotImplementedError(f"{type(self).__name__} gives no reward")
+
+    relabel: Callable[[TensorDictBase, torch.Tensor], TensorDictBase] | None = None
+    """Recorded transitions as if the goal had been another, where the task can say so in torch: see `Reach.relabel`."""
+
+    @classmethod
+    def relabels(cls) -> bool:
+        """Whether ``relabel`` speaks for this task: a subclass that changes rewards or moves goals says so anew."""
+
+        def owner(name: str) -> int:
+            return next(i for i, one in enumerate(cls.__mro__) if name in vars(one))
+
+        return cls.relabel is not None and owner("relabel") <= min(owner("judge"), owner("advance"))
+
+    def measures(self, sim: Simulation) -> dict[str, torch.Tensor]:
+        """What else evaluation reports, by names with their units: (N,) each, after a step; the episode's last counts.
+
+        Computed with torch, outside the captured step, from ``sim.next_true_state`` (N, 20): finished worlds have
+        been reset already.
+        """
+        return {}
 
 
 def make_task(config: FrankaConfig) -> Task:

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 
 import torch
 import warp as wp
+from tensordict import TensorDict, TensorDictBase
 
 from franka_wm.envs import kernels
 from franka_wm.envs.config import HOME, FrankaConfig
@@ -58,9 +59,21 @@ class Reach(Task):
     every world and episode. **Reward**: :func:`reach_reward`. **Success**: tool within ``success_distance``.
     """
 
+    goal_distance = True
+
     def __init__(self, config: FrankaConfig):
         super().__init__(config)
         self._fixed: tuple[wp.array, wp.array] | None = None
+
+    @property
+    def reward_bounds(self) -> tuple[float, float] | None:
+        """Of :func:`reach_reward`; ``None`` where a subclass judges otherwise."""
+        if type(self).judge is not Reach.judge:
+            return None
+        least, largest = {"dense": (-1.0, 0.0), "sparse": (0.0, 1.0), "normalized": (-1.0, 1.0)}[
+            self.config.reward
+        ]
+        return least - self.config.action_penalty, largest
 
     def reset(self, sim: Simulation, mask: wp.array) -> None:
         self.choose(sim, mask, sim.warp.task_goal)
@@ -89,6 +102,36 @@ class Reach(Task):
             ],
             device=sim.device,
         )  # fmt: skip
+
+    def relabel(self, transitions: TensorDictBase, goal: torch.Tensor) -> TensorDictBase:
+        """What another goal changes in recorded transitions; exact where observations have no noise.
+
+        Args:
+            transitions: (B, H) with ``state``, ``action`` (continuous), and in ``next`` ``state`` and ``reward``.
+            goal: (B, 3) [m].
+
+        Returns:
+            (B, H): ``state``, ``goal`` where there is one, and in ``next`` the same, ``reward`` and ``terminated``.
+        """
+        goal, c = goal.unsqueeze(1).expand(*transitions.batch_size, 3), self.config
+        out = TensorDict({}, batch_size=transitions.batch_size)
+        for root in ((), ("next",)):
+            state = transitions.get((*root, "state"))
+            out.set((*root, "state"), torch.cat([state[..., :17], state[..., 14:17] - goal], -1))
+            if transitions.get((*root, "goal"), None) is not None:
+                out.set((*root, "goal"), goal)
+        after = out.get(("next", "state"))
+        reward = reach_reward(
+            after,
+            transitions.get("action"),
+            kind=c.reward,
+            action_penalty=c.action_penalty,
+            success_distance=c.success_distance,
+        )
+        out.set(("next", "reward"), reward)
+        reached = goal_distance(after).unsqueeze(-1) < c.success_distance
+        out.set(("next", "terminated"), reached & c.terminate_on_success)
+        return out
 
     def begin(self, sim: Simulation, mask: wp.array) -> None:
         if self.config.reward == "normalized":

@@ -38,6 +38,13 @@ def test_within_episodes_and_uniform(pictures: Path, opened: Callable, window: i
     assert chisquare([counts[w] for w in sorted(expected)]).pvalue > 1e-3
 
 
+def test_rewards_are_bounded_by_all_that_were_recorded(pictures: Path, opened: Callable) -> None:
+    windows = opened(pictures, keys=["joints"], validation_fraction=0.4)
+    least, largest = windows.reward_bounds
+    assert largest == 0.0 and least == pytest.approx(-(max(LENGTHS) - 1) / 10)
+    assert windows.split("validation").reward_bounds == (least, largest)
+
+
 def test_pictures_belong_to_their_rows(pictures: Path, foreign, opened: Callable) -> None:
     for batch in opened(pictures).batches(1):
         for step in batch[0]:

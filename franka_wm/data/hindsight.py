@@ -1,0 +1,76 @@
+"""Hindsight goals: sampled windows as if their goal had been a place that the same episode reached later."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import torch
+from tensordict import TensorDictBase
+
+from franka_wm.data.stacks import BOUNDARY
+
+Relabel = Callable[[TensorDictBase, torch.Tensor], TensorDictBase]
+"""(windows (B, H), goals (B, 3) [m]) -> the entries that another goal changes, of the same shapes."""
+
+
+class Hindsight:
+    """Relabels a share of each batch of windows with goals reached later (HER, arXiv:1707.01495, strategy `future`).
+
+    The reward is a known function of state and goal, so relabeled windows are exact, not approximate. The new goal is
+    where the tool was after a step drawn uniformly from those between the window's end and the episode's.
+
+    Args:
+        relabel: The task's, see `franka_wm.envs.tasks.Task.relabel`.
+        achieved: Place that a state has reached: (…, 20) → (…, 3) [m].
+        share: Of the windows of a batch, in [0, 1].
+        episode_length: Steps of an episode, at most: how far to look ahead.
+    """
+
+    def __init__(
+        self,
+        relabel: Relabel,
+        achieved: Callable[[torch.Tensor], torch.Tensor],
+        *,
+        share: float,
+        episode_length: int,
+    ):
+        self.relabel, self.achieved, self.share, self.episode_length = (
+            relabel,
+            achieved,
+            share,
+            episode_length,
+        )
+
+    def __call__(
+        self,
+        batch: TensorDictBase,
+        data: Any,
+        time: torch.Tensor,
+        world: torch.Tensor,
+        newest: int | torch.Tensor,
+    ) -> TensorDictBase:
+        """Relabels in place; no operation waits for the device.
+
+        Args:
+            batch: Windows (B, H) that were read from `data`.
+            data: The storage, (time, worlds).
+            time, world: Of each step of the windows, (B, H).
+            newest: Time of the step that was written last.
+        """
+        capacity, device = data.shape[0], time.device
+        last, world = time[:, -1], world[:, 0]
+        ahead = torch.arange(self.episode_length, device=device)
+        later = (last.unsqueeze(1) + ahead) % capacity  # (B, L): the window's last step and what follows
+        # Of the same episode, and written: neither past the next episode's start nor past the newest step.
+        begins = data.get(BOUNDARY)[later, world.unsqueeze(1)].squeeze(-1)
+        begins[:, 0] = False
+        same = (begins.cumsum(1) == 0) & (ahead <= ((newest - last) % capacity).unsqueeze(1))
+        chosen = (torch.rand(last.shape, device=device) * same.sum(1)).long()
+        reached = data.get(("next", "state"))[later.gather(1, chosen.unsqueeze(1)).squeeze(1), world]
+        relabeled = self.relabel(batch, self.achieved(reached))
+        mask = torch.rand(last.shape, device=device) < self.share
+        for key in relabeled.keys(True, True):
+            new, old = relabeled.get(key), batch.get(key)
+            batch.set(key, torch.where(mask.view(-1, *[1] * (old.dim() - 1)), new, old))
+        return batch

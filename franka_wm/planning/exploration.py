@@ -1,0 +1,60 @@
+"""How worlds explore while experience is gathered: noise of their own, and a share that acts with the planner."""
+
+import torch
+from tensordict import TensorDictBase
+from tensordict.nn import InteractionType, TensorDictModuleBase
+from tensordict.nn.probabilistic import interaction_type
+
+
+class ExploringPolicy(TensorDictModuleBase):
+    """A policy whose worlds explore unlike each other, so that planners and critics see more than its own actions.
+
+    World k of N adds Gaussian noise of standard deviation `noise` · k / (N - 1) to its actions, as the actors of Ape-X
+    (arXiv:1803.00933) have an ε each. The last `planner_worlds` act with `planner` instead: a planner that is judged
+    but never gathers meets states and actions that its model has not seen (arXiv:2502.03550).
+
+    Nothing is changed where TorchRL's exploration type is not RANDOM.
+
+    Args:
+        policy: Writes `action` (N, A) in [-1, 1].
+        noise: Standard deviation of the noisiest world, in units of the action.
+        planner: Writes `action` and `plan`.
+        planner_worlds: How many of the worlds, the last ones, act with it.
+    """
+
+    def __init__(
+        self,
+        policy: TensorDictModuleBase,
+        *,
+        noise: float = 0.0,
+        planner: TensorDictModuleBase | None = None,
+        planner_worlds: int = 0,
+    ) -> None:
+        super().__init__()
+        self.policy, self.noise, self.planner, self.planner_worlds = policy, noise, planner, planner_worlds
+        # in_keys and out_keys are what a collector carries from step to step.
+        more = [] if planner is None or not planner_worlds else [planner]
+        self.in_keys = list(dict.fromkeys(key for one in (policy, *more) for key in one.in_keys))  # pyright: ignore
+        self.out_keys = list(dict.fromkeys(key for one in (policy, *more) for key in one.out_keys))  # pyright: ignore
+
+    @torch.no_grad()
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Write `action`, and the planner's entries."""
+        worlds = tensordict.batch_size[0]
+        tensordict = self.policy(tensordict)
+        action = tensordict.get("action")
+        if interaction_type() is not InteractionType.RANDOM:
+            return tensordict
+        if self.noise:
+            std = torch.linspace(0.0, self.noise, worlds, device=action.device).unsqueeze(-1)
+            action = (action + std * torch.randn_like(action)).clamp(-1.0, 1.0)
+        if self.planner is not None and self.planner_worlds:
+            first = worlds - self.planner_worlds
+            keys = [*self.planner.in_keys, "plan", "context", "context_action"]
+            planned = self.planner(tensordict[first:].select(*keys, strict=False))  # pyright: ignore[reportCallIssue]
+            action = torch.cat((action[:first], planned.get("action")))
+            for key in self.planner.out_keys:
+                if key != "action":
+                    own = planned.get(key)
+                    tensordict.set(key, torch.cat((own.new_zeros(first, *own.shape[1:]), own)))
+        return tensordict.set("action", action)

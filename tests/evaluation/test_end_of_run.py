@@ -1,0 +1,63 @@
+"""What a run leaves at its end: one table, whose numbers are the last point of the curves, drawn and logged."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+from matplotlib.axes import Axes
+from omegaconf import OmegaConf
+
+from franka_wm.data.policies import NoopPolicy
+from franka_wm.evaluation.report import evaluate_and_report
+from franka_wm.report.results import END, read_result
+
+
+@pytest.mark.parametrize("during", [["policy"], []])
+def test_the_table_is_the_curves_last_point(
+    during: list[str], small_env, tmp_path: Path, monkeypatch
+) -> None:
+    env = small_env(3, episode_length=4, goal_sampling="reachable", success_distance=0.4)
+    cfg = OmegaConf.create(
+        {
+            "env": {"task": "reach"},
+            "model": {"name": "none"},
+            "seed": 7,
+            "evaluation": {"during": during, "video_episodes": 0},
+        }
+    )
+    before = {"eval/policy/final_distance": 0.9, "eval/policy/success": 0.1, "env_steps": 50, "updates": 5}
+    drawn: dict[tuple[int, str], tuple[list[float], list[float]]] = {}
+    plot, logged = Axes.plot, []
+
+    def record(self, xs, ys, **kwargs):
+        drawn[self.figure.axes.index(self), kwargs["label"]] = (list(xs), list(ys))
+        return plot(self, xs, ys, **kwargs)
+
+    monkeypatch.setattr(Axes, "plot", record)
+    counters = {"updates": 9, "env_steps": 120, "seconds": 3.5}
+    results = evaluate_and_report(
+        cfg,
+        tmp_path,
+        env,
+        {"policy": NoopPolicy(), "noop": NoopPolicy()},
+        rows=[before],
+        counters=counters,
+        say=lambda text: None,
+        log=logged.append,
+    )
+    found = read_result(tmp_path / "evaluation.json")
+    assert json.loads((tmp_path / "evaluation.json").read_text()) == results
+    assert found.told == f"{END}, 3 episodes" and found.protocol["seed"] == 7
+    assert [found.protocol[k] for k in ("updates", "env_steps", "training_seconds")] == [9, 120, 3.5]
+    table = found.policies["policy"]
+    distance, success = table["final_distance"]["mean"], table["success"]["0.4"]["mean"]
+    assert 0 < success < 1
+    if during:
+        assert drawn[0, "policy alone"] == ([50, 120], pytest.approx([90.0, 100 * distance]))
+        assert drawn[1, "policy alone"] == ([50, 120], pytest.approx([10.0, 100 * success]))
+        numbers = {"final_distance": distance, "success": success, "return": table["return"]["mean"]}
+        assert logged == [{f"eval/policy/{name}": value for name, value in numbers.items()}]
+    else:  # no curve was asked for
+        assert drawn[0, "policy alone"][0] == [50] and logged == []

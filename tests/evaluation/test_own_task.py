@@ -1,0 +1,124 @@
+"""A task of one's own is judged by its own success, return and measures, in everything that a run shows."""
+
+from __future__ import annotations
+
+import json
+
+import pytest
+import torch
+
+from examples.add_a_task import HEIGHT, RaiseTool
+from franka_wm.data.policies import NoopPolicy, OraclePolicy, SmoothRandomPolicy
+from franka_wm.envs import FrankaConfig, FrankaEnv
+from franka_wm.evaluation.closed_loop import play_episodes, reaches
+from franka_wm.evaluation.protocol import Evaluation, describe, evaluate_policies, numbers_to_log, thresholds
+from franka_wm.evaluation.robustness import verdict_of_success
+from franka_wm.evaluation.tables import robustness_table
+from franka_wm.report.compare import compare_page
+from franka_wm.report.curves import axis, panel_figure, panels, plot_learning_curves
+from franka_wm.report.page import page
+from franka_wm.report.results import END, last_row
+from franka_wm.report.run import read_run
+from franka_wm.report.seeds import seeds_table, summary
+from tests.conftest import SMALL
+
+LENGTH = 10
+
+
+@pytest.fixture(scope="module")
+def env() -> FrankaEnv:
+    """Episodes that end at a success go on into others, whose height must not be taken for theirs."""
+    config = FrankaConfig(**SMALL, pose_noise=0.6, episode_length=LENGTH, terminate_on_success=True)
+    return FrankaEnv(config, num_envs=6, device="cpu", task=RaiseTool(config))
+
+
+@pytest.fixture(scope="module")
+def found(env: FrankaEnv) -> Evaluation:
+    oracle = OraclePolicy(env.kinematics, env.config)
+    random = SmoothRandomPolicy(generator=torch.Generator().manual_seed(0))
+    return evaluate_policies(env, {"planner": random, "oracle": oracle, "noop": NoopPolicy()})
+
+
+def test_success_and_measures_at_the_true_end(env: FrankaEnv) -> None:
+    """Played by hand: the height of the last observation of each world's first episode."""
+    episodes = play_episodes(env, SmoothRandomPolicy(generator=torch.Generator().manual_seed(3)), seed=2)
+    policy = SmoothRandomPolicy(generator=torch.Generator().manual_seed(3))
+    observation, height, success = env.reset(seed=2), torch.full((6,), torch.nan), torch.zeros(6)
+    for _ in range(LENGTH):
+        step, observation = env.step_and_maybe_reset(policy(observation))
+        ended = step["next", "done"].squeeze(-1) & height.isnan()
+        height = torch.where(ended, step["next", "state"][:, 16], height)
+        success = torch.where(ended, step["next", "success"].squeeze(-1).float(), success)
+    assert torch.equal(episodes["measures", "height [m]"], height)
+    assert torch.equal(episodes["success"], success) and 0 < success.sum() < 6
+    assert torch.equal(episodes["success"], (height >= HEIGHT).float())
+    assert episodes["success_once"].sum() >= success.sum()
+    assert not {"final_distance", "closest_distance"} & set(episodes.keys())
+
+
+def test_reach_is_judged_by_distances_as_ever(small_env) -> None:
+    """Its own success is to be within success_distance, which is among the thresholds."""
+    reach = small_env(6, episode_length=LENGTH, goal_sampling="reachable", success_distance=0.3)
+    assert reaches(reach) and thresholds(reach) == [0.3, 0.05, 0.025, 0.01]
+    evaluation = evaluate_policies(reach, {"noop": NoopPolicy()})
+    rows, told = evaluation.episodes["noop"], evaluation.policies["noop"]
+    assert torch.equal(rows["success"], (rows["final_distance"] < 0.3).float()) and rows["success"].sum() > 0
+    assert list(told["success"]) == ["0.3", "0.05", "0.025", "0.01"] and "measures" not in told
+    assert told["success"]["0.3"]["mean"] == rows["success"].mean()
+
+
+def test_no_distance_is_shown_anywhere(env: FrankaEnv, found: Evaluation) -> None:
+    assert not reaches(env) and thresholds(env) == []
+    for summary_ in found.policies.values():
+        assert {"success", "success_once", "return", "measures", "episodes"} <= set(summary_)
+        assert "final_distance" not in summary_ and set(summary_["success"]) == {"mean", "low", "high"}
+    text = found.markdown()
+    assert text.startswith("| policy | success [%] | height [m] | return | episodes |")
+    assert "distance [cm]" not in text and "once [%]" in text
+    assert describe("planner", found.policies["planner"]).startswith("  planner: success ")
+    numbers = numbers_to_log(env, {"noop": NoopPolicy()})
+    assert set(numbers) == {f"eval/noop/{name}" for name in ("success", "return", "height_m")}
+    assert numbers["eval/noop/height_m"] == found.policies["noop"]["measures"]["height [m]"]["mean"]
+
+
+def test_pages_curves_and_summaries_show_it(env: FrankaEnv, found: Evaluation, tmp_path, capsys) -> None:
+    protocol = {"by": END, "updates": 20, "env_steps": 200, "training_seconds": 1.0}
+    for k in range(2):
+        run = tmp_path / f"run{k}"
+        run.mkdir()
+        (run / "config.yaml").write_text(
+            f"env: {{task: raise_tool}}\nevaluation: {{during: [planner]}}\nseed: {k}\n"
+        )
+        (run / "evaluation.json").write_text(json.dumps({"protocol": protocol, "policies": found.policies}))
+    read = read_run(tmp_path / "run0")
+    last = last_row(read.results, ["planner"])
+    mean = found.policies["planner"]["measures"]["height [m]"]["mean"]
+    assert last["eval/planner/height_m"] == mean and last["env_steps"] == 200
+    assert read.rows == [last] and "height_m" in panels(read.rows)
+    assert panel_figure(read.rows, "height_m") is not None
+    assert panel_figure(read.rows, "final_distance") is None
+    text = page(read)
+    assert "height [m]" in text and "success" in text and "final distance" not in text
+    assert "as the task judges" in text
+    assert "height [m]" in compare_page([read_run(tmp_path / f"run{k}") for k in range(2)])
+    summary([str(tmp_path / "run0"), str(tmp_path / "run1")])
+    assert "| policy | success [%] | return | height [m] |" in capsys.readouterr().out
+    assert "final distance" not in seeds_table([found.policies])
+    assert axis(read.rows) == "env_steps"
+    assert plot_learning_curves(read.rows, tmp_path / "curves.png").stat().st_size > 1000
+
+
+def test_what_a_shift_breaks_is_said_by_success() -> None:
+    before = torch.zeros(100, dtype=torch.bool)
+    before[:50] = True
+    after = before.clone()
+    assert verdict_of_success(after, before) == "holds"
+    after[:20] = False
+    assert verdict_of_success(after, before) == "worse"
+    after[:40] = False
+    assert verdict_of_success(after, before) == "breaks"
+    assert verdict_of_success(after, torch.zeros(100, dtype=torch.bool)) == "never worked"
+    interval = {"mean": 0.5, "low": 0.4, "high": 0.6}
+    row = {"return": interval, "success": interval, "return_change": None, "verdict": ""}
+    table = robustness_table({"as trained": {"planner": row}}, 0.05)
+    assert table.header == ["shift", "policy", "return", "change", "success [%]", "verdict"]

@@ -1,0 +1,64 @@
+"""Worlds that explore unlike each other."""
+
+import pytest
+import torch
+from tensordict import TensorDict
+from tensordict.nn import TensorDictModuleBase
+from torchrl.envs.utils import ExplorationType, set_exploration_type
+
+from franka_wm.planning import ExploringPolicy
+
+WORLDS = 5
+
+
+class Constant(TensorDictModuleBase):
+    """Writes one action, and a plan that counts what was carried to it."""
+
+    def __init__(self, value: float, plans: bool = False) -> None:
+        super().__init__()
+        self.value, self.plans = value, plans
+        self.in_keys = ["state"]
+        self.out_keys = ["action", "plan"] if plans else ["action"]
+
+    def forward(self, tensordict):
+        rows = tensordict.batch_size[0]
+        if self.plans:
+            tensordict.set("plan", tensordict.get("plan", torch.zeros(rows, 2, 1)) + 1)
+        return tensordict.set("action", torch.full((rows, 1), self.value))
+
+
+def root() -> TensorDict:
+    return TensorDict({"state": torch.zeros(WORLDS, 3)}, [WORLDS])
+
+
+@pytest.fixture(autouse=True)
+def _exploring():
+    torch.manual_seed(0)
+    with set_exploration_type(ExplorationType.RANDOM):
+        yield
+
+
+def test_noise_grows_from_none_in_the_first_world_to_all_of_it_in_the_last() -> None:
+    policy = ExploringPolicy(Constant(0.1), noise=0.2)
+    actions = torch.stack([policy(root())["action"] for _ in range(4000)]).squeeze(-1)
+    torch.testing.assert_close(actions.std(0), torch.linspace(0, 0.2, WORLDS), atol=0.01, rtol=0)
+    torch.testing.assert_close(actions.mean(0), torch.full((WORLDS,), 0.1), atol=0.02, rtol=0)
+
+
+def test_actions_stay_within_their_bounds() -> None:
+    assert ExploringPolicy(Constant(0.9), noise=2.0)(root())["action"].abs().max() <= 1.0
+
+
+def test_the_last_worlds_act_with_the_planner_and_carry_its_plan() -> None:
+    policy = ExploringPolicy(Constant(0.1), planner=Constant(-0.5, plans=True), planner_worlds=2)
+    assert set(policy.out_keys) == {"action", "plan"}
+    step = policy(root())
+    assert step["action"].squeeze(-1).tolist() == pytest.approx([0.1, 0.1, 0.1, -0.5, -0.5])
+    step = policy(step)
+    assert step["plan"][:, 0, 0].tolist() == [0, 0, 0, 2, 2]  # the second decision saw the first one's plan
+
+
+def test_without_exploration_it_is_the_policy_alone() -> None:
+    policy = ExploringPolicy(Constant(0.1), noise=0.5, planner=Constant(-0.5, plans=True), planner_worlds=2)
+    with set_exploration_type(ExplorationType.DETERMINISTIC):
+        assert policy(root())["action"].unique().tolist() == pytest.approx([0.1])
