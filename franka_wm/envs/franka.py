@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import itertools
 import logging
 import multiprocessing
 import time
@@ -56,15 +57,17 @@ def resolve_device(device: torch.device | str | None) -> torch.device:
     return torch.device("cpu")
 
 
-def own_seed() -> int:
-    """A seed for an environment that is given none: drawn from torch's generator, so that each instance has its own.
+_unseeded = itertools.count()
 
-    Processes that were started alike (the workers of a ``ParallelEnv`` or of a collector) draw the same numbers. So
-    the place of the process among its parent's children, (), (2,) or (2, 1), counts, too.
+
+def own_seed() -> int:
+    """A seed for an environment that is given none: of its number among those of this process.
+
+    The workers of a ``ParallelEnv`` or of a collector count alike. So the place of the process among its parent's
+    children, (), (2,) or (2, 1), counts, too. The same program has the same seeds when it is run again.
     """
-    drawn = int(torch.randint(2**31 - 1, (1,)))
     place = getattr(multiprocessing.current_process(), "_identity", ())
-    return derive_seed("worlds", drawn, *place)
+    return derive_seed("worlds", next(_unseeded), *place)
 
 
 class FrankaEnv(EnvBase):
@@ -102,9 +105,8 @@ class FrankaEnv(EnvBase):
         config: The arm and its task; :class:`FrankaConfig` lists every field.
         num_envs: Number of worlds, N ≥ 1.
         device: ``None`` or ``"auto"`` (GPU where there is one), ``"cpu"``, ``"cuda"``, ``"cuda:K"``.
-        seed: Of all randomness. ``None``: one of its own (:func:`own_seed`), so that the environments of a
-            ``SerialEnv`` or ``ParallelEnv`` play different episodes. ``torch.manual_seed`` before repeats it, but
-            in the processes of a ``ParallelEnv``, which do not inherit torch's seed; ``set_seed`` reaches them.
+        seed: Of all randomness. ``None``: one that no other instance has (:func:`own_seed`), so that the
+            environments of a ``SerialEnv`` or ``ParallelEnv`` play different episodes.
         urdf_path: A robot of your own.
         task: A task of your own (:class:`~franka_wm.envs.tasks.Task`); the config's if not given.
 
