@@ -228,7 +228,7 @@ def test_stacked_frames_begin_anew_in_their_own_world(env, plain) -> None:
 
 
 def test_stacked_pictures_are_those_of_a_bare_environment(env) -> None:
-    config = replace(env.config, observations=("pixels", "state"), image_size=8, frame_stack=2)
+    config = replace(env.config, observations=("pixels", "state"), image_size=8, frame_stack=3)
     arm, seen = FrankaEnv(config, num_envs=N, device="cpu", seed=0), []
     for wrapper in ("bare", "RewardSum", "ours"):
         for drive in (by_hand, by_step_and_maybe_reset):
@@ -240,7 +240,7 @@ def test_stacked_pictures_are_those_of_a_bare_environment(env) -> None:
     root = arm.reset()
     for _ in range(LENGTH + 2):  # beyond the end, without a reset, the episode goes on
         after = arm.step(Wave()(root.clone()))["next"]
-        assert torch.equal(after["pixels"][..., :3], root["pixels"][..., 3:])
+        assert torch.equal(after["pixels"][..., :6], root["pixels"][..., 3:])
         root = after.select("state", "pixels")
 
 
