@@ -3,24 +3,21 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import torch
 from tensordict import TensorDict, TensorDictBase
-from torch import Tensor, nn
+from torch import Tensor
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from franka_wm.envs import FrankaEnv
 from franka_wm.errors import UserError
 from franka_wm.evaluation.intervals import bootstrap_mean, wilson
+from franka_wm.seeding import evaluation_seed, seeded
 
 THRESHOLDS = (0.05, 0.025, 0.01)
 """Distances to the goal that count as success [m]."""
-
-EVALUATION_SEED = 1_000_003
-"""Added to a run's seed: worlds and goals of the evaluation are not those of training."""
 
 Policy = Callable[[TensorDictBase], TensorDictBase]
 
@@ -38,20 +35,6 @@ def begin(env: Any, seed: int) -> TensorDictBase:
         return env.reset(seed=seed)
     env.set_seed(seed)
     return env.reset()
-
-
-@contextmanager
-def seeded(seed: int, *policies: Any) -> Iterator[None]:
-    """Random numbers of torch, and of the policies' own generators, from ``seed``; torch's are put back after."""
-    devices = list(range(torch.cuda.device_count())) if torch.cuda.is_initialized() else []
-    with torch.random.fork_rng(devices=devices):
-        torch.manual_seed(seed)
-        for policy in policies:
-            for module in policy.modules() if isinstance(policy, nn.Module) else (policy,):
-                for value in vars(module).values() if hasattr(module, "__dict__") else ():
-                    if isinstance(value, torch.Generator):
-                        value.manual_seed(seed)
-        yield
 
 
 @torch.no_grad()
@@ -203,9 +186,10 @@ def evaluate_policies(
     if env.num_envs < 2:
         raise UserError(f"evaluation over {env.num_envs} episodes has no interval; use at least 2")
     outcome = ("return", "length") if arm_of(env) is None else ("final_distance", "return")
-    results = {}
+    results, held_out = {}, evaluation_seed(seed)
     for name, policy in policies.items():
-        episodes = play_episodes(env, policy, seed=seed + EVALUATION_SEED)
+        with seeded(held_out, policy):
+            episodes = play_episodes(env, policy, seed=held_out)
         results[name] = summarize(episodes if thorough else episodes.select(*outcome))
         if report is not None:
             report(name, results[name])
@@ -214,13 +198,14 @@ def evaluate_policies(
 
 @torch.no_grad()
 def decision_times(
-    env: Any, policy: Policy, *, seed: int = EVALUATION_SEED, decisions: int = 20, warm_up: int = 3
+    env: Any, policy: Policy, *, seed: int = 0, decisions: int = 20, warm_up: int = 3
 ) -> Tensor:
     """How long a policy takes to decide for all worlds of the environment at once.
 
     The device is waited for before and after each decision; the environment's own step is not counted.
 
     Args:
+        seed: Of the episodes.
         decisions: How many to measure.
         warm_up: How many before that, not measured.
 

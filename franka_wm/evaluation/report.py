@@ -11,12 +11,13 @@ import torch
 from omegaconf import DictConfig
 
 from franka_wm.envs.camera import project
-from franka_wm.evaluation.closed_loop import EVALUATION_SEED, arm_of, evaluate_policies, play_episodes
+from franka_wm.evaluation.closed_loop import arm_of, evaluate_policies, play_episodes
 from franka_wm.evaluation.tables import motion_table, outcome_table, terminal
 from franka_wm.report import written_whole
 from franka_wm.report.curves import plot_learning_curves
 from franka_wm.report.table import markdown
 from franka_wm.report.video import draw_marker, tile_frames, write_png, write_video
+from franka_wm.seeding import evaluation_seed, seeded
 
 
 def evaluate_and_report(
@@ -91,7 +92,9 @@ def film(cfg: DictConfig, folder: Path, policy: Any) -> torch.Tensor:
         marks = project(arm.goal, arm.config, size)
         frames.append(draw_marker(view.cpu(), marks.cpu(), radius=size / 32))
 
-    play_episodes(env, policy, seed=cfg.seed + EVALUATION_SEED, video=picture)
+    seed = evaluation_seed(cfg.seed)
+    with seeded(seed, policy):
+        play_episodes(env, policy, seed=seed, video=picture)
     film = tile_frames(torch.stack(frames))
     write_video(film, folder / "video.mp4", fps=round(arm.config.fps))
     write_png(film[-1], folder / "last_frame.png")

@@ -16,6 +16,7 @@ from typing import Any
 from omegaconf import DictConfig, OmegaConf
 
 from franka_wm.errors import FrankaError, UserError
+from franka_wm.seeding import derive_seed, evaluation_seed, seeded
 from franka_wm.training.progress import announced, say
 
 INTERRUPTED = 130
@@ -198,9 +199,10 @@ class Run:
             env = build.make_env(self.cfg) if gathers else None
             for one in (env, judge):
                 if one is not None:
-                    one.step(one.rand_action(one.reset()))
+                    with seeded(0):  # how many worlds there are must not decide what a run draws later
+                        one.step(one.rand_action(one.reset()))
                     one.statistics()
-                    one.set_seed(self.cfg.seed)
+                    one.set_seed(derive_seed("training" if one is env else "evaluation", self.cfg.seed))
         return env, judge
 
     def build_experience(self, env: Any) -> tuple[Any, Any]:
@@ -262,14 +264,15 @@ class Run:
         self, env: Any, policies: Mapping[str, Any]
     ) -> Callable[[], dict[str, float]]:
         """A function that plays the policies of ``evaluation.during`` and returns numbers to log."""
-        from franka_wm.evaluation.closed_loop import EVALUATION_SEED, play_episodes
+        from franka_wm.evaluation.closed_loop import play_episodes
 
         names = [name for name in self.cfg.evaluation.during if name in policies]
 
         def evaluate() -> dict[str, float]:
-            numbers = {}
+            numbers, held_out = {}, evaluation_seed(self.cfg.seed)
             for name in names:
-                episodes = play_episodes(env, policies[name], seed=self.cfg.seed + EVALUATION_SEED)
+                with seeded(held_out, policies[name]):
+                    episodes = play_episodes(env, policies[name], seed=held_out)
                 distance = episodes.get("final_distance", None)
                 if distance is not None:
                     reached = distance < env.config.success_distance
@@ -302,7 +305,7 @@ def start(cfg: DictConfig) -> Run:
     check(cfg)
     device = resolve_device(cfg.device)
     logging.getLogger("torchrl").setLevel(logging.WARNING)
-    torch.manual_seed(cfg.seed)
+    torch.manual_seed(derive_seed("weights", cfg.seed))
     if device.type == "cuda":
         torch.set_float32_matmul_precision("high")
     claim(folder)
