@@ -11,7 +11,7 @@ import tempfile
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
 from omegaconf import DictConfig, OmegaConf
 
@@ -250,6 +250,14 @@ class Run:
 
         log_video(self.loggers, name, frames, fps=fps, step=self.cfg.trainer.updates)
 
+    def stop(self) -> NoReturn:
+        """The last line of a run that was interrupted and has saved; exits with 130."""
+        from franka_wm.training.loggers import close_loggers
+
+        close_loggers(self.loggers)
+        say(f"stopped; go on with: python train.py resume={self.folder}")
+        sys.exit(INTERRUPTED)
+
     def diagnose(self, model: Any, batch: Any) -> tuple[dict[str, float], str | None]:
         """Whether latents collapse and values drift: numbers to log, and a warning."""
         from franka_wm.evaluation.health import training_diagnostics
@@ -345,6 +353,8 @@ def resumed(cfg: DictConfig, overrides: list[str]) -> tuple[Any, DictConfig]:
 
     checkpoint = load_checkpoint(latest_checkpoint(str(cfg.resume)))
     saved = checkpoint.config
+    if "whole_run" in saved:  # the checkpoint is a first stage's
+        saved = OmegaConf.create(OmegaConf.to_container(saved.whole_run))
     changes = []
     for override in overrides:
         name = override.split("=", 1)[0].lstrip("+~")
@@ -386,14 +396,11 @@ def finish(run: Run, trainer: Any) -> None:
     """Closes the loggers, writes the run's page, exports, says the last line; exits with 130 after Ctrl-C."""
     from franka_wm.training.loggers import close_loggers
 
-    interrupted = trainer.interrupted
+    if trainer.interrupted:
+        run.stop()
     close_loggers(run.loggers)
-    if not interrupted:
-        from franka_wm.report.page import write_page
+    from franka_wm.report.page import write_page
 
-        say(f"page:    {write_page(run.folder)}")
-        export_experience(run, trainer)
-    if interrupted:
-        say(f"stopped; go on with: python train.py resume={run.folder}")
-        sys.exit(INTERRUPTED)
+    say(f"page:    {write_page(run.folder)}")
+    export_experience(run, trainer)
     say(f"results: {run.folder}")

@@ -20,6 +20,7 @@ from franka_wm.seeding import derive_seed, seeded
 from franka_wm.training.checkpoint import Checkpoint, save_checkpoint
 from franka_wm.training.learner import Learner
 from franka_wm.training.loggers import log_numbers
+from franka_wm.training.moment import draws, go_on_drawing, put_back, restorable, same_worlds, worlds_now
 from franka_wm.training.progress import Progress, say
 from franka_wm.training.room import fill, held, left_out
 from franka_wm.training.spaces import Spaces
@@ -162,14 +163,17 @@ class Trainer:
                 self.standardize(self.replay.statistics())
             else:
                 assert self._acting is not None
-                if len(self.replay) == 0:
+                anew = len(self.replay) == 0 and (self.learner.updates < total or not self.learner.updates)
+                if anew:
                     self.seed()
                 self._acting.use(self.actor)
             while self.learner.updates < total and not stop():
                 before = self.learner.updates
-                if self.env is not None:
+                done = before % trainer.updates_per_batch  # by a run that ended amid a batch's updates
+                if self.env is not None and (not done or anew):
                     self.gather()
-                for _ in range(min(trainer.updates_per_batch, total - before)):
+                    anew = False
+                for _ in range(min(trainer.updates_per_batch - done, total - before)):
                     self._batch = self._draw()
                     self.learner.update(self._batch, static=self._static(self._batch))
                 self.seconds = time.perf_counter() - started
@@ -219,17 +223,8 @@ class Trainer:
     def gather(self) -> None:
         """One batch of the collector into the replay."""
         if self._experience is None:
-            collector = self.cfg.collector
-            self._collector = Collector(
-                self.env,
-                self._acting,
-                frames_per_batch=collector.steps_per_batch * self.env.num_envs,
-                total_frames=-1,
-                track_traj_ids=False,
-                no_cuda_sync=True,
-                trust_policy=True,
-            )
-            self._experience = iter(self._collector)
+            self._collect()
+        assert self._experience is not None
         batch = next(self._experience)
         self.env_steps += batch.numel()
         keys = [*self._keys, "action", "is_init", *self._extra]
@@ -239,6 +234,21 @@ class Trainer:
             fill(self.replay, batch, self.cfg, updates=self.learner.updates)
         else:
             self.replay.extend(batch)
+
+    def _collect(self) -> Collector:
+        """Starts the collector: it resets all worlds."""
+        collector = self.cfg.collector
+        self._collector = Collector(
+            self.env,
+            self._acting,
+            frames_per_batch=collector.steps_per_batch * self.env.num_envs,
+            total_frames=-1,
+            track_traj_ids=False,
+            no_cuda_sync=True,
+            trust_policy=True,
+        )
+        self._experience = iter(self._collector)
+        return self._collector
 
     # -- what is kept and said ------------------------------------------------------------------------------
 
@@ -314,7 +324,9 @@ class Trainer:
         """Writes ``checkpoints/latest``; with the experience if it is wanted and there is room, or says so."""
         replay = None
         wanted = self.cfg.trainer.checkpoint_replay
-        if self.env is not None and wanted is not False and len(self.replay):
+        # A first stage that is done leaves its weights; the second gathers what it needs itself.
+        needed = "whole_run" not in self.cfg or self.learner.updates < self.cfg.trainer.updates
+        if self.env is not None and wanted is not False and len(self.replay) and needed:
             why = left_out(held(self.replay), self.folder, last=last, wanted=wanted)
             replay = self.experience() if why is None else None
             if why is not None and (last or not self._said):
@@ -327,7 +339,7 @@ class Trainer:
             config=self._config(),
             counters={"env_steps": self.env_steps, "updates": self.learner.updates, "seconds": self.seconds},
             replay=replay,
-            extra={"rows": self.rows, "spaces": self.spaces.as_dict()},
+            extra={"rows": self.rows, "spaces": self.spaces.as_dict(), "moment": self._moment()},
         )
 
     def _config(self) -> DictConfig:
@@ -339,25 +351,59 @@ class Trainer:
         cfg.model.update(own)
         return cfg
 
-    def restore(self, checkpoint: Checkpoint) -> None:
-        """Continues from a checkpoint: weights, optimiser, counters, history, experience, random numbers.
+    def _moment(self) -> dict[str, Any]:
+        """Where worlds, policies and recorded windows stand."""
+        if self.env is None:
+            parts = {"windows": self.replay, "validation": self.validation}
+            return {name: part.get_state() for name, part in parts.items() if part is not None}
+        assert self._acting is not None
+        return {"worlds": worlds_now(self.env, self._collector), "policies": draws(self._acting.policies)}
 
-        The worlds themselves start new episodes.
+    def restore(self, checkpoint: Checkpoint) -> None:
+        """Goes on from a checkpoint as if there had been no interruption, on the CPU to the bit.
+
+        Weights, optimiser, counters, history, experience, worlds, plans, policies, recorded windows and all random
+        numbers are put back. What cannot be is said in a line: experience that the checkpoint was too large for, and
+        worlds of other libraries or of a changed configuration, which start new episodes.
         """
         checkpoint.load_model(self.model)
         checkpoint.load_optimizer(self.learner.optimizer)
+        self.learner.use_rates()
         self.learner.updates = int(checkpoint.counters["updates"])
         self.env_steps = int(checkpoint.counters["env_steps"])
         self.seconds = float(checkpoint.counters["seconds"])
-        self.rows = list((checkpoint.extra() or {}).get("rows", []))
+        extra = checkpoint.extra() or {}
+        self.rows = list(extra.get("rows", []))
         experience = None if self.env is None else checkpoint.replay(self.env.device)
         if experience is not None:
             fill(self.replay, experience, self.cfg, updates=self.learner.updates, restored=True)
-        checkpoint.restore_rng()
+        elif self.env is not None and self.learner.updates < self.cfg.trainer.updates:
+            say("  the checkpoint holds no experience: this run gathers anew and will not be the same")
+        self._restore_moment(checkpoint, extra.get("moment", {}))
+        checkpoint.restore_rng()  # the last: whatever is built draws
+
+    def _restore_moment(self, checkpoint: Checkpoint, moment: Mapping[str, Any]) -> None:
+        """Undoes :meth:`_moment`."""
         if self.env is None:
+            for name, part in {"windows": self.replay, "validation": self.validation}.items():
+                if part is not None and name in moment:
+                    part.set_state(moment[name])
             return
-        # Otherwise the worlds would repeat the episodes that the first run has already seen.
-        self.env.set_seed(self.cfg.seed + self.env_steps)
+        assert self._acting is not None
+        worlds = moment.get("worlds")
+        if worlds is not None and same_worlds(checkpoint.config, self.cfg):
+            put_back(self.env, self._collect(), worlds)
+        else:
+            if restorable(self.env) is None:
+                why = "the simulators of other libraries cannot be put back"
+            else:
+                why = (
+                    "of another configuration" if worlds is not None else "the checkpoint does not hold them"
+                )
+            say(f"  worlds: {why}; they start new episodes, and this run will not be the same")
+            # Not those that the first run has seen already.
+            self.env.set_seed(derive_seed("training", self.cfg.seed, "resumed", self.env_steps))
+        go_on_drawing(self._acting.policies, moment.get("policies", {}), self.env.device)
 
     def experience(self) -> TensorDictBase | None:
         """The filled part of the replay, (worlds, time), in the order in which it was gathered."""

@@ -194,6 +194,14 @@ class RecordedWindows:
         draw = torch.randint(self._count, (count,), device=self._home, generator=self._generator)
         return self.windows(draw)
 
+    def get_state(self) -> Tensor:
+        """Where the generator of :meth:`sample` stands, on the CPU."""
+        return self._generator.get_state()
+
+    def set_state(self, state: Tensor) -> None:
+        """The next samples are those that followed :meth:`get_state`."""
+        self._generator.set_state(state)
+
     def windows(self, indices: Tensor) -> TensorDict:
         """The windows of these numbers.
 
