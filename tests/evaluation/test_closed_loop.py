@@ -32,9 +32,9 @@ def test_the_true_end_of_each_episode(env: FrankaEnv) -> None:
     observation = env.reset(seed=3)
     total = torch.zeros(5)
     for _ in range(LENGTH):
-        observation = env.step(observation.set("action", torch.zeros(5, 7)))["next"]
-        total += observation["reward"].squeeze(-1)
-    assert torch.equal(episodes["final_distance"], observation["state"][:, 17:].norm(dim=-1))
+        step, observation = env.step_and_maybe_reset(observation.set("action", torch.zeros(5, 7)))
+        total += step["next", "reward"].squeeze(-1)
+    assert torch.equal(episodes["final_distance"], step["next", "state"][:, 17:].norm(dim=-1))
     torch.testing.assert_close(episodes["return"], total)
     assert (episodes["length"] == LENGTH).all()
     # Not the distance in the episode that began then.
