@@ -112,6 +112,11 @@ class ExternalEnv(TransformedEnv):
         return out
 
     @property
+    def terminates(self) -> bool:
+        """Whether episodes may end by more than their length: those of the suite do not."""
+        return self.config.kind == "gym"
+
+    @property
     def action_dim(self) -> int:
         """Size of a continuous action, A; the number of moves where actions are discrete."""
         spec = self.action_spec

@@ -368,6 +368,11 @@ class FrankaEnv(EnvBase):
         return STATE_DIM
 
     @property
+    def terminates(self) -> bool:
+        """Whether episodes may end by more than their length."""
+        return self.config.terminate_on_success
+
+    @property
     def reward_bounds(self) -> tuple[float, float] | None:
         """The least and the largest reward of a step; ``None`` where the task does not say."""
         return self.simulation.task.reward_bounds

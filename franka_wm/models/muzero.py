@@ -9,8 +9,9 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from franka_wm.models.groups import decay_groups
-from franka_wm.models.parts import NormedLinear, SimNorm, TwoHotSymlog, initialize, mlp, value_range
+from franka_wm.models.parts import NormedLinear, SimNorm, TwoHotSymlog, initialize, mlp
 from franka_wm.models.pixel_encoder import PixelEncoder
+from franka_wm.models.returns import episode_discount, value_range
 from franka_wm.models.vectors import copy_statistics
 from franka_wm.models.vision import RandomShift, check_image_sizes, check_pictures
 
@@ -463,9 +464,4 @@ def _discount(discount: float | None, episode_length: int | None) -> float:
         if not 0.0 <= discount <= 1.0:
             raise ValueError(f"discount must be in [0, 1], got {discount}")
         return float(discount)
-    if episode_length is None:
-        return 0.997
-    if episode_length < 1:
-        raise ValueError(f"episode_length must be at least 1, got {episode_length}")
-    fifth = episode_length / 5.0
-    return min(max((fifth - 1.0) / fifth, 0.95), 0.995)
+    return 0.997 if episode_length is None else episode_discount(episode_length)

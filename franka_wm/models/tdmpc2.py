@@ -9,16 +9,9 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from franka_wm.models.parts import (
-    Ensemble,
-    GaussianPolicy,
-    RunningScale,
-    SimNorm,
-    TwoHotSymlog,
-    mlp,
-    value_range,
-)
+from franka_wm.models.parts import Ensemble, GaussianPolicy, RunningScale, SimNorm, TwoHotSymlog, mlp
 from franka_wm.models.pixel_encoder import PixelEncoder
+from franka_wm.models.returns import episode_discount, value_range
 from franka_wm.models.streams import beside
 from franka_wm.models.vectors import copy_statistics
 from franka_wm.models.vision import RandomShift, check_image_sizes, check_pictures
@@ -27,7 +20,8 @@ from franka_wm.models.vision import RandomShift, check_image_sizes, check_pictur
 class TDMPC2(nn.Module):
     """Encoder, dynamics, reward, Q-ensemble and policy over one latent space, trained together.
 
-    z = h(s);  z' = d(z, a);  r = R(z, a);  q = Q(z, a);  a = π(z). The defaults are the published
+    z = h(s);  z' = d(z, a);  r = R(z, a);  q = Q(z, a);  a = π(z). Where episodes may terminate, a head on z' says
+    whether they do, for planners (as in the authors' later code). The defaults are the published
     5 M-parameter model for state observations, for pictures with `image_sizes` (shifted at random in `loss`
     in training mode, never while planning), or for both. Latents (..., `latent_dim`) are simplices of `simnorm_dim`
     features, both from the encoder and from the dynamics. Rewards and values are in the units of the
@@ -62,9 +56,10 @@ class TDMPC2(nn.Module):
         bins, value_low, value_high: two-hot code of rewards and values; the range is in symlog space. None:
             derived from `reward_bounds` and the discount, see `value_range`.
         reward_bounds: the least and the largest reward of a step; None: unknown.
+        terminates: whether episodes may terminate; otherwise there is no head for it.
         log_std_min, log_std_max: bounds of the policy's log standard deviation before squashing.
         rho: weight of unroll step t is rho^t.
-        consistency_coef, reward_coef, value_coef: weights of the losses.
+        consistency_coef, reward_coef, value_coef, termination_coef: weights of the losses.
         entropy_coef: weight, against scaled values, of `action_dim` times the entropy [nat] of the Gaussian
             before squashing, as in the authors' code.
         tau: how far target Q-functions, and the policy loss's scale, move at each update.
@@ -104,12 +99,14 @@ class TDMPC2(nn.Module):
         value_low: float | None = None,
         value_high: float | None = None,
         reward_bounds: tuple[float, float] | None = None,
+        terminates: bool = False,
         log_std_min: float = -10.0,
         log_std_max: float = 2.0,
         rho: float = 0.5,
         consistency_coef: float = 20.0,
         reward_coef: float = 0.1,
         value_coef: float = 0.1,
+        termination_coef: float = 1.0,
         entropy_coef: float = 1e-4,
         tau: float = 0.01,
         encoder_lr_scale: float = 0.3,
@@ -151,6 +148,7 @@ class TDMPC2(nn.Module):
         self.rho, self.tau, self.encoder_lr_scale = rho, tau, encoder_lr_scale
         self.consistency_coef, self.reward_coef = consistency_coef, reward_coef
         self.value_coef, self.entropy_coef = value_coef, entropy_coef
+        self.terminates, self.termination_coef = terminates, termination_coef
 
         observation_dim, hidden = sum(sizes.values()), (hidden_dim, hidden_dim)
         pretrained = encoder_from is not None or encoder_architecture is not None
@@ -195,6 +193,7 @@ class TDMPC2(nn.Module):
             log_std_max=log_std_max,
         )
         self.two_hot = TwoHotSymlog(bins, *value_range(value_low, value_high, reward_bounds, self.discount))
+        self.termination_head = mlp(latent_dim, hidden, 1) if terminates else None
         self.scale = RunningScale(tau)
         self.register_buffer("observation_mean", torch.zeros(observation_dim))
         self.register_buffer("observation_std", torch.ones(observation_dim))
@@ -280,6 +279,16 @@ class TDMPC2(nn.Module):
             return self.q(z, action, reduce="mean", first=self.value_members)
         return self.q(z, action, reduce="pair_mean")
 
+    def terminated(self, z: Tensor) -> Tensor:
+        """Whether an episode ends in z (..., latent_dim), likelier than not: (..., 1) bool.
+
+        Raises:
+            ValueError: the model was built for episodes that do not terminate.
+        """
+        if self.termination_head is None:
+            raise ValueError("this model was built without terminates=True: it does not predict ends")
+        return self.termination_head(z) > 0.0
+
     def policy(self, z: Tensor, deterministic: bool = False) -> Tensor:
         """Actions (..., action_dim) in [-1, 1] for z (..., latent_dim): a sample, or the mode."""
         return self.policy_head(z, deterministic=deterministic)
@@ -317,7 +326,7 @@ class TDMPC2(nn.Module):
             batch size []: `loss` to differentiate, and detached: `loss_consistency`, `loss_reward`,
             `loss_value`, `loss_policy`, `q_mean`, `q_target_mean`, `policy_entropy` [nat], `policy_scale`,
             `latent_norm`, `reward_error` (mean absolute), `target_outside` (share of rewards and targets of
-            values that the two-hot code clamps).
+            values that the two-hot code clamps); with `terminates` also `loss_termination`.
 
         Raises:
             ValueError: the batch size is not [B, H].
@@ -348,12 +357,17 @@ class TDMPC2(nn.Module):
             predicted, after, action, reward, target, weight[:-1]
         )
         policy.join(policy_loss, entropy)
+        ends = {}
+        if self.termination_head is not None:  # every step weighs the same, as published
+            logits = self.termination_head(predicted[1:])
+            ends["loss_termination"] = F.binary_cross_entropy_with_logits(logits, terminated.to(logits.dtype))
 
         total = (
             self.consistency_coef * consistency
             + self.reward_coef * reward_loss
             + self.value_coef * value_loss
             + policy_loss
+            + self.termination_coef * sum(ends.values())
         )
         with torch.no_grad():
             q_mean, q_target_mean, latent_norm, reward_error, outside = call["_metrics"](
@@ -371,6 +385,7 @@ class TDMPC2(nn.Module):
             "latent_norm": latent_norm,
             "reward_error": reward_error,
             "target_outside": outside,
+            **{name: loss.detach() for name, loss in ends.items()},
         }
         return TensorDict({"loss": total, **metrics}, batch_size=[])
 
@@ -477,7 +492,4 @@ def _discount(discount: float | None, episode_length: int | None) -> float:
         return float(discount)
     if episode_length is None:
         raise ValueError("give episode_length, from which the discount follows, or discount itself")
-    if episode_length < 1:
-        raise ValueError(f"episode_length must be at least 1, got {episode_length}")
-    fifth = episode_length / 5.0
-    return min(max((fifth - 1.0) / fifth, 0.95), 0.995)
+    return episode_discount(episode_length)

@@ -36,34 +36,55 @@ class RewardPlusValue:
     """Discounted rewards of the H steps plus the discounted value of the last latent.
 
     score = Σ_{t<H} γ^t · reward(z_t, a_t) + γ^H · value(z_H). The value is that of the latent after the last
-    action, so every action counts (TD-MPC2, arXiv:2310.16828, equation 5).
+    action, so every action counts (TD-MPC2, arXiv:2310.16828, equation 5). Where the episode is predicted to have
+    terminated, nothing that follows counts: neither rewards nor the value.
 
     Args:
         reward: (z (..., D), action (..., A)) -> (..., 1).
         value: z (..., D) -> (..., 1).
         discount: γ per step.
+        terminated: z (..., D) -> (..., 1) bool, whether an episode ends there; None: no episode terminates.
 
     Raises:
         ValueError: `discount` outside [0, 1].
     """
 
     def __init__(
-        self, reward: Callable[[Tensor, Tensor], Tensor], value: Callable[[Tensor], Tensor], discount: float
+        self,
+        reward: Callable[[Tensor, Tensor], Tensor],
+        value: Callable[[Tensor], Tensor],
+        discount: float,
+        terminated: Callable[[Tensor], Tensor] | None = None,
     ) -> None:
         if not 0.0 <= discount <= 1.0:
             raise ValueError(f"discount must be in [0, 1], got {discount}")
-        self.reward, self.value, self.discount = reward, value, discount
+        self.reward, self.value, self.discount, self.terminated = reward, value, discount, terminated
+
+    @classmethod
+    def of(cls, model: Any) -> "RewardPlusValue":
+        """Of a model with `reward`, `value` and `discount`; with its `terminated`, if it says `terminates`."""
+        ends = model.terminated if getattr(model, "terminates", False) else None
+        return cls(model.reward, model.value, model.discount, ends)
 
     def compiled(self) -> "RewardPlusValue":
         """The same, with what it calls compiled by `torch.compile`."""
+        ends = self.terminated
         return RewardPlusValue(
-            torch.compile(self.reward, dynamic=False), torch.compile(self.value, dynamic=False), self.discount
+            torch.compile(self.reward, dynamic=False),
+            torch.compile(self.value, dynamic=False),
+            self.discount,
+            None if ends is None else torch.compile(ends, dynamic=False),
         )
 
     def __call__(self, trajectory: Tensor, actions: Tensor) -> Tensor:
         horizon = actions.shape[2]
         rewards = self.reward(trajectory[:, :, :horizon], actions).squeeze(-1)  # (E, S, H), one call
-        score = self.discount**horizon * self.value(trajectory[:, :, horizon]).squeeze(-1)
+        value = self.value(trajectory[:, :, horizon]).squeeze(-1)
+        if self.terminated is not None:
+            ended = self.terminated(trajectory[:, :, 1:]).squeeze(-1).cumsum(-1) > 0  # (E, S, H): by then
+            rewards = torch.cat((rewards[..., :1], rewards[..., 1:].masked_fill(ended[..., :-1], 0.0)), -1)
+            value = value.masked_fill(ended[..., -1], 0.0)
+        score = self.discount**horizon * value
         for t in range(horizon):
             score = score + self.discount**t * rewards[:, :, t]
         return score

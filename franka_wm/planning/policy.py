@@ -147,7 +147,7 @@ class PlannerPolicy(TensorDictModuleBase):
             lacking = [name for name in ("reward", "value", "discount") if not hasattr(model, name)]
             if lacking:
                 raise ValueError(f"{type(model).__name__} has no {', '.join(lacking)}: give an objective")
-            objective = RewardPlusValue(model.reward, model.value, model.discount)
+            objective = RewardPlusValue.of(model)
         return cls(
             planner,
             encode=model.encode,

@@ -189,7 +189,7 @@ def make_model(cfg: DictConfig, surroundings: Any, device: torch.device | str | 
     sizes: dict[str, Any] = {"observation_sizes": spaces.observation_sizes}
     if spaces.image_sizes:
         sizes["image_sizes"] = spaces.image_sizes
-    known = {"reward_bounds": spaces.reward_bounds}
+    known = {"reward_bounds": spaces.reward_bounds, "terminates": spaces.terminates}
     takes = signature(models.family(name)).parameters
     further = {key: value for key, value in known.items() if key in takes}
     try:
@@ -277,7 +277,7 @@ def make_objective(cfg: DictConfig, model: Any) -> Any:
             raise UserError(
                 f"objective=reward_value: model={cfg.model.name} has no {', '.join(lacking)}; use objective=goal_image"
             )
-        chosen: Any = planning.RewardPlusValue(model.reward, model.value, model.discount)
+        chosen: Any = planning.RewardPlusValue.of(model)
     elif name == "goal_image":
         if not hasattr(model, "encode_goal"):
             raise UserError(

@@ -9,7 +9,7 @@ import re
 import sys
 import tempfile
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, NoReturn
 
@@ -212,7 +212,7 @@ class Run:
 
         if not build.is_offline(self.cfg):
             hindsight = build.make_hindsight(self.cfg, env)
-            return build.make_replay_buffer(self.cfg, env.device, hindsight), Spaces.of_env(env)
+            return build.make_replay_buffer(self.cfg, env.device, hindsight), self.as_saved(Spaces.of_env(env))
         windows, self.validation = build.open_recorded(self.cfg, self.device)
         spaces = Spaces(
             observation_sizes=dict(windows.observation_sizes),
@@ -221,8 +221,14 @@ class Run:
             num_actions=windows.num_actions,
             episode_length=windows.episode_length,
             reward_bounds=windows.reward_bounds,
+            terminates=windows.terminates,
         )
-        return windows, spaces
+        return windows, self.as_saved(spaces)
+
+    def as_saved(self, spaces: Any) -> Any:
+        """``spaces`` with what decides on a model's parts as it was when the run that this one goes on from began."""
+        saved = None if self.checkpoint is None else (self.checkpoint.extra() or {}).get("spaces")
+        return spaces if saved is None else replace(spaces, terminates=saved.get("terminates", False))
 
     @property
     def device(self) -> Any:

@@ -28,6 +28,7 @@ class Spaces:
         num_actions: How many moves there are; 0 where actions are continuous.
         episode_length: Steps, at most.
         reward_bounds: The least and the largest reward of a step; ``None`` where unknown.
+        terminates: Whether episodes may end by more than their length.
     """
 
     observation_sizes: Mapping[str, int] = field(default_factory=dict)
@@ -36,6 +37,7 @@ class Spaces:
     num_actions: int = 0
     episode_length: int = 50
     reward_bounds: tuple[float, float] | None = None
+    terminates: bool = False
 
     def only(self, keys: Sequence[str] | None, reader: str) -> Spaces:
         """The same with the observations ``keys`` alone; with every vector but the goal if ``None``.
@@ -99,6 +101,7 @@ class Spaces:
             num_actions=moves if discrete else 0,
             episode_length=config.episode_length,
             reward_bounds=make_task(config).reward_bounds,
+            terminates=config.terminate_on_success,
         )
 
     @classmethod
@@ -122,6 +125,7 @@ class Spaces:
             num_actions=int(action.n) if discrete else 0,
             episode_length=env.config.episode_length,
             reward_bounds=env.reward_bounds,
+            terminates=env.terminates,
         )
 
 

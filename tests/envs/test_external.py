@@ -14,7 +14,9 @@ pytest.importorskip("gymnasium")
 
 def test_moves_and_statistics() -> None:
     env = ExternalEnv(ExternalConfig(kind="gym", name="CartPole-v1"), num_envs=3, seed=1)
-    assert Spaces.of_env(env) == Spaces(observation_sizes={"state": 4}, num_actions=2, episode_length=500)
+    assert Spaces.of_env(env) == Spaces(
+        observation_sizes={"state": 4}, num_actions=2, episode_length=500, terminates=True
+    )
     torch.manual_seed(0)
     data = env.rollout(80, break_when_any_done=False)
     done = data["next", "done"]

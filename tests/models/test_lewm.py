@@ -212,6 +212,31 @@ def test_the_loss_is_what_it_says(dots):
     torch.testing.assert_close(extra["loss"].detach(), total)
 
 
+@pytest.mark.parametrize("rollout", [2, 3, 9])
+def test_the_rollout_loss_compares_predictions_fed_back_with_what_came(rollout, dots):
+    """Step by step, with `observe` and `next`; the first prediction is that of the plain loss, and not counted."""
+    model = small(rollout=rollout, history=2).eval()
+    with torch.no_grad():
+        for block in model.predictor.blocks:
+            block.modulation.weight.normal_(std=0.3)
+    batch, never = dots.windows(6, 4), torch.zeros(6, 1, dtype=torch.bool)
+    z, start = model.encode(batch[:, 0]), max(0, 4 - rollout)
+    for t in range(start):
+        z = model.observe(batch["next"][:, t], z, batch["action"][:, t], never)
+    errors = []
+    for t in range(start, 4):
+        z = model.next(z, batch["action"][:, t])
+        errors.append((model.embed(z) - model.embed(model.encode(batch["next"][:, t]))).square().mean())
+    expected = torch.stack(errors[1:]).mean().detach()
+    torch.testing.assert_close(model.loss(batch)["loss_rollout"], expected, rtol=1e-4, atol=1e-6)
+
+    frames = torch.randn(6, 5, 32, requires_grad=True)  # no stop-gradient: what came is pulled, too
+    model._rollout_loss(frames, batch["action"]).backward()
+    assert frames.grad is not None
+    reached = frames.grad.abs().amax((0, 2)) > 0
+    assert reached[: start + 1][-2:].all() and not reached[start + 1] and reached[start + 2 :].all()
+
+
 def test_inverse_dynamics_pull_the_encoder_and_read_the_actions(dots):
     model = small(inverse_coef=1.0, history=2)
     batch = dots.windows(8, 2)

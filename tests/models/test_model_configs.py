@@ -16,6 +16,7 @@ NOT_IN_FILES = {
     "action_dim",
     "episode_length",
     "reward_bounds",
+    "terminates",
     "encoder_architecture",
     "huggingface_config",
 }

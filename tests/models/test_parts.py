@@ -13,8 +13,8 @@ from franka_wm.models.parts import (
     mlp,
     symexp,
     symlog,
-    value_range,
 )
+from franka_wm.models.returns import value_range
 
 
 @pytest.fixture(autouse=True)

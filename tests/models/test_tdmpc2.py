@@ -206,6 +206,49 @@ def test_the_policy_loss_is_the_published_one():
     torch.testing.assert_close(losses["policy_entropy"], -squashed.mean().detach(), rtol=1e-3, atol=1e-3)
 
 
+def test_ends_are_learned_where_episodes_terminate_and_only_there():
+    """A point that is moved by the action and ends beyond 0.5: the head knows ends that it has not seen."""
+    plain = small()
+    with pytest.raises(ValueError, match="terminates"):
+        plain.terminated(torch.zeros(1, 32))
+    assert "loss_termination" not in plain.loss(windows())
+    torch.manual_seed(0)
+    model = small(observation_sizes={"state": 1}, action_dim=1, terminates=True)
+    optimiser = optimiser_of(model, lr=3e-3)
+
+    def ending(batch):
+        data = _point_mass(batch)
+        data["next", "terminated"] = data["next", "state"] > 0.5
+        return data
+
+    losses = [float(update(model, optimiser, ending(128))["loss_termination"]) for _ in range(200)]
+    assert losses[-1] < 0.3 * losses[0]
+    model.eval()
+    test = ending(500)[:, 0]
+    predicted = model.terminated(model.next(model.encode(test), test["action"]))
+    assert predicted.dtype == torch.bool and predicted.shape == (500, 1)
+    far = (test["next", "state"] - 0.5).abs() > 0.1
+    assert (predicted == test["next", "terminated"])[far].float().mean() > 0.98
+
+
+def test_the_loss_of_ends_is_the_cross_entropy_of_what_is_predicted():
+    batch = windows()
+    batch["next", "terminated"][:2, -1] = True
+    model = small(
+        terminates=True, termination_coef=0.5, consistency_coef=0.0, reward_coef=0.0, value_coef=0.0
+    ).eval()
+    losses = model.loss(batch)
+    z, logits = model.encode(batch[:, 0]), []
+    for t in range(3):
+        z = model.next(z, batch["action"][:, t])
+        assert model.termination_head is not None
+        logits.append(model.termination_head(z))
+    chance = torch.stack(logits, 1).sigmoid()
+    wanted = -torch.where(batch["next", "terminated"], chance.log(), (1 - chance).log()).mean()
+    torch.testing.assert_close(losses["loss_termination"], wanted.detach())
+    torch.testing.assert_close(losses["loss"], losses["loss_policy"] + 0.5 * wanted)
+
+
 def test_one_backward_keeps_policy_and_model_gradients_apart():
     torch.manual_seed(0)
     batch = windows()

@@ -159,6 +159,21 @@ def test_a_sum_adds_weighted_terms_and_binds_them(trajectory, actions):
         Sum([(float("nan"), ActionPenalty(1.0))])
 
 
+def test_nothing_counts_past_a_predicted_end():
+    """One environment; candidates end after no, the first, the second, the last, the first and third step."""
+    ends = torch.tensor([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1], [1, 0, 1]]).bool()
+    trajectory = torch.cat((torch.full((5, 1), 9.0), ends.float()), 1).view(1, 5, 4, 1)
+    arguments = (lambda z, a: a, lambda z: torch.full_like(z, 100.0), 0.5)
+    terminated = lambda z: z == 1.0  # noqa: E731  (the present latent, 9, is not asked)
+    actions = torch.tensor([4.0, 6.0, 8.0]).expand(1, 5, 3).unsqueeze(-1)
+    found = RewardPlusValue(*arguments, terminated)(trajectory, actions)
+    whole = 4.0 + 3.0 + 2.0 + 12.5
+    assert found.flatten().tolist() == [whole, 4.0, 7.0, 9.0, 4.0]
+    assert RewardPlusValue(*arguments)(trajectory, actions).flatten().tolist() == [whole] * 5
+    compiled = RewardPlusValue(*arguments, terminated).compiled()
+    assert compiled.terminated is not None
+
+
 def test_objectives_can_be_copied():
     copied = copy.deepcopy(Sum([(1.0, RewardPlusValue(encode_goal, encode_goal, 0.9)), (1.0, Smoothness(1))]))
     assert len(copied.terms) == 2

@@ -178,10 +178,23 @@ def test_the_range_of_values_holds_the_returns_of_long_episodes(model, scale: st
     assert high("model.value_high=7.5")[0] == 7.5
 
 
+def test_a_head_for_ends_is_there_where_episodes_terminate(composed) -> None:
+    small = ("device=cpu", "env.substeps=1", "collector.num_envs=2")
+    for overrides, there in (((), False), (("env.terminate_on_success=true",), True)):
+        cfg = composed(*small, *overrides)
+        env = build.make_env(cfg)
+        assert Spaces.of_env(env) == Spaces.of_config(env.config)
+        model = build.make_model(cfg, env)
+        policy = build.make_policies(model, build.make_planner(cfg, 7), env)["planner"]
+        assert (model.termination_head is not None) == there
+        assert (policy.objective.terminated is not None) == there
+        assert (build.make_objective(cfg, model).terminated is not None) == there
+
+
 def test_spaces_of_an_older_checkpoint_know_no_bounds() -> None:
     values = Spaces(observation_sizes={"state": 20}, action_dim=7, reward_bounds=(-1.0, 0.0)).as_dict()
-    del values["reward_bounds"]
-    assert Spaces.from_dict(values).reward_bounds is None
+    del values["reward_bounds"], values["terminates"]
+    assert Spaces.from_dict(values).reward_bounds is None and not Spaces.from_dict(values).terminates
 
 
 def test_muzero_sees_ends_and_episodes_shorter_than_its_windows(composed) -> None:

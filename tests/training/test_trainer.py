@@ -17,6 +17,7 @@ from tensordict import TensorDict
 from franka_wm.envs import FrankaEnv
 from franka_wm.training import build, room
 from franka_wm.training.checkpoint import latest_checkpoint, load_checkpoint
+from franka_wm.training.entry import Run
 from franka_wm.training.learner import Learner
 from franka_wm.training.trainer import Trainer
 
@@ -102,6 +103,21 @@ def test_targets_outside_of_the_range_are_said(make: Make, cfg: DictConfig, monk
     said = [line for line in capsys.readouterr().out.splitlines() if "outside" in line]
     assert bool(said) == (low is not None)
     assert all("model.value_low" in line for line in said)
+
+
+def test_weights_fit_when_a_run_goes_on_in_another_environment(make: Make, tmp_path: Path) -> None:
+    """With episodes that end at success and with another reward: parts and ranges stay those of the first start."""
+    trainer = make()
+    trainer.fit()
+    checkpoint = load_checkpoint(latest_checkpoint(trainer.folder))
+    cfg = checkpoint.config.copy()
+    cfg.env.terminate_on_success, cfg.env.action_penalty = True, 5.0
+    env = build.make_env(cfg)
+    _, spaces = Run(cfg=cfg, folder=tmp_path, checkpoint=checkpoint).build_experience(env)
+    model = build.make_model(cfg, spaces, env.device)
+    checkpoint.load_model(model)
+    assert torch.equal(model.two_hot.support, trainer.model.two_hot.support)
+    assert build.make_model(cfg, env).termination_head is not None  # of a run that starts there
 
 
 def test_observations_are_standardized_by_the_seed_data(make: Make) -> None:

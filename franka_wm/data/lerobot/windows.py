@@ -274,6 +274,11 @@ class RecordedWindows:
         least, largest = min(float(r.min()) for r in rewards), max(float(r.max()) for r in rewards)
         return (least, largest) if math.isfinite(least) and math.isfinite(largest) else None
 
+    @property
+    def terminates(self) -> bool:
+        """Whether any episode of the data terminated."""
+        return any(bool(ends.any()) for ends in self.recording.arrays.get("next.terminated", ()))
+
     def statistics(self) -> dict[str, Moments]:
         """Mean, deviation, least and largest of each vector observation and of ``action``, over this split.
 
