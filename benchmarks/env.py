@@ -104,7 +104,7 @@ def measure(name: str, worlds: int, device: str, seconds: float) -> dict:
         free = torch.cuda.mem_get_info()[0]
     started = time.perf_counter()
     env = FrankaEnv(config, num_envs=worlds, device=device)
-    env.step(env.rand_action(env.reset()))
+    env.step_and_maybe_reset(env.rand_action(env.reset()))
     startup = time.perf_counter() - started
     memory = (free - torch.cuda.mem_get_info()[0]) / worlds / 2**10 if on_gpu else float("nan")
     env.simulation.step_count.random_(0, config.episode_length)
