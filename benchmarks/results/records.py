@@ -18,6 +18,7 @@ import yaml
 from benchmarks.results.rows import Row
 from franka_wm.errors import UserError
 from franka_wm.report import written_whole
+from franka_wm.report.results import read_result
 from franka_wm.report.run import SAME_BUT, read_config
 from franka_wm.report.source import ROOT
 from franka_wm.report.versions import PACKAGES
@@ -29,7 +30,6 @@ FREE = (
     "device",
     "logger",
     "evaluation.video_episodes",
-    "evaluation.thorough",
     "trainer.checkpoint_replay",
 )
 """Arguments that a run may have beside its row's, or lack: they change none of its numbers."""
@@ -47,28 +47,26 @@ def record_run(row: Row, folder: Path, *, jobs: int, commit: str | None = None) 
     Raises:
         UserError: It did not finish, was resumed, is not a run of this row, or ran on another kind of machine.
     """
-    versions, finished, found = (
-        read_json(folder / f"{name}.json") for name in ("versions", "finished", "evaluation")
-    )
+    made = (read_json(folder / "versions.json") or {}) | (read_json(folder / "finished.json") or {})
     config = read_config(folder)
-    if not versions or not finished or not found:
+    if "source" not in made or not (folder / "evaluation.json").is_file():
         raise UserError(f"{folder}: not the folder of a run that finished; results need the whole run")
     if config.get("resume"):
         raise UserError(f"{folder}: a run that was resumed; results need runs in one piece")
     typed = overrides(folder)
     check_arguments(row, typed, folder)
-    check_machine(row, versions, folder)
-    policies = found.get("policies", found)  # earlier versions wrote the policies alone
+    check_machine(row, made, folder)
+    found = read_result(folder / "evaluation.json")
     kept = {name: value for name, value in config.items() if name not in SAME_BUT}
     return {
         "row": row.name,
         "seed": config["seed"],
         "command": shlex.join(["python", "train.py", *typed]),
-        **_made_with(versions, jobs, commit),
-        "training": _training(folder) | {"command_seconds": finished["seconds"]},
-        "protocol": found.get("protocol"),
-        "policies": policies,
-        "code": {"files": finished["source"], "config": kept},
+        **_made_with(made, jobs, commit),
+        "training": _training(folder) | {"command_seconds": made["seconds"]},
+        "protocol": found.protocol,
+        "policies": found.policies,
+        "code": {"files": made["source"], "config": kept},
     }
 
 

@@ -84,7 +84,9 @@ def rectangles(area, aspect, count=4000, grid=(1, 16, 16)):
     return rows, columns
 
 
-@pytest.mark.parametrize(("aspect", "height", "width"), [(4.0, 8, 2), (0.25, 2, 8), (1.0, 4, 4), (100.0, 16, 1)])
+@pytest.mark.parametrize(
+    ("aspect", "height", "width"), [(4.0, 8, 2), (0.25, 2, 8), (1.0, 4, 4), (100.0, 16, 1)]
+)
 def test_blocks_have_the_area_and_aspect_that_was_asked_for(aspect, height, width):
     rows, columns = rectangles(16.0, (aspect, aspect))
     # A block begins between two rows; one row more or less is rounding, none on average.

@@ -70,7 +70,7 @@ def make_run(tmp_path: Path) -> Callable[..., Path]:
             yaml.safe_dump(now | {"seed": seed, "device": "cpu"} | (config or {}))
         )
         policies = {"planner": policy(distance, within), "noop": policy(0.25, 0.0)}
-        found = policies if protocol is None else {"protocol": protocol, "policies": policies}
+        found = {"protocol": protocol or {}, "policies": policies}
         (run / "evaluation.json").write_text(json.dumps(found))
         counters = {"env_steps": 200, "updates": 30, "seconds": 30.0 + seed - 100}
         (run / "checkpoints" / "latest" / "counters.json").write_text(json.dumps(counters))
@@ -110,11 +110,6 @@ def test_a_record_holds_what_the_run_wrote(make_run) -> None:
     machine = {"processor": "a processor", "cores": 2, "threads": 2, "gpu": None, "jobs": 3}
     assert record["machine"] == machine
     assert record["training"] == {"env_steps": 200, "updates": 30, "seconds": 30.0, "command_seconds": 40}
-
-
-def test_a_record_of_the_format_before(make_run) -> None:
-    record = records.record_run(ROW, make_run(100, 0.01), jobs=1)
-    assert set(record["policies"]) == {"planner", "noop"} and record["protocol"] is None
 
 
 def test_both_stages_count(make_run, tmp_path) -> None:
