@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import math
-import platform
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Any, cast
 
 import torch
@@ -25,6 +23,7 @@ from franka_wm.evaluation.closed_loop import (
 )
 from franka_wm.report.results import point
 from franka_wm.report.table import evaluation_tables, markdown
+from franka_wm.report.versions import processor
 
 EPISODES = 100
 """Episodes per policy, if not said otherwise."""
@@ -179,11 +178,8 @@ def hardware(device: torch.device) -> str:
     """What computes: the GPU's name, or the processor's and the threads that torch uses."""
     if device.type == "cuda":
         return torch.cuda.get_device_name(device)
-    told = Path("/proc/cpuinfo")
-    lines = told.read_text().splitlines() if told.is_file() else []
-    name = next((line.partition(":")[2].strip() for line in lines if line.startswith("model name")), "")
     threads = torch.get_num_threads()
-    return f"{name or platform.processor() or platform.machine()}, {threads} thread{'s' * (threads > 1)}"
+    return f"{processor()}, {threads} thread{'s' * (threads > 1)}"
 
 
 def thresholds(env: Any) -> list[float]:

@@ -198,7 +198,7 @@ class Run:
             env = build.make_env(self.cfg) if gathers else None
             for one in (env, judge):
                 if one is not None:
-                    one.step(one.rand_action(one.reset()))
+                    one.step_and_maybe_reset(one.rand_action(one.reset()))
                     one.statistics()
                     one.set_seed(self.cfg.seed)
         return env, judge

@@ -10,6 +10,7 @@ import torch
 from examples.add_a_task import HEIGHT, RaiseTool
 from franka_wm.data.policies import NoopPolicy, OraclePolicy, SmoothRandomPolicy
 from franka_wm.envs import FrankaConfig, FrankaEnv
+from franka_wm.envs.tasks import Reach, Track
 from franka_wm.evaluation.closed_loop import play_episodes, reaches
 from franka_wm.evaluation.protocol import Evaluation, describe, evaluate_policies, numbers_to_log, thresholds
 from franka_wm.evaluation.robustness import verdict_of_success
@@ -65,6 +66,18 @@ def test_reach_is_judged_by_distances_as_ever(small_env) -> None:
     assert torch.equal(rows["success"], (rows["final_distance"] < 0.3).float()) and rows["success"].sum() > 0
     assert list(told["success"]) == ["0.3", "0.05", "0.025", "0.01"] and "measures" not in told
     assert told["success"]["0.3"]["mean"] == rows["success"].mean()
+
+
+def test_a_subclass_of_reach_that_judges_otherwise_is_judged_by_itself() -> None:
+    class Otherwise(Reach):
+        def judge(self, sim) -> None: ...
+
+    class Near(Otherwise):
+        goal_distance = True
+
+    config = FrankaConfig()
+    assert Reach(config).goal_distance and Track(config).goal_distance and Near(config).goal_distance
+    assert not (Otherwise(config).goal_distance or RaiseTool(config).goal_distance)
 
 
 def test_no_distance_is_shown_anywhere(env: FrankaEnv, found: Evaluation) -> None:

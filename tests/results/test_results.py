@@ -112,6 +112,13 @@ def test_a_record_holds_what_the_run_wrote(make_run) -> None:
     assert record["training"] == {"env_steps": 200, "updates": 30, "seconds": 30.0, "command_seconds": 40}
 
 
+def test_a_run_whose_evaluation_is_of_an_older_form_is_refused(make_run) -> None:
+    run = make_run(100, 0.01)
+    (run / "evaluation.json").write_text(json.dumps({"planner": policy(0.01, 1.0)}))
+    with pytest.raises(UserError, match="older form"):
+        records.record_run(ROW, run, jobs=1)
+
+
 def test_both_stages_count(make_run, tmp_path) -> None:
     run = make_run(100)
     first = run / "pretrained" / "checkpoints" / "latest"

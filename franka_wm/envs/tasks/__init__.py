@@ -27,10 +27,6 @@ class Task:
         config: The environment's.
     """
 
-    goal_distance = False
-    """Whether success is to have the tool near ``task_goal``. Then evaluation reports the distance, and success within
-    several distances; of other tasks it reports what ``judge`` writes into ``success``."""
-
     def __init__(self, config: FrankaConfig):
         self.config = config
 
@@ -41,6 +37,15 @@ class Task:
         ``None``: unknown. A class attribute is enough: ``reward_bounds = (-1.0, 0.0)``.
         """
         return None
+
+    @property
+    def goal_distance(self) -> bool:
+        """Whether success is to have the tool near ``task_goal``.
+
+        Then evaluation reports the distance, and success within several distances, and else what ``judge`` writes into
+        ``success``. A class attribute is enough.
+        """
+        return False
 
     def reset(self, sim: Simulation, mask: wp.array) -> None:
         """Writes ``sim.warp.task_goal`` (N, 3), and ``sim.warp.goal_q`` (N, 7) if known, where ``mask`` (N,)."""
@@ -58,6 +63,14 @@ class Task:
         ``next_true_state`` is ``next_state`` without observation noise."""
         raise NotImplementedError(f"{type(self).__name__} gives no reward")
 
+    def measures(self, sim: Simulation) -> dict[str, torch.Tensor]:
+        """What else evaluation reports, by names with their units: (N,) each, after a step; the episode's last counts.
+
+        Computed with torch, outside the captured step, from ``sim.next_true_state`` (N, 20): finished worlds have
+        been reset already.
+        """
+        return {}
+
     relabel: Callable[[TensorDictBase, torch.Tensor], TensorDictBase] | None = None
     """Recorded transitions as if the goal had been another, where the task can say so in torch: see `Reach.relabel`."""
 
@@ -69,14 +82,6 @@ class Task:
             return next(i for i, one in enumerate(cls.__mro__) if name in vars(one))
 
         return cls.relabel is not None and owner("relabel") <= min(owner("judge"), owner("advance"))
-
-    def measures(self, sim: Simulation) -> dict[str, torch.Tensor]:
-        """What else evaluation reports, by names with their units: (N,) each, after a step; the episode's last counts.
-
-        Computed with torch, outside the captured step, from ``sim.next_true_state`` (N, 20): finished worlds have
-        been reset already.
-        """
-        return {}
 
 
 def make_task(config: FrankaConfig) -> Task:
