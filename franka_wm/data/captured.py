@@ -41,9 +41,6 @@ class CapturedSampling:
         Raises:
             UserError: There are fewer steps than a window has.
         """
-        self._calls += 1
-        if self._calls <= self.EAGER_CALLS:
-            return self.replay.sample()
         storage: Any = self.replay.storage
         sampler = self.replay.sampler
         assert isinstance(sampler, WindowSampler)
@@ -51,34 +48,41 @@ class CapturedSampling:
         data = storage._storage
         memory = (id(data), data.get(sampler.boundary).data_ptr())
         if memory != self._memory:
-            self._record(data, sampler)
-            self._memory = memory
-        assert self._graph is not None and self._batch is not None
+            self._choices = torch.ones((), dtype=torch.float64, device=data.device)
+            self._oldest = torch.zeros((), dtype=torch.int64, device=data.device)
+            self._newest = torch.zeros((), dtype=torch.int64, device=data.device)
+            self._memory, self._graph = memory, None
         self._choices.fill_(span * data.shape[1])
         self._oldest.fill_(oldest)
         self._newest.fill_(newest_step(self.replay))
-        self._graph.replay()
+        if self._graph is None and self._calls >= self.EAGER_CALLS:
+            self._graph = self._record(data, sampler)
+        self._calls += 1
+        if (
+            self._graph is None
+        ):  # by the same draws as the graph's: a resumed run, eager again, gets the same batches
+            self._draw(data, sampler)
+        else:
+            self._graph.replay()
+        assert self._batch is not None
         if self._crossing is not None:
             sampler.record_missing(self._crossing)
         return self._batch
 
     def is_static(self, batch: TensorDictBase) -> bool:
         """Whether later batches will lie in the memory of this one."""
-        return batch is self._batch
+        return self._graph is not None and batch is self._batch
 
-    def _record(self, data: Any, sampler: WindowSampler) -> None:
-        device, size = data.device, self.replay._batch_size
-        assert size is not None
-        self._choices = torch.ones((), dtype=torch.float64, device=device)
-        self._oldest = torch.zeros((), dtype=torch.int64, device=device)
-        self._newest = torch.zeros((), dtype=torch.int64, device=device)
+    def _record(self, data: Any, sampler: WindowSampler) -> torch.cuda.CUDAGraph:
         graph = torch.cuda.CUDAGraph()
         with torch.cuda.graph(graph, capture_error_mode="thread_local"):
-            self._draw(data, sampler, size)
-        self._graph = graph
+            self._draw(data, sampler)
+        return graph
 
-    def _draw(self, data: Any, sampler: WindowSampler, size: int) -> None:
+    def _draw(self, data: Any, sampler: WindowSampler) -> None:
         """Draws a batch; everything that changes from call to call is read from tensors."""
+        size = self.replay._batch_size
+        assert size is not None
         uniform = torch.rand(sampler.candidates(size), dtype=torch.float64, device=data.device)
         # The largest product rounds up to the number of choices itself for huge buffers only; hence the bound.
         draw = torch.minimum(uniform * self._choices, self._choices - 1.0).long()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 
 import torch
 from tensordict import TensorDictBase
@@ -67,6 +68,18 @@ class SmoothRandomPolicy(TensorDictModuleBase):
             s = self.smoothness
             self._present = torch.where(is_init, noise, s * self._present + math.sqrt(1 - s * s) * noise)
         return tensordict.set("action", self._present.clamp(-1.0, 1.0))
+
+    def get_state(self) -> dict[str, torch.Tensor | None]:
+        """What the next actions depend on: the last one, and where the generator stands."""
+        generator = None if self.generator is None else self.generator.get_state()
+        return {"generator": generator, "present": self._present}
+
+    def set_state(self, state: Mapping[str, torch.Tensor | None], device: torch.device | str = "cpu") -> None:
+        """Goes on from what :meth:`get_state` gave; actions are on ``device``."""
+        if self.generator is not None and (generator := state["generator"]) is not None:
+            self.generator.set_state(generator)
+        present = state["present"]
+        self._present = None if present is None else present.to(device)
 
 
 class OraclePolicy(TensorDictModuleBase):
@@ -197,3 +210,12 @@ class RandomMovesPolicy(TensorDictModuleBase):
             self.num_actions, is_init.shape[:-1], device=is_init.device, generator=self.generator
         )
         return tensordict.set("action", action)
+
+    def get_state(self) -> dict[str, torch.Tensor | None]:
+        """Where the generator stands."""
+        return {"generator": None if self.generator is None else self.generator.get_state()}
+
+    def set_state(self, state: Mapping[str, torch.Tensor | None], device: torch.device | str = "cpu") -> None:
+        """Goes on from what :meth:`get_state` gave."""
+        if self.generator is not None and (generator := state["generator"]) is not None:
+            self.generator.set_state(generator)

@@ -43,6 +43,9 @@ from franka_wm.training.tree import read_tree, save_tensors, tree_files, write_j
 
 FORMAT_VERSION = 1
 
+FIRST_STAGE = "pretrained"
+"""Folder of the first stage, in that of its run."""
+
 type Optimizers = Optimizer | Mapping[str, Optimizer]
 
 _MANIFEST = "manifest.json"
@@ -334,7 +337,8 @@ def load_checkpoint(folder: str | Path) -> Checkpoint:
 def latest_checkpoint(folder: str | Path) -> Path:
     """The checkpoint that was written last in a run's folder, or `folder` itself if it is one.
 
-    Looks at `folder`, at the folders in it, and at those in its `checkpoints/`.
+    Looks at `folder`, at the folders in it, and at those in its `checkpoints/`; if there is none, at those of the run's
+    first stage.
 
     Raises:
         UserError: there is none.
@@ -343,16 +347,22 @@ def latest_checkpoint(folder: str | Path) -> Path:
     if _find(run) is not None:
         return run
     places = [run, run / "checkpoints"]
-    inside = [entry for place in places if place.is_dir() for entry in place.iterdir() if entry.is_dir()]
-    # A NAME.old that lost its NAME to a kill stands for NAME.
-    names = {p.with_name(p.name.removesuffix(_OLD)) for p in inside if not p.name.endswith(_WRITING)}
-    found = [(_saved_at(whole), name) for name in names if (whole := _find(name)) is not None]
+    # A run that ended in its first stage has a checkpoint of that one alone.
+    found = _found(places) or _found([run / FIRST_STAGE / "checkpoints"])
     if not found:
         raise UserError(
             f"no checkpoint in {folder}: expected a checkpoint (a folder with a {_MANIFEST}) or a run's "
             "folder that holds one; give a folder that a training run wrote."
         )
     return max(found)[1]
+
+
+def _found(places: Sequence[Path]) -> list[tuple[int, Path]]:
+    """Time of saving and name of every checkpoint in some folders."""
+    inside = [entry for place in places if place.is_dir() for entry in place.iterdir() if entry.is_dir()]
+    # A NAME.old that lost its NAME to a kill stands for NAME.
+    names = {p.with_name(p.name.removesuffix(_OLD)) for p in inside if not p.name.endswith(_WRITING)}
+    return [(_saved_at(whole), name) for name in names if (whole := _find(name)) is not None]
 
 
 # -- comparing -------------------------------------------------------------------------------------------

@@ -11,11 +11,12 @@ import tempfile
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
 from omegaconf import DictConfig, OmegaConf
 
 from franka_wm.errors import FrankaError, UserError
+from franka_wm.seeding import derive_seed, seeded
 from franka_wm.training.progress import announced, say
 
 INTERRUPTED = 130
@@ -198,9 +199,10 @@ class Run:
             env = build.make_env(self.cfg) if gathers else None
             for one in (env, judge):
                 if one is not None:
-                    one.step_and_maybe_reset(one.rand_action(one.reset()))
+                    with seeded(0):  # how many worlds there are must not decide what a run draws later
+                        one.step_and_maybe_reset(one.rand_action(one.reset()))
                     one.statistics()
-                    one.set_seed(self.cfg.seed)
+                    one.set_seed(derive_seed("training" if one is env else "evaluation", self.cfg.seed))
         return env, judge
 
     def build_experience(self, env: Any) -> tuple[Any, Any]:
@@ -250,6 +252,14 @@ class Run:
 
         log_video(self.loggers, name, frames, fps=fps, step=self.cfg.trainer.updates)
 
+    def stop(self) -> NoReturn:
+        """The last line of a run that was interrupted and has saved; exits with 130."""
+        from franka_wm.training.loggers import close_loggers
+
+        close_loggers(self.loggers)
+        say(f"stopped; go on with: python train.py resume={self.folder}")
+        sys.exit(INTERRUPTED)
+
     def diagnose(self, model: Any, batch: Any) -> tuple[dict[str, float], str | None]:
         """Whether latents collapse and values drift: numbers to log, and a warning."""
         from franka_wm.evaluation.health import training_diagnostics
@@ -292,7 +302,7 @@ def start(cfg: DictConfig) -> Run:
     check(cfg)
     device = resolve_device(cfg.device)
     logging.getLogger("torchrl").setLevel(logging.WARNING)
-    torch.manual_seed(cfg.seed)
+    torch.manual_seed(derive_seed("weights", cfg.seed))
     if device.type == "cuda":
         torch.set_float32_matmul_precision("high")
     claim(folder)
@@ -332,6 +342,8 @@ def resumed(cfg: DictConfig, overrides: list[str]) -> tuple[Any, DictConfig]:
 
     checkpoint = load_checkpoint(latest_checkpoint(str(cfg.resume)))
     saved = checkpoint.config
+    if "whole_run" in saved:  # the checkpoint is a first stage's
+        saved = OmegaConf.create(OmegaConf.to_container(saved.whole_run))
     changes = []
     for override in overrides:
         name = override.split("=", 1)[0].lstrip("+~")
@@ -374,15 +386,12 @@ def finish(run: Run, trainer: Any) -> None:
     from franka_wm.report.versions import write_finished
     from franka_wm.training.loggers import close_loggers
 
-    interrupted = trainer.interrupted
+    if trainer.interrupted:
+        run.stop()
     close_loggers(run.loggers)
-    if not interrupted:
-        write_finished(run.folder)
-        from franka_wm.report.page import write_page
+    write_finished(run.folder)
+    from franka_wm.report.page import write_page
 
-        say(f"page:    {write_page(run.folder)}")
-        export_experience(run, trainer)
-    if interrupted:
-        say(f"stopped; go on with: python train.py resume={run.folder}")
-        sys.exit(INTERRUPTED)
+    say(f"page:    {write_page(run.folder)}")
+    export_experience(run, trainer)
     say(f"results: {run.folder}")

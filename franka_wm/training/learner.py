@@ -134,6 +134,19 @@ class Learner:
             factor *= 0.5 * (1.0 + math.cos(math.pi * min(1.0, past)))
         return factor
 
+    def use_rates(self) -> None:
+        """Goes back to the learning rates that were asked for, after an optimiser's state was loaded.
+
+        A schedule sets them at every update anyway.
+        """
+        if self._scheduled:
+            return
+        for group, rate in zip(self.optimizer.param_groups, self._rates, strict=True):
+            if isinstance(group["lr"], torch.Tensor):
+                group["lr"].fill_(rate)
+            else:
+                group["lr"] = rate
+
     def _set_rates(self) -> None:
         factor = self.rate(self.updates)
         for group, rate in zip(self.optimizer.param_groups, self._rates, strict=True):

@@ -9,8 +9,12 @@ from __future__ import annotations
 import gc
 from typing import TYPE_CHECKING, Any
 
+from omegaconf import open_dict
+
 from franka_wm.errors import UserError
+from franka_wm.seeding import derive_seed
 from franka_wm.training import build
+from franka_wm.training.checkpoint import FIRST_STAGE
 from franka_wm.training.learner import Learner
 from franka_wm.training.progress import say
 from franka_wm.training.spaces import Spaces
@@ -19,16 +23,15 @@ from franka_wm.training.trainer import Trainer
 if TYPE_CHECKING:
     from franka_wm.training.entry import Run
 
-FOLDER = "pretrained"
-
 
 def pretrain(run: Run, env: Any, experience: Any, spaces: Spaces) -> None:
     """The first stage, if ``cfg.pretrain`` asks for one; ``cfg.model.encoder_from`` then names its checkpoint.
 
-    Experience comes from smooth random motion, or from the recorded data. A run that resumes has its encoder already.
+    Experience comes from smooth random motion, or from the recorded data. A run that resumes goes on with the stage in
+    which it ended; in the second it has its encoder already.
 
     Args:
-        run: Its configuration is changed: the second stage starts from what was learned here.
+        run: Its configuration is changed: the second stage starts from what was learned here, and from no checkpoint.
         env: The training worlds; ``None`` on recorded data.
         experience: Recorded windows; not used where there are worlds.
         spaces: Of observations and actions.
@@ -37,18 +40,22 @@ def pretrain(run: Run, env: Any, experience: Any, spaces: Spaces) -> None:
         UserError: The model takes no pretrained encoder.
     """
     cfg = run.cfg
-    if cfg.pretrain.kind == "none" or run.checkpoint is not None:
+    begun = run.checkpoint if run.checkpoint is not None and "whole_run" in run.checkpoint.config else None
+    if cfg.pretrain.kind == "none" or (run.checkpoint is not None and begun is None):
         return
     first = cfg.copy()
+    with open_dict(first):
+        first.whole_run = cfg  # so that this stage's checkpoint resumes the run, not the stage alone
     first.model = cfg.pretrain.model
     first.trainer.updates = cfg.pretrain.updates
-    first.trainer.checkpoint_replay = False
     first.export.kind = "none"
     model = build.make_model(first, spaces, run.device)
     say(f"first stage: {cfg.pretrain.model.name}, {cfg.pretrain.updates} updates on pictures alone")
     policies = {}
     if env is not None:
-        policies = build.make_scripted_policies(env, seed=cfg.seed, smoothness=cfg.collector.smoothness)
+        policies = build.make_scripted_policies(
+            env, seed=derive_seed("policies", cfg.seed, FIRST_STAGE), smoothness=cfg.collector.smoothness
+        )
     trainer = Trainer(
         env=env,
         learner=Learner(model, **run.learner_options(first)),
@@ -56,18 +63,21 @@ def pretrain(run: Run, env: Any, experience: Any, spaces: Spaces) -> None:
         policies=policies,
         actor="random",
         cfg=first,
-        folder=run.folder / FOLDER,
+        folder=run.folder / FIRST_STAGE,
         loggers=[],
         evaluate=dict,
         spaces=spaces,
         validation=run.validation,
     )
+    if begun is not None:
+        trainer.restore(begun)
+        run.checkpoint = None
     trainer.fit()
     if trainer.interrupted:
-        raise KeyboardInterrupt
+        run.stop()
     del trainer
     gc.collect()  # these hold one another, and the second stage needs the memory of the first one's replay
-    cfg.model.encoder_from = str(run.folder.absolute() / FOLDER / "checkpoints" / "latest")
+    cfg.model.encoder_from = str(run.folder.absolute() / FIRST_STAGE / "checkpoints" / "latest")
     say("second stage: dynamics on the frozen encoder")
 
 

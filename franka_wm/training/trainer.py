@@ -5,7 +5,7 @@ from __future__ import annotations
 import signal
 import time
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
 from typing import Any, cast
 
@@ -16,10 +16,12 @@ from tensordict.nn import TensorDictModuleBase
 from torchrl.collectors import Collector
 
 from franka_wm.data.captured import CapturedSampling
+from franka_wm.seeding import derive_seed, seeded
 from franka_wm.training.build import explore
 from franka_wm.training.checkpoint import Checkpoint, save_checkpoint
 from franka_wm.training.learner import Learner
 from franka_wm.training.loggers import log_numbers
+from franka_wm.training.moment import draws, go_on_drawing, put_back, restorable, same_worlds, worlds_now
 from franka_wm.training.progress import Progress, say
 from franka_wm.training.room import fill, held, left_out
 from franka_wm.training.spaces import Spaces
@@ -70,6 +72,16 @@ def interruptible() -> Iterator[Any]:
             signal.signal(number, handler)
 
 
+EVALUATION_SHARE = 0.1
+"""Evaluations while training are left out once they have taken more than this share of the training's time, unless
+``evaluation.every`` asks for them. The weights are the same with and without."""
+
+
+def evaluation_period(cfg: DictConfig) -> int:
+    """Updates between evaluations while training: ``evaluation.every``, or an eighth of the run."""
+    return max(1, -(-cfg.trainer.updates // 8)) if cfg.evaluation.every is None else cfg.evaluation.every
+
+
 class Trainer:
     """Gathers experience and learns from it, in turns.
 
@@ -77,12 +89,13 @@ class Trainer:
         env: The training worlds; ``None`` on recorded data.
         learner: Updates the model.
         replay: Receives (worlds, time) batches, gives windows; or recorded windows.
-        policies: By name; ``random`` gathers the first steps, ``actor`` the rest.
+        policies: By name, for the training worlds alone; ``random`` gathers the first steps, ``actor`` the rest.
         actor: Which of them acts.
         cfg: The whole configuration; saved with every checkpoint.
         folder: Of the run.
         loggers: TorchRL loggers.
-        evaluate: Called now and then with nothing, returns numbers to log.
+        evaluate: Called now and then with nothing, returns numbers to log. What it and ``diagnose`` draw at random
+            comes from generators of their own: they do not change what is learned.
         spaces: What the model was built for; the environment's if not given.
         validation: Recorded windows that training never sees; their losses are logged.
         diagnose: From model and batch to numbers to log and, if something is going wrong, a warning.
@@ -116,7 +129,8 @@ class Trainer:
         self.validation = validation
         self.diagnose = diagnose
         self._batch: TensorDictBase | None = None
-        self._said = False
+        self._said = self._said_too_long = False
+        self._evaluated = 0.0  # s
         self._draw, self._static = replay.sample, lambda batch: False
         if learner.capture and env is not None:
             self._draw = sampling = CapturedSampling(replay)
@@ -147,20 +161,25 @@ class Trainer:
         progress = Progress(
             total, done=self.learner.updates, env_steps=self.env_steps, every=trainer.log_every
         )
-        evaluated = saved = time.perf_counter()
+        saved = time.perf_counter()
+        every = evaluation_period(self.cfg)
         ahead = sorted(steps for steps in self.cfg.evaluation.get("at_steps", []) if steps > self.env_steps)
         with interruptible() as stop:
             if self.env is None:
                 self.standardize(self.replay.statistics())
             else:
                 assert self._acting is not None
-                if len(self.replay) == 0:
+                anew = len(self.replay) == 0 and (self.learner.updates < total or not self.learner.updates)
+                if anew:
                     self.seed()
                 self._acting.use(self.actor)
             while self.learner.updates < total and not stop():
-                if self.env is not None:
+                before = self.learner.updates
+                done = before % trainer.updates_per_batch  # by a run that ended amid a batch's updates
+                if self.env is not None and (not done or anew):
                     self.gather()
-                for _ in range(min(trainer.updates_per_batch, total - self.learner.updates)):
+                    anew = False
+                for _ in range(min(trainer.updates_per_batch - done, total - before)):
                     self._batch = self._draw()
                     self.learner.update(self._batch, static=self._static(self._batch))
                 self.seconds = time.perf_counter() - started
@@ -170,9 +189,15 @@ class Trainer:
                     self.log(progress)
                 reached = bool(ahead) and self.env_steps >= ahead[0]
                 ahead = [steps for steps in ahead if steps > self.env_steps]
-                if (reached or now - evaluated >= self.cfg.evaluation.every) and not last:
-                    evaluated = self.record(self.evaluate(), say_it=True)
-                    started += evaluated - now  # seconds count training, not evaluation
+                passed = self.learner.updates // every > before // every
+                if (reached or (passed and not self._too_long())) and not last:
+                    with self.aside("evaluation"):
+                        numbers = self.evaluate()
+                    if numbers:
+                        self.record(numbers, say_it=True)
+                    spent = time.perf_counter() - now
+                    self._evaluated += spent
+                    started += spent  # seconds count training, not evaluation
                 if now - saved >= trainer.checkpoint_every and not last:
                     self.save(last=False)
                     saved = time.perf_counter()
@@ -204,17 +229,8 @@ class Trainer:
     def gather(self) -> None:
         """One batch of the collector into the replay."""
         if self._experience is None:
-            collector = self.cfg.collector
-            self._collector = Collector(
-                self.env,
-                self._acting,
-                frames_per_batch=collector.steps_per_batch * self.env.num_envs,
-                total_frames=-1,
-                track_traj_ids=False,
-                no_cuda_sync=True,
-                trust_policy=True,
-            )
-            self._experience = iter(self._collector)
+            self._collect()
+        assert self._experience is not None
         batch = next(self._experience)
         self.env_steps += batch.numel()
         keys = [*self._keys, "action", "is_init", *self._extra]
@@ -225,7 +241,40 @@ class Trainer:
         else:
             self.replay.extend(batch)
 
+    def _collect(self) -> Collector:
+        """Starts the collector: it resets all worlds."""
+        collector = self.cfg.collector
+        self._collector = Collector(
+            self.env,
+            self._acting,
+            frames_per_batch=collector.steps_per_batch * self.env.num_envs,
+            total_frames=-1,
+            track_traj_ids=False,
+            no_cuda_sync=True,
+            trust_policy=True,
+        )
+        self._experience = iter(self._collector)
+        return self._collector
+
     # -- what is kept and said ------------------------------------------------------------------------------
+
+    def _too_long(self) -> bool:
+        """Whether evaluations have taken more of the time than they may; where ``every`` is given, they may."""
+        if self.cfg.evaluation.every is not None or self._evaluated <= EVALUATION_SHARE * self.seconds:
+            return False
+        if not self._said_too_long:
+            say(
+                "  evaluations take long here: some are left out; evaluation.every=UPDATES asks for all of them"
+            )
+            self._said_too_long = True
+        return True
+
+    def aside(self, purpose: str) -> AbstractContextManager[None]:
+        """Around what only looks on: it draws from seeds of its own, and training goes on as if it had not been.
+
+        How often and when that happens depends on the machine and on what is wanted to be known.
+        """
+        return seeded(derive_seed(purpose, self.cfg.seed, self.learner.updates))
 
     def log(self, progress: Progress) -> None:
         """Reads what the device has summed up, tells the terminal and the loggers."""
@@ -245,11 +294,12 @@ class Trainer:
         metrics = self.learner.metrics()
         if not text and "loss" in metrics:
             text = f"loss {metrics['loss']:.4g}"
-        row |= metrics | self.validate()
         warning = None
-        if self.diagnose is not None and self._batch is not None:
-            numbers, warning = self.diagnose(self.model, self._batch)
-            row |= numbers
+        with self.aside("log"):
+            row |= metrics | self.validate()
+            if self.diagnose is not None and self._batch is not None:
+                numbers, warning = self.diagnose(self.model, self._batch)
+                row |= numbers
         row |= progress.line(self.learner.updates, self.env_steps, text)
         if warning:
             say(f"  warning: {warning}")
@@ -272,21 +322,22 @@ class Trainer:
         means = {name: torch.stack([one.get(name) for one in losses]).mean() for name in losses[0].keys()}  # noqa: SIM118
         return {f"validation/{name}": float(value) for name, value in means.items()}
 
-    def record(self, numbers: Mapping[str, float], *, say_it: bool = False) -> float:
-        """Adds a row to the history and the loggers; returns the time."""
+    def record(self, numbers: Mapping[str, float], *, say_it: bool = False) -> None:
+        """Adds a row to the history and the loggers."""
         row = dict(numbers)
         row |= {"env_steps": self.env_steps, "updates": self.learner.updates, "time_s": self.seconds}
         self.rows.append(row)
         log_numbers(self.loggers, numbers, step=self.learner.updates)
         if say_it:
             say("  " + "   ".join(f"{name} {value:.3f}" for name, value in numbers.items()))
-        return time.perf_counter()
 
     def save(self, *, last: bool = True) -> Path:
         """Writes ``checkpoints/latest``; with the experience if it is wanted and there is room, or says so."""
         replay = None
         wanted = self.cfg.trainer.checkpoint_replay
-        if self.env is not None and wanted is not False and len(self.replay):
+        # A first stage that is done leaves its weights; the second gathers what it needs itself.
+        needed = "whole_run" not in self.cfg or self.learner.updates < self.cfg.trainer.updates
+        if self.env is not None and wanted is not False and len(self.replay) and needed:
             why = left_out(held(self.replay), self.folder, last=last, wanted=wanted)
             replay = self.experience() if why is None else None
             if why is not None and (last or not self._said):
@@ -299,7 +350,7 @@ class Trainer:
             config=self._config(),
             counters={"env_steps": self.env_steps, "updates": self.learner.updates, "seconds": self.seconds},
             replay=replay,
-            extra={"rows": self.rows, "spaces": self.spaces.as_dict()},
+            extra={"rows": self.rows, "spaces": self.spaces.as_dict(), "moment": self._moment()},
         )
 
     def _config(self) -> DictConfig:
@@ -311,25 +362,59 @@ class Trainer:
         cfg.model.update(own)
         return cfg
 
-    def restore(self, checkpoint: Checkpoint) -> None:
-        """Continues from a checkpoint: weights, optimiser, counters, history, experience, random numbers.
+    def _moment(self) -> dict[str, Any]:
+        """Where worlds, policies and recorded windows stand."""
+        if self.env is None:
+            parts = {"windows": self.replay, "validation": self.validation}
+            return {name: part.get_state() for name, part in parts.items() if part is not None}
+        assert self._acting is not None
+        return {"worlds": worlds_now(self.env, self._collector), "policies": draws(self._acting.policies)}
 
-        The worlds themselves start new episodes.
+    def restore(self, checkpoint: Checkpoint) -> None:
+        """Goes on from a checkpoint as if there had been no interruption, on the CPU to the bit.
+
+        Weights, optimiser, counters, history, experience, worlds, plans, policies, recorded windows and all random
+        numbers are put back. What cannot be is said in a line: experience that the checkpoint was too large for, and
+        worlds of other libraries or of a changed configuration, which start new episodes.
         """
         checkpoint.load_model(self.model)
         checkpoint.load_optimizer(self.learner.optimizer)
+        self.learner.use_rates()
         self.learner.updates = int(checkpoint.counters["updates"])
         self.env_steps = int(checkpoint.counters["env_steps"])
         self.seconds = float(checkpoint.counters["seconds"])
-        self.rows = list((checkpoint.extra() or {}).get("rows", []))
+        extra = checkpoint.extra() or {}
+        self.rows = list(extra.get("rows", []))
         experience = None if self.env is None else checkpoint.replay(self.env.device)
         if experience is not None:
             fill(self.replay, experience, self.cfg, updates=self.learner.updates, restored=True)
-        checkpoint.restore_rng()
+        elif self.env is not None and self.learner.updates < self.cfg.trainer.updates:
+            say("  the checkpoint holds no experience: this run gathers anew and will not be the same")
+        self._restore_moment(checkpoint, extra.get("moment", {}))
+        checkpoint.restore_rng()  # the last: whatever is built draws
+
+    def _restore_moment(self, checkpoint: Checkpoint, moment: Mapping[str, Any]) -> None:
+        """Undoes :meth:`_moment`."""
         if self.env is None:
+            for name, part in {"windows": self.replay, "validation": self.validation}.items():
+                if part is not None and name in moment:
+                    part.set_state(moment[name])
             return
-        # Otherwise the worlds would repeat the episodes that the first run has already seen.
-        self.env.set_seed(self.cfg.seed + self.env_steps)
+        assert self._acting is not None
+        worlds = moment.get("worlds")
+        if worlds is not None and same_worlds(checkpoint.config, self.cfg):
+            put_back(self.env, self._collect(), worlds)
+        else:
+            if restorable(self.env) is None:
+                why = "the simulators of other libraries cannot be put back"
+            else:
+                why = (
+                    "of another configuration" if worlds is not None else "the checkpoint does not hold them"
+                )
+            say(f"  worlds: {why}; they start new episodes, and this run will not be the same")
+            # Not those that the first run has seen already.
+            self.env.set_seed(derive_seed("training", self.cfg.seed, "resumed", self.env_steps))
+        go_on_drawing(self._acting.policies, moment.get("policies", {}), self.env.device)
 
     def experience(self) -> TensorDictBase | None:
         """The filled part of the replay, (worlds, time), in the order in which it was gathered."""

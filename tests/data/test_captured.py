@@ -38,18 +38,8 @@ class Unrecorded:
 class OnTheCpu(CapturedSampling):
     """As on CUDA, but the work is repeated instead of a graph of it."""
 
-    def _record(self, data: Any, sampler: Any) -> None:
-        size = self.replay._batch_size
-        self._choices = torch.ones((), dtype=torch.float64)
-        self._oldest = torch.zeros((), dtype=torch.int64)
-        self._batch = data[:size, 0]
-        batch = []
-
-        def work() -> None:
-            self._draw(data, sampler, size)
-            batch[:] = [self._batch]
-
-        self._graph = Unrecorded(work)  # type: ignore[assignment]
+    def _record(self, data: Any, sampler: Any) -> Any:
+        return Unrecorded(lambda: self._draw(data, sampler))
 
 
 DEVICES = [
@@ -120,6 +110,23 @@ def test_what_cannot_be_filled_is_reported(device: str, kind: type[CapturedSampl
             assert "too few episodes" in str(error)
         else:
             pytest.fail("windows across episodes were given out as whole ones")
+
+
+@pytest.mark.parametrize(("device", "kind"), DEVICES)
+def test_eager_calls_draw_what_captured_ones_would(device: str, kind: type[CapturedSampling]) -> None:
+    """So a run that resumes, and is eager again at first, goes on with the batches that the first would have had."""
+    replay = make_replay(
+        capacity=WORLDS * STEPS, num_envs=WORLDS, window=WINDOW, batch_size=64, device=device
+    )
+    replay.extend(experience(0, 30).to(device))
+    sampling = kind(replay)
+    for _ in range(4):
+        sampling()
+    torch.manual_seed(5)
+    captured = [sampling()["time"].clone() for _ in range(3)]
+    torch.manual_seed(5)
+    fresh = kind(replay)
+    assert all(torch.equal(fresh()["time"], one) for one in captured)
 
 
 @pytest.mark.gpu

@@ -1,0 +1,75 @@
+"""Where worlds, policies and samplers of a run stand: what the next step depends on beside weights and experience."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import torch
+from omegaconf import DictConfig
+from tensordict import TensorDict, TensorDictBase
+from torchrl.collectors import Collector
+
+from franka_wm.envs import FrankaEnv
+
+
+def restorable(env: Any) -> FrankaEnv | None:
+    """The arm inside an environment, whose worlds can be put back; ``None``: those of another library cannot."""
+    base = getattr(env, "base_env", env)
+    return base if isinstance(base, FrankaEnv) else None
+
+
+def same_worlds(saved: DictConfig, cfg: DictConfig) -> bool:
+    """Whether worlds and plans of a run with the configuration ``saved`` fit into one with ``cfg``."""
+    parts = ("env", "planner", "objective")
+    return saved.collector.num_envs == cfg.collector.num_envs and all(saved[k] == cfg[k] for k in parts)
+
+
+def worlds_now(env: Any, collector: Collector | None) -> dict[str, Any] | None:
+    """The simulation of all worlds and the root that the collector's next step starts from, plans included.
+
+    ``None`` before anything was gathered, and for environments of other libraries.
+    """
+    arm = restorable(env)
+    if arm is None or collector is None:
+        return None
+    # TorchRL keeps this to itself; its own state_dict leaves it out.
+    return {"state": _nested(arm.get_state()), "carry": _nested(collector._carrier)}
+
+
+def put_back(env: Any, collector: Collector, worlds: Mapping[str, Any]) -> None:
+    """Undoes whatever happened to worlds and collector since :func:`worlds_now`, in this process or another."""
+    arm = restorable(env)
+    assert arm is not None
+    arm.set_state(TensorDict(worlds["state"], batch_size=arm.batch_size, device=arm.device))
+    carry = TensorDict(worlds["carry"], batch_size=arm.batch_size, device=arm.device)
+    collector._carrier = carry.clear_device_() if collector._carrier.device is None else carry
+
+
+def draws(policies: Mapping[str, Any]) -> dict[str, Any]:
+    """What policies that draw at random carry from step to step: generators, last actions. By name of the module."""
+    return {name: module.get_state() for name, module in _drawing(policies).items()}
+
+
+def go_on_drawing(policies: Mapping[str, Any], states: Mapping[str, Any], device: torch.device) -> None:
+    """Puts policies where :func:`draws` found them."""
+    for name, module in _drawing(policies).items():
+        if name in states:
+            module.set_state(states[name], device)
+
+
+def _drawing(policies: Mapping[str, Any]) -> dict[str, Any]:
+    return {
+        f"{name}/{path}": module
+        for name, policy in policies.items()
+        for path, module in policy.named_modules()
+        if hasattr(module, "get_state") and hasattr(module, "set_state")
+    }
+
+
+def _nested(data: TensorDictBase) -> dict[str, Any]:
+    """A TensorDict as nested dicts of tensors."""
+    return {
+        str(key): _nested(value) if isinstance(value, TensorDictBase) else value
+        for key, value in data.items()
+    }

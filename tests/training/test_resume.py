@@ -1,0 +1,319 @@
+"""N + N updates are 2 N updates, to the bit: after an end, a signal or a kill, in every stage."""
+
+from __future__ import annotations
+
+import os
+import random
+import signal
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from safetensors.torch import load_file
+from tensordict import TensorDictBase
+
+from franka_wm.cli import main
+from franka_wm.training import build
+from franka_wm.training.checkpoint import Checkpoint, latest_checkpoint, load_checkpoint
+from franka_wm.training.learner import Learner
+from franka_wm.training.moment import draws
+from franka_wm.training.trainer import Trainer
+
+HALF = 15  # amid the updates of a batch, which has 10
+
+KINDS = {
+    "policy": (),
+    "planner": ("collector.acts=planner",),
+    "random": ("collector.acts=smooth",),
+    "moves": ("model=muzero", "planner=gumbel"),
+    "pictures": (
+        "env=reach_fixed_pixels",
+        "env.image_size=40",
+        "env.frame_stack=2",
+        "model=tdmpc2_pixels",
+        "model.channels=4",
+        "env.randomization.action_noise=0.1",
+        "env.randomization.observation_noise=0.01",
+    ),
+    "memory": ("model=lewm", "env=reach_goal_image", "env.image_size=32", "planner=icem", "collector.acts=planner"),
+}  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def kind(request) -> str:
+    return getattr(request, "param", "policy")
+
+
+@pytest.fixture(scope="module")
+def make(kind: str, composed, tiny: list[str], tmp_path_factory) -> Callable[..., Trainer]:
+    """Makes trainers whose weights, policies, worlds and global generators are those of ``seed``."""
+    asked = KINDS[kind]
+    given = {one.split("=", 1)[0] for one in asked}
+    sizes = [one for one in tiny if one.split("=", 1)[0] not in given]
+    if kind in ("moves", "memory"):
+        sizes = [one for one in sizes if not one.startswith("planner.")]
+    cfg = composed(
+        *sizes, *asked, "trainer.schedule=cosine", "trainer.warmup=5", f"trainer.updates={2 * HALF}"
+    )
+    env, folder = build.make_env(cfg), tmp_path_factory.mktemp(kind)
+
+    def make(name: str, *, seed: int, updates: int = 2 * HALF, **options: Any) -> Trainer:
+        mine = cfg.copy()
+        mine.seed, mine.trainer.updates = seed, updates
+        mine.trainer.update(options)
+        torch.manual_seed(seed)
+        random.seed(seed)
+        np.random.seed(seed)
+        env.set_seed(seed)
+        spaces = build.Spaces.of_env(env)
+        model = build.make_model(mine, spaces, "cpu")
+        return Trainer(
+            env=env,
+            learner=Learner(model, lr=1e-3, schedule="cosine", warmup=5, total_updates=2 * HALF),
+            replay=build.make_replay_buffer(mine, env.device),
+            policies=build.make_agent_policies(mine, model, env, spaces, purpose="training"),
+            actor=build.actor(mine),
+            cfg=mine,
+            folder=folder / name,
+            loggers=[],
+            evaluate=dict,
+        )
+
+    return make
+
+
+def everything(trainer: Trainer) -> dict[str, Any]:
+    """All that the next step depends on, as tensors and numbers by name."""
+    experience = trainer.experience()
+    assert experience is not None and trainer._acting is not None and trainer._collector is not None
+    arm = getattr(trainer.env, "base_env", trainer.env)
+    parts = {
+        "weights": trainer.model.state_dict(),
+        "optimizer": trainer.learner.optimizer.state_dict(),
+        "experience": experience,
+        "worlds": arm.get_state(),
+        "carry": trainer._collector._carrier,
+        "policies": draws(trainer._acting.policies),
+        "generators": [torch.get_rng_state(), np.random.get_state()[1:], random.getstate()],
+        "counters": [trainer.env_steps, trainer.learner.updates],
+    }
+    return flat(parts)
+
+
+def play(trainer: Trainer) -> dict[str, Any]:
+    """Everything at the end of the run."""
+    save, states = trainer.save, []
+    trainer.save = lambda **options: (states.append(everything(trainer)), save(**options))[1]  # type: ignore[method-assign]
+    trainer.fit()
+    return states[-1]
+
+
+def flat(value: Any, name: str = "") -> dict[str, Any]:
+    if isinstance(value, (dict, TensorDictBase)):
+        return {k: v for key, one in value.items() for k, v in flat(one, f"{name}/{key}").items()}
+    if isinstance(value, (list, tuple)):
+        return {k: v for i, one in enumerate(value) for k, v in flat(one, f"{name}/{i}").items()}
+    return {name: torch.as_tensor(value).clone() if isinstance(value, (torch.Tensor, np.ndarray)) else value}
+
+
+def differing(a: dict[str, Any], b: dict[str, Any]) -> list[str]:
+    assert a.keys() == b.keys()
+    same = lambda x, y: torch.equal(x, y) if isinstance(x, torch.Tensor) else x == y  # noqa: E731
+    return [name for name in a if not same(a[name], b[name])]
+
+
+@pytest.mark.parametrize("kind", list(KINDS), indirect=True)
+def test_two_halves_are_a_whole(make: Callable[..., Trainer]) -> None:
+    """All of it: weights, optimiser, experience, worlds, carried roots and plans, policies, generators."""
+    expected = play(make("whole", seed=0))
+    first = make("first", seed=0, updates=HALF)
+    halfway = play(first)
+    second = make("second", seed=99)  # other weights, worlds, policies and generators
+    second.env.rollout(3)
+    second.cfg.seed = 0
+    second.restore(load_checkpoint(latest_checkpoint(first.folder)))
+    assert differing(everything(second), halfway) == []
+    got = play(second)
+    assert {name.split("/")[1] for name in got} >= {"weights", "optimizer", "worlds", "carry", "policies"}
+    assert differing(got, expected) == []
+    assert not torch.equal(expected["/generators/0"], halfway["/generators/0"])
+
+
+def test_a_signal_changes_nothing(make: Callable[..., Trainer]) -> None:
+    """SIGTERM, as a cluster's scheduler sends it, amid the updates."""
+    expected = play(make("whole", seed=0))
+    first = make("first", seed=0)
+    update = first.learner.update
+
+    def signalled(*arguments: Any, **options: Any) -> None:
+        update(*arguments, **options)
+        if first.learner.updates == 13:
+            os.kill(os.getpid(), signal.SIGTERM)
+
+    first.learner.update = signalled  # type: ignore[method-assign]
+    first.fit()
+    assert first.interrupted and first.learner.updates == 20
+    second = make("second", seed=98)
+    second.cfg.seed = 0
+    second.restore(load_checkpoint(latest_checkpoint(first.folder)))
+    assert differing(play(second), expected) == []
+
+
+# -- whole runs ------------------------------------------------------------------------------------------------
+
+
+def weights(checkpoint: Checkpoint) -> dict[str, torch.Tensor]:
+    return load_file(checkpoint.folder / "model.safetensors")
+
+
+def test_after_a_kill(root: Path, train, tiny: list[str], tmp_path: Path) -> None:
+    """``kill -9`` between two checkpoints: from the last one, in another process, to the same weights."""
+    (tmp_path / "killer.py").write_text(
+        "import os, signal\n"
+        "from franka_wm.training.learner import Learner\n"
+        "update = Learner.update\n"
+        "def killed(self, *arguments, **options):\n"
+        "    update(self, *arguments, **options)\n"
+        "    if self.updates == 25:\n"
+        "        os.kill(os.getpid(), signal.SIGKILL)\n"
+        "Learner.update = killed\n"
+    )
+    sizes = [*tiny, "evaluation.during=[]", "trainer.updates=40"]
+    command = [
+        sys.executable,
+        str(root / "train.py"),
+        *sizes,
+        "plugins=[killer]",
+        "trainer.checkpoint_every=1e-9",
+    ]
+    killed = subprocess.run(
+        [*command, f"hydra.run.dir={tmp_path}/killed"],
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert killed.returncode == -signal.SIGKILL, killed.stdout + killed.stderr
+    assert load_checkpoint(latest_checkpoint(tmp_path / "killed")).counters["updates"] == 20
+    whole = weights(train(*sizes, folder=tmp_path / "whole"))
+    resumed = train(f"resume={tmp_path}/killed", folder=tmp_path / "resumed")
+    assert resumed.counters["updates"] == 40
+    assert differing(weights(resumed), whole) == []
+
+
+def interrupt(monkeypatch, number: int, stage: type) -> None:
+    """Signals this process after so many updates of a model of this class."""
+    update = Learner.update
+
+    def signalled(self, *arguments: Any, **options: Any) -> None:
+        update(self, *arguments, **options)
+        if self.updates == number and type(self.model) is stage:
+            os.kill(os.getpid(), signal.SIGTERM)
+
+    monkeypatch.setattr(Learner, "update", signalled)
+
+
+def test_recorded_data_go_on_where_they_were(train, monkeypatch, tmp_path: Path) -> None:
+    """The second half draws other batches than the first."""
+    from franka_wm.models.tdmpc2 import TDMPC2
+
+    arguments = [
+        "collect",
+        f"out={tmp_path}/data",
+        "env=reach_fixed",
+        "scale=smoke",
+        "episodes=6",
+        "num_envs=3",
+    ]
+    sizes = ["env.substeps=1", "env.episode_length=8", "device=cpu"]
+    assert main([*arguments, *sizes, "seed=0", "workers=0"]) == 0
+    data = [
+        "trainer=offline",
+        "dataset=lerobot",
+        f"dataset.root={tmp_path}/data",
+        "dataset.workers=0",
+        *sizes,
+    ]
+    data += [f"dataset.cache_dir={tmp_path}/cache", "env=reach_fixed", "dataset.validation_fraction=0.3"]
+    data += ["trainer.updates=12", "trainer.updates_per_batch=1", "evaluation.during=[]"]
+    whole = train(*data, folder=tmp_path / "whole")
+    with monkeypatch.context() as patched:
+        interrupt(patched, 6, TDMPC2)
+        train(*data, folder=tmp_path / "first", status=130)
+    assert load_checkpoint(latest_checkpoint(tmp_path / "first")).counters["updates"] == 6
+    second = train(f"resume={tmp_path}/first", folder=tmp_path / "second")
+    assert differing(weights(second), weights(whole)) == []
+    states = [(one.extra() or {})["moment"] for one in (whole, second)]
+    assert torch.equal(states[0]["windows"], states[1]["windows"])
+
+
+@pytest.mark.parametrize("stage", ["first", "second"])
+def test_any_stage_goes_on(stage: str, train, monkeypatch, tmp_path: Path, capsys) -> None:
+    from franka_wm.models.action_world_model import ActionWorldModel
+    from franka_wm.models.jepa import JEPA
+
+    run = [
+        "model=action_world_model",
+        "pretrain=lejepa",
+        "env=reach_goal_image",
+        "env.image_size=32",
+        "planner=icem",
+    ]
+    run += [
+        "pretrain.updates=12",
+        "trainer.updates=12",
+        "trainer.updates_per_batch=3",
+        "evaluation.during=[]",
+    ]
+    run += ["planner.num_samples=8", "planner.num_elites=4", "planner.iterations=1"]
+    whole = train(*run, folder=tmp_path / "whole")
+    with monkeypatch.context() as patched:
+        interrupt(patched, 6, JEPA if stage == "first" else ActionWorldModel)
+        train(*run, folder=tmp_path / "stopped", status=130)
+    assert f"resume={tmp_path}/stopped" in capsys.readouterr().out
+    begun = latest_checkpoint(tmp_path / "stopped")
+    assert load_checkpoint(begun).model_name == ("JEPA" if stage == "first" else "ActionWorldModel")
+    resumed = train(f"resume={tmp_path}/stopped", folder=tmp_path / "resumed")
+    assert resumed.model_name == "ActionWorldModel" and resumed.counters == whole.counters | {
+        "seconds": resumed.counters["seconds"]
+    }
+    assert differing(weights(resumed), weights(whole)) == []
+    if stage == "first":
+        one, other = (
+            load_checkpoint(tmp_path / n / "pretrained/checkpoints/latest") for n in ("whole", "resumed")
+        )
+        assert differing(weights(one), weights(other)) == []
+
+
+# -- what cannot be put back --------------------------------------------------------------------------------
+
+
+def test_more_updates_and_another_rate(make: Callable[..., Trainer]) -> None:
+    """A resumed run may be longer; a learning rate that is given anew counts."""
+    first = make("first", seed=0, updates=10)
+    first.fit()
+    longer = make("longer", seed=0, updates=20)
+    longer.learner._rates = [2e-3 for _ in longer.learner._rates]
+    longer.learner._scheduled = False
+    longer.restore(load_checkpoint(latest_checkpoint(first.folder)))
+    assert [group["lr"] for group in longer.learner.optimizer.param_groups] == longer.learner._rates
+    longer.fit()
+    assert longer.learner.updates == 20
+
+
+def test_other_worlds_start_new_episodes_and_say_so(make: Callable[..., Trainer], capsys) -> None:
+    first = make("first", seed=0, updates=10)
+    first.fit()
+    other = make("other", seed=0, updates=20)
+    other.cfg.env.success_distance = 0.2
+    other.restore(load_checkpoint(latest_checkpoint(first.folder)))
+    said = capsys.readouterr().out
+    assert "of another configuration; they start new episodes" in said
+    arm = getattr(other.env, "base_env", other.env)
+    assert arm.get_state()["episode"].eq(-1).all()
+    assert arm.simulation._seed.item() != first.cfg.seed
