@@ -35,7 +35,6 @@ sys.path.insert(0, str(ROOT))
 
 from franka_wm.errors import UserError  # noqa: E402
 from franka_wm.report import written_whole  # noqa: E402
-from franka_wm.report.source import code_hash  # noqa: E402
 from franka_wm.report.versions import versions  # noqa: E402
 
 DECLARED = ROOT / "scripts" / "mutation.yaml"
@@ -78,10 +77,6 @@ class Target:
     @property
     def code(self) -> str:
         return (ROOT / self.path).read_text()
-
-    @property
-    def hash(self) -> str:
-        return code_hash(self.path, self.code.encode())
 
 
 @dataclass(frozen=True)
@@ -312,7 +307,6 @@ def measure(target: Target, *, sample: int | None, seed: int, at_once: int) -> d
             survivors.append({"line": one.line, "operator": one.operator, "change": one.change()})
             print(f"  survived, line {one.line}: {one.change()}", flush=True)
     return {
-        "hash": target.hash,
         "tests": target.tests,
         "mutants": len(everything),
         "tested": len(chosen),
@@ -345,41 +339,43 @@ nothing, or nothing on a CPU, each with its reason below. A drawn sample is the 
 
 def page(targets: Sequence[Target], results: Mapping[str, Any]) -> str:
     """The content of docs/mutation.md."""
-    lines = [HEAD]
-    lines += [
-        "| file | tested of all | killed | survived | score | without explained | |",
-        "|---|" + "---:|" * 5 + "---|",
+    titles = [
+        "file",
+        "tested of all",
+        "killed",
+        "never ended",
+        "survived",
+        "score",
+        "without explained",
+        "at commit",
     ]
-    counted = [0, 0, 0]
-    rest = []
+    lines = [HEAD, "| " + " | ".join(titles) + " |", "|---|" + "---:|" * 6 + "---|"]
+    total = dict.fromkeys(("mutants", "tested", "killed", "timeout", "survived"), 0)
+    explained, rest = 0, []
     for target in targets:
         found = results.get(target.path)
         if found is None:
-            lines.append(f"| `{target.path}` | | | | | | | not run yet |")
+            lines.append(f"| `{target.path}` |" + " |" * 6 + " not run yet |")
             continue
-        killed = found["killed"] + found["timeout"]
-        same = [one for one in found["survivors"] if one["change"] in target.explained]
-        old = "" if found["hash"] == target.hash else "before changes of this file"
-        counted = [a + b for a, b in zip(counted, (found["tested"], killed, len(same)), strict=True)]
-        lines.append(
-            f"| `{target.path}` | {found['tested']} of {found['mutants']} | {found['killed']} | {found['timeout']} "
-            f"| {found['survived']} "
-            f"| {percent(killed, found['tested'])} | {percent(killed, found['tested'] - len(same))} | {old} |"
-        )
+        same = sum(one["change"] in target.explained for one in found["survivors"])
+        lines.append(_line(f"`{target.path}`", found, same, f"{found['commit']}, {found['date']}"))
+        total = {name: total[name] + found[name] for name in total}
+        explained += same
         rest += [(target, one) for one in found["survivors"]]
-    tested, killed, same_in_all = counted
-    lines.append(
-        f"| together | {tested} | {killed} | | {tested - killed} | {percent(killed, tested)} "
-        f"| {percent(killed, tested - same_in_all)} | |"
-    )
+    lines.append(_line("together", total, explained, ""))
     lines += ["", "## Survivors", ""]
     for target, one in rest:
         reason = target.explained.get(one["change"], "**no test notices it**")
         before, after = one["change"].split(" → ", 1)
         lines.append(f"- `{target.path}`, line {one['line']}: `{before}` → `{after}`: {reason}")
-    made = sorted({f"{found['commit']}, {found['date']}" for found in results.values()})
-    lines += ["", f"Run at commit {'; '.join(made)}." if made else "Nothing was run yet.", ""]
-    return "\n".join(lines)
+    return "\n".join([*lines, ""])
+
+
+def _line(name: str, found: Mapping[str, Any], explained: int, made: str) -> str:
+    tested, noticed = found["tested"], found["killed"] + found["timeout"]
+    cells = [f"{tested} of {found['mutants']}", found["killed"], found["timeout"], found["survived"]]
+    cells += [percent(noticed, tested), percent(noticed, tested - explained), made]
+    return f"| {name} | " + " | ".join(map(str, cells)) + " |"
 
 
 def percent(part: int, whole: int) -> str:

@@ -68,14 +68,14 @@ def test_the_page_counts_and_explains() -> None:
         {"line": 2, "operator": "AddNot", "change": "c → d"},
     ]
     measured = {
-        "hash": target.hash, "mutants": 20, "tested": 10, "killed": 7, "timeout": 1, "survived": 2,
+        "mutants": 20, "tested": 10, "killed": 7, "timeout": 1, "survived": 2,
         "survivors": survivors, "commit": "abc", "date": "2026-01-02",
     }  # fmt: skip
     text = page([target, Target("franka_wm/errors.py", [])], {SEEDING: measured})
-    assert f"| `{SEEDING}` | 10 of 20 | 7 | 1 | 2 | 80 % | 89 % |  |" in text
+    assert "| together | 10 of 20 | 7 | 1 | 2 | 80 % | 89 % |  |" in text
+    assert f"| `{SEEDING}` | 10 of 20 | 7 | 1 | 2 | 80 % | 89 % | abc, 2026-01-02 |" in text
     assert "| `franka_wm/errors.py` | | | | | | | not run yet |" in text
     assert "`a` → `b`: b is a" in text and "`c` → `d`: **no test notices it**" in text
-    assert "before changes of this file" in page([target], {SEEDING: measured | {"hash": "0"}})
 
 
 def test_the_committed_page_is_what_was_measured() -> None:
