@@ -29,17 +29,18 @@ def main(cfg: DictConfig) -> None:
     replay, spaces = run.build_experience(env)
     pretrain(run, env, replay, spaces)
     model = build.make_model(run.cfg, spaces, run.device)
-    policies = build.make_agent_policies(run.cfg, model, judge, spaces)
+    acting = build.make_agent_policies(run.cfg, model, env, spaces, purpose="training")
+    judged = build.make_agent_policies(run.cfg, model, judge, spaces)
     trainer = Trainer(
         env=env,
         learner=Learner(model, **run.learner_options()),
         replay=replay,
-        policies=policies,
+        policies=acting,
         actor=build.actor(run.cfg),
         cfg=run.cfg,
         folder=run.folder,
         loggers=run.loggers,
-        evaluate=run.evaluation_during_training(judge, policies),
+        evaluate=run.evaluation_during_training(judge, judged),
         spaces=spaces,
         validation=run.validation,
         diagnose=run.diagnose,
@@ -47,12 +48,12 @@ def main(cfg: DictConfig) -> None:
     if run.checkpoint is not None:
         trainer.restore(run.checkpoint)
     trainer.fit()
-    if not trainer.interrupted and policies:
+    if not trainer.interrupted and judged:
         evaluate_and_report(
             run.cfg,
             run.folder,
             judge,
-            policies,
+            judged,
             rows=trainer.rows,
             counters={
                 "updates": trainer.learner.updates,

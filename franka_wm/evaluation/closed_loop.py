@@ -18,9 +18,6 @@ from franka_wm.evaluation.intervals import bootstrap_mean, wilson
 THRESHOLDS = (0.05, 0.025, 0.01)
 """Distances to the goal that count as success [m]."""
 
-EVALUATION_SEED = 1_000_003
-"""Added to a run's seed: worlds and goals of the evaluation are not those of training."""
-
 Policy = Callable[[TensorDictBase], TensorDictBase]
 
 
@@ -45,32 +42,6 @@ def begin(env: Any, seed: int) -> TensorDictBase:
     return env.reset()
 
 
-def _parts(policy: Any) -> list[Any]:
-    return list(policy.modules()) if isinstance(policy, nn.Module) else [policy]
-
-
-@contextmanager
-def seeded(seed: int, *policies: Any) -> Iterator[None]:
-    """Random numbers of torch, and of the policies' own generators, from ``seed``; all are put back after."""
-    held = [
-        value
-        for policy in policies
-        for part in _parts(policy)
-        for value in getattr(part, "__dict__", {}).values()
-    ]
-    generators = [(value, value.get_state()) for value in held if isinstance(value, torch.Generator)]
-    devices = list(range(torch.cuda.device_count())) if torch.cuda.is_initialized() else []
-    with torch.random.fork_rng(devices=devices):
-        torch.manual_seed(seed)
-        for generator, _ in generators:
-            generator.manual_seed(seed)
-        try:
-            yield
-        finally:
-            for generator, state in generators:
-                generator.set_state(state)
-
-
 @contextmanager
 def evaluating(acting: Any) -> Iterator[None]:
     """A model, or a policy and the model behind it, in evaluation mode; afterwards every part is in its own again.
@@ -78,7 +49,8 @@ def evaluating(acting: Any) -> Iterator[None]:
     Families may act differently in training mode: TD-MPC2 plans by two Q-functions drawn at random. What is evaluated
     is one agent, whoever asks: the end of a run, the curves, the film, ``franka-wm evaluate``.
     """
-    modes = [(part, part.training) for part in _parts(acting) if isinstance(part, nn.Module)]
+    parts = acting.modules() if isinstance(acting, nn.Module) else ()
+    modes = [(part, part.training) for part in parts]
     for part, _ in modes:
         part.training = False
     try:
@@ -250,13 +222,14 @@ def summarize(episodes: TensorDictBase, *, thresholds: Sequence[float] = THRESHO
 
 @torch.no_grad()
 def decision_times(
-    env: Any, policy: Policy, *, seed: int = EVALUATION_SEED, decisions: int = 20, warm_up: int = 3
+    env: Any, policy: Policy, *, seed: int = 0, decisions: int = 20, warm_up: int = 3
 ) -> Tensor:
     """How long a policy takes to decide for all worlds of the environment at once.
 
     The device is waited for before and after each decision; the environment's own step is not counted.
 
     Args:
+        seed: Of the episodes.
         decisions: How many to measure.
         warm_up: How many before that, not measured.
 

@@ -10,7 +10,7 @@ import torch
 from tensordict import TensorDict
 from torch import Tensor
 
-from franka_wm.evaluation.closed_loop import arm_of, begin, reaches, seeded
+from franka_wm.evaluation.closed_loop import arm_of, begin, reaches
 from franka_wm.evaluation.decoder import (
     SIZES,
     Decoder,
@@ -40,6 +40,7 @@ from franka_wm.evaluation.rollouts import (
 )
 from franka_wm.evaluation.spectrum import spectrum
 from franka_wm.report.spectra import principal_components
+from franka_wm.seeding import derive_seed, seeded
 
 EPISODES = 48
 """Held-out episodes of the diagnostics, at most; half of them random, half the model's own."""
@@ -248,7 +249,7 @@ def _starts(agent: Any, *, decoder_size: int, rounds: int = 6, steps: int = 8) -
         episodes, seen = gather_episodes(
             agent.env,
             mixture(agent.policies),
-            seed=ROLLOUT_SEED + 1 + k,
+            seed=derive_seed("diagnostics", 0, "starts", k),
             steps=steps,
             keys=keys,
             picture_size=decoder_size,

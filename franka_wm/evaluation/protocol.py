@@ -12,18 +12,17 @@ from tensordict import TensorDict
 
 from franka_wm.errors import UserError
 from franka_wm.evaluation.closed_loop import (
-    EVALUATION_SEED,
     THRESHOLDS,
     arm_of,
     decision_times,
     play_episodes,
     reaches,
-    seeded,
     summarize,
 )
 from franka_wm.report.results import point
 from franka_wm.report.table import evaluation_tables, markdown
 from franka_wm.report.versions import processor
+from franka_wm.seeding import derive_seed, seeded
 
 EPISODES = 100
 """Episodes per policy, if not said otherwise."""
@@ -36,7 +35,7 @@ INTERVALS = (
 
 def held_out_seeds(count: int) -> list[int]:
     """The seeds of the protocol: the same for every run, whatever seed it was trained with."""
-    return [EVALUATION_SEED + 1009 * k for k in range(count)]
+    return [derive_seed("protocol", k) for k in range(count)]
 
 
 @dataclass

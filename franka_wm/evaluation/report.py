@@ -10,7 +10,7 @@ import torch
 from omegaconf import DictConfig
 
 from franka_wm.envs.camera import project
-from franka_wm.evaluation.closed_loop import arm_of, play_episodes, reaches, seeded
+from franka_wm.evaluation.closed_loop import arm_of, play_episodes, reaches
 from franka_wm.evaluation.protocol import describe, evaluate_policies, held_out_seeds, protocol
 from franka_wm.evaluation.tables import terminal
 from franka_wm.report import written_whole
@@ -18,6 +18,7 @@ from franka_wm.report.curves import axis, plot_learning_curves
 from franka_wm.report.results import END, Result, last_row, to_json
 from franka_wm.report.table import evaluation_tables
 from franka_wm.report.video import draw_marker, tile_frames, write_png, write_video
+from franka_wm.seeding import seeded
 
 
 def evaluate_and_report(

@@ -10,9 +10,10 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 from franka_wm.errors import UserError
-from franka_wm.evaluation.closed_loop import arm_of, play_episodes, seeded
+from franka_wm.evaluation.closed_loop import arm_of, play_episodes
 from franka_wm.evaluation.intervals import bootstrap_mean, wilson
 from franka_wm.evaluation.protocol import held_out_seeds
+from franka_wm.seeding import seeded
 
 UNSHIFTED = "as trained"
 

@@ -11,9 +11,10 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
-from franka_wm.evaluation.closed_loop import EVALUATION_SEED, arm_of, begin, evaluating, seeded
+from franka_wm.evaluation.closed_loop import arm_of, begin, evaluating
+from franka_wm.seeding import derive_seed, seeded
 
-ROLLOUT_SEED = EVALUATION_SEED + 500_000
+ROLLOUT_SEED = derive_seed("diagnostics", 0)
 """Episodes of the diagnostics: neither those of training nor those of the closed loop."""
 
 

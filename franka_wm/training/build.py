@@ -27,6 +27,7 @@ from franka_wm.envs.discretize import DiscreteActions
 from franka_wm.errors import UserError
 from franka_wm.planning import ModelPolicy, PlannerPolicy, registry
 from franka_wm.planning.policy import PRECISIONS
+from franka_wm.seeding import derive_seed, evaluation_seed
 from franka_wm.training.progress import say
 from franka_wm.training.spaces import Spaces
 
@@ -78,11 +79,12 @@ def is_arm(cfg: DictConfig) -> bool:
 def make_env(cfg: DictConfig, *, num_envs: int | None = None, seed: int | None = None, **changes: Any) -> Any:
     """The environment that ``cfg.env`` describes; ``changes`` override fields of its config.
 
-    For a model that chooses among moves, the arm's actions are numbers of moves.
+    For a model that chooses among moves, the arm's actions are numbers of moves. Its episodes are those of training
+    unless ``seed`` says otherwise.
     """
     values = plain(cfg.env) | changes
     worlds = int(cfg.collector.num_envs if num_envs is None else num_envs)
-    start = int(cfg.seed if seed is None else seed)
+    start = derive_seed("training", cfg.seed) if seed is None else seed
     if not is_arm(cfg):
         from franka_wm.envs.external import ExternalEnv, external_config
 
@@ -105,7 +107,7 @@ def make_evaluation_env(cfg: DictConfig, *, num_envs: int | None = None, **chang
         pictures = [o for o in cfg.env.observations if o not in ("state", "joint_target")]
         used = [o for o in pictures if any(key == o or key.startswith(f"{o}_") for key in [*read, *goal])]
         changes = {"observations": [*used, "state", "joint_target"]} | changes
-    return make_env(cfg, num_envs=num_envs, **changes)
+    return make_env(cfg, num_envs=num_envs, seed=evaluation_seed(cfg.seed), **changes)
 
 
 # -- models -------------------------------------------------------------------------------------------------
@@ -351,8 +353,18 @@ def make_scripted_policies(env: Any, *, seed: int = 0, smoothness: float = 0.7) 
     return scripted
 
 
-def make_agent_policies(cfg: DictConfig, model: Any, env: Any, spaces: Spaces) -> dict[str, Any]:
-    """Planner, objective and policies by the configuration; none without an environment to act in."""
+def make_agent_policies(
+    cfg: DictConfig, model: Any, env: Any, spaces: Spaces, *, purpose: str = "evaluation"
+) -> dict[str, Any]:
+    """Planner, objective and policies by the configuration; none without an environment to act in.
+
+    Those that gather experience and those that are evaluated must not be the same objects: a random policy has a
+    generator and a last action of its own.
+
+    Args:
+        env: Where they act.
+        purpose: ``training`` or ``evaluation``; random policies of each draw other numbers.
+    """
     if env is None:
         return {}
     planner = make_planner(cfg, spaces.num_actions or spaces.action_dim) if hasattr(model, "next") else None
@@ -360,7 +372,7 @@ def make_agent_policies(cfg: DictConfig, model: Any, env: Any, spaces: Spaces) -
         model,
         planner,
         env,
-        seed=cfg.seed,
+        seed=derive_seed("policies", cfg.seed, purpose),
         smoothness=cfg.collector.smoothness,
         objective=make_objective(cfg, model),
         capture=None if cfg.trainer.capture else cfg.trainer.capture,  # true asks for what CUDA does anyway

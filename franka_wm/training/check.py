@@ -78,10 +78,15 @@ def check(cfg: DictConfig) -> None:
     for name, value in (
         ("trainer.log_every", cfg.trainer.log_every),
         ("trainer.checkpoint_every", cfg.trainer.checkpoint_every),
-        ("evaluation.every", cfg.evaluation.every),
     ):
         if isinstance(value, bool) or not isinstance(value, (int, float)) or not value > 0:
             raise UserError(f"{name}={value!r}: must be a number of seconds above 0")
+    every = cfg.evaluation.every
+    if every is not None and (isinstance(every, bool) or not isinstance(every, int) or every < 1):
+        raise UserError(
+            f"evaluation.every={every!r}: must be a whole number of updates of at least 1 (it no longer counts "
+            "seconds), or null: an eighth of trainer.updates"
+        )
     _check_at_steps(cfg)
     if not 0 <= cfg.collector.smoothness < 1:
         raise UserError(f"collector.smoothness={cfg.collector.smoothness}: must be at least 0 and below 1")
@@ -206,7 +211,7 @@ def _check_at_steps(cfg: DictConfig) -> None:
     if len(at_steps) and build.is_offline(cfg):
         raise UserError(
             "evaluation.at_steps counts environment steps, and a run on recorded data makes none; "
-            "use evaluation.every=SECONDS"
+            "use evaluation.every=UPDATES"
         )
 
 

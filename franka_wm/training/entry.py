@@ -16,6 +16,7 @@ from typing import Any
 from omegaconf import DictConfig, OmegaConf
 
 from franka_wm.errors import FrankaError, UserError
+from franka_wm.seeding import derive_seed, seeded
 from franka_wm.training.progress import announced, say
 
 INTERRUPTED = 130
@@ -198,9 +199,10 @@ class Run:
             env = build.make_env(self.cfg) if gathers else None
             for one in (env, judge):
                 if one is not None:
-                    one.step(one.rand_action(one.reset()))
+                    with seeded(0):  # how many worlds there are must not decide what a run draws later
+                        one.step(one.rand_action(one.reset()))
                     one.statistics()
-                    one.set_seed(self.cfg.seed)
+                    one.set_seed(derive_seed("training" if one is env else "evaluation", self.cfg.seed))
         return env, judge
 
     def build_experience(self, env: Any) -> tuple[Any, Any]:
@@ -292,7 +294,7 @@ def start(cfg: DictConfig) -> Run:
     check(cfg)
     device = resolve_device(cfg.device)
     logging.getLogger("torchrl").setLevel(logging.WARNING)
-    torch.manual_seed(cfg.seed)
+    torch.manual_seed(derive_seed("weights", cfg.seed))
     if device.type == "cuda":
         torch.set_float32_matmul_precision("high")
     claim(folder)

@@ -10,6 +10,7 @@ import gc
 from typing import TYPE_CHECKING, Any
 
 from franka_wm.errors import UserError
+from franka_wm.seeding import derive_seed
 from franka_wm.training import build
 from franka_wm.training.learner import Learner
 from franka_wm.training.progress import say
@@ -48,7 +49,9 @@ def pretrain(run: Run, env: Any, experience: Any, spaces: Spaces) -> None:
     say(f"first stage: {cfg.pretrain.model.name}, {cfg.pretrain.updates} updates on pictures alone")
     policies = {}
     if env is not None:
-        policies = build.make_scripted_policies(env, seed=cfg.seed, smoothness=cfg.collector.smoothness)
+        policies = build.make_scripted_policies(
+            env, seed=derive_seed("policies", cfg.seed, FOLDER), smoothness=cfg.collector.smoothness
+        )
     trainer = Trainer(
         env=env,
         learner=Learner(model, **run.learner_options(first)),

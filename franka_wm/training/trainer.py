@@ -5,7 +5,7 @@ from __future__ import annotations
 import signal
 import time
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
 from typing import Any, cast
 
@@ -16,6 +16,7 @@ from tensordict.nn import TensorDictModuleBase
 from torchrl.collectors import Collector
 
 from franka_wm.data.captured import CapturedSampling
+from franka_wm.seeding import derive_seed, seeded
 from franka_wm.training.build import explore
 from franka_wm.training.checkpoint import Checkpoint, save_checkpoint
 from franka_wm.training.learner import Learner
@@ -70,6 +71,16 @@ def interruptible() -> Iterator[Any]:
             signal.signal(number, handler)
 
 
+EVALUATION_SHARE = 0.1
+"""Evaluations while training are left out once they have taken more than this share of the training's time, unless
+``evaluation.every`` asks for them. The weights are the same with and without."""
+
+
+def evaluation_period(cfg: DictConfig) -> int:
+    """Updates between evaluations while training: ``evaluation.every``, or an eighth of the run."""
+    return max(1, -(-cfg.trainer.updates // 8)) if cfg.evaluation.every is None else cfg.evaluation.every
+
+
 class Trainer:
     """Gathers experience and learns from it, in turns.
 
@@ -77,12 +88,13 @@ class Trainer:
         env: The training worlds; ``None`` on recorded data.
         learner: Updates the model.
         replay: Receives (worlds, time) batches, gives windows; or recorded windows.
-        policies: By name; ``random`` gathers the first steps, ``actor`` the rest.
+        policies: By name, for the training worlds alone; ``random`` gathers the first steps, ``actor`` the rest.
         actor: Which of them acts.
         cfg: The whole configuration; saved with every checkpoint.
         folder: Of the run.
         loggers: TorchRL loggers.
-        evaluate: Called now and then with nothing, returns numbers to log.
+        evaluate: Called now and then with nothing, returns numbers to log. What it and ``diagnose`` draw at random
+            comes from generators of their own: they do not change what is learned.
         spaces: What the model was built for; the environment's if not given.
         validation: Recorded windows that training never sees; their losses are logged.
         diagnose: From model and batch to numbers to log and, if something is going wrong, a warning.
@@ -116,7 +128,8 @@ class Trainer:
         self.validation = validation
         self.diagnose = diagnose
         self._batch: TensorDictBase | None = None
-        self._said = False
+        self._said = self._said_too_long = False
+        self._evaluated = 0.0  # s
         self._draw, self._static = replay.sample, lambda batch: False
         if learner.capture and env is not None:
             self._draw = sampling = CapturedSampling(replay)
@@ -147,7 +160,8 @@ class Trainer:
         progress = Progress(
             total, done=self.learner.updates, env_steps=self.env_steps, every=trainer.log_every
         )
-        evaluated = saved = time.perf_counter()
+        saved = time.perf_counter()
+        every = evaluation_period(self.cfg)
         ahead = sorted(steps for steps in self.cfg.evaluation.get("at_steps", []) if steps > self.env_steps)
         with interruptible() as stop:
             if self.env is None:
@@ -158,9 +172,10 @@ class Trainer:
                     self.seed()
                 self._acting.use(self.actor)
             while self.learner.updates < total and not stop():
+                before = self.learner.updates
                 if self.env is not None:
                     self.gather()
-                for _ in range(min(trainer.updates_per_batch, total - self.learner.updates)):
+                for _ in range(min(trainer.updates_per_batch, total - before)):
                     self._batch = self._draw()
                     self.learner.update(self._batch, static=self._static(self._batch))
                 self.seconds = time.perf_counter() - started
@@ -170,9 +185,15 @@ class Trainer:
                     self.log(progress)
                 reached = bool(ahead) and self.env_steps >= ahead[0]
                 ahead = [steps for steps in ahead if steps > self.env_steps]
-                if (reached or now - evaluated >= self.cfg.evaluation.every) and not last:
-                    evaluated = self.record(self.evaluate(), say_it=True)
-                    started += evaluated - now  # seconds count training, not evaluation
+                passed = self.learner.updates // every > before // every
+                if (reached or (passed and not self._too_long())) and not last:
+                    with self.aside("evaluation"):
+                        numbers = self.evaluate()
+                    if numbers:
+                        self.record(numbers, say_it=True)
+                    spent = time.perf_counter() - now
+                    self._evaluated += spent
+                    started += spent  # seconds count training, not evaluation
                 if now - saved >= trainer.checkpoint_every and not last:
                     self.save(last=False)
                     saved = time.perf_counter()
@@ -227,6 +248,24 @@ class Trainer:
 
     # -- what is kept and said ------------------------------------------------------------------------------
 
+    def _too_long(self) -> bool:
+        """Whether evaluations have taken more of the time than they may; where ``every`` is given, they may."""
+        if self.cfg.evaluation.every is not None or self._evaluated <= EVALUATION_SHARE * self.seconds:
+            return False
+        if not self._said_too_long:
+            say(
+                "  evaluations take long here: some are left out; evaluation.every=UPDATES asks for all of them"
+            )
+            self._said_too_long = True
+        return True
+
+    def aside(self, purpose: str) -> AbstractContextManager[None]:
+        """Around what only looks on: it draws from seeds of its own, and training goes on as if it had not been.
+
+        How often and when that happens depends on the machine and on what is wanted to be known.
+        """
+        return seeded(derive_seed(purpose, self.cfg.seed, self.learner.updates))
+
     def log(self, progress: Progress) -> None:
         """Reads what the device has summed up, tells the terminal and the loggers."""
         row, text = {}, ""
@@ -245,11 +284,12 @@ class Trainer:
         metrics = self.learner.metrics()
         if not text and "loss" in metrics:
             text = f"loss {metrics['loss']:.4g}"
-        row |= metrics | self.validate()
         warning = None
-        if self.diagnose is not None and self._batch is not None:
-            numbers, warning = self.diagnose(self.model, self._batch)
-            row |= numbers
+        with self.aside("log"):
+            row |= metrics | self.validate()
+            if self.diagnose is not None and self._batch is not None:
+                numbers, warning = self.diagnose(self.model, self._batch)
+                row |= numbers
         row |= progress.line(self.learner.updates, self.env_steps, text)
         if warning:
             say(f"  warning: {warning}")
@@ -272,15 +312,14 @@ class Trainer:
         means = {name: torch.stack([one.get(name) for one in losses]).mean() for name in losses[0].keys()}  # noqa: SIM118
         return {f"validation/{name}": float(value) for name, value in means.items()}
 
-    def record(self, numbers: Mapping[str, float], *, say_it: bool = False) -> float:
-        """Adds a row to the history and the loggers; returns the time."""
+    def record(self, numbers: Mapping[str, float], *, say_it: bool = False) -> None:
+        """Adds a row to the history and the loggers."""
         row = dict(numbers)
         row |= {"env_steps": self.env_steps, "updates": self.learner.updates, "time_s": self.seconds}
         self.rows.append(row)
         log_numbers(self.loggers, numbers, step=self.learner.updates)
         if say_it:
             say("  " + "   ".join(f"{name} {value:.3f}" for name, value in numbers.items()))
-        return time.perf_counter()
 
     def save(self, *, last: bool = True) -> Path:
         """Writes ``checkpoints/latest``; with the experience if it is wanted and there is room, or says so."""

@@ -138,6 +138,8 @@ def test_environments_of_a_run(composed) -> None:
         ("evaluation.video_size=97", "video_size"),
         ("trainer.checkpoint_replay=8", "checkpoint_replay"),
         ("evaluation.at_steps=1000", "at_steps"),
+        ("evaluation.every=60.0", "whole number of updates"),
+        ("evaluation.every=-1", "whole number of updates"),
         ("evaluation.at_steps=[1000,-5]", "at_steps"),
         (("evaluation.at_steps=[1000]", "evaluation.during=[]"), "evaluation.during=[planner]"),
         (("dataset=lerobot", "trainer=offline", "dataset.root=/tmp", "evaluation.at_steps=[9]"), "at_steps"),

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import signal
+import time
 from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
@@ -35,6 +36,7 @@ def cfg(composed) -> DictConfig:
         f"replay.capacity={CAPACITY * N}",
         "trainer.updates=20",
         "logger=none",
+        "evaluation.every=1000",
     )
 
 
@@ -193,11 +195,24 @@ def test_large_experience_is_written_at_the_end_alone(make: Make, monkeypatch, c
 
 def test_evaluation_while_training(make: Make, cfg: DictConfig) -> None:
     trainer = make(evaluate=lambda: {"eval/policy/success": 0.5})
-    trainer.cfg.evaluation.every = 0.0
+    trainer.cfg.evaluation.every = 10
     trainer.fit()
     rows = [row for row in trainer.rows if "eval/policy/success" in row]
     assert len(rows) == 1  # after the first batch; the last one is left to the end of the run
     assert rows[0]["updates"] == 10
+
+
+def test_evaluations_that_take_long_are_left_out_unless_asked_for(make: Make, capsys) -> None:
+    def slowly() -> dict[str, float]:
+        time.sleep(2.0)
+        return {"eval/policy/success": 0.5}
+
+    for every, count in ((None, 1), (10, 3)):
+        trainer = make(str(every), updates=40, evaluate=slowly)
+        trainer.cfg.evaluation.every = every
+        trainer.fit()
+        assert sum("eval/policy/success" in row for row in trainer.rows) == count
+        assert capsys.readouterr().out.count("some are left out") == (every is None)
 
 
 def test_evaluation_at_environment_steps(make: Make, capsys) -> None:
@@ -223,7 +238,7 @@ def test_a_signal_ends_the_run_with_everything_saved(make: Make, number: int) ->
     trainer = make(
         updates=40, evaluate=lambda: (os.kill(os.getpid(), number), {"eval/policy/success": 0.5})[1]
     )
-    trainer.cfg.evaluation.every = 0.0
+    trainer.cfg.evaluation.every = 10
     trainer.fit()
     assert trainer.interrupted and trainer.learner.updates == 10
     checkpoint = load_checkpoint(latest_checkpoint(trainer.folder))

@@ -16,6 +16,7 @@ from franka_wm.data.lerobot.provenance import describe
 from franka_wm.data.lerobot.schema import FORMATS, SEED, schema_for
 from franka_wm.data.lerobot.writer import DatasetWriter, default_shard_frames
 from franka_wm.errors import UserError
+from franka_wm.seeding import derive_seed
 
 OPTIONS: dict[str, Any] = {
     "out": "",
@@ -167,7 +168,9 @@ def _simple(name: str, options: dict[str, Any], overrides: list[str]) -> Source:
         "smooth": lambda: SmoothRandomPolicy(
             env.action_dim,
             smoothness=smoothness,
-            generator=torch.Generator(device=env.device).manual_seed(seed),
+            generator=torch.Generator(device=env.device).manual_seed(
+                derive_seed("policies", seed, "collection")
+            ),
         ),
     }
     resolved: Any = OmegaConf.to_container(cfg, resolve=True)
@@ -243,8 +246,8 @@ def gather(
     does not fill the dataset with short episodes.
 
     Args:
-        source: Who acts where. Going on (``resume``) seeds the worlds with ``seed`` plus the number of episodes that
-            are there, which the feature ``seed`` then says.
+        source: Who acts where. The worlds' seed is derived from ``seed`` and the number of episodes that are there
+            already; the feature ``seed`` says it.
         out, workers, shard_frames, resume: As for :class:`~franka_wm.data.lerobot.writer.DatasetWriter`.
         episodes: In all.
         format: Of pictures.
@@ -280,7 +283,7 @@ def gather(
             say(f"{writer.resumed} episodes are there already")
             return writer.finish(), True
         writer.start()
-        seed = source.seed + writer.resumed
+        seed = derive_seed("collection", source.seed, writer.resumed)
         source.env.set_seed(seed)
         quota = np.full(worlds, left // worlds) + (np.arange(worlds) < left % worlds)
         cutter = EpisodeCutter(schema, seed=seed, discrete=_table(source.env))

@@ -16,6 +16,7 @@ from franka_wm.data.lerobot.cache import Cache
 from franka_wm.data.lerobot.mapping import FeatureMap
 from franka_wm.data.stacks import CHANNELS
 from franka_wm.errors import UserError
+from franka_wm.seeding import derive_seed
 
 SPLITS = ("train", "validation", "all")
 
@@ -163,7 +164,7 @@ class RecordedWindows:
         self._shift = torch.from_numpy(shift).to(self._home)
         self._first_rows = torch.from_numpy(start[useful]).to(self._home)
         self._steps = torch.arange(window + 1, device=self._home)
-        self._generator = torch.Generator(device=self._home).manual_seed(seed)
+        self._generator = torch.Generator(device=self._home).manual_seed(derive_seed("windows", seed, split))
         self._bounds = torch.tensor([0, *np.cumsum([c.arrays["action"].shape[0] for c in recording.caches])])
         if mapping.discrete:
             self.num_actions = int(max(int(a.max()) for a in recording.arrays["action"])) + 1
@@ -377,7 +378,7 @@ def _split(dataset: np.ndarray, split: str, fraction: float, seed: int) -> np.nd
     for k in np.unique(dataset):
         mine = np.flatnonzero(dataset == k)
         count = min(max(1, round(fraction * len(mine))), len(mine) - 1) if fraction > 0 else 0
-        validation[np.random.default_rng(seed).permutation(mine)[:count]] = True
+        validation[np.random.default_rng(derive_seed("validation", seed)).permutation(mine)[:count]] = True
     return np.flatnonzero(validation if split == "validation" else ~validation)
 
 

@@ -1,0 +1,57 @@
+"""What tests of whole runs share."""
+
+from __future__ import annotations
+
+import runpy
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+from hydra.core.global_hydra import GlobalHydra
+
+from franka_wm.training.checkpoint import Checkpoint, latest_checkpoint, load_checkpoint
+
+TINY = [
+    "scale=smoke",
+    "device=cpu",
+    "env.substeps=1",
+    "env.episode_length=8",
+    "collector.num_envs=3",
+    "evaluation.episodes=2",
+    "evaluation.video_episodes=0",
+    "logger=none",
+    "planner.num_samples=8",
+    "planner.num_elites=4",
+]
+
+Train = Callable[..., Checkpoint]
+
+
+@pytest.fixture(scope="session")
+def tiny() -> list[str]:
+    """Overrides for a run of seconds."""
+    return TINY
+
+
+@pytest.fixture
+def train(root: Path, tmp_path: Path, monkeypatch) -> Train:
+    """``python train.py`` in this process, with tiny sizes; returns the run's last checkpoint."""
+
+    def train(*arguments: str, folder: Path = tmp_path / "run", status: int | None = None) -> Checkpoint:
+        given = {argument.split("=", 1)[0] for argument in arguments}
+        sizes = [] if "resume" in given else [one for one in TINY if one.split("=", 1)[0] not in given]
+        monkeypatch.chdir(tmp_path)
+        monkeypatch.setattr(
+            sys, "argv", [str(root / "train.py"), *sizes, *arguments, f"hydra.run.dir={folder}"]
+        )
+        GlobalHydra.instance().clear()
+        if status is None:
+            runpy.run_path(str(root / "train.py"), run_name="__main__")
+        else:
+            with pytest.raises(SystemExit) as caught:
+                runpy.run_path(str(root / "train.py"), run_name="__main__")
+            assert caught.value.code == status
+        return load_checkpoint(latest_checkpoint(folder))
+
+    return train
