@@ -16,7 +16,7 @@ VENV := .venv
 STAMP := $(VENV)/.installed
 BIN := $(VENV)/bin
 
-.PHONY: help setup train test results lint format lock clean
+.PHONY: help setup train test results mutation lint format lock clean
 
 help: ## show the targets
 	@grep -hE '^[a-z]+:.*## ' $(firstword $(MAKEFILE_LIST)) | sed -E 's/:[^#]*## /\t/' | \
@@ -41,6 +41,12 @@ results: $(STAMP) ## which results are older than the code; ROW=name measures on
 	@if [[ -n "$(ROW)" ]]; then $(BIN)/python -m benchmarks.results run $(ROW) $(ARGS); fi
 	@$(BIN)/python -m benchmarks.results render
 	@$(BIN)/python -m benchmarks.results list
+
+# Not in CI: every mistake runs tests of seconds. Its tool is not locked; nothing else needs it.
+mutation: $(STAMP) ## which small mistakes in the code no test notices (hours; ARGS="--sample 40")
+	@$(BIN)/python -c 'import cosmic_ray' 2>/dev/null || \
+	  $(BIN)/python -m pip install --quiet --disable-pip-version-check cosmic-ray==8.7.0
+	@$(BIN)/python scripts/mutation.py $(ARGS)
 
 lint: $(STAMP) ## ruff check, ruff format --check, pyright
 	@$(BIN)/ruff check .

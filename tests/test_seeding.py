@@ -15,4 +15,9 @@ def test_purposes_seeds_and_parts_are_told_apart():
 
 
 def test_every_seed_fits_into_31_bits():
-    assert all(0 <= derive_seed("training", seed) < 2**31 for seed in range(1000))
+    seeds = [derive_seed("training", seed) for seed in range(1000)]
+    assert all(0 <= seed < 2**31 for seed in seeds)
+    every = 0
+    for seed in seeds:
+        every |= seed
+    assert every == 2**31 - 1  # and every bit is used

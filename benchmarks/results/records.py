@@ -47,26 +47,28 @@ def record_run(row: Row, folder: Path, *, jobs: int, commit: str | None = None) 
     Raises:
         UserError: It did not finish, was resumed, is not a run of this row, or ran on another kind of machine.
     """
-    versions = read_json(folder / "versions.json")
+    versions, finished, found = (
+        read_json(folder / f"{name}.json") for name in ("versions", "finished", "evaluation")
+    )
     config = read_config(folder)
-    if not versions or "source" not in versions or not (folder / "evaluation.json").is_file():
+    if not versions or not finished or not found:
         raise UserError(f"{folder}: not the folder of a run that finished; results need the whole run")
     if config.get("resume"):
         raise UserError(f"{folder}: a run that was resumed; results need runs in one piece")
     typed = overrides(folder)
     check_arguments(row, typed, folder)
     check_machine(row, versions, folder)
-    found = read_result(folder / "evaluation.json")
+    result = read_result(folder / "evaluation.json")
     kept = {name: value for name, value in config.items() if name not in SAME_BUT}
     return {
         "row": row.name,
         "seed": config["seed"],
         "command": shlex.join(["python", "train.py", *typed]),
         **_made_with(versions, jobs, commit),
-        "training": _training(folder) | {"command_seconds": versions["seconds"]},
-        "protocol": found.protocol,
-        "policies": found.policies,
-        "code": {"files": versions["source"], "config": kept},
+        "training": _training(folder) | {"command_seconds": finished["seconds"]},
+        "protocol": result.protocol,
+        "policies": result.policies,
+        "code": {"files": finished["source"], "config": kept},
     }
 
 

@@ -155,8 +155,9 @@ class FrankaConfig:
             from running ahead of what the arm can follow.
         solver_iterations: Constraint solver iterations per physics step (MuJoCo).
         solver_ls_iterations: Line-search iterations of each of those.
-        auto_reset: ``"native"`` (finished worlds restart inside the step, no host sync) or ``"standard"``
-            (TorchRL resets by mask; slower, needs no support from what drives the environment).
+        auto_reset: How ``step_and_maybe_reset``, the call of TorchRL's collectors, begins new episodes:
+            ``"native"`` (finished worlds restart inside the step, no host sync) or ``"standard"`` (TorchRL asks
+            whether a world is done and resets by mask; slower). The numbers are the same.
     """
 
     image_size: int = 64

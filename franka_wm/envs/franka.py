@@ -5,15 +5,19 @@
 
 from __future__ import annotations
 
+import itertools
 import logging
+import multiprocessing
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import torch
 import warp as wp
 from tensordict import TensorDict, TensorDictBase
 from torchrl.data import Binary, Bounded, Composite, Unbounded
-from torchrl.envs import EnvBase, TransformedEnv
+from torchrl.envs import EnvBase
 
 from franka_wm.envs.camera import Camera, as_torch, camera_framing
 from franka_wm.envs.config import STATE_DIM, FrankaConfig
@@ -23,6 +27,7 @@ from franka_wm.envs.robots import load_robot
 from franka_wm.envs.simulation import STATISTICS, Simulation
 from franka_wm.envs.tasks import Task, goal_distance, reach_reward
 from franka_wm.errors import UserError
+from franka_wm.seeding import derive_seed
 
 log = logging.getLogger(__name__)
 
@@ -52,17 +57,17 @@ def resolve_device(device: torch.device | str | None) -> torch.device:
     return torch.device("cpu")
 
 
-def _mark_first(
-    env: EnvBase, step: TensorDictBase, following: TensorDictBase
-) -> tuple[TensorDictBase, TensorDictBase]:
-    """Marks the first observation of every new episode.
+_unseeded = itertools.count()
 
-    TorchRL writes ``is_init`` once for each of ``done``, ``terminated``, ``truncated``, and the last one wins:
-    an episode that follows a success would not be marked.
+
+def own_seed() -> int:
+    """A seed for an environment that is given none: of its number among those of this process.
+
+    The workers of a ``ParallelEnv`` or of a collector count alike. So the place of the process among its parent's
+    children, (), (2,) or (2, 1), counts, too. The same program has the same seeds when it is run again.
     """
-    if env.__dict__.get("_torchrl_native_autoreset", False):
-        following.set("is_init", step.get(("next", "done")).clone())
-    return step, following
+    place = getattr(multiprocessing.current_process(), "_identity", ())
+    return derive_seed("worlds", next(_unseeded), *place)
 
 
 class FrankaEnv(EnvBase):
@@ -84,11 +89,12 @@ class FrankaEnv(EnvBase):
     ``done``, …         (N, 1) bool             ``terminated`` by success (if asked), ``truncated`` by time
     ==================  ======================  ==================================================================
 
-    **Auto-reset.** With ``auto_reset="native"`` a finished world starts its next episode inside the step: no
-    host sync, nothing stepped or rendered twice. What TorchRL's collectors see is exact: ``("next", …)`` holds
-    the *true last observation* of a finished episode, and the following step's root the first of the next one.
-    Plain :meth:`step` does the same; :meth:`step_and_maybe_reset` is the call that hands over the new episode's
-    first observation. Under transforms use :class:`TransformedFrankaEnv`.
+    **Auto-reset.** ``("next", …)`` holds the *true last observation* of a finished episode, and the following
+    step's root the first of the next one. This is so under any wrapper and collector of TorchRL's: a world that
+    is finished stays so until it is reset, and every episode is played. With ``auto_reset="native"`` worlds
+    restart inside :meth:`step_and_maybe_reset`, which a collector calls and which hands over the new episode's
+    first observation: no host sync, nothing stepped or rendered twice. A plain ``TransformedEnv`` asks the device
+    whether a world is done and resets by mask; :class:`TransformedFrankaEnv` does not ask.
 
     **A world that is no longer finite** is put back to its last finite observation, truncated, reset and
     counted (``statistics()["nonfinite"]``); no NaN is emitted.
@@ -99,7 +105,8 @@ class FrankaEnv(EnvBase):
         config: The arm and its task; :class:`FrankaConfig` lists every field.
         num_envs: Number of worlds, N ≥ 1.
         device: ``None`` or ``"auto"`` (GPU where there is one), ``"cpu"``, ``"cuda"``, ``"cuda:K"``.
-        seed: Of all randomness.
+        seed: Of all randomness. ``None``: one that no other instance has (:func:`own_seed`), so that the
+            environments of a ``SerialEnv`` or ``ParallelEnv`` play different episodes.
         urdf_path: A robot of your own.
         task: A task of your own (:class:`~franka_wm.envs.tasks.Task`); the config's if not given.
 
@@ -118,7 +125,7 @@ class FrankaEnv(EnvBase):
         *,
         num_envs: int = 1,
         device: torch.device | str | None = None,
-        seed: int = 0,
+        seed: int | None = None,
         urdf_path: str | Path | None = None,
         task: Task | None = None,
     ):
@@ -132,14 +139,17 @@ class FrankaEnv(EnvBase):
         if task is None:
             check_robot(config, urdf_path)
         started = time.perf_counter()
-        log.info("building %d worlds on %s", num_envs, device)
+        seed = own_seed() if seed is None else seed
+        log.info("building %d worlds on %s with seed %d", num_envs, device, seed)
         self.simulation = Simulation(config, num_envs, str(device), seed=seed, urdf_path=urdf_path, task=task)
         self.kinematics = self.simulation.kinematics
         log.info(
             "built in %.1f s; the first reset and step compile what is not cached yet",
             time.perf_counter() - started,
         )
-        self._torchrl_native_autoreset = config.auto_reset == "native"
+        self._restart = (
+            False  # whether finished worlds begin their next episode inside the step that is under way
+        )
         self._stack = FrameStack(config.frame_stack) if config.frame_stack > 1 else None
         self._stacked = [key for key in self.simulation.images if self._stack and key.startswith("pixels")]
         self._make_specs()
@@ -201,7 +211,7 @@ class FrankaEnv(EnvBase):
                 f"action has shape {tuple(action.shape)}; it must be {tuple(sim.action.shape)}: (worlds, joints)"
             )
         sim.action.copy_(action)
-        sim.step()
+        sim.step(restart=self._restart)
         for key in self._stacked:
             self._stack.push(key, sim.next_images[key])
         out = {
@@ -210,7 +220,7 @@ class FrankaEnv(EnvBase):
             else getattr(sim, f"next_{key}").clone()
             for key in self._observed
         }
-        if self._torchrl_native_autoreset:  # the next episode has begun where one has ended
+        if self._restart:  # the next episode has begun where one has ended
             for key in self._stacked:
                 self._stack.restart(key, sim.images[key], sim.done.squeeze(-1))
         for key in ("success", "reward", "done", "terminated", "truncated"):
@@ -218,19 +228,35 @@ class FrankaEnv(EnvBase):
         out["is_init"] = torch.zeros_like(sim.done)
         return TensorDict(out, batch_size=self.batch_size, device=self.device)
 
-    def step_and_maybe_reset(self, tensordict: TensorDictBase) -> tuple[TensorDictBase, TensorDictBase]:
-        return _mark_first(self, *super().step_and_maybe_reset(tensordict))
+    def _step_and_maybe_reset(self, tensordict: TensorDictBase) -> tuple[TensorDictBase, TensorDictBase]:
+        """What ``step_and_maybe_reset`` calls: only here is the new episode's first observation handed over.
 
-    def _native_autoreset_set_invalid_next_observation(self, tensordict: TensorDictBase) -> dict:
-        """TorchRL's hook for environments that reset themselves; returns what the next step starts from.
-
-        TorchRL would take that from ``next`` and blank ``next`` out. Here ``next`` keeps the true last
-        observation and the new episode's first comes from the simulation.
+        So only here may worlds restart inside the step. Whatever steps the environment in another way (a
+        ``TransformedEnv``, a ``SerialEnv``, ``step`` by hand) finds its finished worlds finished, and resets them.
         """
-        sim = self.simulation
-        out = self._present()
-        out["success"] = sim.success & ~sim.done
-        return out
+        if self.config.auto_reset == "standard":
+            return super()._step_and_maybe_reset(tensordict)
+        if tensordict.device != self.device:
+            tensordict = tensordict.to(self.device)
+        with self._restarting():
+            tensordict = self.step(tensordict)
+        following = self._step_mdp(tensordict)
+        done = following.get("done")
+        following.update(self._present())
+        following.set("success", following.get("success") & ~done)
+        following.set("is_init", done.clone())
+        for key in ("done", "terminated", "truncated"):
+            following.set(key, torch.zeros_like(done))
+        return tensordict, following
+
+    @contextmanager
+    def _restarting(self) -> Iterator[None]:
+        """Steps inside begin the next episode of finished worlds."""
+        self._restart = True
+        try:
+            yield
+        finally:
+            self._restart = False
 
     def _present(self) -> dict[str, torch.Tensor]:
         sim = self.simulation
@@ -319,7 +345,7 @@ class FrankaEnv(EnvBase):
         return TensorDict(out, batch_size=self.batch_size, device=self.device)
 
     def _set_seed(self, seed: int | None) -> None:
-        self.simulation.set_seed(0 if seed is None else int(seed))
+        self.simulation.set_seed(own_seed() if seed is None else int(seed))
 
     # -- the arm ------------------------------------------------------------------------------------------
 
@@ -455,7 +481,8 @@ class FrankaEnv(EnvBase):
         if "pixels" in sim.images:
             videos.append(sim.images["pixels"].clone())
         for t in range(actions.shape[1]):
-            step = self._step(TensorDict({"action": actions[:, t]}, batch_size=self.batch_size))
+            with self._restarting():
+                step = self._step(TensorDict({"action": actions[:, t]}, batch_size=self.batch_size))
             rewards.append(step["reward"])
             dones.append(step["done"])
             states.append(sim.next_state.clone())
@@ -497,38 +524,3 @@ def check_robot(config: FrankaConfig, urdf_path: str | Path | None = None) -> No
         raise UserError(
             f"goal={config.goal} m: out of the arm's reach; it reaches about 0.85 m from (0, 0, 0.333)"
         )
-
-
-class TransformedFrankaEnv(TransformedEnv):
-    """A ``TransformedEnv`` that keeps what :class:`FrankaEnv` promises at the end of episodes.
-
-    TorchRL calls the auto-reset hook on the outermost environment; a plain ``TransformedEnv`` would overwrite
-    the true last observation with NaN and start the next episode from a wrong one. This one runs the new
-    episode's first observation through the transforms instead.
-    """
-
-    def step_and_maybe_reset(self, tensordict: TensorDictBase) -> tuple[TensorDictBase, TensorDictBase]:
-        return _mark_first(self.base_env, *super().step_and_maybe_reset(tensordict))
-
-    def _native_autoreset_set_invalid_next_observation(self, tensordict: TensorDictBase) -> dict:
-        base = self.base_env
-        if not isinstance(base, FrankaEnv):
-            return super()._native_autoreset_set_invalid_next_observation(tensordict)
-        next_tensordict = tensordict.get("next")
-        done = next_tensordict.get("done")
-        fresh = TensorDict(
-            base._native_autoreset_set_invalid_next_observation(tensordict),
-            batch_size=base.batch_size,
-            device=base.device,
-        )
-        fresh["is_init"] = done.clone()
-        for key in ("done", "terminated", "truncated"):
-            fresh[key] = torch.zeros_like(done)
-        reset = self.transform._reset(TensorDict({"_reset": done.clone()}, batch_size=base.batch_size), fresh)
-        mask = done.squeeze(-1)
-        out = {}
-        for key in self._observation_keys_step_mdp:
-            new, old = reset.get(key, None), next_tensordict.get(key, None)
-            if new is not None and old is not None:
-                out[key] = torch.where(mask.view(-1, *[1] * (old.dim() - 1)), new, old)
-        return out

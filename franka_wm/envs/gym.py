@@ -53,7 +53,8 @@ class FrankaVectorEnv(gymnasium.vector.VectorEnv):
     ``environment_state``    (N, 3) float32                the goal [m]
     =======================  ============================  ======================================
 
-    Actions are (N, 7) float32 in [−1, 1], rewards (N,) float32, terminations and truncations (N,) bool.
+    Actions are (N, A) float32 in [−1, 1], where A is 7, or 3 with ``action_mode="ee_delta"``. Rewards are (N,)
+    float32, terminations and truncations (N,) bool.
 
     **Autoreset is same-step**: where an episode ended, the observation returned is already the first of the
     next one. The last of the finished one is in ``info["final_obs"]`` (an object array, ``None`` elsewhere),
@@ -118,7 +119,7 @@ class FrankaVectorEnv(gymnasium.vector.VectorEnv):
         entries["agent_pos"] = spaces.Box(-np.inf, np.inf, (NUM_JOINTS,), np.float32)
         entries["environment_state"] = spaces.Box(-np.inf, np.inf, (3,), np.float32)
         self.single_observation_space = spaces.Dict(entries)
-        self.single_action_space = spaces.Box(-1.0, 1.0, (NUM_JOINTS,), np.float32)
+        self.single_action_space = spaces.Box(-1.0, 1.0, (env.action_dim,), np.float32)
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
         self.action_space = batch_space(self.single_action_space, self.num_envs)
         self._present: TensorDictBase | None = None
@@ -159,7 +160,7 @@ class FrankaVectorEnv(gymnasium.vector.VectorEnv):
         """One control step of all worlds.
 
         Args:
-            actions: (N, 7), clipped to [−1, 1].
+            actions: (N, A), clipped to [−1, 1].
 
         Returns:
             Observations, rewards, terminations, truncations, info.
@@ -167,8 +168,8 @@ class FrankaVectorEnv(gymnasium.vector.VectorEnv):
         if self._present is None:
             raise UserError("step before reset: call reset() first")
         actions = np.asarray(actions, dtype=np.float32)
-        if actions.shape != (self.num_envs, NUM_JOINTS):
-            raise UserError(f"actions has shape {actions.shape}; it must be ({self.num_envs}, {NUM_JOINTS})")
+        if actions.shape != self.action_space.shape:
+            raise UserError(f"actions has shape {actions.shape}; it must be {self.action_space.shape}")
         self._present.set("action", torch.from_numpy(actions).to(self.env.device))
         stepped, self._present = self.env.step_and_maybe_reset(self._present)
         after = stepped.get("next")

@@ -253,7 +253,6 @@ def end_step(
     broken: wp.array[wp.bool],
     episode_length: int,
     terminate_on_success: bool,
-    auto_reset: bool,
     # in and out
     step_count: wp.array2d[int],
     episode_return: wp.array2d[float],
@@ -268,9 +267,11 @@ def end_step(
     """Ends episodes and keeps their statistics.
 
     A broken world is truncated, not terminated: all rewards are negative, so an end worth 0 would pay an
-    agent for breaking the simulation.
+    agent for breaking the simulation. A world that is stepped on after its end, without a reset, stays done by
+    time or success, and is not counted again.
     """
     world = wp.tid()
+    over = step_count[world, 0] >= episode_length or (terminate_on_success and episode_success[world, 0])
     count = step_count[world, 0] + 1
     step_count[world, 0] = count
     total = episode_return[world, 0] + reward[world, 0]
@@ -278,14 +279,14 @@ def end_step(
     solved = success[world, 0] and not broken[world]
     once = episode_success[world, 0] or solved
     episode_success[world, 0] = once
-    ended = terminate_on_success and solved
+    ended = terminate_on_success and once
     late = (count >= episode_length) or broken[world]
     terminated[world, 0] = ended
     truncated[world, 0] = late and not ended
     finished = ended or late
     done[world, 0] = finished
-    reset_mask[world] = finished and auto_reset
-    if finished:
+    reset_mask[world] = finished
+    if finished and not over:
         statistics[world, 0] += wp.float64(1.0)
         statistics[world, 1] += wp.float64(total)
         statistics[world, 2] += wp.float64(float(count))

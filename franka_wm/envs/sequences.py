@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING
 import torch
 from tensordict import TensorDict
 
-from franka_wm.envs.config import NUM_JOINTS
 from franka_wm.errors import UserError
 
 if TYPE_CHECKING:
@@ -82,7 +81,7 @@ def franka_sequences(
         - ``video`` (n, T, 3, H, W) uint8. Bytes, because float would take four times the memory of what is
           mostly memory: ``video.float() / 255`` is in [0, 1]. In memory the channels are last, so that
           ``video.movedim(2, -1)``, this package's ``pixels``, costs no copy.
-        - ``action`` (n, T − 1, 7) in [−1, 1]: ``action[:, t]`` leads from frame t to frame t + 1.
+        - ``action`` (n, T − 1, A) in [−1, 1]: ``action[:, t]`` leads from frame t to frame t + 1.
         - ``joint_q`` (n, T, 7) [rad] and ``tool`` (n, T, 3) [m].
 
     Raises:
@@ -111,7 +110,7 @@ def franka_sequences(
     allowed = max_attempts * math.ceil(n_sequences / env.num_envs)
     for _ in range(allowed):
         actions = smooth_actions(
-            env.num_envs, length - 1, NUM_JOINTS, smoothness=smoothness, generator=generator
+            env.num_envs, length - 1, env.action_dim, smoothness=smoothness, generator=generator
         ).to(env.device)
         reset_seed = int(torch.randint(2**31 - 1, (1,), generator=generator))
         nonfinite = count.clone()

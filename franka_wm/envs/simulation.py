@@ -8,6 +8,8 @@ is one graph launch, on CUDA and on the CPU:
 
     actions → servo targets → physics → observation → task → ends of episodes → pictures
             → masked reset → observation → pictures of the worlds that were reset
+
+Without the second line, for who resets finished worlds by himself, it is another graph.
 """
 
 from __future__ import annotations
@@ -110,16 +112,23 @@ class Simulation:
         self._allocate_images()
         self._dt = 1.0 / (config.fps * config.substeps)
         newton.eval_fk(self.model, self.model.joint_q, self.model.joint_qd, self.newton_state)
-        self._step_graph: wp.Graph | None = None
+        self._step_graphs: dict[bool, wp.Graph] = {}
         self._reset_graph: wp.Graph | None = None
 
     # -- what a user of this class calls ------------------------------------------------------------------
 
-    def step(self) -> None:
-        """One control step of all worlds with :attr:`action`; one graph launch, no host sync."""
-        if self._step_graph is None:
-            self._step_graph = self._capture(self._launch_step)
-        self._replay(self._step_graph)
+    def step(self, *, restart: bool = True) -> None:
+        """One control step of all worlds with :attr:`action`; one graph launch, no host sync.
+
+        Args:
+            restart: Whether finished worlds begin their next episode at once. Where they do not, they stay
+                :attr:`done` until :meth:`reset` begins it.
+        """
+        if restart not in self._step_graphs:
+            self._step_graphs[restart] = self._capture(
+                self._launch_step_and_restart if restart else self._launch_step
+            )
+        self._replay(self._step_graphs[restart])
 
     def reset(self, mask: torch.Tensor | None = None) -> None:
         """Starts the next episode where ``mask`` (N,) is true, or everywhere; other worlds are untouched."""
@@ -398,7 +407,17 @@ class Simulation:
         else:
             wp.capture_launch(graph)
 
+    def _launch_step_and_restart(self) -> None:
+        self._launch_control_step()
+        self._launch_reset_and_observe()
+
     def _launch_step(self) -> None:
+        w = self.warp
+        self._launch_control_step()
+        self._launch_observe(w.true_state, w.joint_target, w.goal)
+        self._launch_noise(w.true_state, w.state)
+
+    def _launch_control_step(self) -> None:
         cfg, n, w, d = self.config, self.num_envs, self.warp, self.device
         self._launch_action()
         self._launch_physics()
@@ -425,7 +444,7 @@ class Simulation:
             n,
             [
                 w.reward, w.success, w.broken, cfg.episode_length, cfg.terminate_on_success,
-                cfg.auto_reset == "native", w.step_count, w.episode_return, w.episode_success, w.statistics,
+                w.step_count, w.episode_return, w.episode_success, w.statistics,
                 w.terminated, w.truncated, w.done, w.reset_mask,
             ],
             device=d,
@@ -442,7 +461,6 @@ class Simulation:
                     wp.copy(now[kind], image)
         for _, now, after in self._goal_cameras:
             wp.copy(after, now)
-        self._launch_reset_and_observe()
 
     def _launch_action(self) -> None:
         cfg, n, w, d = self.config, self.num_envs, self.warp, self.device

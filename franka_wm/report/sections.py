@@ -259,9 +259,7 @@ def what(run: RunFiles) -> str:
         ("scale", config.get("scale")),
     ]
     told = facts((name, plain(value)) for name, value in rows if value is not None)
-    used = facts(
-        (name.replace("_", " "), plain(value)) for name, value in run.versions.items() if name != "source"
-    )
+    used = facts((name.replace("_", " "), plain(value)) for name, value in run.versions.items())
     text = told + (f"<h3>Made with</h3>{used}" if used else "")
     if config:
         text += folded(

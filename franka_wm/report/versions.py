@@ -54,18 +54,19 @@ def write_versions(folder: str | Path, device: Any = None) -> Path:
         UserError: it cannot be written.
     """
     source.snapshot()
-    return _write(Path(folder), versions(device) | {"started": _now().isoformat(timespec="seconds")})
+    started = _now().isoformat(timespec="seconds")
+    return _write(Path(folder) / "versions.json", versions(device) | {"started": started})
 
 
-def complete_versions(folder: str | Path) -> Path:
-    """Add to ``versions.json``, as the run ends, what it took [s] and the hashes of the code that it has imported.
+def write_finished(folder: str | Path) -> Path:
+    """Write ``finished.json`` as the run ends: what it took since `write_versions` [s], and the hashes of its code.
 
     Raises:
         UserError: it cannot be written.
     """
-    found = json.loads((Path(folder) / "versions.json").read_text())
-    taken = (_now() - datetime.fromisoformat(found["started"])).total_seconds()
-    return _write(Path(folder), found | {"seconds": round(taken), "source": source.source()})
+    started = json.loads((Path(folder) / "versions.json").read_text())["started"]
+    taken = (_now() - datetime.fromisoformat(started)).total_seconds()
+    return _write(Path(folder) / "finished.json", {"seconds": round(taken), "source": source.source()})
 
 
 def processor() -> str:
@@ -82,8 +83,7 @@ def _now() -> datetime:
     return datetime.now(UTC)
 
 
-def _write(folder: Path, found: dict[str, Any]) -> Path:
-    path = folder / "versions.json"
+def _write(path: Path, found: dict[str, Any]) -> Path:
     with written_whole(path) as temporary:
         temporary.write_text(json.dumps(found, indent=2) + "\n")
     return path

@@ -200,7 +200,7 @@ class Run:
             for one in (env, judge):
                 if one is not None:
                     with seeded(0):  # how many worlds there are must not decide what a run draws later
-                        one.step(one.rand_action(one.reset()))
+                        one.step_and_maybe_reset(one.rand_action(one.reset()))
                     one.statistics()
                     one.set_seed(derive_seed("training" if one is env else "evaluation", self.cfg.seed))
         return env, judge
@@ -373,13 +373,13 @@ def export_experience(run: Run, trainer: Any) -> None:
 
 def finish(run: Run, trainer: Any) -> None:
     """Closes the loggers, writes the run's page, exports, says the last line; exits with 130 after Ctrl-C."""
-    from franka_wm.report.versions import complete_versions
+    from franka_wm.report.versions import write_finished
     from franka_wm.training.loggers import close_loggers
 
     interrupted = trainer.interrupted
     close_loggers(run.loggers)
     if not interrupted:
-        complete_versions(run.folder)
+        write_finished(run.folder)
         from franka_wm.report.page import write_page
 
         say(f"page:    {write_page(run.folder)}")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
+from types import SimpleNamespace
 from unittest import mock
 
 import pytest
@@ -126,8 +127,8 @@ def test_cost_does_not_depend_on_capacity() -> None:
         with mock.patch.object(torch, "randint", wraps=torch.randint) as randint:
             replay.sample()
         assert randint.call_count == 1
-        drawn.append(randint.call_args.args[1])
-    assert drawn[0] == drawn[1] and drawn[0][0] <= 4 * 32 + 64
+        drawn.append(randint.call_args.args[1:])
+    assert drawn[0] == drawn[1] == ((4 * 32 + 64,),)
 
 
 def test_a_batch_size_of_ones_own() -> None:
@@ -157,6 +158,49 @@ def test_smallest_capacity() -> None:
     replay = make_replay(capacity=12, num_envs=3, window=3, batch_size=4, device="cpu")
     replay.extend(experience(4, lengths=(4, 4, 4)))
     assert replay.sample()["time"].amin() == 0
+
+
+def test_a_buffer_of_one_window_has_one() -> None:
+    replay = buffer(40, 5)
+    replay.extend(experience(5, lengths=(5, 5, 5)))
+    assert replay.sampler.bounds(replay.storage) == (1, 0)
+    assert (replay.sample()["time"] == torch.arange(5)).all()
+
+
+def test_capacity_counts_the_images_before_a_window() -> None:
+    options = {"num_envs": 3, "window": 3, "batch_size": 4, "device": "cpu"}
+    with pytest.raises(UserError, match="and 2 before them; use at least 18"):
+        make_replay(capacity=17, frame_stack=3, stacked=("pixels",), **options)
+    assert make_replay(capacity=18, frame_stack=3, stacked=("pixels",), **options).sampler.before == 2
+    assert make_replay(capacity=12, frame_stack=3, **options).sampler.before == 0  # nothing is stacked
+
+
+def test_windows_end_with_their_episode_unless_asked() -> None:
+    replay = make_replay(capacity=120, num_envs=3, window=3, batch_size=200, device="cpu")
+    replay.extend(experience(40))
+    sample = replay.sample()
+    assert (sample["episode"] == sample["episode"][:, :1]).all()
+    assert WindowSampler(replay.writer, length=1).candidates(8) == 8  # one step crosses nothing
+    assert WindowSampler(replay.writer, length=1, oversample=1).length == 1
+
+
+def test_on_a_gpu_missing_windows_are_kept_in_mind_until_asked_for() -> None:
+    """Without waiting for the device: whether a batch was whole is a tensor until :meth:`check`."""
+
+    def crossing(missing: bool) -> SimpleNamespace:
+        return SimpleNamespace(device=SimpleNamespace(type="cuda"), any=lambda: torch.tensor(missing))
+
+    sampler = buffer(40, 3).sampler
+    sampler.check()
+    for batches in ([True], [True, False], [False, True]):
+        for missing in batches:
+            sampler.record_missing(crossing(missing))
+        with pytest.raises(UserError, match="too few episodes"):
+            sampler.check()
+        sampler._missing = None
+    sampler.record_missing(crossing(False))
+    sampler.check()
+    assert sampler._missing is None
 
 
 @pytest.mark.parametrize("options", [{"length": 0}, {"length": 2, "oversample": 0}])

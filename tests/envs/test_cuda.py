@@ -6,14 +6,15 @@ These run where there is a GPU (``make test ARGS="-m gpu"``); everywhere else th
 from __future__ import annotations
 
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from typing import Any
 
 import pytest
 import torch
 from torch.profiler import ProfilerActivity, profile
 
-from franka_wm.envs import FrankaConfig, FrankaEnv, Randomization
+from franka_wm.envs import FrankaConfig, FrankaEnv, Randomization, TransformedFrankaEnv
+from franka_wm.envs.discretize import DiscreteActions
 from franka_wm.training.learner import Learner
 
 pytestmark = [
@@ -104,6 +105,19 @@ def test_no_step_waits_or_copies(case: str) -> None:
     assert copies == []
     # One is ours, after the steps; the profiler's own stop may add a few, but never one for each step.
     assert len(waits) < STEPS // 2
+
+
+def test_no_step_waits_under_transforms() -> None:
+    env = TransformedFrankaEnv(
+        FrankaEnv(FrankaConfig(**BASE | CASES["stacked"]), num_envs=N, device="cuda"), DiscreteActions()
+    )
+    tensordict = env.reset()
+    action = env.rand_action(tensordict)["action"]
+    for steps in (3, STEPS):
+        with no_waiting() if steps == STEPS else nullcontext():
+            for _ in range(steps):
+                _, tensordict = env.step_and_maybe_reset(tensordict.set("action", action))
+                tensordict.pop("next", None)
 
 
 @pytest.mark.parametrize("case", CASES)

@@ -52,6 +52,13 @@ def test_without_pixels_there_is_no_video_and_statistics_stay() -> None:
     assert torch.equal(env.simulation.statistics, before)
 
 
+def test_actions_are_those_of_the_mode() -> None:
+    env = FrankaEnv(
+        replace(CONFIG, observations=("state",), action_mode="ee_delta"), num_envs=2, device="cpu"
+    )
+    assert franka_sequences(env, 2, 4)["action"].shape == (2, 3, 3)
+
+
 class Sabotage:
     """Puts a NaN into one world's action, in the first ``batches`` batches."""
 

@@ -45,6 +45,20 @@ def test_made_by_name_and_inside_its_spaces() -> None:
     envs.close()
 
 
+def test_actions_are_as_many_as_the_mode_has() -> None:
+    """With ``ee_delta``, three: the space says so, and what it samples is played."""
+    view = FrankaVectorEnv(2, **STATE, action_mode="ee_delta", seed=0)
+    env = FrankaEnv(view.env.config, num_envs=2, device="cpu", seed=0)
+    assert view.single_action_space.shape == (3,) and view.action_space.shape == (2, 3)
+    view.action_space.seed(0)
+    view.reset()
+    action = view.action_space.sample()
+    expected = env.step(env.reset().set("action", torch.from_numpy(action)))["next", "state"]
+    assert np.array_equal(view.step(action)[0]["agent_pos"], expected[:, :7].numpy())
+    with pytest.raises(UserError, match=r"\(2, 7\).*\(2, 3\)"):
+        view.step(np.zeros((2, 7), np.float32))
+
+
 def test_registering_again_changes_nothing() -> None:
     spec = gymnasium.spec("FrankaWM/Reach-v0")
     register()

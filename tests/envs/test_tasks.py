@@ -172,7 +172,7 @@ def test_the_documented_task(height, random_actions, auto_reset: str) -> None:
     for part in (data, data["next"]):
         assert torch.equal(part["goal"], torch.tensor([0.0, 0.0, 0.75]).expand(N, 30, 3))
     assert torch.equal(data["is_init"][:, 1:], data["next", "done"][:, :-1])
-    assert env.simulation._step_graph is not None
+    assert env.simulation._step_graphs
     statistics = env.statistics()
     assert statistics["episodes"] == data["next", "done"].sum()
     assert statistics["success_once"] == pytest.approx(

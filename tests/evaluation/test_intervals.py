@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from franka_wm.errors import UserError
-from franka_wm.evaluation.intervals import Interval, bootstrap_mean, wilson
+from franka_wm.evaluation.intervals import Interval, bootstrap_mean, bootstrap_ratio, wilson
 
 
 @pytest.mark.parametrize(
@@ -94,7 +94,17 @@ def test_equal_values_have_an_interval_of_no_width_around_themselves() -> None:
         (lambda: bootstrap_mean(torch.zeros(3, 2)), "one value per episode"),
         (lambda: bootstrap_mean([1.0, math.nan]), "1 of 2 values are not finite"),
         (lambda: bootstrap_mean([1.0], confidence=1.0), "between 0 and 1"),
-        (lambda: bootstrap_mean([1.0], resamples=3), "at least 100"),
+        (lambda: bootstrap_mean([1.0], confidence=0.0), "between 0 and 1"),
+        (lambda: bootstrap_mean([1.0], resamples=99), "at least 100"),
+        (lambda: bootstrap_ratio([1.0], [1.0], resamples=99), "at least 100"),
+        (lambda: bootstrap_ratio([1.0], [1.0], confidence=0.0), "between 0 and 1"),
+        (lambda: bootstrap_ratio([1.0, 2.0], [1.0]), "one pair per unit"),
+        (lambda: bootstrap_ratio([[1.0, 2.0]], [[1.0, 2.0]]), "one pair per unit"),
+        (lambda: bootstrap_ratio([], []), "one pair per unit"),
+        (lambda: bootstrap_ratio([math.nan], [1.0]), "finite values"),
+        (lambda: bootstrap_ratio([1.0], [math.inf]), "finite values"),
+        (lambda: bootstrap_ratio([1.0, 1.0], [3.0, -1.0]), "at least 0"),
+        (lambda: bootstrap_ratio([1.0, 1.0], [0.0, 0.0]), "do not sum to 0"),
         (lambda: wilson(0, 0), "0 successes in 0 episodes"),
         (lambda: wilson(5, 4), "5 successes in 4"),
         (lambda: wilson(-1, 4), "-1 successes"),
@@ -104,6 +114,50 @@ def test_equal_values_have_an_interval_of_no_width_around_themselves() -> None:
 def test_bad_input_is_refused(call, says: str) -> None:
     with pytest.raises(UserError, match=says):
         call()
+
+
+def test_a_ratio_to_ones_is_a_mean() -> None:
+    values = np.random.default_rng(3).gamma(2.0, 0.02, size=40)
+    ratio, mean = bootstrap_ratio(values, np.ones(40)), bootstrap_mean(values, resamples=2000)
+    assert ratio == pytest.approx(mean)
+    assert bootstrap_ratio(values, np.full(40, 0.25)) == pytest.approx([4 * x for x in mean])
+
+
+def test_a_ratio_is_that_of_sums_and_pairs_stay_together() -> None:
+    below = np.random.default_rng(4).gamma(2.0, 0.1, size=30)
+    assert bootstrap_ratio(3 * below, below) == pytest.approx((3.0, 3.0, 3.0))
+    assert bootstrap_ratio([1.0, 2.0, 6.0], [2.0, 1.0, 3.0]).mean == pytest.approx(9 / 6)
+    assert bootstrap_ratio([3.0], [4.0]) == pytest.approx((0.75, 0.75, 0.75))
+
+
+def test_the_interval_of_a_ratio_agrees_with_the_delta_method() -> None:
+    generator = np.random.default_rng(5)
+    below = generator.gamma(4.0, 0.05, size=2000)
+    above = 2 * below + generator.normal(0.5, 0.1, size=2000)
+    for confidence in (0.95, 0.5):
+        ratio = bootstrap_ratio(above, below, confidence=confidence)
+        rest = above - ratio.mean * below
+        half = NormalDist().inv_cdf((1 + confidence) / 2) * rest.std() / below.mean() / math.sqrt(2000)
+        assert ratio.high - ratio.mean == pytest.approx(half, rel=0.08)
+        assert ratio.mean - ratio.low == pytest.approx(half, rel=0.08)
+
+
+def test_samples_without_anything_below_are_left_out_of_a_ratio() -> None:
+    ratio = bootstrap_ratio(
+        [1.0, 0.0, 0.0], [2.0, 0.0, 0.0]
+    )  # every third sample or so is of the last two alone
+    assert ratio == pytest.approx((0.5, 0.5, 0.5))
+
+
+def test_what_is_not_said_is_the_usual() -> None:
+    values = np.random.default_rng(6).normal(1.0, 1.0, size=25)
+    assert bootstrap_mean(values) == bootstrap_mean(values, confidence=0.95, resamples=10_000, seed=0)
+    ones = np.ones(25)
+    usual = bootstrap_ratio(values, ones, confidence=0.95, resamples=2_000, seed=0)
+    assert bootstrap_ratio(values, ones) == usual
+    assert wilson(3, 7) == wilson(3, 7, confidence=0.95)
+    assert bootstrap_mean(values, resamples=100).low < bootstrap_mean(values, resamples=100).high
+    assert bootstrap_ratio(values, ones, resamples=100).low < 1 < bootstrap_ratio(values + 1, ones).high
 
 
 def test_as_dict_is_what_evaluation_json_holds() -> None:

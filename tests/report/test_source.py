@@ -5,7 +5,7 @@ from pathlib import Path
 
 import franka_wm.envs.kinematics  # noqa: F401  # what the tests below look for among the imported
 from franka_wm.report import source
-from franka_wm.report.versions import complete_versions, processor, versions, write_versions
+from franka_wm.report.versions import processor, versions, write_finished, write_versions
 
 CODE = (
     b'"""A text."""\n\nX = 1  # one\n"""What X is."""\n\n\ndef f(a, b):\n    """Adds."""\n    return a + b\n'
@@ -42,11 +42,11 @@ def test_what_is_imported_is_told_and_what_shows_results_is_not() -> None:
     assert source.differing(found, now) == ["franka_wm/envs/kinematics.py", "franka_wm/envs/robots/fr3.urdf"]
 
 
-def test_versions_are_completed_at_the_end(tmp_path: Path) -> None:
-    write_versions(tmp_path, "cpu")
-    found = json.loads(complete_versions(tmp_path).read_text())
-    assert found["processor"] == processor() and found["threads"] >= 1 and found["seconds"] >= 0
-    assert found["source"] == source.source()
+def test_a_run_tells_its_machine_and_at_its_end_its_code(tmp_path: Path) -> None:
+    begun = json.loads(write_versions(tmp_path, "cpu").read_text())
+    assert begun["processor"] == processor() and begun["threads"] >= 1 and begun["cores"] >= 1
+    found = json.loads(write_finished(tmp_path).read_text())
+    assert found["seconds"] >= 0 and found["source"] == source.source()
 
 
 def test_the_commit_of_a_copy_is_given_by_the_environment(tmp_path: Path, monkeypatch) -> None:

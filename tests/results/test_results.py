@@ -47,7 +47,7 @@ def policy(distance: float, within: float) -> dict[str, Any]:
 
 @pytest.fixture
 def make_run(tmp_path: Path) -> Callable[..., Path]:
-    """A finished run's folder: ``make_run(seed, distance, within, typed=…, versions=…, config=…)``."""
+    """A finished run's folder: ``make_run(seed, distance, within, typed=…, versions=…, files=…, config=…)``."""
 
     def make(
         seed: int,
@@ -56,6 +56,7 @@ def make_run(tmp_path: Path) -> Callable[..., Path]:
         *,
         typed: list[str] = TYPED,
         versions: dict[str, Any] | None = None,
+        files: dict[str, str] | None = None,
         config: dict[str, Any] | None = None,
         protocol: dict[str, Any] | None = None,
     ) -> Path:
@@ -76,9 +77,11 @@ def make_run(tmp_path: Path) -> Callable[..., Path]:
         made = {
             "python": "3.12.1", "torch": "2.11.0", "newton": "1.8.0", "processor": "a processor", "cores": 2,
             "threads": 2, "device": "cpu", "commit": "0123456789ab", "started": "2026-01-02T03:04:05+00:00",
-            "seconds": 40, "source": {n: source.code_hash(n, c) for n, c in source.read(["train.py"]).items()},
         }  # fmt: skip
         (run / "versions.json").write_text(json.dumps(made | (versions or {})))
+        now_there = {n: source.code_hash(n, c) for n, c in source.read(["train.py"]).items()}
+        finished = {"seconds": 40, "source": now_there if files is None else files}
+        (run / "finished.json").write_text(json.dumps(finished))
         return run
 
     return make
@@ -141,9 +144,7 @@ def test_another_run_is_refused(make_run, given, says) -> None:
 
 def test_a_run_that_did_not_finish_is_refused(make_run) -> None:
     run = make_run(100)
-    versions = json.loads((run / "versions.json").read_text())
-    del versions["source"]
-    (run / "versions.json").write_text(json.dumps(versions))
+    (run / "finished.json").unlink()
     with pytest.raises(UserError, match="finished"):
         records.record_run(ROW, run, jobs=1)
 
@@ -190,7 +191,7 @@ def test_single_seeds_stand_below_and_not_in_the_readme(measured) -> None:
 @pytest.mark.parametrize(
     ("given", "says"),
     [
-        ({"versions": {"source": {"train.py": "000000000000"}}}, "seeds 100 and 101 differ in train.py"),
+        ({"files": {"train.py": "000000000000"}}, "seeds 100 and 101 differ in train.py"),
         ({"versions": {"torch": "2.11.1"}}, "differ in torch 2.11.1"),
         ({"config": {"scale": "other"}}, "differ in scale smoke → other"),
     ],
@@ -223,7 +224,7 @@ def test_times_are_those_of_runs_that_were_alone(make_run, tmp_path) -> None:
 def test_code_that_no_file_names_is_removed(measured, make_run) -> None:
     place = measured({"seed": 100})
     before = {path.name for path in (place / "code").iterdir()}
-    newer = make_run(101, versions={"source": {"train.py": "1"}})
+    newer = make_run(101, files={"train.py": "1"})
     records.write(records.record_run(ROW, newer, jobs=1), place)
     (place / "reach" / "seed-100.json").unlink()
     records.prune(place)
@@ -232,7 +233,7 @@ def test_code_that_no_file_names_is_removed(measured, make_run) -> None:
 
 
 def test_rows_older_than_the_code_say_so(measured) -> None:
-    old = {"versions": {"source": {"train.py": "000000000000", "gone.py": "1"}}}
+    old = {"files": {"train.py": "000000000000", "gone.py": "1"}}
     place = measured({"seed": 100, **old}, {"seed": 101, **old})
     assert state(ROW, records.read(ROW, place)) == ("stale", ["gone.py", "train.py"])
     text = render.page({"reach": ROW}, place)

@@ -123,7 +123,7 @@ class FrankaWMEnv(EnvConfig):
         """``{"franka_wm": {0: ENV}}``: one simulation of ``n_envs`` worlds, asynchronous or not."""
         from franka_wm.envs.franka import FrankaEnv
 
-        env = FrankaEnv(self.config, num_envs=n_envs, device=self.device)
+        env = FrankaEnv(self.config, num_envs=n_envs, device=self.device, seed=0)
         return {self.type: {0: RecordedView(env=env, render_mode="rgb_array")}}
 
 
