@@ -42,10 +42,6 @@ def begin(env: Any, seed: int) -> TensorDictBase:
     return env.reset()
 
 
-def _parts(policy: Any) -> list[Any]:
-    return list(policy.modules()) if isinstance(policy, nn.Module) else [policy]
-
-
 @contextmanager
 def evaluating(acting: Any) -> Iterator[None]:
     """A model, or a policy and the model behind it, in evaluation mode; afterwards every part is in its own again.
@@ -53,7 +49,8 @@ def evaluating(acting: Any) -> Iterator[None]:
     Families may act differently in training mode: TD-MPC2 plans by two Q-functions drawn at random. What is evaluated
     is one agent, whoever asks: the end of a run, the curves, the film, ``franka-wm evaluate``.
     """
-    modes = [(part, part.training) for part in _parts(acting) if isinstance(part, nn.Module)]
+    parts = acting.modules() if isinstance(acting, nn.Module) else ()
+    modes = [(part, part.training) for part in parts]
     for part, _ in modes:
         part.training = False
     try:

@@ -212,7 +212,9 @@ class Run:
 
         if not build.is_offline(self.cfg):
             hindsight = build.make_hindsight(self.cfg, env)
-            return build.make_replay_buffer(self.cfg, env.device, hindsight), self.as_saved(Spaces.of_env(env))
+            return build.make_replay_buffer(self.cfg, env.device, hindsight), self.as_saved(
+                Spaces.of_env(env)
+            )
         windows, self.validation = build.open_recorded(self.cfg, self.device)
         spaces = Spaces(
             observation_sizes=dict(windows.observation_sizes),

@@ -72,7 +72,9 @@ def test_no_episode_of_the_evaluation_occurs_in_training(run: Run, worlds, train
     watching = Watching()
     during = run.evaluation_during_training(worlds[1], {"policy": watching})
     assert during()
-    evaluate_and_report(run.cfg, run.folder, worlds[1], {"policy": watching}, rows=[], say=lambda text: None)
+    evaluate_and_report(
+        run.cfg, run.folder, worlds[1], {"policy": watching}, rows=[], counters={}, say=lambda text: None
+    )
     evaluated = torch.cat(watching.starts)
     assert len(evaluated) >= 2 * run.cfg.evaluation.episodes
     assert not meet(evaluated, trained)
@@ -82,16 +84,17 @@ def test_no_episode_of_the_evaluation_occurs_in_training(run: Run, worlds, train
 
 
 def test_seeds_of_a_whole_run(train, monkeypatch, tmp_path: Path) -> None:
-    """Worlds of training get training's seed, worlds of the evaluation the held-out one; the run's own: nobody."""
+    """Worlds of training get training's seed, worlds of the evaluation held-out ones; the run's own: nobody."""
     given: dict[int, set[int]] = {2: set(), 3: set(), 4: set()}
     set_seed = Simulation.set_seed
     monkeypatch.setattr(
         Simulation, "set_seed", lambda self, seed: (given[self.num_envs].add(seed), set_seed(self, seed))[1]
     )
     train("seed=5", "evaluation.during=[policy]", "evaluation.every=10", "evaluation.video_episodes=4")
-    training, held_out = derive_seed("training", 5), evaluation_seed(5)
-    assert given == {3: {training}, 2: {held_out}, 4: {held_out}}
-    assert len({5, training, held_out, *held_out_seeds(3), ROLLOUT_SEED}) == 7
+    training, evaluation = derive_seed("training", 5), evaluation_seed(5)
+    held_out = held_out_seeds(1)[0]
+    assert given == {3: {training}, 2: {evaluation, held_out}, 4: {held_out}}
+    assert len({5, training, evaluation, *held_out_seeds(3), ROLLOUT_SEED}) == 7
 
 
 def test_seeds_of_the_worlds_of_a_configuration(cfg: DictConfig) -> None:
