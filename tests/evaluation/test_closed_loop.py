@@ -36,7 +36,7 @@ def test_the_true_end_of_each_episode(env: FrankaEnv) -> None:
     assert torch.equal(episodes["final_distance"], step["next", "state"][:, 17:].norm(dim=-1))
     torch.testing.assert_close(episodes["return"], total)
     assert (episodes["length"] == LENGTH).all()
-    # Not the distance in the episode that began then.
+    env.reset()  # Not the distance in the episode that begins then.
     assert (episodes["final_distance"] - env.goal_distance()).abs().min() > 1e-4
 
 
