@@ -161,7 +161,11 @@ def stage_dataset(root: Path, place: Path, *, repo_id: str, license: str) -> Pat
 
     Returns:
         ``place``: what is published, file by file.
+
+    Raises:
+        UserError: A link in the dataset leads to what is not part of it.
     """
+    _check_links(root)
     for name in _files(root):
         (place / name).parent.mkdir(parents=True, exist_ok=True)
         if name not in (README, PROVENANCE, PICTURE):
@@ -177,6 +181,22 @@ def stage_dataset(root: Path, place: Path, *, repo_id: str, license: str) -> Pat
     card = dataset_card(place, repo_id=repo_id, license=license)
     (place / README).write_text(card, encoding="utf-8")
     return place
+
+
+def _check_links(root: Path) -> None:
+    """Raises ``UserError`` at a link to anything but a file of the dataset that is sent as well."""
+    home = root.resolve()
+    for path in sorted(root.rglob("*")):
+        name = path.relative_to(root).as_posix()
+        if not path.is_symlink() or not _goes(name):
+            continue
+        target = path.resolve()
+        inside = target.is_file() and target.is_relative_to(home)
+        if not inside or not _goes(target.relative_to(home).as_posix()):
+            raise UserError(
+                f"publish: root={root}: {name} is a link to {target}, which is no file of the dataset; "
+                "copy the file to where the link is, or remove the link"
+            )
 
 
 def publish_model(

@@ -130,6 +130,8 @@ class FrankaWMEnv(EnvConfig):
 def recorded_settings(root: str) -> dict[str, Any]:
     """The settings of the arm that a dataset was recorded with, as fields of ``FrankaConfig``.
 
+    Without ``frame_stack``: of a run that stacked pictures, too, a dataset holds single ones.
+
     Raises:
         UserError: If the dataset does not say, or was recorded with several.
     """
@@ -138,7 +140,9 @@ def recorded_settings(root: str) -> dict[str, Any]:
         raise UserError(
             f"env.dataset={root}: has no {schema.PROVENANCE}; give a dataset that franka-wm wrote, or env.options"
         )
-    settings = [session["config"].get("env", session["config"]) for session in provenance["sessions"]]
+    settings = [dict(session["config"].get("env", session["config"])) for session in provenance["sessions"]]
+    for one in settings:
+        one.pop("frame_stack", None)
     if any(other != settings[0] for other in settings):
         raise UserError(f"env.dataset={root}: recorded with different settings; give env.options instead")
     return {key: value for key, value in settings[0].items() if key not in ("kind", "urdf_path")}

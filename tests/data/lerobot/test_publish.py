@@ -132,6 +132,29 @@ def copy(dataset, tmp_path):
     return Path(shutil.copytree(dataset, tmp_path / "copy"))
 
 
+def test_links_out_of_a_dataset_are_not_followed(hub, publish, copy, tmp_path) -> None:
+    secret = tmp_path / "secret" / "key.txt"
+    secret.parent.mkdir()
+    secret.write_text("private")
+    (copy / ".hidden").write_text("hidden")
+    link = copy / "meta" / "notes.txt"
+    for target in (secret, copy / ".hidden", secret.parent, tmp_path / "nothing"):
+        link.symlink_to(target)
+        with pytest.raises(UserError, match=r"meta/notes\.txt is a link") as caught:
+            stage_dataset(copy, tmp_path / "place", repo_id="user/arm", license="mit")
+        assert "\n" not in str(caught.value) and not (tmp_path / "place").exists()
+        link.unlink()
+    (copy / "more").symlink_to(secret.parent)
+    one_line(publish(f"root={copy}", "repo_id=user/arm"), "more is a link")
+    assert "datasets/user/arm" not in hub.repos
+    (copy / "more").unlink()
+    link.symlink_to("info.json")  # a file of the dataset
+    place = tmp_path / "place"
+    place.mkdir()
+    stage_dataset(copy, place, repo_id="user/arm", license="mit")
+    assert (place / "meta" / "notes.txt").read_text() == (copy / "meta" / "info.json").read_text()
+
+
 def test_a_folder_stays_as_it_is_and_what_is_shown_is_what_goes(hub, publish, copy) -> None:
     (copy / "README.md").write_text("mine")
     for name in (".env", "meta/.secret", "data/.env", "data/.cache/x", "images/front/frame.png"):

@@ -87,6 +87,20 @@ def test_settings_of_a_dataset(tmp_path: Path) -> None:
         recorded_settings(str(tmp_path / "nothing"))
 
 
+def test_a_dataset_of_a_run_that_stacked_pictures_shows_single_ones(tmp_path: Path) -> None:
+    """As `export` writes it: the run's configuration, and of each stack the newest picture."""
+    path = tmp_path / PROVENANCE
+    path.parent.mkdir(parents=True)
+    env = {**OPTIONS, "kind": "franka", "urdf_path": None, "observations": ["pixels", "state"]}
+    sessions = [{"config": {"env": env | {"frame_stack": count}}} for count in (3, 1)]
+    path.write_text(json.dumps({"sessions": sessions}))
+    config = FrankaWMEnv(dataset=str(tmp_path), device="cpu")
+    assert config.features["pixels/front"].shape == (16, 16, 3)
+    (env,) = config.create_envs(2)["franka_wm"].values()
+    assert env.reset(seed=[5, 6])[0]["pixels"]["front"].shape == (2, 16, 16, 3)
+    env.close()
+
+
 def test_refused() -> None:
     with pytest.raises(UserError, match="unknown"):
         FrankaWMEnv(options={"speed": 3})
