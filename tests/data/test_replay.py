@@ -12,7 +12,7 @@ from scipy.stats import chisquare
 from tensordict import TensorDict
 from torchrl.data import ReplayBuffer
 
-from franka_wm.data.replay import WindowSampler, make_replay
+from franka_wm.data.replay import WindowSampler, make_replay, newest_step
 from franka_wm.errors import UserError
 
 WORLDS = 3
@@ -59,7 +59,7 @@ def whole_windows(first: int, last: int, window: int) -> set[tuple[int, int]]:
     }
 
 
-@pytest.mark.parametrize("window", [1, 3])
+@pytest.mark.parametrize("window", [1, 2, 3])
 @pytest.mark.parametrize(("total", "chunk"), [(21, 7), (40, 8), (63, 9), (67, 5)])
 def test_windows(window: int, total: int, chunk: int) -> None:
     """A buffer of 40 steps: half full, full, wrapped once, wrapped in the middle of a chunk."""
@@ -165,6 +165,20 @@ def test_a_buffer_of_one_window_has_one() -> None:
     replay.extend(experience(5, lengths=(5, 5, 5)))
     assert replay.sampler.bounds(replay.storage) == (1, 0)
     assert (replay.sample()["time"] == torch.arange(5)).all()
+
+
+def test_windows_start_after_the_steps_that_must_be_kept_before_them() -> None:
+    """Full or not, and where the writer has come round: the oldest steps start no window."""
+    replay = buffer(10, 3)
+    sampler = WindowSampler(replay.writer, length=3, before=2)
+    replay.extend(experience(7))
+    assert sampler.bounds(replay.storage) == (3, 2)  # steps 2 … 4 start windows, which end at 6
+    assert newest_step(replay) == 6
+    replay.extend(experience(7, start=7))
+    assert sampler.bounds(replay.storage) == (6, 6)  # the oldest, step 4, lies at 4
+    assert newest_step(replay) == 3
+    replay.extend(experience(6, start=14))
+    assert newest_step(replay) == 9  # the last place, from where the writer starts anew
 
 
 def test_capacity_counts_the_images_before_a_window() -> None:

@@ -128,6 +128,7 @@ def test_a_ratio_is_that_of_sums_and_pairs_stay_together() -> None:
     assert bootstrap_ratio(3 * below, below) == pytest.approx((3.0, 3.0, 3.0))
     assert bootstrap_ratio([1.0, 2.0, 6.0], [2.0, 1.0, 3.0]).mean == pytest.approx(9 / 6)
     assert bootstrap_ratio([3.0], [4.0]) == pytest.approx((0.75, 0.75, 0.75))
+    assert bootstrap_ratio([0.1, 0.2], [0.2, 0.4]) == pytest.approx((0.5, 0.5, 0.5))
 
 
 def test_the_interval_of_a_ratio_agrees_with_the_delta_method() -> None:
