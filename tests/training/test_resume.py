@@ -298,10 +298,10 @@ def test_more_updates_and_another_rate(make: Callable[..., Trainer]) -> None:
     first = make("first", seed=0, updates=10)
     first.fit()
     longer = make("longer", seed=0, updates=20)
-    longer.learner._rates = [2e-3 for _ in longer.learner._rates]
+    longer.learner.rates = [2e-3 for _ in longer.learner.rates]
     longer.learner._scheduled = False
     longer.restore(load_checkpoint(latest_checkpoint(first.folder)))
-    assert [group["lr"] for group in longer.learner.optimizer.param_groups] == longer.learner._rates
+    assert [group["lr"] for group in longer.learner.optimizer.param_groups] == longer.learner.rates
     longer.fit()
     assert longer.learner.updates == 20
 
