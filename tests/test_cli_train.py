@@ -19,7 +19,7 @@ from omegaconf import OmegaConf
 from franka_wm.errors import FrankaError
 from franka_wm.report.run import read_run
 from franka_wm.training.checkpoint import latest_checkpoint, load_checkpoint
-from franka_wm.training.entry import check_command, run_name, with_scale
+from franka_wm.training.entry import check_command, occupied, run_name, with_scale
 
 TRAIN = Path(__file__).resolve().parents[1] / "train.py"
 LENGTH = 20
@@ -293,6 +293,26 @@ def test_going_on_with_another_model(run, refuse) -> None:
 
 def test_going_on_with_an_unknown_option(run, refuse) -> None:
     assert "updatez" in refuse(f"resume={run[0]}", "trainer.updatez=3")
+
+
+def test_a_learning_rate_that_breaks_the_run(refuse, tmp_path: Path) -> None:
+    """One line, no checkpoint that nobody could use."""
+    said = refuse(
+        "device=cpu", "collector.num_envs=2", "evaluation.episodes=2", "env.substeps=1", "trainer.lr=1e30"
+    )
+    assert "not finite" in said and "trainer.lr (1e+30)" in said and "no checkpoint was written" in said
+    assert not (tmp_path / "run" / "checkpoints").exists()
+
+
+def test_the_folder_of_another_run(run, refuse) -> None:
+    """Its weights stay what they are; to go on with them one has to say so."""
+    everything = {path: path.stat().st_mtime_ns for path in run[0].rglob("*")}
+    said = refuse("seed=1", folder=run[0])
+    assert f"resume={run[0]}" in said and "another folder" in said
+    assert {path: path.stat().st_mtime_ns for path in run[0].rglob("*")} == everything
+    checkpoint = latest_checkpoint(run[0])
+    assert occupied(run[0], str(run[0])) is None and occupied(run[0], str(checkpoint)) is None
+    assert occupied(run[0], str(run[0].parent / "other")) is not None
 
 
 def test_in_a_process_of_its_own(tmp_path: Path) -> None:

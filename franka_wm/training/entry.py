@@ -128,7 +128,7 @@ def check_command(arguments: list[str]) -> str | None:
     finally:
         GlobalHydra.instance().clear()
     chosen = next((a.split("=", 1)[1] for a in arguments if a.startswith("hydra.run.dir=")), "outputs")
-    return unwritable(Path(chosen))
+    return unwritable(Path(chosen)) or occupied(Path(chosen), cfg.resume)
 
 
 def import_plugins(cfg: DictConfig) -> None:
@@ -164,6 +164,26 @@ def unwritable(folder: Path) -> str | None:
     except OSError:
         return f"hydra.run.dir={folder}: {place} is not writable; choose another place for the results"
     return None
+
+
+def occupied(folder: Path, resume: str | None) -> str | None:
+    """Why a run may not write into ``folder``: another one's weights are there; ``None`` if it may.
+
+    A run that goes on from there may.
+    """
+    from franka_wm.training.checkpoint import latest_checkpoint
+
+    place = folder.resolve()
+    if resume is not None and place in (Path(resume).resolve(), *Path(resume).resolve().parents):
+        return None
+    try:
+        found = latest_checkpoint(place)
+    except UserError:  # there is none
+        return None
+    return (
+        f"hydra.run.dir={folder}: a run has left its weights there ({found}); go on with it by resume={folder}, or "
+        "choose another folder"
+    )
 
 
 # -- a run --------------------------------------------------------------------------------------------------
@@ -314,6 +334,9 @@ def start(cfg: DictConfig) -> Run:
     if device.type == "cuda":
         torch.set_float32_matmul_precision("high")
     claim(folder)
+    problem = occupied(folder, cfg.resume)  # also of a sweep, whose folders only Hydra knows
+    if problem is not None:
+        raise UserError(problem)
     OmegaConf.save(cfg, folder / "config.yaml", resolve=True)
     write_versions(folder, device)
     say(f"device {device}   seed {cfg.seed}   results in {folder}")

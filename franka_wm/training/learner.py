@@ -72,7 +72,7 @@ class Learner:
             raise UserError(
                 "capture=true needs device=cuda; leave it at null to capture where it is possible"
             )
-        self.grad_clip = grad_clip
+        self.lr, self.grad_clip = lr, grad_clip
         groups = model.parameter_groups(lr)
         self._clip_groups: dict[str, list[nn.Parameter]] = {}
         for group in groups:
@@ -84,7 +84,7 @@ class Learner:
                 group["lr"] = torch.tensor(float(group.get("lr", lr)), device=self.device)
         # Without weight decay, the default of every group, AdamW is Adam.
         self.optimizer = torch.optim.AdamW(groups, lr=lr, weight_decay=0.0, fused=True, capturable=on_cuda)
-        self._rates = [float(group["lr"]) for group in self.optimizer.param_groups]
+        self.rates = [float(group["lr"]) for group in self.optimizer.param_groups]
         self.precision = precision
         self._loss = _compiled(model) if compile else model.loss
         self.updates = 0
@@ -141,7 +141,7 @@ class Learner:
         """
         if self._scheduled:
             return
-        for group, rate in zip(self.optimizer.param_groups, self._rates, strict=True):
+        for group, rate in zip(self.optimizer.param_groups, self.rates, strict=True):
             if isinstance(group["lr"], torch.Tensor):
                 group["lr"].fill_(rate)
             else:
@@ -149,7 +149,7 @@ class Learner:
 
     def _set_rates(self) -> None:
         factor = self.rate(self.updates)
-        for group, rate in zip(self.optimizer.param_groups, self._rates, strict=True):
+        for group, rate in zip(self.optimizer.param_groups, self.rates, strict=True):
             if isinstance(group["lr"], torch.Tensor):
                 group["lr"].fill_(rate * factor)
             else:
@@ -163,6 +163,13 @@ class Learner:
         self._sums.zero_()
         self._summed = 0
         return dict(zip(self._names, values, strict=True))
+
+    def broken(self) -> list[str]:
+        """What was not finite since the last :meth:`metrics`: the loss, norms of gradients; one host sync."""
+        if self._sums is None:
+            return []
+        finite = dict(zip(self._names, self._sums.isfinite().tolist(), strict=True))
+        return [name for name, fine in finite.items() if not fine and name.startswith(("loss", "grad_norm_"))]
 
     def _eager(self, batch: TensorDictBase) -> None:
         low = self.precision == "bfloat16"

@@ -16,6 +16,7 @@ from tensordict.nn import TensorDictModuleBase
 from torchrl.collectors import Collector
 
 from franka_wm.data.captured import CapturedSampling
+from franka_wm.errors import UserError
 from franka_wm.seeding import derive_seed, seeded
 from franka_wm.training.build import explore
 from franka_wm.training.checkpoint import Checkpoint, save_checkpoint
@@ -131,6 +132,7 @@ class Trainer:
         self._batch: TensorDictBase | None = None
         self._said = self._said_too_long = False
         self._evaluated = 0.0  # s
+        self._asks_at_once = learner.device.type == "cpu"  # elsewhere asking would wait for the device
         self._draw, self._static = replay.sample, lambda batch: False
         if learner.capture and env is not None:
             self._draw = sampling = CapturedSampling(replay)
@@ -182,6 +184,8 @@ class Trainer:
                 for _ in range(min(trainer.updates_per_batch - done, total - before)):
                     self._batch = self._draw()
                     self.learner.update(self._batch, static=self._static(self._batch))
+                    if self._asks_at_once:
+                        self.require_finite()
                 self.seconds = time.perf_counter() - started
                 now = time.perf_counter()
                 last = self.learner.updates >= total
@@ -191,6 +195,7 @@ class Trainer:
                 ahead = [steps for steps in ahead if steps > self.env_steps]
                 passed = self.learner.updates // every > before // every
                 if (reached or (passed and not self._too_long())) and not last:
+                    self.require_finite()
                     with self.aside("evaluation"):
                         numbers = self.evaluate()
                     if numbers:
@@ -279,6 +284,7 @@ class Trainer:
     def log(self, progress: Progress) -> None:
         """Reads what the device has summed up, tells the terminal and the loggers."""
         row, text = {}, ""
+        self.require_finite()
         if self.env is None:
             self.replay.check()
         else:
@@ -332,7 +338,12 @@ class Trainer:
             say("  " + "   ".join(f"{name} {value:.3f}" for name, value in numbers.items()))
 
     def save(self, *, last: bool = True) -> Path:
-        """Writes ``checkpoints/latest``; with the experience if it is wanted and there is room, or says so."""
+        """Writes ``checkpoints/latest``; with the experience if it is wanted and there is room, or says so.
+
+        Raises:
+            UserError: Training broke; what was saved before stays.
+        """
+        self.require_finite(weights=True)
         replay = None
         wanted = self.cfg.trainer.checkpoint_replay
         # A first stage that is done leaves its weights; the second gathers what it needs itself.
@@ -361,6 +372,33 @@ class Trainer:
         cfg = cast(DictConfig, OmegaConf.create(OmegaConf.to_container(self.cfg, resolve=True)))
         cfg.model.update(own)
         return cfg
+
+    def require_finite(self, *, weights: bool = False) -> None:
+        """Ends a run that cannot recover; waits for the device.
+
+        Args:
+            weights: Look at them, too, not at losses and gradients alone.
+
+        Raises:
+            UserError: Something is not finite.
+        """
+        broken = self.learner.broken()
+        if weights and not broken:
+            kept = [x for x in self.model.state_dict().values() if isinstance(x, torch.Tensor)]
+            finite = torch.stack([x.isfinite().all() for x in kept if x.is_floating_point()]).all()
+            broken = [] if bool(finite) else ["weights"]
+        if not broken:
+            return
+        latest = self.folder / "checkpoints" / "latest"
+        saved = (
+            f"the last checkpoint before is whole: {latest}"
+            if latest.exists()
+            else "no checkpoint was written"
+        )
+        raise UserError(
+            f"training broke: {', '.join(broken[:3])} not finite at update {self.learner.updates}; lower trainer.lr "
+            f"({self.learner.lr:g}) or trainer.grad_clip ({self.learner.grad_clip:g}); {saved}"
+        )
 
     def _moment(self) -> dict[str, Any]:
         """Where worlds, policies and recorded windows stand."""

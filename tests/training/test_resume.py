@@ -298,10 +298,10 @@ def test_more_updates_and_another_rate(make: Callable[..., Trainer]) -> None:
     first = make("first", seed=0, updates=10)
     first.fit()
     longer = make("longer", seed=0, updates=20)
-    longer.learner._rates = [2e-3 for _ in longer.learner._rates]
+    longer.learner.rates = [2e-3 for _ in longer.learner.rates]
     longer.learner._scheduled = False
     longer.restore(load_checkpoint(latest_checkpoint(first.folder)))
-    assert [group["lr"] for group in longer.learner.optimizer.param_groups] == longer.learner._rates
+    assert [group["lr"] for group in longer.learner.optimizer.param_groups] == longer.learner.rates
     longer.fit()
     assert longer.learner.updates == 20
 
@@ -317,3 +317,18 @@ def test_other_worlds_start_new_episodes_and_say_so(make: Callable[..., Trainer]
     arm = getattr(other.env, "base_env", other.env)
     assert arm.get_state()["episode"].eq(-1).all()
     assert arm.simulation._seed.item() != first.cfg.seed
+
+
+def test_other_simulators_start_new_episodes_and_say_so(train, tmp_path: Path, capsys) -> None:
+    """Not those that the first run has seen."""
+    pytest.importorskip("gymnasium")
+    first = train("env=gym", "env.name=Pendulum-v1", "env.episode_length=8", folder=tmp_path / "first")
+    assert "cannot be put back" not in capsys.readouterr().out
+    second = train(f"resume={tmp_path}/first", "trainer.updates=50", folder=tmp_path / "second")
+    assert "cannot be put back; they start new episodes" in capsys.readouterr().out
+    before, after = first.replay(), second.replay()
+    assert before is not None and after is not None and after.shape[1] == before.shape[1] + 10
+    new = after[:, before.shape[1] :]
+    assert new["is_init"][:, 0].all()
+    starts, seen = new["state"][:, 0], before["state"][before["is_init"].squeeze(-1)]
+    assert not (starts.unsqueeze(1) == seen.unsqueeze(0)).all(-1).any()

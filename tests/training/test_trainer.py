@@ -15,6 +15,7 @@ from omegaconf import DictConfig
 from tensordict import TensorDict
 
 from franka_wm.envs import FrankaEnv
+from franka_wm.errors import UserError
 from franka_wm.training import build, room
 from franka_wm.training.checkpoint import latest_checkpoint, load_checkpoint
 from franka_wm.training.entry import Run
@@ -261,6 +262,46 @@ def test_a_signal_ends_the_run_with_everything_saved(make: Make, number: int) ->
     checkpoint = load_checkpoint(latest_checkpoint(trainer.folder))
     assert checkpoint.counters["updates"] == 10 and checkpoint.replay("cpu") is not None
     assert signal.getsignal(number) is before
+
+
+@pytest.mark.parametrize("at_once", [True, False])
+def test_a_run_that_breaks_stops_and_keeps_the_last_whole_checkpoint(
+    make: Make, at_once: bool, monkeypatch
+) -> None:
+    """Within a few updates on the CPU; elsewhere (no wait for the device in between) before it logs or saves."""
+    trainer = make(updates=60, checkpoint_every=1e-9)
+    update, broken = trainer.learner.update, trainer.learner.broken
+    asked = []
+
+    def breaking(*arguments, **options) -> None:
+        if trainer.learner.updates == 12:
+            for group in trainer.learner.optimizer.param_groups:
+                group["lr"] = 1e30
+        update(*arguments, **options)
+
+    trainer.learner.update = breaking  # type: ignore[method-assign]
+    if not at_once:
+        trainer._asks_at_once = False  # as on CUDA
+        trainer.learner.broken = lambda: (asked.append(trainer.learner.updates), broken())[1]  # type: ignore[method-assign]
+    with pytest.raises(UserError, match=r"not finite at update \d+; lower trainer\.lr") as caught:
+        trainer.fit()
+    assert 12 < trainer.learner.updates <= (20 if not at_once else 16)
+    assert asked == ([] if at_once else [10, 20])
+    latest = load_checkpoint(latest_checkpoint(trainer.folder))
+    assert latest.counters["updates"] == 10 and str(latest.folder) in str(caught.value)
+    latest.load_model(trainer.model)
+    assert all(x.isfinite().all() for x in trainer.model.state_dict().values() if isinstance(x, torch.Tensor))
+
+
+def test_weights_that_are_not_finite_are_not_saved(make: Make) -> None:
+    """Though the losses so far were."""
+    trainer = make(updates=10)
+    trainer.fit()
+    with torch.no_grad():
+        next(iter(trainer.model.parameters())).flatten()[0] = torch.inf
+    with pytest.raises(UserError, match="weights not finite"):
+        trainer.save()
+    assert load_checkpoint(latest_checkpoint(trainer.folder)).counters["updates"] == 10
 
 
 def test_policies_take_turns(make: Make) -> None:

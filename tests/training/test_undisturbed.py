@@ -58,6 +58,14 @@ def test_what_is_looked_at_does_not_change_the_weights(acts: str, name: str, kep
     assert [key for key in got if not torch.equal(got[key], kept[acts][key])] == []
 
 
+def test_other_simulators_are_not_disturbed_either(train, tmp_path: Path) -> None:
+    pytest.importorskip("gymnasium")
+    gym = ("env=gym", "env.name=Pendulum-v1", "env.episode_length=8")
+    alone = train(*gym, "evaluation.during=[]", folder=tmp_path / "alone")
+    watched = train(*gym, "evaluation.during=[policy,random]", "evaluation.every=1", "evaluation.episodes=3")
+    assert_same_weights(alone, watched)
+
+
 def test_another_seed_gives_other_weights(train, tmp_path: Path) -> None:
     one, other = (weights(train(f"seed={k}", folder=tmp_path / str(k))) for k in (0, 1))
     assert any(not torch.equal(one[name], other[name]) for name in one)
