@@ -272,6 +272,8 @@ def test_fresh_values_are_the_models_and_not_the_searchs(ends, terminated):
     expected = rewards.sum(-1, keepdim=True) + 0.5**summed * lent
     torch.testing.assert_close(found["value_target_mean"], expected.mean())
     assert not found["value_target_mean"].requires_grad
+    # No gradient reaches the model through its own targets.
+    assert not model._fresh(batch, torch.full((6, 1), ends)).requires_grad
 
 
 @pytest.mark.parametrize("terminated", [False, True])

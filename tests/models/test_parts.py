@@ -173,7 +173,7 @@ def test_the_ensemble_drops_only_when_asked():
 def test_log_prob_of_the_squashed_gaussian_is_a_density():
     torch.manual_seed(0)
     policy = GaussianPolicy(latent_dim=3, hidden=(8,), action_dim=2)
-    z = torch.randn(5, 3)
+    z = torch.randn(4, 5, 3)
     mean, log_std = policy.distribution(z)
     normal = torch.distributions.Normal(mean, log_std.exp())
     reference = torch.distributions.TransformedDistribution(
@@ -250,3 +250,14 @@ def test_padding_changes_neither_results_nor_gradients(monkeypatch, kind):
         for size in sizes[1:]
         if len(size) > 1 and size[-2] > 1
     )
+
+
+def test_what_is_not_said_is_as_published():
+    """Groups of 8; 101 classes from −10 to 10 in symlog; log standard deviations from −10 to 2."""
+    assert SimNorm().group_size == 8
+    two_hot = TwoHotSymlog()
+    assert two_hot.support.shape == (101,)
+    assert (two_hot.support[0].item(), two_hot.support[-1].item()) == (-10.0, 10.0)
+    policy = GaussianPolicy(latent_dim=2, hidden=(4,), action_dim=1)
+    assert (policy.log_std_min, policy.log_std_max) == (-10.0, 2.0)
+    assert RunningScale().tau == 0.01

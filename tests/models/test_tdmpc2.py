@@ -326,6 +326,20 @@ def test_the_last_next_observation_is_learned_from():
     torch.testing.assert_close(model.loss(changed)["loss_consistency"], model.loss(batch)["loss_consistency"])
 
 
+def test_a_window_of_images_is_its_frames_and_the_last_next_one():
+    model = small(image_sizes={"pixels": (64, 64, 3)}).eval()
+    frames = torch.randint(256, (2, 5, 64, 64, 3), dtype=torch.uint8)
+    pieces = {"pixels": frames, "state": torch.randn(2, 5, 3), "joint_target": torch.randn(2, 5, 2)}
+    after = {key: value[:, 1:] for key, value in pieces.items()}
+    root = {key: value[:, :-1] for key, value in pieces.items()}
+    batch = TensorDict(root | {"next": TensorDict(after, batch_size=[2, 4])}, batch_size=[2, 4])
+    moments = [
+        TensorDict({key: value[:, t] for key, value in pieces.items()}, batch_size=[2]) for t in range(5)
+    ]
+    expected = [model.encode(moment) for moment in moments]
+    torch.testing.assert_close(model._encode_window(batch), torch.stack(expected))
+
+
 def test_the_target_is_the_smaller_of_two_distinct_members():
     model = small()
     randomise(model)
