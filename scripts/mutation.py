@@ -99,13 +99,14 @@ class Mutant:
 
     def change(self) -> str:
         """``line before → line after``."""
-        before, after = self.target.code.splitlines(), self.code().splitlines()
+        before, after = (
+            [line for line in code.splitlines() if line.strip()] for code in (self.target.code, self.code())
+        )
         apart = next(
             (k for k, (a, b) in enumerate(zip(before, after, strict=False)) if a != b), self.line - 1
         )
-        changed = (
-            after[apart].strip().replace("( ", "(").replace("[ ", "[")
-        )  # cosmic-ray sets a blank before numbers
+        # cosmic-ray sets a blank before numbers
+        changed = after[apart].strip().replace("( ", "(").replace("[ ", "[")
         return f"{before[apart].strip()} → {changed}"
 
 

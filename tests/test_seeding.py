@@ -1,6 +1,13 @@
 """Seeds by purpose."""
 
-from franka_wm.seeding import derive_seed
+import random
+
+import numpy as np
+import pytest
+import torch
+from torch import nn
+
+from franka_wm.seeding import derive_seed, evaluation_seed, seeded
 
 
 def test_the_same_purpose_and_seed_give_the_same_number_in_every_process():
@@ -21,3 +28,54 @@ def test_every_seed_fits_into_31_bits():
     for seed in seeds:
         every |= seed
     assert every == 2**31 - 1  # and every bit is used
+
+
+class Draws:
+    """A policy of one's own, with a generator of its own."""
+
+    def __init__(self) -> None:
+        self.generator = torch.Generator().manual_seed(77)
+
+
+class Modules(nn.Module):
+    """A policy whose part has the generator."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.part = nn.Linear(1, 1)
+        self.part.generator = torch.Generator().manual_seed(78)  # pyright: ignore[reportArgumentType]
+
+
+def drawn(*generators: torch.Generator) -> list[float]:
+    """A number of every source."""
+    own = [torch.rand(1, generator=generator).item() for generator in generators]
+    return [torch.rand(1).item(), random.random(), np.random.rand(), *own]
+
+
+def test_what_is_seeded_repeats_and_leaves_no_trace() -> None:
+    """The numbers after are those that would have come without; also where the work inside failed."""
+    plain, module = Draws(), Modules()
+    own = plain.generator, module.part.generator
+    for source in (torch.manual_seed, random.seed, np.random.seed):
+        source(5)
+    expected = [drawn(*own) for _ in range(3)]
+    for source in (torch.manual_seed, random.seed, np.random.seed):
+        source(5)
+    for generator, seed in zip(own, (77, 78), strict=True):
+        generator.manual_seed(seed)
+
+    assert drawn(*own) == expected[0]
+    inside = []
+    for seed in (3, 3, 4):
+        with seeded(seed, plain, module, lambda observation: observation):
+            inside.append(drawn(*own))
+    assert inside[0] == inside[1] and not set(inside[0]) & set(inside[2])
+    assert drawn(*own) == expected[1]
+    with pytest.raises(KeyError), seeded(3, plain, module):
+        drawn(*own)
+        raise KeyError
+    assert drawn(*own) == expected[2]
+
+
+def test_the_seed_of_the_evaluation_is_that_of_its_purpose() -> None:
+    assert evaluation_seed(4) == derive_seed("evaluation", 4)
