@@ -19,7 +19,7 @@ config = FrankaConfig(
     image_size=32,
     episode_length=20,
 )
-env = FrankaEnv(config, num_envs=16)  # on the GPU if there is one
+env = FrankaEnv(config, num_envs=16, seed=0)  # on the GPU if there is one
 check_env_specs(env)
 
 # One episode of every world, by inverse kinematics.

@@ -357,18 +357,18 @@ class TDMPC2(nn.Module):
             predicted, after, action, reward, target, weight[:-1]
         )
         policy.join(policy_loss, entropy)
-        ends = {}
-        if self.termination_head is not None:  # every step weighs the same, as published
-            logits = self.termination_head(predicted[1:])
-            ends["loss_termination"] = F.binary_cross_entropy_with_logits(logits, terminated.to(logits.dtype))
 
         total = (
             self.consistency_coef * consistency
             + self.reward_coef * reward_loss
             + self.value_coef * value_loss
             + policy_loss
-            + self.termination_coef * sum(ends.values())
         )
+        ends = {}
+        if self.termination_head is not None:  # every step weighs the same, as published
+            logits = self.termination_head(predicted[1:])
+            loss = F.binary_cross_entropy_with_logits(logits, terminated.to(logits.dtype))
+            total, ends = total + self.termination_coef * loss, {"loss_termination": loss.detach()}
         with torch.no_grad():
             q_mean, q_target_mean, latent_norm, reward_error, outside = call["_metrics"](
                 q_logits.detach(), reward_logits.detach(), target, encoded.detach(), reward
@@ -385,7 +385,7 @@ class TDMPC2(nn.Module):
             "latent_norm": latent_norm,
             "reward_error": reward_error,
             "target_outside": outside,
-            **{name: loss.detach() for name, loss in ends.items()},
+            **ends,
         }
         return TensorDict({"loss": total, **metrics}, batch_size=[])
 

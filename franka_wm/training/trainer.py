@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import signal
 import time
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import AbstractContextManager, contextmanager
+from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any, cast
 
@@ -20,6 +19,7 @@ from franka_wm.errors import UserError
 from franka_wm.seeding import derive_seed, seeded
 from franka_wm.training.build import explore
 from franka_wm.training.checkpoint import Checkpoint, save_checkpoint
+from franka_wm.training.interrupt import interruptible
 from franka_wm.training.learner import Learner
 from franka_wm.training.loggers import log_numbers
 from franka_wm.training.moment import draws, go_on_drawing, put_back, restorable, same_worlds, worlds_now
@@ -43,34 +43,6 @@ class ActingPolicy(TensorDictModuleBase):
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         return self.policies[self.name](tensordict)
-
-
-@contextmanager
-def interruptible() -> Iterator[Any]:
-    """Yields a function that tells whether the run shall end: after Ctrl-C, or the SIGTERM of a cluster's scheduler.
-
-    A second one stops at once.
-    """
-    pressed = False
-
-    def note(signum: int, frame: Any) -> None:
-        nonlocal pressed
-        if pressed:
-            raise KeyboardInterrupt
-        pressed = True
-        say("\ninterrupted: finishing this step and saving; press Ctrl-C again to stop at once")
-
-    numbers = (signal.SIGINT, signal.SIGTERM)
-    try:
-        before = {number: signal.signal(number, note) for number in numbers}
-    except ValueError:  # not in the main thread: the one who started us handles Ctrl-C
-        yield lambda: False
-        return
-    try:
-        yield lambda: pressed
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
 
 
 EVALUATION_SHARE = 0.1

@@ -7,6 +7,7 @@ import random
 import signal
 import subprocess
 import sys
+from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -171,7 +172,7 @@ def weights(checkpoint: Checkpoint) -> dict[str, torch.Tensor]:
     return load_file(checkpoint.folder / "model.safetensors")
 
 
-def test_after_a_kill(root: Path, train, tiny: list[str], tmp_path: Path) -> None:
+def test_after_a_kill(root: Path, train, made: Counter[str], tiny: list[str], tmp_path: Path) -> None:
     """``kill -9`` between two checkpoints: from the last one, in another process, to the same weights."""
     (tmp_path / "killer.py").write_text(
         "import os, signal\n"
@@ -201,9 +202,24 @@ def test_after_a_kill(root: Path, train, tiny: list[str], tmp_path: Path) -> Non
     assert killed.returncode == -signal.SIGKILL, killed.stdout + killed.stderr
     assert load_checkpoint(latest_checkpoint(tmp_path / "killed")).counters["updates"] == 20
     whole = weights(train(*sizes, folder=tmp_path / "whole"))
+    made.clear()
     resumed = train(f"resume={tmp_path}/killed", folder=tmp_path / "resumed")
-    assert resumed.counters["updates"] == 40
+    assert resumed.counters["updates"] == 40 and made == {"TDMPC2": 20}
     assert differing(weights(resumed), whole) == []
+
+
+@pytest.fixture
+def made(monkeypatch) -> Counter[str]:
+    """Updates by class of the model, in this process: a run from the beginning would have the same weights, too."""
+    counts: Counter[str] = Counter()
+    update = Learner.update
+
+    def counted(self, *arguments: Any, **options: Any) -> None:
+        update(self, *arguments, **options)
+        counts[type(self.model).__name__] += 1
+
+    monkeypatch.setattr(Learner, "update", counted)
+    return counts
 
 
 def interrupt(monkeypatch, number: int, stage: type) -> None:
@@ -218,7 +234,7 @@ def interrupt(monkeypatch, number: int, stage: type) -> None:
     monkeypatch.setattr(Learner, "update", signalled)
 
 
-def test_recorded_data_go_on_where_they_were(train, monkeypatch, tmp_path: Path) -> None:
+def test_recorded_data_go_on_where_they_were(train, made: Counter[str], monkeypatch, tmp_path: Path) -> None:
     """The second half draws other batches than the first."""
     from franka_wm.models.tdmpc2 import TDMPC2
 
@@ -246,14 +262,18 @@ def test_recorded_data_go_on_where_they_were(train, monkeypatch, tmp_path: Path)
         interrupt(patched, 6, TDMPC2)
         train(*data, folder=tmp_path / "first", status=130)
     assert load_checkpoint(latest_checkpoint(tmp_path / "first")).counters["updates"] == 6
+    made.clear()
     second = train(f"resume={tmp_path}/first", folder=tmp_path / "second")
+    assert made == {"TDMPC2": 6}
     assert differing(weights(second), weights(whole)) == []
     states = [(one.extra() or {})["moment"] for one in (whole, second)]
     assert torch.equal(states[0]["windows"], states[1]["windows"])
 
 
 @pytest.mark.parametrize("stage", ["first", "second"])
-def test_any_stage_goes_on(stage: str, train, monkeypatch, tmp_path: Path, capsys) -> None:
+def test_any_stage_goes_on(
+    stage: str, train, made: Counter[str], monkeypatch, tmp_path: Path, capsys
+) -> None:
     from franka_wm.models.action_world_model import ActionWorldModel
     from franka_wm.models.jepa import JEPA
 
@@ -278,7 +298,10 @@ def test_any_stage_goes_on(stage: str, train, monkeypatch, tmp_path: Path, capsy
     assert f"resume={tmp_path}/stopped" in capsys.readouterr().out
     begun = latest_checkpoint(tmp_path / "stopped")
     assert load_checkpoint(begun).model_name == ("JEPA" if stage == "first" else "ActionWorldModel")
+    made.clear()
     resumed = train(f"resume={tmp_path}/stopped", folder=tmp_path / "resumed")
+    left = {"JEPA": 6, "ActionWorldModel": 12} if stage == "first" else {"ActionWorldModel": 6}
+    assert made == left
     assert resumed.model_name == "ActionWorldModel" and resumed.counters == whole.counters | {
         "seconds": resumed.counters["seconds"]
     }

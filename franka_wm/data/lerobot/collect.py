@@ -261,8 +261,8 @@ def gather(
     """
     from torchrl.collectors import Collector
 
+    from franka_wm.training.interrupt import interruptible
     from franka_wm.training.progress import count, duration, say
-    from franka_wm.training.trainer import interruptible
 
     base = getattr(source.env, "base_env", source.env)
     schema = schema_for(base.config, format=format)

@@ -11,6 +11,7 @@ from tensordict import TensorDictBase
 
 from franka_wm.training import build
 from franka_wm.training.check import check
+from franka_wm.training.entry import Run
 
 KEYS = ["pixels", "state", "joint_target", "goal"]
 FLAGS = ["reward", "done", "terminated", "truncated", "success"]
@@ -69,6 +70,11 @@ def test_a_run_gets_stacks_from_it(exact: Any, composed: Callable, tmp_path: Any
     check(cfg)
     train, validation = build.open_recorded(cfg, torch.device("cpu"))
     assert train.image_sizes == {"pixels": (64, 64, 9)} == validation.image_sizes
+    _, spaces = Run(cfg=cfg, folder=tmp_path).build_experience(None)
+    assert spaces.image_sizes == train.image_sizes and not spaces.terminates
+    rewards = torch.stack([piece["next", "reward"] for piece in replay_windows(exact.replay).values()])
+    least, largest = spaces.reward_bounds
+    assert least == rewards.min() and rewards.max() <= largest <= 0.0  # rows after an end may hold 0
     single = build.open_recorded(composed(*overrides, "env.frame_stack=1"), torch.device("cpu"))
     for windows, alone in zip((train, validation), single, strict=True):
         h = windows.window
