@@ -261,3 +261,9 @@ def test_what_is_not_said_is_as_published():
     policy = GaussianPolicy(latent_dim=2, hidden=(4,), action_dim=1)
     assert (policy.log_std_min, policy.log_std_max) == (-10.0, 2.0)
     assert RunningScale().tau == 0.01
+
+
+def test_numbers_are_decoded_along_the_last_dimension_alone():
+    two_hot, logits = TwoHotSymlog(), torch.randn(2, 3, 4, 101)
+    each = torch.stack([two_hot.decode(one) for one in logits.flatten(0, 2)]).view(2, 3, 4, 1)
+    torch.testing.assert_close(two_hot.decode(logits), each)
