@@ -64,7 +64,7 @@ def test_add(arguments: tuple[str, ...], root: Path, tmp_path: Path) -> None:
     assert "planner" in out
     told = json.loads((tmp_path / "run" / "evaluation.json").read_text())
     own = "env.task=raise_tool" in arguments
-    assert ("height [m]" in out) is own and ("final distance [cm]" in out) is not own
+    assert ("height [m]" in out) is own and ("final distance" in out) is not own
     assert told["protocol"]["task"] == ("raise_tool" if own else "reach")
     assert ("final_distance" in told["policies"]["planner"]) is not own
 
