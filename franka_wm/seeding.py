@@ -32,7 +32,10 @@ def derive_seed(purpose: str, seed: int, *parts: int | str) -> int:
 
 
 def evaluation_seed(seed: int) -> int:
-    """Seed of the held-out episodes of the run with this seed: worlds and goals are not those of its training."""
+    """Seed that a run's evaluation worlds start with, before anybody plays in them.
+
+    Held-out episodes are those of `franka_wm.evaluation.protocol.held_out_seeds`, the same for every run.
+    """
     return derive_seed("evaluation", seed)
 
 
@@ -60,3 +63,11 @@ def seeded(seed: int, *policies: Any) -> Iterator[None]:
             np.random.set_state(others[1])
             for generator, state in generators:
                 generator.set_state(state)
+
+
+def restore_generator(generator: torch.Generator, state: torch.Tensor) -> bool:
+    """Puts a generator where ``state`` was taken; ``False`` where that was another kind of device's."""
+    if state.shape != generator.get_state().shape:
+        return False
+    generator.set_state(state)
+    return True

@@ -7,7 +7,7 @@ import pytest
 import torch
 from torch import nn
 
-from franka_wm.seeding import derive_seed, evaluation_seed, seeded
+from franka_wm.seeding import derive_seed, evaluation_seed, restore_generator, seeded
 
 
 def test_the_same_purpose_and_seed_give_the_same_number_in_every_process():
@@ -79,3 +79,12 @@ def test_what_is_seeded_repeats_and_leaves_no_trace() -> None:
 
 def test_the_seed_of_the_evaluation_is_that_of_its_purpose() -> None:
     assert evaluation_seed(4) == derive_seed("evaluation", 4)
+
+
+def test_a_generator_of_another_kind_of_device_is_left_alone() -> None:
+    generator = torch.Generator().manual_seed(3)
+    before = generator.get_state()
+    assert not restore_generator(generator, torch.zeros(16, dtype=torch.uint8))  # as of a GPU
+    assert torch.equal(generator.get_state(), before)
+    torch.rand(5, generator=generator)
+    assert restore_generator(generator, before) and torch.equal(generator.get_state(), before)

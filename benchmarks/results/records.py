@@ -32,7 +32,7 @@ FREE = (
     "evaluation.video_episodes",
     "trainer.checkpoint_replay",
 )
-"""Arguments that a run may have beside its row's, or lack: they change none of its numbers."""
+"""Arguments that a run may have beside its row's, or lack: they change none of its numbers but times."""
 
 
 def record_run(row: Row, folder: Path, *, jobs: int, commit: str | None = None) -> dict[str, Any]:
@@ -110,6 +110,8 @@ def check_arguments(row: Row, typed: Sequence[str], where: Any) -> None:
 def check_machine(row: Row, versions: Mapping[str, Any], where: Any) -> None:
     """Refuses numbers of a GPU for a row of CPU cores, and the other way round.
 
+    Fewer threads than the row's are accepted, because its time is then harder to keep. The pages say so.
+
     Raises:
         UserError: It says what the row is of.
     """
@@ -118,7 +120,9 @@ def check_machine(row: Row, versions: Mapping[str, Any], where: Any) -> None:
         raise UserError(f"{where}: ran on a CPU, and {row.name} is measured on a GPU")
     if cores is not None and not (on_cpu and versions["threads"] <= cores):
         ran = f"with {versions['threads']} threads" if on_cpu else f"on {versions['device']}"
-        raise UserError(f"{where}: ran {ran}, and {row.name} is measured with {cores} threads on CPU cores")
+        raise UserError(
+            f"{where}: ran {ran}, and {row.name} is measured with at most {cores} threads on CPU cores"
+        )
 
 
 def overrides(folder: Path) -> list[str]:

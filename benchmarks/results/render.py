@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import shlex
+from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from benchmarks.results.records import PLACE, read
+from benchmarks.results.records import FREE, PLACE, read
 from benchmarks.results.rows import Row
 from benchmarks.results.state import Record, numbers, state
 from franka_wm.errors import UserError
@@ -16,12 +17,13 @@ from franka_wm.errors import UserError
 BEGIN, END = "<!-- results: written by `make results` -->", "<!-- end of results -->"
 HEAD = """# Results
 
-Written by `make results` from the files in [results/](results), which the runs wrote themselves; nothing is typed by
-hand. `benchmarks/results/rows.yaml` declares the rows. `make results ROW=name` measures one again.
+Written by `make results` from the files in [results/](results), which the runs wrote themselves; no number in a table
+is typed by hand. `benchmarks/results/rows.yaml` declares the rows. `make results ROW=name` measures one again.
 
 `a (b – c)` over several seeds is their mean, lowest and highest. For one seed `b – c` is the 95 % interval over its
 episodes: bootstrap for distances and returns, Wilson for rates. Episodes are held out: training never sees their seeds.
 *Doing nothing* and *random smooth* motion are what a policy must beat; *inverse kinematics* knows the true geometry.
+Where moves are discrete, a *search with the same actions* takes its place: the best pair of them, by the true geometry.
 """
 POLICIES = {
     "planner": "planner",
@@ -30,6 +32,8 @@ POLICIES = {
     "random": "random smooth",
     "oracle": "inverse kinematics",
 }
+DISCRETE_ORACLE = "search with the same actions"
+COUNTS = {1: "One CPU core", 2: "Two CPU cores"}
 
 
 @dataclass(frozen=True)
@@ -76,10 +80,9 @@ def verdicts(row: Row, records: Sequence[Record]) -> list[tuple[str, str, bool]]
     for name, wanted in row.wanted.items():
         policy = acting(records[0]["policies"])
         if name == "minutes":
-            slowest = max(timed(records), key=seconds)
-            shared = slowest["machine"]["jobs"]
-            reached = duration(seconds(slowest)) + (f", {shared} runs at a time" if shared > 1 else "")
-            found.append((f"≤ {wanted:g} min of training", reached, seconds(slowest) <= 60 * wanted))
+            slowest = max(map(seconds, timed(records)))
+            reached = duration(slowest) + company(records)
+            found.append((f"≤ {wanted:g} min of training", reached, slowest <= 60 * wanted))
         elif name == "distance_cm":
             mean = _mean([DISTANCE.of(record, policy) for record in records])
             found.append((f"≤ {wanted:g} cm on average", f"{mean:.2f} cm", mean <= wanted))
@@ -87,10 +90,15 @@ def verdicts(row: Row, records: Sequence[Record]) -> list[tuple[str, str, bool]]
             mean = _mean([RETURN.of(record, policy) for record in records])
             found.append((f"return ≥ {wanted:g} on average", f"{mean:.0f}", mean >= wanted))
         elif name == "planner_no_worse":
-            ours, alone = (
-                _mean([DISTANCE.of(record, one) for record in records]) for one in ("planner", "policy")
-            )
-            found.append(("planner no worse than policy", f"{ours:.2f} and {alone:.2f} cm", ours <= alone))
+            pairs = {r["seed"]: (DISTANCE.of(r, "planner"), DISTANCE.of(r, "policy")) for r in records}
+            worse = [
+                f"{seed} ({ours:.2f}, policy {alone:.2f} cm)"
+                for seed, (ours, alone) in pairs.items()
+                if ours > alone
+            ]
+            reached = f"{len(pairs) - len(worse)} of {len(pairs)} seeds"
+            reached += f"; worse on {', '.join(worse)}" if worse else ""
+            found.append(("planner no worse than policy, each seed", reached, not worse))
         else:
             cm = name.removeprefix("within_").removesuffix("cm")
             worst = min(WITHIN[cm].of(record, policy) for record in records)
@@ -109,6 +117,15 @@ def seconds(record: Record) -> float:
 def timed(records: Sequence[Record]) -> Sequence[Record]:
     """The runs whose times count: those that had the machine to themselves, if there are any."""
     return [record for record in records if record["machine"]["jobs"] == 1] or records
+
+
+def company(records: Sequence[Record]) -> str:
+    """What to say after the times of ``timed``: which of the runs these are, and how many ran at a time."""
+    jobs = sorted({record["machine"]["jobs"] for record in timed(records)})
+    if jobs == [1]:
+        alone = len(timed(records))
+        return "" if alone == len(records) else f" alone ({alone} of {len(records)} runs)"
+    return f", {' – '.join(map(str, dict.fromkeys((jobs[0], jobs[-1]))))} at a time"
 
 
 def acting(policies: Mapping[str, Any]) -> str:
@@ -180,7 +197,7 @@ def _over_seeds(records: Sequence[Record]) -> str:
     """A line for each policy."""
     cells = []
     for policy in records[0]["policies"]:
-        line = [POLICIES.get(policy, policy)]
+        line = [label(policy, records[0])]
         for metric in columns(records):
             if len(records) == 1:
                 line.append(_one_seed(records[0], policy, metric))
@@ -189,6 +206,16 @@ def _over_seeds(records: Sequence[Record]) -> str:
                 line.append(metric.show(_mean(each), min(each), max(each)))
         cells.append(line)
     return table(["policy", *(metric.title for metric in columns(records))], cells)
+
+
+def label(policy: str, record: Record) -> str:
+    """The policy's name; with discrete moves, those of tree search, the oracle is another one."""
+    from franka_wm.planning import registry
+
+    planner = (record["code"]["config"].get("planner") or {}).get("name")
+    if policy == "oracle" and planner in registry.available() and registry.is_search(planner):
+        return DISCRETE_ORACLE
+    return POLICIES.get(policy, policy)
 
 
 def _one_seed(record: Record, policy: str, metric: Metric) -> str:
@@ -219,8 +246,10 @@ def _command(row: Row, records: Sequence[Record]) -> str:
 
 
 def _provenance(row: Row, records: Sequence[Record]) -> str:
-    """Machine, versions, commit, date; of runs also seeds, episodes and what training took."""
-    machines = "; ".join(dict.fromkeys(machine(record) for record in records))
+    """Machine, versions, commit, date; of runs also seeds, episodes, what training took, arguments not in the row."""
+    allowed = row.section.threads
+    fewer = allowed and any(record["machine"]["threads"] < allowed for record in records)
+    machines = grouped(records) + (f" (up to {allowed} threads are allowed)" if fewer else "")
     commits = ", ".join(dict.fromkeys(str(record["commit"]) for record in records))
     dates = " – ".join(dict.fromkeys(f(record["date"] for record in records) for f in (min, max)))
     made = records[0]["versions"]
@@ -234,18 +263,52 @@ def _provenance(row: Row, records: Sequence[Record]) -> str:
     training = records[0]["training"]
     episodes = next(iter(records[0]["policies"].values()))["episodes"]
     seeds = numbers([record["seed"] for record in records])
+    typed = " or ".join(dict.fromkeys(_beside(row, record) for record in records))
     return (
         f"Seed{'s' * (len(records) > 1)} {seeds}, {episodes} episodes each. {training['updates']:,.0f} updates, "
-        f"{training['env_steps']:,.0f} steps; training {duration(*spread)}, the whole command {whole}. "
-        + with_what
+        f"{training['env_steps']:,.0f} steps; training {duration(*spread)}{company(records)}, the whole command "
+        f"{whole}. {with_what}" + (f" Run {typed}." if typed else "")
     )
 
 
+def _beside(row: Row, record: Record) -> str:
+    """Arguments in which the run's command differs from the row's; the seed and the device stand elsewhere."""
+    typed = shlex.split(record["command"])[2:]
+    hidden = [name for name in FREE if name not in ("seed", "device")]
+    more, less = (
+        [a for a in some if a.split("=", 1)[0] in hidden and a not in others]
+        for some, others in ((typed, row.words), (row.words, typed))
+    )
+    parts = [f"{word} `{' '.join(some)}`" for word, some in (("with", more), ("without", less)) if some]
+    return " and ".join(parts)
+
+
 def machine(record: Record) -> str:
-    """The machine of a run, and how many runs shared it."""
+    """The machine of a run."""
     made = record["machine"]
-    text = made["gpu"] or f"{made['processor']}, {made['threads']} thread{'s' * (made['threads'] > 1)}"
-    return text + (f", {made['jobs']} runs at a time" if made["jobs"] > 1 else "")
+    return made["gpu"] or f"{made['processor']}, {made['threads']} thread{'s' * (made['threads'] > 1)}"
+
+
+def grouped(records: Sequence[Record]) -> str:
+    """Each machine once, with how many runs it had at a time; numbers of runs where these are not all the same."""
+    kinds = Counter((machine(record), record["machine"]["jobs"]) for record in records)
+    if len(kinds) == 1:
+        ((kind, jobs),) = kinds
+        return kind + (f", {jobs} runs at a time" if jobs > 1 else "")
+    texts: dict[str, list[str]] = {}
+    for (kind, jobs), runs in sorted(kinds.items()):
+        said = texts.setdefault(kind, [])
+        noun = "" if said else f" run{'s' * (runs > 1)}"
+        said.append(f"{runs}{noun} " + (f"at {jobs} a time" if jobs > 1 else "alone"))
+    return "; ".join(f"{kind}: {', '.join(said)}" for kind, said in texts.items())
+
+
+def cores(row: Row, records: Sequence[Record]) -> str:
+    """The kind of machine: the section's, on a CPU with the cores that the runs used."""
+    if row.section.threads is None:
+        return row.section.title
+    used = sorted({record["machine"]["threads"] for record in records})
+    return " or ".join(COUNTS.get(threads, f"{threads} CPU cores") for threads in used)
 
 
 def table(titles: Sequence[str], cells: Sequence[Sequence[str]]) -> str:
@@ -275,6 +338,7 @@ def _mean(values: Sequence[float]) -> float:
 def readme_tables(rows: Mapping[str, Row], place: Path = PLACE) -> str:
     """README's part: the arm, other environments, speed; rows of several seeds that belong together."""
     arm, others, speed = [], [], []
+    episodes: set[int] = set()
     aged = False
     for row in rows.values():
         records = read(row, place) if row.readme else []
@@ -289,7 +353,7 @@ def readme_tables(rows: Mapping[str, Row], place: Path = PLACE) -> str:
             speed += [table(titles, cells), ""]
             continue
         policy = acting(records[0]["policies"])
-        where, runs = row.section.title, f"{len(records)} seeds"
+        where, runs = cores(row, records), f"{len(records)} seeds"
         who = f"{row.title}{mark}"
         if columns(records) == [RETURN]:
             values = [RETURN.of(record, policy) for record in records]
@@ -297,15 +361,23 @@ def readme_tables(rows: Mapping[str, Row], place: Path = PLACE) -> str:
             others.append([who, row.model, f"{where}, {runs}", reached, f"{row.wanted.get('return', '–')}"])
             continue
         times = _mean([seconds(record) for record in timed(records)])
+        command = _mean([record["training"]["command_seconds"] for record in timed(records)])
+        episodes |= {summary["episodes"] for record in records for summary in record["policies"].values()}
         distance = _mean([DISTANCE.of(record, policy) for record in records])
         worst = min(WITHIN["5"].of(record, policy) for record in records)
         nothing = _mean([DISTANCE.of(record, "noop") for record in records])
-        found = [duration(times), f"{distance:.1f} cm", f"{worst:.0f} %", f"{nothing:.0f} cm"]
+        took = [duration(times) + company(records), f"{command / 60:.1f} min"]
+        found = [*took, f"{distance:.1f} cm", f"{worst:.0f} %", f"{nothing:.0f} cm"]
         arm.append([who, row.model, f"{where}, {runs}", *found])
     parts = []
     if arm:
-        titles = ["task", "model, planner", "machine", "training", "final distance"]
+        titles = ["task", "model, planner", "machine", "training", "whole command", "final distance"]
         parts += [table([*titles, "within 5 cm, worst seed", "doing nothing"], arm), ""]
+        many = " or ".join(map(str, sorted(episodes)))
+        parts += [
+            f"*Whole command*: start, training, and the evaluation of each policy on {many} episodes.",
+            "",
+        ]
     if others:
         parts += [table(["other environments", "model, planner", "machine", "return", "wanted"], others), ""]
     if speed:

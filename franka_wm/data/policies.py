@@ -12,6 +12,7 @@ from tensordict.nn import TensorDictModuleBase
 from franka_wm.envs.config import FrankaConfig
 from franka_wm.envs.kinematics import Kinematics
 from franka_wm.errors import UserError
+from franka_wm.seeding import restore_generator
 
 
 class NoopPolicy(TensorDictModuleBase):
@@ -74,12 +75,11 @@ class SmoothRandomPolicy(TensorDictModuleBase):
         generator = None if self.generator is None else self.generator.get_state()
         return {"generator": generator, "present": self._present}
 
-    def set_state(self, state: Mapping[str, torch.Tensor | None], device: torch.device | str = "cpu") -> None:
-        """Goes on from what :meth:`get_state` gave; actions are on ``device``."""
-        if self.generator is not None and (generator := state["generator"]) is not None:
-            self.generator.set_state(generator)
+    def set_state(self, state: Mapping[str, torch.Tensor | None], device: torch.device | str = "cpu") -> bool:
+        """Goes on from what :meth:`get_state` gave; actions are on ``device``. ``False``: as in :func:`_go_on`."""
         present = state["present"]
         self._present = None if present is None else present.to(device)
+        return _go_on(self.generator, state["generator"])
 
 
 class OraclePolicy(TensorDictModuleBase):
@@ -124,8 +124,8 @@ class DiscreteOraclePolicy(TensorDictModuleBase):
     """The oracle for numbered moves: the first of the two moves after which the tool is nearest to the goal.
 
     All pairs of moves are tried with the true geometry, on the tool's position where the servo's targets put it. A
-    tenth of the distance after the first move counts as well, so that arriving is not put off. On ``env=reach`` it ends
-    0.8 cm from the goal; the move nearest to the continuous oracle's action, 2.6 cm.
+    tenth of the distance after the first move counts as well, so that arriving is not put off. How near it
+    comes: `docs/results.md`, MuZero's *inverse kinematics*.
 
     Args:
         kinematics: The arm's.
@@ -215,7 +215,11 @@ class RandomMovesPolicy(TensorDictModuleBase):
         """Where the generator stands."""
         return {"generator": None if self.generator is None else self.generator.get_state()}
 
-    def set_state(self, state: Mapping[str, torch.Tensor | None], device: torch.device | str = "cpu") -> None:
-        """Goes on from what :meth:`get_state` gave."""
-        if self.generator is not None and (generator := state["generator"]) is not None:
-            self.generator.set_state(generator)
+    def set_state(self, state: Mapping[str, torch.Tensor | None], device: torch.device | str = "cpu") -> bool:
+        """Goes on from what :meth:`get_state` gave. ``False``: as in :func:`_go_on`."""
+        return _go_on(self.generator, state["generator"])
+
+
+def _go_on(generator: torch.Generator | None, state: torch.Tensor | None) -> bool:
+    """Puts a policy's generator back; ``False`` where its state is another kind of device's."""
+    return generator is None or state is None or restore_generator(generator, state)

@@ -41,17 +41,19 @@ class ExploringPolicy(TensorDictModuleBase):
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write `action`, and the planner's entries."""
         worlds = tensordict.batch_size[0]
+        first = worlds - self.planner_worlds
+        seen = tensordict[first:]  # with the last executed action, before the policy writes its own
         tensordict = self.policy(tensordict)
         action = tensordict.get("action")
         if interaction_type() is not InteractionType.RANDOM:
             return tensordict
         if self.noise:
-            std = torch.linspace(0.0, self.noise, worlds, device=action.device).unsqueeze(-1)
+            # From the end: one world alone has all of the noise.
+            std = torch.linspace(self.noise, 0.0, worlds, device=action.device).flip(0).unsqueeze(-1)
             action = (action + std * torch.randn_like(action)).clamp(-1.0, 1.0)
         if self.planner is not None and self.planner_worlds:
-            first = worlds - self.planner_worlds
-            keys = [*self.planner.in_keys, "plan", "context", "context_action"]
-            planned = self.planner(tensordict[first:].select(*keys, strict=False))  # pyright: ignore[reportCallIssue]
+            keys = dict.fromkeys([*self.planner.in_keys, "action", "plan", "context", "context_action"])
+            planned = self.planner(seen.select(*keys, strict=False))  # pyright: ignore[reportCallIssue]
             action = torch.cat((action[:first], planned.get("action")))
             for key in self.planner.out_keys:
                 if key != "action":

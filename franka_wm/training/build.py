@@ -380,19 +380,25 @@ def make_agent_policies(
     )
 
 
-def explore(cfg: DictConfig, policies: Mapping[str, Any], name: str) -> Any:
-    """The policy that gathers experience, with the exploration that ``cfg.collector`` asks for.
+def check_exploration(cfg: DictConfig) -> None:
+    """Refuses what ``cfg.collector`` cannot ask for.
 
     Raises:
-        UserError: A value out of range, or one that this policy cannot have.
+        UserError: A value out of range, or planner worlds where another policy than the model's own acts.
     """
     noise, worlds = cfg.collector.get("noise", 0.0), cfg.collector.get("planner_worlds", 0)
     if isinstance(noise, bool) or not isinstance(noise, int | float) or not 0.0 <= noise <= 2.0:
         raise UserError(f"collector.noise={noise!r}: must be a number from 0 to 2, in units of the action")
     if isinstance(worlds, bool) or not isinstance(worlds, int) or not 0 <= worlds <= cfg.collector.num_envs:
         raise UserError(
-            f"collector.planner_worlds={worlds!r}: must be a whole number of at most collector.num_envs"
+            f"collector.planner_worlds={worlds!r}: must be a whole number of at most "
+            f"collector.num_envs={cfg.collector.num_envs}; 0 leaves all worlds to the policy"
         )
+
+
+def explore(cfg: DictConfig, policies: Mapping[str, Any], name: str) -> Any:
+    """The policy that gathers experience; the model's own explores as ``cfg.collector`` says, others as they are."""
+    noise, worlds = cfg.collector.get("noise", 0.0), cfg.collector.get("planner_worlds", 0)
     if name != "policy" or not (noise or worlds):
         return policies[name]
     return planning.ExploringPolicy(
@@ -419,26 +425,39 @@ HINDSIGHT = 0.5
 """Share of windows that ``replay.hindsight=null`` relabels, where that can be done."""
 
 
+def hindsight_share(cfg: DictConfig) -> float | None:
+    """``replay.hindsight``: a share, or ``None`` where it is left to the task.
+
+    Raises:
+        UserError: It is no share, or asked for on recorded data.
+    """
+    share = cfg.replay.get("hindsight", 0.0)  # checkpoints of earlier versions have none
+    if share is None:
+        return None
+    if isinstance(share, bool) or not isinstance(share, int | float) or not 0.0 <= share <= 1.0:
+        raise UserError(f"replay.hindsight={share!r}: must be a share from 0 to 1, or null")
+    if share and is_offline(cfg):
+        raise UserError(f"replay.hindsight={share}: recorded data keep their goals; leave it at null")
+    return share
+
+
 def make_hindsight(cfg: DictConfig, env: Any) -> Hindsight | None:
     """Goals in hindsight for the share of windows that ``cfg.replay.hindsight`` asks for; ``None``: for none.
 
     Raises:
         UserError: The share is none, or it is asked for where goals cannot be exchanged.
     """
-    share = cfg.replay.get("hindsight", 0.0)
-    given = share is not None
-    if given and (isinstance(share, bool) or not isinstance(share, int | float) or not 0.0 <= share <= 1.0):
-        raise UserError(f"replay.hindsight={share!r}: must be a share from 0 to 1, or null")
+    share = hindsight_share(cfg)
     if share == 0:
         return None
     why = no_hindsight(cfg, env)
     if why is not None:
-        if given:
+        if share is not None:
             raise UserError(f"replay.hindsight={share}: {why}; leave it at null")
         return None
     arm = _arm(env)
     assert arm is not None and arm.simulation.task.relabel is not None
-    share = share if given else HINDSIGHT
+    share = HINDSIGHT if share is None else share
     say(f"hindsight: {100 * share:.0f} % of the windows get a goal that their episode reached later")
     return Hindsight(
         arm.simulation.task.relabel, achieved, share=share, episode_length=arm.config.episode_length

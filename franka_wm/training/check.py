@@ -43,6 +43,8 @@ def check(cfg: DictConfig) -> None:
     for name, (value, least) in numbers.items():
         if isinstance(value, bool) or not isinstance(value, int) or value < least:
             raise UserError(f"{name}={value!r}: must be a whole number of at least {least}")
+    build.check_exploration(cfg)
+    build.hindsight_share(cfg)
     if cfg.evaluation.video_size % 2:
         raise UserError(
             f"evaluation.video_size={cfg.evaluation.video_size}: must be even, video codecs want it"

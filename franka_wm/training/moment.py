@@ -51,11 +51,10 @@ def draws(policies: Mapping[str, Any]) -> dict[str, Any]:
     return {name: module.get_state() for name, module in _drawing(policies).items()}
 
 
-def go_on_drawing(policies: Mapping[str, Any], states: Mapping[str, Any], device: torch.device) -> None:
-    """Puts policies where :func:`draws` found them."""
-    for name, module in _drawing(policies).items():
-        if name in states:
-            module.set_state(states[name], device)
+def go_on_drawing(policies: Mapping[str, Any], states: Mapping[str, Any], device: torch.device) -> bool:
+    """Puts policies where :func:`draws` found them; ``False`` if any drew on another kind of device."""
+    there = [(module, states[name]) for name, module in _drawing(policies).items() if name in states]
+    return all([module.set_state(state, device) for module, state in there])
 
 
 def _drawing(policies: Mapping[str, Any]) -> dict[str, Any]:

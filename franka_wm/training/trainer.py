@@ -27,6 +27,10 @@ from franka_wm.training.progress import Progress, say
 from franka_wm.training.room import fill, held, left_out
 from franka_wm.training.spaces import Spaces
 
+OTHER_DEVICE = (
+    "the checkpoint is of another kind of device: random numbers start anew; this run will not be the same"
+)
+
 
 class ActingPolicy(TensorDictModuleBase):
     """One of several policies, exchangeable while a collector runs it."""
@@ -407,8 +411,8 @@ class Trainer:
         """Undoes :meth:`_moment`."""
         if self.env is None:
             for name, part in {"windows": self.replay, "validation": self.validation}.items():
-                if part is not None and name in moment:
-                    part.set_state(moment[name])
+                if part is not None and name in moment and not part.set_state(moment[name]):
+                    say(f"  {OTHER_DEVICE}")
             return
         assert self._acting is not None
         worlds = moment.get("worlds")
@@ -424,7 +428,8 @@ class Trainer:
             say(f"  worlds: {why}; they start new episodes, and this run will not be the same")
             # Not those that the first run has seen already.
             self.env.set_seed(derive_seed("training", self.cfg.seed, "resumed", self.env_steps))
-        go_on_drawing(self._acting.policies, moment.get("policies", {}), self.env.device)
+        if not go_on_drawing(self._acting.policies, moment.get("policies", {}), self.env.device):
+            say(f"  {OTHER_DEVICE}")
 
     def experience(self) -> TensorDictBase | None:
         """The filled part of the replay, (worlds, time), in the order in which it was gathered."""

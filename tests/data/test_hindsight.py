@@ -48,6 +48,28 @@ def test_another_goal_changes_reward_and_way_to_the_goal(env: FrankaEnv, steps: 
     assert torch.equal(again["state"][..., :17], window["state"][..., :17])
 
 
+def test_sparse_rewards_and_ends_follow_the_new_goal() -> None:
+    config = FrankaConfig(
+        observations=("state",),
+        goal_sampling="reachable",
+        episode_length=6,
+        substeps=2,
+        reward="sparse",
+        terminate_on_success=True,
+    )
+    env = FrankaEnv(config, num_envs=3, device="cpu", seed=1)
+    step, _ = env.step_and_maybe_reset(env.reset().set("action", torch.zeros(3, 7)))
+    window, tool = step.unsqueeze(1), step["next", "state"][:, 14:17]
+    assert not step["next", "success"].any()
+    for goal, reached in ((tool + 0.02, True), (tool + 0.2, False)):
+        again = env.simulation.task.relabel(window, goal)
+        assert (again["next", "terminated"] == reached).all()
+        torch.testing.assert_close(again["next", "reward"], torch.full((3, 1, 1), float(reached)))
+    sparse = env.simulation.task.relabel(window, step["goal"])
+    torch.testing.assert_close(sparse["next", "reward"], window["next", "reward"])
+    assert torch.equal(sparse["next", "terminated"], window["next", "terminated"])
+
+
 def numbered(worlds: int, steps: int, first: int, length: int) -> TensorDict:
     """Steps whose state is (time, world, episode, …), in episodes of so many steps."""
     time = torch.arange(first, first + steps).expand(worlds, steps)

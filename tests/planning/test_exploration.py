@@ -58,6 +58,25 @@ def test_the_last_worlds_act_with_the_planner_and_carry_its_plan() -> None:
     assert step["plan"][:, 0, 0].tolist() == [0, 0, 0, 2, 2]  # the second decision saw the first one's plan
 
 
+def test_one_world_alone_has_all_of_the_noise() -> None:
+    policy = ExploringPolicy(Constant(0.0), noise=0.2)
+    actions = torch.cat([policy(root()[:1])["action"] for _ in range(2000)])
+    assert abs(float(actions.std()) - 0.2) < 0.02
+
+
+def test_planners_are_told_the_last_executed_action() -> None:
+    seen = []
+
+    class Looking(Constant):
+        def forward(self, tensordict):
+            seen.append(tensordict.get("action", None))
+            return super().forward(tensordict)
+
+    policy = ExploringPolicy(Constant(0.1), planner=Looking(-0.5, plans=True), planner_worlds=2)
+    policy(policy(root()))
+    assert seen[0] is None and seen[1].squeeze(-1).tolist() == pytest.approx([-0.5, -0.5])
+
+
 def test_without_exploration_it_is_the_policy_alone() -> None:
     policy = ExploringPolicy(Constant(0.1), noise=0.5, planner=Constant(-0.5, plans=True), planner_worlds=2)
     with set_exploration_type(ExplorationType.DETERMINISTIC):

@@ -133,7 +133,10 @@ def test_both_stages_count(make_run, tmp_path) -> None:
         ({"typed": [*TYPED, "trainer.lr=1"]}, "not a run of reach, started with trainer.lr=1"),
         ({"typed": TYPED[:2]}, "started without env=reach_fixed"),
         ({"config": {"resume": "outputs/before"}}, "resumed"),
-        ({"versions": {"device": "NVIDIA H200"}}, "on NVIDIA H200, and reach is measured with 2 threads"),
+        (
+            {"versions": {"device": "NVIDIA H200"}},
+            "on NVIDIA H200, and reach is measured with at most 2 threads",
+        ),
         ({"versions": {"threads": 4}}, "with 4 threads"),
     ],
 )
@@ -173,8 +176,12 @@ def test_the_page_tells_mean_worst_and_what_was_wanted(measured) -> None:
     assert "| 101 | 3.00 (1.50 – 6.00) | 80 (40 – 100) |" in text
     assert "a processor, 2 threads; torch 2.11.0" in text and "commit 0123456789ab, 2026-01-02" in text
     readme = render.readme_tables({"reach": ROW}, place)
-    line = "| One fixed goal | TD-MPC2, MPPI | Two CPU cores, 2 seeds | 30 s | 2.0 cm | 80 % | 25 cm |"
+    line = (
+        "| One fixed goal | TD-MPC2, MPPI | Two CPU cores, 2 seeds | 30 s | 0.7 min | 2.0 cm | 80 % | 25 cm |"
+    )
     assert line in readme
+    assert "| training | whole command |" in readme
+    assert "*Whole command*: start, training, and the evaluation of each policy on 128 episodes." in readme
     assert "missed: ≤ 1.5 cm" in overview({"reach": ROW}, place)
 
 
@@ -214,11 +221,90 @@ def test_a_row_measured_with_another_command_is_refused(measured) -> None:
 
 
 def test_times_are_those_of_runs_that_were_alone(make_run, tmp_path) -> None:
-    """Seed 100 shared the machine, seed 101 did not; with none alone the page says how many shared it."""
+    """Seed 100 shared the machine, seed 101 did not; the verdict, the page and README say so."""
     shared = records.record_run(ROW, make_run(100), jobs=3)
     alone = records.record_run(ROW, make_run(101), jobs=1)
-    assert render.verdicts(ROW, [shared, alone])[0] == ("≤ 1 min of training", "31 s", True)
-    assert render.verdicts(ROW, [shared])[0][1] == "30 s, 3 runs at a time"
+    said = "31 s alone (1 of 2 runs)"
+    assert render.verdicts(ROW, [shared, alone])[0] == ("≤ 1 min of training", said, True)
+    for record in (shared, alone):
+        records.write(record, tmp_path / "one")
+    text = render.page({"reach": ROW}, tmp_path / "one")
+    assert f"training {said}, the whole command 40 s." in text
+    assert "a processor, 2 threads: 1 run alone, 1 at 3 a time; torch" in text
+    assert f"2 seeds | {said} | 0.7 min |" in render.readme_tables({"reach": ROW}, tmp_path / "one")
+
+
+def test_with_no_run_alone_times_say_how_many_ran_at_a_time(make_run, tmp_path) -> None:
+    few, many = (records.record_run(ROW, make_run(100 + k), jobs=jobs) for k, jobs in enumerate((3, 4)))
+    assert render.verdicts(ROW, [few])[0][1] == "30 s, 3 at a time"
+    assert render.company([few, many]) == ", 3 – 4 at a time"
+    for record in (few, many):
+        record["machine"]["jobs"] = 3
+        records.write(record, tmp_path)
+    assert "training 30 (30 – 31) s, 3 at a time," in render.page({"reach": ROW}, tmp_path)
+    assert "a processor, 2 threads, 3 runs at a time; torch" in render.page({"reach": ROW}, tmp_path)
+    assert "2 seeds | 30 s, 3 at a time | 0.7 min |" in render.readme_tables({"reach": ROW}, tmp_path)
+
+
+def test_fewer_threads_than_the_row_allows_are_told(measured) -> None:
+    one = {"versions": {"threads": 1, "cores": 1}}
+    place = measured({"seed": 100, **one}, {"seed": 101, **one})
+    assert "a processor, 1 thread (up to 2 threads are allowed); torch" in render.page({"reach": ROW}, place)
+    assert "| One CPU core, 2 seeds |" in render.readme_tables({"reach": ROW}, place)
+
+
+def test_machines_stand_once_with_their_runs(make_run) -> None:
+    made = records.record_run(ROW, make_run(100), jobs=1)
+    some = [made | {"machine": made["machine"] | {"gpu": gpu, "jobs": jobs}} for gpu, jobs in
+            (("A", 1), ("A", 3), ("A", 3), ("B", 2))]  # fmt: skip
+    assert render.grouped(some[:3]) == "A: 1 run alone, 2 at 3 a time"
+    assert render.grouped(some) == "A: 1 run alone, 2 at 3 a time; B: 1 run at 2 a time"
+    assert render.grouped(some[:1]) == "A"
+
+
+def test_arguments_beside_those_of_the_row_are_told(measured) -> None:
+    from dataclasses import replace
+
+    typed = [*TYPED, "logger=none", "evaluation.video_episodes=0"]
+    place = measured({"seed": 100, "typed": typed}, {"seed": 101, "typed": typed})
+    assert " Run with `logger=none evaluation.video_episodes=0`.\n" in render.page({"reach": ROW}, place)
+    row = replace(ROW, arguments="env=reach_fixed logger=none trainer.checkpoint_replay=false")
+    said = "Run with `evaluation.video_episodes=0` and without `trainer.checkpoint_replay=false`."
+    assert said in render.page({"reach": row}, place)
+
+
+def test_the_planner_is_held_against_its_policy_on_each_seed(make_run) -> None:
+    """On average the planner is the better one; on seed 101 it is not."""
+    from dataclasses import replace
+
+    row = replace(ROW, wanted={"planner_no_worse": True})
+    found = [records.record_run(ROW, make_run(100 + k, d), jobs=1) for k, d in enumerate((0.01, 0.03))]
+    for record, alone in zip(found, (0.09, 0.02), strict=True):
+        record["policies"]["policy"] = policy(alone, 1.0)
+    ((wanted, reached, enough),) = render.verdicts(row, found)
+    assert wanted == "planner no worse than policy, each seed"
+    assert reached == "1 of 2 seeds; worse on 101 (3.00, policy 2.00 cm)" and not enough
+    assert render.verdicts(row, found[:1]) == [(wanted, "1 of 1 seeds", True)]
+
+
+@pytest.mark.parametrize(
+    ("planner", "label"), [("mppi", "inverse kinematics"), ("mcts", "search with the same actions")]
+)
+def test_the_oracle_of_discrete_moves_is_a_search(measured, planner, label) -> None:
+    given = {"config": {"planner": {"name": planner}}}
+    place = measured({"seed": 100, **given}, {"seed": 101, **given})
+    for file in (place / "reach").iterdir():
+        found = json.loads(file.read_text())
+        found["policies"]["oracle"] = policy(0.001, 1.0)
+        file.write_text(json.dumps(found))
+    assert f"| {label} | 0.10 (0.10 – 0.10) |" in render.page({"reach": ROW}, place)
+
+
+def test_the_arm_on_a_fixed_or_new_goal_wants_a_planner_that_helps_on_each_seed() -> None:
+    rows = load_rows()
+    assert all(
+        rows[name].wanted["planner_no_worse"] for name in ("reach-cpu", "reach-fixed-cpu", "reach-gpu")
+    )
 
 
 def test_code_that_no_file_names_is_removed(measured, make_run) -> None:

@@ -14,6 +14,7 @@ from franka_wm.envs import FrankaConfig
 from franka_wm.errors import UserError
 from franka_wm.training import build
 from franka_wm.training.check import check
+from franka_wm.training.entry import Run
 from franka_wm.training.spaces import Spaces
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -358,3 +359,35 @@ def test_elsewhere_hindsight_is_none_and_refused_where_it_is_asked_for(
 def test_a_share_that_is_none_is_refused(share: str, hindsight) -> None:
     with pytest.raises(UserError, match="must be a share from 0 to 1, or null"):
         hindsight(f"replay.hindsight={share}")
+
+
+def test_windows_of_a_run_are_relabeled(composed, tmp_path: Path) -> None:
+    run = Run(cfg=composed("scale=smoke", "device=cpu"), folder=tmp_path)
+    replay, _ = run.build_experience(build.make_env(run.cfg, num_envs=2))
+    assert replay.hindsight is not None
+
+
+def test_the_models_policy_explores_and_others_act_as_they_are(composed) -> None:
+    cfg = composed("scale=smoke", "collector.noise=0.4", "collector.planner_worlds=2")
+    policies = {name: torch.nn.Identity() for name in ("policy", "planner", "random")}
+    for one in policies.values():
+        one.in_keys = one.out_keys = ["action"]  # pyright: ignore[reportAttributeAccessIssue]
+    found = build.explore(cfg, policies, "policy")
+    assert (found.noise, found.planner_worlds, found.planner) == (0.4, 2, policies["planner"])
+    assert build.explore(cfg, policies, "random") is policies["random"]
+    assert build.explore(composed("env=reach_fixed"), policies, "policy") is policies["policy"]
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        "collector.noise=-1",
+        "collector.noise=some",
+        "collector.planner_worlds=100000",
+        "collector.planner_worlds=1.5",
+        "replay.hindsight=2",
+    ],
+)
+def test_exploration_that_cannot_be_is_refused_before_anything_is_built(wrong: str, composed) -> None:
+    with pytest.raises(UserError, match=wrong.split("=")[0]):
+        check(composed("scale=smoke", "device=cpu", wrong))

@@ -31,6 +31,7 @@ KINDS = {
     "policy": (),
     "planner": ("collector.acts=planner",),
     "random": ("collector.acts=smooth",),
+    "exploring": ("collector.noise=0.4", "collector.planner_worlds=1", "env.goal_sampling=reachable"),
     "moves": ("model=muzero", "planner=gumbel"),
     "pictures": (
         "env=reach_fixed_pixels",
@@ -76,7 +77,7 @@ def make(kind: str, composed, tiny: list[str], tmp_path_factory) -> Callable[...
         return Trainer(
             env=env,
             learner=Learner(model, lr=1e-3, schedule="cosine", warmup=5, total_updates=2 * HALF),
-            replay=build.make_replay_buffer(mine, env.device),
+            replay=build.make_replay_buffer(mine, env.device, build.make_hindsight(mine, env)),
             policies=build.make_agent_policies(mine, model, env, spaces, purpose="training"),
             actor=build.actor(mine),
             cfg=mine,

@@ -16,7 +16,7 @@ from franka_wm.data.lerobot.cache import Cache
 from franka_wm.data.lerobot.mapping import FeatureMap
 from franka_wm.data.stacks import CHANNELS
 from franka_wm.errors import UserError
-from franka_wm.seeding import derive_seed
+from franka_wm.seeding import derive_seed, restore_generator
 
 SPLITS = ("train", "validation", "all")
 
@@ -199,9 +199,9 @@ class RecordedWindows:
         """Where the generator of :meth:`sample` stands, on the CPU."""
         return self._generator.get_state()
 
-    def set_state(self, state: Tensor) -> None:
-        """The next samples are those that followed :meth:`get_state`."""
-        self._generator.set_state(state)
+    def set_state(self, state: Tensor) -> bool:
+        """The next samples are those after :meth:`get_state`; ``False`` if that was on another kind of device."""
+        return restore_generator(self._generator, state)
 
     def windows(self, indices: Tensor) -> TensorDict:
         """The windows of these numbers.
