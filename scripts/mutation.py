@@ -363,7 +363,9 @@ def page(targets: Sequence[Target], results: Mapping[str, Any]) -> str:
         total = {name: total[name] + found[name] for name in total}
         explained += same
         rest += [(target, one) for one in found["survivors"]]
-    lines.append(_line("together", total, explained, ""))
+    missing = sum(target.path not in results for target in targets)
+    together = "together" + (f", {missing} files not run" if missing else "")
+    lines.append(_line(together, total, explained, ""))
     lines += ["", "## Survivors", ""]
     for target, one in rest:
         reason = target.explained.get(one["change"], "**no test notices it**")
