@@ -364,7 +364,7 @@ def page(targets: Sequence[Target], results: Mapping[str, Any]) -> str:
         explained += same
         rest += [(target, one) for one in found["survivors"]]
     missing = sum(target.path not in results for target in targets)
-    together = "together" + (f", {missing} files not run" if missing else "")
+    together = "together" + (f", {missing} of {len(targets)} files not run" if missing else "")
     lines.append(_line(together, total, explained, ""))
     lines += ["", "## Survivors", ""]
     for target, one in rest:

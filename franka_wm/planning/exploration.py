@@ -20,6 +20,9 @@ class ExploringPolicy(TensorDictModuleBase):
         noise: Standard deviation of the noisiest world, in units of the action.
         planner: Writes `action` and `plan`.
         planner_worlds: How many of the worlds, the last ones, act with it.
+
+    Raises:
+        ValueError: Planner worlds without a planner.
     """
 
     def __init__(
@@ -31,6 +34,8 @@ class ExploringPolicy(TensorDictModuleBase):
         planner_worlds: int = 0,
     ) -> None:
         super().__init__()
+        if planner_worlds and planner is None:
+            raise ValueError(f"planner_worlds={planner_worlds} needs a planner; leave it at 0")
         self.policy, self.noise, self.planner, self.planner_worlds = policy, noise, planner, planner_worlds
         # in_keys and out_keys are what a collector carries from step to step.
         more = [] if planner is None or not planner_worlds else [planner]
@@ -51,7 +56,7 @@ class ExploringPolicy(TensorDictModuleBase):
             # From the end: one world alone has all of the noise.
             std = torch.linspace(self.noise, 0.0, worlds, device=action.device).flip(0).unsqueeze(-1)
             action = (action + std * torch.randn_like(action)).clamp(-1.0, 1.0)
-        if self.planner is not None and self.planner_worlds:
+        if self.planner is not None and self.planner_worlds > 0:
             keys = dict.fromkeys([*self.planner.in_keys, "action", "plan", "context", "context_action"])
             planned = self.planner(seen.select(*keys, strict=False))  # pyright: ignore[reportCallIssue]
             action = torch.cat((action[:first], planned.get("action")))

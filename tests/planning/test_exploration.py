@@ -45,6 +45,18 @@ def test_noise_grows_from_none_in_the_first_world_to_all_of_it_in_the_last() -> 
     torch.testing.assert_close(actions.mean(0), torch.full((WORLDS,), 0.1), atol=0.02, rtol=0)
 
 
+def test_no_gradient_is_recorded_and_worlds_need_a_planner() -> None:
+    class Trained(Constant):
+        def forward(self, tensordict):
+            tensordict = super().forward(tensordict)
+            weight = torch.ones((), requires_grad=True)
+            return tensordict.set("action", weight * tensordict.get("action"))
+
+    assert not ExploringPolicy(Trained(0.1), noise=0.2)(root())["action"].requires_grad
+    with pytest.raises(ValueError, match="needs a planner"):
+        ExploringPolicy(Constant(0.1), planner_worlds=1)
+
+
 def test_actions_stay_within_their_bounds() -> None:
     assert ExploringPolicy(Constant(0.9), noise=2.0)(root())["action"].abs().max() <= 1.0
 
