@@ -36,9 +36,10 @@ class ExploringPolicy(TensorDictModuleBase):
         super().__init__()
         if planner_worlds and planner is None:
             raise ValueError(f"planner_worlds={planner_worlds} needs a planner; leave it at 0")
+        planner = planner if planner_worlds else None
         self.policy, self.noise, self.planner, self.planner_worlds = policy, noise, planner, planner_worlds
         # in_keys and out_keys are what a collector carries from step to step.
-        more = [] if planner is None or not planner_worlds else [planner]
+        more = [] if planner is None else [planner]
         self.in_keys = list(dict.fromkeys(key for one in (policy, *more) for key in one.in_keys))  # pyright: ignore
         self.out_keys = list(dict.fromkeys(key for one in (policy, *more) for key in one.out_keys))  # pyright: ignore
 
@@ -56,7 +57,7 @@ class ExploringPolicy(TensorDictModuleBase):
             # From the end: one world alone has all of the noise.
             std = torch.linspace(self.noise, 0.0, worlds, device=action.device).flip(0).unsqueeze(-1)
             action = (action + std * torch.randn_like(action)).clamp(-1.0, 1.0)
-        if self.planner is not None and self.planner_worlds > 0:
+        if self.planner is not None:
             keys = dict.fromkeys([*self.planner.in_keys, "action", "plan", "context", "context_action"])
             planned = self.planner(seen.select(*keys, strict=False))  # pyright: ignore[reportCallIssue]
             action = torch.cat((action[:first], planned.get("action")))
