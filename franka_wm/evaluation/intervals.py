@@ -1,4 +1,4 @@
-"""Confidence intervals for what an evaluation measures.
+"""Confidence intervals for what an evaluation measures, computed by SciPy.
 
 Distances and returns get a percentile bootstrap of the mean: B. Efron, "Bootstrap methods: another look at
 the jackknife", Annals of Statistics 7 (1979); Efron & Tibshirani, "An Introduction to the Bootstrap" (1993),
@@ -10,16 +10,17 @@ it keeps its coverage: Brown, Cai & DasGupta, "Interval estimation for a binomia
 Science 16 (2001).
 """
 
-import math
+import warnings
 from collections.abc import Sequence
-from statistics import NormalDist
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 from torch import Tensor
 
 from franka_wm.errors import UserError
+
+type Values = Tensor | NDArray[np.floating] | Sequence[float]
 
 # Values drawn at a time: bounds the memory at some 32 MB, whatever the number of episodes.
 _DRAWN_AT_ONCE = 2_000_000
@@ -38,10 +39,7 @@ class Interval(NamedTuple):
 
 
 def bootstrap_mean(
-    values: Tensor | NDArray[np.floating] | Sequence[float],
-    confidence: float = 0.95,
-    resamples: int = 10_000,
-    seed: int = 0,
+    values: Values, confidence: float = 0.95, resamples: int = 10_000, seed: int = 0
 ) -> Interval:
     """Mean of independent values, with its percentile bootstrap interval.
 
@@ -56,35 +54,13 @@ def bootstrap_mean(
     Raises:
         UserError: no values, non-finite ones, not one per episode, or a parameter out of range.
     """
-    _check_confidence(confidence)
-    if resamples < 100:
-        raise UserError(
-            f"resamples is {resamples}; at least 100 are needed for an interval, 10000 are usual."
-        )
-    sample = np.asarray(values.detach().cpu() if isinstance(values, Tensor) else values, dtype=np.float64)
-    if sample.ndim != 1 or sample.size == 0:
-        raise UserError(f"values have shape {sample.shape}; give a vector with one value per episode.")
-    if not np.isfinite(sample).all():
-        bad = int((~np.isfinite(sample)).sum())
-        raise UserError(f"{bad} of {sample.size} values are not finite; a mean over the rest would mislead.")
-
-    generator = np.random.default_rng(seed)
-    means = np.empty(resamples)
-    rows = max(1, _DRAWN_AT_ONCE // sample.size)
-    for start in range(0, resamples, rows):
-        count = min(rows, resamples - start)
-        drawn = generator.integers(sample.size, size=(count, sample.size))
-        means[start : start + count] = sample[drawn].mean(axis=1)
-    tail = (1 - confidence) / 2
-    low, high = np.quantile(means, (tail, 1 - tail))
-    mean = float(sample.mean())
-    # Equal values, summed in another order, may differ in the last bit.
-    return Interval(mean, min(float(low), mean), max(float(high), mean))
+    (sample,) = _samples(values)
+    return _bootstrap((sample,), np.mean, float(sample.mean()), confidence, resamples, seed)
 
 
 def bootstrap_ratio(
-    numerators: Tensor | NDArray[np.floating] | Sequence[float],
-    denominators: Tensor | NDArray[np.floating] | Sequence[float],
+    numerators: Values,
+    denominators: Values,
     confidence: float = 0.95,
     resamples: int = 2_000,
     seed: int = 0,
@@ -92,7 +68,7 @@ def bootstrap_ratio(
     """Ratio of two means, with its percentile bootstrap interval; pairs are drawn together.
 
     Deterministic. The `mean` is Σ numerators / Σ denominators, not the mean of ratios, which a single small
-    denominator would rule.
+    denominator would rule. Bootstrap samples whose denominators sum to 0 are left out.
 
     Args:
         numerators, denominators: (n,) one pair per independent unit (an episode); denominators ≥ 0, their
@@ -103,23 +79,16 @@ def bootstrap_ratio(
         UserError: other shapes, values that are not finite, denominators that sum to 0, or a parameter out of
             range.
     """
-    _check_confidence(confidence)
-    if resamples < 100:
-        raise UserError(f"resamples is {resamples}; at least 100 are needed for an interval.")
-    top, bottom = (np.asarray(x, dtype=np.float64) for x in (numerators, denominators))
-    if top.ndim != 1 or top.shape != bottom.shape or top.size == 0:
-        raise UserError(f"shapes are {top.shape} and {bottom.shape}; one pair per unit is needed, (n,) each.")
-    if not (np.isfinite(top).all() and np.isfinite(bottom).all()):
-        raise UserError("a ratio needs finite values; leave out or repair what is not.")
+    top, bottom = _samples(numerators, denominators)
     if bottom.min() < 0 or bottom.sum() <= 0:
         raise UserError("a ratio needs denominators of at least 0 that do not sum to 0.")
-    drawn = np.random.default_rng(seed).integers(top.size, size=(resamples, top.size))
-    below = bottom[drawn].sum(axis=1)
-    ratios = top[drawn].sum(axis=1)[below > 0] / below[below > 0]
-    tail = (1 - confidence) / 2
-    low, high = np.quantile(ratios, (tail, 1 - tail))
-    ratio = float(top.sum() / bottom.sum())
-    return Interval(ratio, min(float(low), ratio), max(float(high), ratio))
+
+    def ratio(above: NDArray, below: NDArray, axis: int = -1) -> NDArray:
+        sums = below.sum(axis)
+        return np.divide(above.sum(axis), sums, out=np.full_like(sums, np.nan), where=sums > 0)
+
+    estimate = float(top.sum() / bottom.sum())
+    return _bootstrap((top, bottom), ratio, estimate, confidence, resamples, seed)
 
 
 def wilson(successes: int, n: int, confidence: float = 0.95) -> Interval:
@@ -136,18 +105,59 @@ def wilson(successes: int, n: int, confidence: float = 0.95) -> Interval:
     Raises:
         UserError: counts or confidence out of range.
     """
+    from scipy.stats import binomtest
+
     _check_confidence(confidence)
     if n < 1 or not 0 <= successes <= n:
         raise UserError(f"{successes} successes in {n} episodes; needed are n ≥ 1 and 0 ≤ successes ≤ n.")
-    z = NormalDist().inv_cdf((1 + confidence) / 2)
-    rate = successes / n
-    shrink = 1 + z * z / n
-    centre = (rate + z * z / (2 * n)) / shrink
-    half = z / shrink * math.sqrt(rate * (1 - rate) / n + z * z / (4 * n * n))
-    # Exact at the ends, where rounding would leave 1e-17 outside of [0, rate] or [rate, 1].
-    low = 0.0 if successes == 0 else centre - half
-    high = 1.0 if successes == n else centre + half
-    return Interval(rate, low, high)
+    bounds = binomtest(successes, n).proportion_ci(confidence, method="wilson")
+    return Interval(successes / n, float(bounds.low), float(bounds.high))
+
+
+def _bootstrap(
+    samples: tuple[NDArray, ...],
+    statistic: Any,
+    estimate: float,
+    confidence: float,
+    resamples: int,
+    seed: int,
+) -> Interval:
+    """Percentile bootstrap of a statistic of paired samples, each (n,), that are finite."""
+    from scipy.stats import DegenerateDataWarning, bootstrap
+
+    _check_confidence(confidence)
+    if resamples < 100:
+        raise UserError(f"resamples is {resamples}; at least 100 are needed, 10000 are usual.")
+    size = samples[0].size
+    if size == 1:
+        return Interval(estimate, estimate, estimate)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", DegenerateDataWarning)  # of its own interval, which is not used
+        found = bootstrap(
+            samples,
+            statistic,
+            n_resamples=resamples,
+            batch=max(1, _DRAWN_AT_ONCE // size),
+            vectorized=True,
+            paired=True,
+            method="percentile",
+            rng=np.random.default_rng(seed),
+        ).bootstrap_distribution
+    tail = (1 - confidence) / 2
+    low, high = np.nanquantile(found, (tail, 1 - tail))  # NaN: a ratio without anything below
+    # Equal values, summed in another order, may differ in the last bit.
+    return Interval(estimate, min(float(low), estimate), max(float(high), estimate))
+
+
+def _samples(*values: Values) -> list[NDArray[np.float64]]:
+    """Vectors of one length, finite; otherwise a `UserError`."""
+    found = [np.asarray(x.cpu() if isinstance(x, Tensor) else x, dtype=np.float64) for x in values]
+    shapes = [x.shape for x in found]
+    if found[0].ndim != 1 or found[0].size == 0 or len(set(shapes)) > 1:
+        raise UserError(f"values have shape {shapes}; give vectors of one length, one value per episode.")
+    if bad := sum(int((~np.isfinite(x)).sum()) for x in found):
+        raise UserError(f"{bad} of {sum(x.size for x in found)} values are not finite; find out why first.")
+    return found
 
 
 def _check_confidence(confidence: float) -> None:
