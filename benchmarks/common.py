@@ -10,8 +10,9 @@ from typing import Any
 
 import torch
 
-from franka_wm.report import source, written_whole
-from franka_wm.report.versions import versions
+from franka_wm import source
+from franka_wm.files import atomic_write
+from franka_wm.versions import versions
 
 source.snapshot()
 
@@ -83,5 +84,5 @@ def publish(name: str, rows: list[dict[str, Any]], out: str | None) -> None:
             "started": datetime.now(UTC).isoformat(timespec="seconds"),
             "source": source.source(),
         }
-        with written_whole(out) as path:
+        with atomic_write(out) as path:
             path.write_text(json.dumps({"benchmark": name, "machine": made, "rows": rows}, indent=2) + "\n")

@@ -20,7 +20,8 @@ from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torchrl.collectors import Collector
 
-from franka_wm.envs import FrankaConfig, FrankaEnv, resolve_device
+from franka_wm.device import resolve_device
+from franka_wm.envs import FrankaConfig, FrankaEnv
 from franka_wm.envs.simulation import Simulation
 
 PRESET = FrankaConfig(

@@ -15,7 +15,7 @@ from tensordict import TensorDict
 
 from franka_wm.data.captured import CapturedSampling
 from franka_wm.data.replay import make_replay
-from franka_wm.envs import resolve_device
+from franka_wm.device import resolve_device
 from franka_wm.training.learner import Learner
 
 SIZES = {  # latent, encoder, hidden, batch

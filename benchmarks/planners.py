@@ -21,7 +21,7 @@ from omegaconf import OmegaConf
 from tensordict import TensorDict
 
 from franka_wm import models
-from franka_wm.envs import resolve_device
+from franka_wm.device import resolve_device
 from franka_wm.planning import (
     CEM,
     ICEM,

@@ -16,7 +16,7 @@ from common import publish, rate
 from tensordict import TensorDict
 
 from franka_wm import models
-from franka_wm.envs import resolve_device
+from franka_wm.device import resolve_device
 from franka_wm.planning import MCTS, SearchPolicy
 
 MOVES = 15

@@ -9,7 +9,7 @@ import torch
 import warp as wp
 
 from franka_wm.envs import FrankaConfig, FrankaEnv
-from franka_wm.report.video import tile_frames, write_png
+from franka_wm.video import tile_frames, write_png
 
 FOLDER = Path(__file__).parent / "images"
 

@@ -26,7 +26,7 @@ from franka_wm.report.page import write_page
 from franka_wm.report.run import read_run
 from franka_wm.report.spectra import latent_figure, spectrum_figure
 from franka_wm.report.style import DARK, LIGHT, POLICY_COLOURS, Theme, policy_name
-from franka_wm.report.video import tile_frames, write_png
+from franka_wm.video import tile_frames, write_png
 
 FOLDER = Path(__file__).parent / "images"
 FLAGS = (

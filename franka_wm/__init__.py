@@ -4,4 +4,4 @@
 `franka_wm.planning` plans with what was learned. Importing this package imports none of them.
 """
 
-__version__ = "0.1.0"
+from franka_wm.version import __version__ as __version__

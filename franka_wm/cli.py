@@ -15,8 +15,8 @@ import sys
 from importlib import import_module
 from pathlib import Path
 
-import franka_wm
 from franka_wm.errors import FrankaError, UserError
+from franka_wm.version import __version__
 
 # verb -> (module:function, arguments, what it does in one line)
 VERBS: dict[str, tuple[str, str, str]] = {
@@ -69,7 +69,7 @@ ROBOTS = {
     "urdf": "a URDF of your own: urdf_path=…",
 }
 
-PACKAGE = Path(franka_wm.__file__).parent
+PACKAGE = Path(__file__).parent
 CHECKOUT = PACKAGE.parent
 """Top of the repository, where ``conf`` and ``benchmarks`` are, if the package runs from one."""
 
@@ -107,7 +107,7 @@ def run(verb: str = "--help", *arguments: str) -> int:
         print(usage())
         return 0
     if verb == "--version":
-        print(f"franka-wm {franka_wm.__version__}")
+        print(f"franka-wm {__version__}")
         return 0
     if verb not in VERBS:
         complain(f"no verb {verb!r}; choose from {', '.join(VERBS)}, or --help")

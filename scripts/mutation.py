@@ -34,8 +34,8 @@ ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT))
 
 from franka_wm.errors import UserError  # noqa: E402
-from franka_wm.report import written_whole  # noqa: E402
-from franka_wm.report.versions import versions  # noqa: E402
+from franka_wm.files import atomic_write  # noqa: E402
+from franka_wm.versions import versions  # noqa: E402
 
 DECLARED = ROOT / "scripts" / "mutation.yaml"
 RESULTS = ROOT / "docs" / "mutation.json"
@@ -411,9 +411,9 @@ def main(arguments: list[str] | None = None) -> int:
             for target in [target for target in targets if wanted(target.path)]:
                 found = measure(target, sample=chosen.sample, seed=chosen.seed, at_once=chosen.jobs)
                 results[target.path] = found
-                with written_whole(RESULTS) as temporary:
+                with atomic_write(RESULTS) as temporary:
                     temporary.write_text(json.dumps(results, indent=1, ensure_ascii=False) + "\n")
-        with written_whole(PAGE) as temporary:
+        with atomic_write(PAGE) as temporary:
             temporary.write_text(page(targets, results))
     except (UserError, ModuleNotFoundError) as error:
         print(f"error: {error}", file=sys.stderr)

@@ -12,8 +12,8 @@ from benchmarks.results import records, render, running
 from benchmarks.results.rows import Row, choose, load_rows
 from benchmarks.results.state import state
 from franka_wm.errors import FrankaError
-from franka_wm.report import written_whole
-from franka_wm.report.source import ROOT
+from franka_wm.files import atomic_write
+from franka_wm.source import ROOT
 
 
 def overview(rows: Mapping[str, Row], place: Path) -> str:
@@ -39,7 +39,7 @@ def write_pages(rows: Mapping[str, Row], place: Path) -> None:
         (ROOT / "docs" / "results.md", render.page(rows, place)),
         (readme, render.with_tables(readme.read_text(), render.readme_tables(rows, place))),
     ):
-        with written_whole(path) as temporary:
+        with atomic_write(path) as temporary:
             temporary.write_text(text)
 
 

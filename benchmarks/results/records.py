@@ -17,11 +17,11 @@ import yaml
 
 from benchmarks.results.rows import Row
 from franka_wm.errors import UserError
-from franka_wm.report import written_whole
+from franka_wm.files import atomic_write
 from franka_wm.report.results import read_result
 from franka_wm.report.run import SAME_BUT, read_config
-from franka_wm.report.source import ROOT
-from franka_wm.report.versions import PACKAGES
+from franka_wm.source import ROOT
+from franka_wm.versions import PACKAGES
 
 PLACE = ROOT / "docs" / "results"
 CODE = "code"
@@ -143,9 +143,9 @@ def write(record: Mapping[str, Any], place: Path = PLACE) -> Path:
     key = hashlib.sha256(code.encode()).hexdigest()[:12]
     name = f"seed-{record['seed']}" if "seed" in record else "run"
     path = place / record["row"] / f"{name}.json"
-    with written_whole(place / CODE / f"{key}.json") as temporary:
+    with atomic_write(place / CODE / f"{key}.json") as temporary:
         temporary.write_text(code)
-    with written_whole(path) as temporary:
+    with atomic_write(path) as temporary:
         temporary.write_text(json.dumps({**record, "code": key}, indent=1) + "\n")
     return path
 

@@ -16,7 +16,7 @@ from queue import Queue
 from benchmarks.results.records import PLACE, record_benchmark, record_run, write
 from benchmarks.results.rows import Row
 from franka_wm.errors import UserError
-from franka_wm.report.source import ROOT
+from franka_wm.source import ROOT
 
 
 @dataclass(frozen=True)

@@ -11,7 +11,7 @@ from benchmarks.results.records import check_arguments
 from benchmarks.results.rows import Row
 from franka_wm.errors import FrankaError
 from franka_wm.report.run import SAME_BUT
-from franka_wm.report.source import ROOT, differing
+from franka_wm.source import ROOT, differing
 
 Record = Mapping[str, Any]
 

@@ -19,6 +19,7 @@ from tensordict import TensorDict, TensorDictBase
 from torchrl.data import Binary, Bounded, Composite, Unbounded
 from torchrl.envs import EnvBase
 
+from franka_wm.device import resolve_device
 from franka_wm.envs.camera import Camera, as_torch, camera_framing
 from franka_wm.envs.config import STATE_DIM, FrankaConfig
 from franka_wm.envs.frames import FrameStack
@@ -30,32 +31,6 @@ from franka_wm.errors import UserError
 from franka_wm.seeding import derive_seed
 
 log = logging.getLogger(__name__)
-
-
-def resolve_device(device: torch.device | str | None) -> torch.device:
-    """``None`` or ``"auto"``: the first GPU, or the CPU where there is none; otherwise the device, checked.
-
-    Raises:
-        UserError: If CUDA is asked for where there is none, or the device is of another kind.
-    """
-    if device is None or device == "auto":
-        device = "cuda" if torch.cuda.is_available() else "cpu"
-    try:
-        device = torch.device(device)
-    except RuntimeError as error:
-        raise UserError(f"device={device!r}: must be auto, cpu, cuda or cuda:K") from error
-    if device.type == "cuda":
-        index = 0 if device.index is None else device.index
-        count = torch.cuda.device_count() if torch.cuda.is_available() else 0
-        if index >= count:
-            raise UserError(
-                f"device={device}: this machine has {count} usable CUDA devices; use device=cpu or auto"
-            )
-        return torch.device("cuda", index)
-    if device.type != "cpu":
-        raise UserError(f"device={device}: Newton runs on cpu and cuda")
-    return torch.device("cpu")
-
 
 _unseeded = itertools.count()
 

@@ -23,7 +23,7 @@ from franka_wm.evaluation.tables import (
     terminal,
     timing_table,
 )
-from franka_wm.report import written_whole
+from franka_wm.files import atomic_write
 from franka_wm.report.results import COMMAND, to_json
 from franka_wm.report.table import Table, evaluation_tables, markdown
 
@@ -128,8 +128,8 @@ def run(options: Options) -> dict[str, Any]:
     """
     from rich.console import Console
 
+    from franka_wm.console import announced, say
     from franka_wm.training.load import load_agent
-    from franka_wm.training.progress import announced, say
 
     check_folder(options.out)
     console = Console(width=120)
@@ -288,7 +288,7 @@ def _write(
 ) -> None:
     """Every file whole; the one that others read, last."""
     if imagined is not None:
-        from franka_wm.report.video import write_png, write_video
+        from franka_wm.video import write_png, write_video
 
         write_png(imagined.strip, folder / "imagined.png")
         write_video(
@@ -303,5 +303,5 @@ def _write(
         ("evaluation.md", text),
         ("evaluation.json", to_json(results)),
     ):
-        with written_whole(folder / name) as path:
+        with atomic_write(folder / name) as path:
             path.write_text(content)

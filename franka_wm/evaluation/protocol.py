@@ -21,8 +21,9 @@ from franka_wm.evaluation.closed_loop import (
 )
 from franka_wm.report.results import point
 from franka_wm.report.table import evaluation_tables, markdown
-from franka_wm.report.versions import processor
 from franka_wm.seeding import derive_seed, seeded
+from franka_wm.version import __version__
+from franka_wm.versions import processor
 
 EPISODES = 100
 """Episodes per policy, if not said otherwise."""
@@ -150,8 +151,6 @@ def protocol(
         by: Who measured: :data:`~franka_wm.report.results.END` or :data:`~franka_wm.report.results.COMMAND`.
         counters: Of the training: ``updates``, ``env_steps``, ``seconds``.
     """
-    import franka_wm
-
     arm = arm_of(env) is not None
     return {
         "by": by,
@@ -168,7 +167,7 @@ def protocol(
         "intervals": INTERVALS,
         "device": str(env.device),
         "hardware": hardware(env.device),
-        "franka_wm": franka_wm.__version__,
+        "franka_wm": __version__,
         "torch": torch.__version__,
     }
 

@@ -13,12 +13,12 @@ from franka_wm.envs.camera import project
 from franka_wm.evaluation.closed_loop import arm_of, play_episodes, reaches
 from franka_wm.evaluation.protocol import describe, evaluate_policies, held_out_seeds, protocol
 from franka_wm.evaluation.tables import terminal
-from franka_wm.report import written_whole
+from franka_wm.files import atomic_write
 from franka_wm.report.curves import axis, plot_learning_curves
 from franka_wm.report.results import END, Result, last_row, to_json
 from franka_wm.report.table import evaluation_tables
-from franka_wm.report.video import draw_marker, tile_frames, write_png, write_video
 from franka_wm.seeding import seeded
+from franka_wm.video import draw_marker, tile_frames, write_png, write_video
 
 
 def evaluate_and_report(
@@ -59,9 +59,9 @@ def evaluate_and_report(
         "protocol": protocol(cfg, env, found, by=END, counters=counters),
         "policies": found.policies,
     }
-    with written_whole(folder / "evaluation.json") as path:
+    with atomic_write(folder / "evaluation.json") as path:
         path.write_text(to_json(results))
-    with written_whole(folder / "evaluation.md") as path:
+    with atomic_write(folder / "evaluation.md") as path:
         path.write_text(found.markdown())
     last = last_row([Result(path, **results)], cfg.evaluation.during)
     drawn = [*rows, last]

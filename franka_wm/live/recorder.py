@@ -13,7 +13,7 @@ from tensordict import TensorDictBase
 from franka_wm.envs import FrankaEnv
 from franka_wm.envs.camera import project
 from franka_wm.errors import UserError
-from franka_wm.report.video import draw_marker, write_video
+from franka_wm.video import draw_marker, write_video
 
 
 class Recorder:

@@ -7,9 +7,9 @@ from pathlib import Path
 from typing import Any
 
 from franka_wm.errors import UserError
+from franka_wm.files import atomic_write
 from franka_wm.live.session import Frame, Session
 from franka_wm.live.shapes import arm_shapes
-from franka_wm.report import written_whole
 from franka_wm.report.style import BLUE, VERMILION
 
 GOAL, PATH, TRAIL = (213, 94, 0), (0, 114, 178), (150, 156, 166)
@@ -67,7 +67,7 @@ def record_episode(
         raise UserError(f"{path}: a recording for Rerun must end in .rrd")
     session = Session(env, policies, policy=policy, seed=seed)
     steps = session.arm.config.episode_length if steps is None else steps
-    with written_whole(path) as temporary:
+    with atomic_write(path) as temporary:
         stream = rr.RecordingStream("franka_wm")
         stream.save(str(temporary), default_blueprint=_layout(rr, "pixels" in session.arm.simulation.images))
         _log_shapes(rr, stream, session)

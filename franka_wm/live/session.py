@@ -18,12 +18,12 @@ import warp as wp
 from tensordict import TensorDictBase
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
+from franka_wm.console import say
 from franka_wm.envs import FrankaEnv
 from franka_wm.errors import UserError
 from franka_wm.live.commanded import commanded_path
 from franka_wm.live.recorder import DatasetRecorder, VideoRecorder
 from franka_wm.live.settings import Setting, planner_settings, rebuilt
-from franka_wm.training.progress import say
 
 PREFERRED = ("planner", "oracle", "noop")
 """Which policy starts, the first one that there is."""

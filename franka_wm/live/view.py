@@ -10,9 +10,9 @@ from typing import Any
 from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
+from franka_wm.console import announced, say
 from franka_wm.envs import FrankaConfig, FrankaEnv
 from franka_wm.errors import UserError
-from franka_wm.training.progress import announced, say
 
 USAGE = """usage: franka-wm view [key=value …]
 

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from franka_wm.errors import UserError
-from franka_wm.report import written_whole
+from franka_wm.files import atomic_write
 from franka_wm.report.figure import inline_svg
 from franka_wm.report.style import DARK, LIGHT, NAMES, Theme
 
@@ -64,7 +64,7 @@ def write_document(text: str, path: str | Path) -> Path:
     path = Path(path)
     if path.suffix.lower() != ".html":
         raise UserError(f"cannot write {path.name}: the page must end in .html.")
-    with written_whole(path) as temporary:
+    with atomic_write(path) as temporary:
         temporary.write_text(text, encoding="utf-8")
     return path
 

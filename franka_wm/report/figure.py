@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 from xml.sax.saxutils import escape, quoteattr
 
 from franka_wm.errors import UserError
-from franka_wm.report import written_whole
+from franka_wm.files import atomic_write
 from franka_wm.report.style import FAINT, GREY, INK, LIGHT, NAMES, PAPER, Theme
 
 if TYPE_CHECKING:
@@ -112,7 +112,7 @@ def save_figure(figure: "Figure", path: str | Path, *, dpi: int = 150) -> Path:
         UserError: an ending other than .pdf, .png, .svg, or the file cannot be written.
     """
     kind = check_format(path)
-    with written_whole(path) as temporary:
+    with atomic_write(path) as temporary:
         figure.savefig(temporary, format=kind, dpi=dpi, facecolor=figure.get_facecolor())
     return Path(path)
 

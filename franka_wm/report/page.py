@@ -7,12 +7,12 @@ What it shows is what lies in the run's folder: :mod:`franka_wm.report.run` says
 from html import escape
 from pathlib import Path
 
-from franka_wm import __version__
 from franka_wm.errors import UserError
 from franka_wm.report.document import document, write_document
 from franka_wm.report.outcome import headline
 from franka_wm.report.run import RunFiles, read_run
 from franka_wm.report.sections import sections, warnings
+from franka_wm.version import __version__
 
 FILE = "report.html"
 

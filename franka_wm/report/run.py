@@ -2,7 +2,7 @@
 
     config.yaml             what was run
     .hydra/overrides.yaml   what was typed after ``train.py``
-    versions.json           packages and machine, as `franka_wm.report.versions` writes them
+    versions.json           packages and machine, as `franka_wm.versions` writes them
     evaluation.json         results, as :mod:`franka_wm.report.results` describes them
     checkpoints/…           counters and the logged rows; without a checkpoint, rows come from ``csv/``
     video.mp4, last_frame.png, imagined.mp4, imagined.png, masks.png    pictures

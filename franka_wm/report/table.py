@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from franka_wm.errors import UserError
-from franka_wm.report import written_whole
+from franka_wm.files import atomic_write
 from franka_wm.report.style import BLACK, centimetres, policy_colour, policy_name
 
 if TYPE_CHECKING:
@@ -205,7 +205,7 @@ def write_tables(evaluation: Evaluation, folder: str | Path, *, name: str = "eva
     paths = []
     for ending, text in texts.items():
         path = Path(folder) / f"{name}.{ending}"
-        with written_whole(path) as temporary:
+        with atomic_write(path) as temporary:
             temporary.write_text(text)
         paths.append(path)
     return paths

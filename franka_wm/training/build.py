@@ -11,6 +11,7 @@ from omegaconf import DictConfig, OmegaConf
 from torchrl.data import ReplayBuffer
 
 from franka_wm import models, planning
+from franka_wm.console import say
 from franka_wm.data.hindsight import Hindsight
 from franka_wm.data.policies import (
     DiscreteOraclePolicy,
@@ -21,14 +22,14 @@ from franka_wm.data.policies import (
     SmoothRandomPolicy,
 )
 from franka_wm.data.replay import make_replay
-from franka_wm.envs import FrankaConfig, FrankaEnv, TransformedFrankaEnv, resolve_device
+from franka_wm.device import resolve_device
+from franka_wm.envs import FrankaConfig, FrankaEnv, TransformedFrankaEnv
 from franka_wm.envs.config import ACTION_MODES
 from franka_wm.envs.discretize import DiscreteActions
 from franka_wm.errors import UserError
 from franka_wm.planning import ModelPolicy, PlannerPolicy, registry
 from franka_wm.planning.policy import PRECISIONS
 from franka_wm.seeding import derive_seed, evaluation_seed
-from franka_wm.training.progress import say
 from franka_wm.training.spaces import Spaces
 
 ACTORS = {"policy": "policy", "planner": "planner", "smooth": "random", "noop": "noop", "ik": "oracle"}

@@ -7,7 +7,8 @@ from typing import Any
 
 from omegaconf import DictConfig, ListConfig
 
-from franka_wm.envs import FrankaConfig, resolve_device
+from franka_wm.device import resolve_device
+from franka_wm.envs import FrankaConfig
 from franka_wm.envs.franka import check_robot
 from franka_wm.errors import UserError
 from franka_wm.training import build

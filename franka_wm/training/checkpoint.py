@@ -37,9 +37,9 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor, nn
 from torch.optim import Optimizer
 
-from franka_wm import __version__
 from franka_wm.errors import UserError
 from franka_wm.training.tree import read_tree, save_tensors, tree_files, write_json, write_tree
+from franka_wm.version import __version__
 
 FORMAT_VERSION = 1
 

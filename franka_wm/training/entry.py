@@ -15,9 +15,9 @@ from typing import Any, NoReturn
 
 from omegaconf import DictConfig, OmegaConf
 
+from franka_wm.console import announced, say
 from franka_wm.errors import FrankaError, UserError
 from franka_wm.seeding import derive_seed, seeded
-from franka_wm.training.progress import announced, say
 
 INTERRUPTED = 130
 """Exit status after Ctrl-C, as shells expect."""
@@ -255,7 +255,7 @@ class Run:
     @property
     def device(self) -> Any:
         """Where the run computes."""
-        from franka_wm.envs import resolve_device
+        from franka_wm.device import resolve_device
 
         return resolve_device(self.cfg.device)
 
@@ -318,9 +318,9 @@ def start(cfg: DictConfig) -> Run:
     import torch
     from hydra.core.hydra_config import HydraConfig
 
-    from franka_wm.envs import resolve_device
-    from franka_wm.report.versions import write_versions
+    from franka_wm.device import resolve_device
     from franka_wm.training.check import check
+    from franka_wm.versions import write_versions
 
     folder = Path(HydraConfig.get().runtime.output_dir)
     checkpoint = None
@@ -414,8 +414,8 @@ def export_experience(run: Run, trainer: Any) -> None:
 
 def finish(run: Run, trainer: Any) -> None:
     """Closes the loggers, writes the run's page, exports, says the last line; exits with 130 after Ctrl-C."""
-    from franka_wm.report.versions import write_finished
     from franka_wm.training.loggers import close_loggers
+    from franka_wm.versions import write_finished
 
     if trainer.interrupted:
         run.stop()

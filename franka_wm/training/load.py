@@ -10,7 +10,7 @@ from typing import Any
 import torch
 from omegaconf import DictConfig
 
-from franka_wm.envs import resolve_device
+from franka_wm.device import resolve_device
 from franka_wm.errors import UserError
 from franka_wm.training import build
 from franka_wm.training.checkpoint import Checkpoint, latest_checkpoint, load_checkpoint

@@ -127,7 +127,7 @@ def log_video(loggers: Iterable[Any], name: str, frames: Tensor, *, fps: int, st
     Raises:
         UserError: other frames, or a file that cannot be written.
     """
-    from franka_wm.report.video import write_gif, write_video
+    from franka_wm.video import write_gif, write_video
 
     with tempfile.TemporaryDirectory() as place:
         film = Path(place) / f"{name.replace('/', '_')}_{step}.mp4"

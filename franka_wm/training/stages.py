@@ -11,12 +11,12 @@ from typing import TYPE_CHECKING, Any
 
 from omegaconf import open_dict
 
+from franka_wm.console import say
 from franka_wm.errors import UserError
 from franka_wm.seeding import derive_seed
 from franka_wm.training import build
 from franka_wm.training.checkpoint import FIRST_STAGE
 from franka_wm.training.learner import Learner
-from franka_wm.training.progress import say
 from franka_wm.training.spaces import Spaces
 from franka_wm.training.trainer import Trainer
 

@@ -14,16 +14,16 @@ from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torchrl.collectors import Collector
 
+from franka_wm.console import Progress, say
 from franka_wm.data.captured import CapturedSampling
 from franka_wm.errors import UserError
+from franka_wm.interrupt import interruptible
 from franka_wm.seeding import derive_seed, seeded
 from franka_wm.training.build import explore
 from franka_wm.training.checkpoint import Checkpoint, save_checkpoint
-from franka_wm.training.interrupt import interruptible
 from franka_wm.training.learner import Learner
 from franka_wm.training.loggers import log_numbers
 from franka_wm.training.moment import draws, go_on_drawing, put_back, restorable, same_worlds, worlds_now
-from franka_wm.training.progress import Progress, say
 from franka_wm.training.room import fill, held, left_out
 from franka_wm.training.spaces import Spaces
 

@@ -10,7 +10,8 @@ import pytest
 import torch
 from omegaconf import OmegaConf
 
-from franka_wm.envs import FrankaConfig, FrankaEnv, resolve_device
+from franka_wm.device import resolve_device
+from franka_wm.envs import FrankaConfig, FrankaEnv
 from franka_wm.errors import UserError
 
 STATE = {"observations": ("state",)}

@@ -11,7 +11,7 @@ import pytest
 import torch
 
 from franka_wm.report.results import END
-from franka_wm.report.video import write_png, write_video
+from franka_wm.video import write_png, write_video
 
 
 def interval(mean: float, spread: float = 0.1) -> dict[str, float]:

@@ -16,7 +16,7 @@ from franka_wm.report.compare import compare_page, differences, repetitions, uni
 from franka_wm.report.page import page, write_page
 from franka_wm.report.results import COMMAND
 from franka_wm.report.run import csv_rows, read_run
-from franka_wm.report.versions import versions, write_versions
+from franka_wm.versions import versions, write_versions
 from tests.report.conftest import extras, policy
 
 VOID = {"meta", "img", "br", "hr", "link", "input"}

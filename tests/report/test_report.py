@@ -12,10 +12,11 @@ from PIL import Image
 from rich.console import Console
 
 from franka_wm.errors import UserError
-from franka_wm.report import style, written_whole
+from franka_wm.files import atomic_write
+from franka_wm.report import style
 from franka_wm.report.curves import plot_learning_curves
 from franka_wm.report.table import markdown_table, terminal_table
-from franka_wm.report.video import tile_frames, write_gif, write_png, write_video
+from franka_wm.video import tile_frames, write_gif, write_png, write_video
 
 # -- video -----------------------------------------------------------------------------------------------
 
@@ -190,7 +191,7 @@ def test_an_unwritable_place_is_one_line(tmp_path: Path) -> None:
 def test_an_interrupted_write_keeps_the_old_file(tmp_path: Path) -> None:
     path = tmp_path / "a.txt"
     path.write_text("old")
-    with pytest.raises(KeyboardInterrupt), written_whole(path) as temporary:
+    with pytest.raises(KeyboardInterrupt), atomic_write(path) as temporary:
         temporary.write_text("ne")
         raise KeyboardInterrupt
     assert path.read_text() == "old"

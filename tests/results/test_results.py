@@ -14,8 +14,8 @@ from benchmarks.results import records, render, running
 from benchmarks.results.__main__ import main, overview
 from benchmarks.results.rows import Row, Section, load_rows
 from benchmarks.results.state import composed, state
+from franka_wm import source
 from franka_wm.errors import UserError
-from franka_wm.report import source
 
 CPU = Section(title="Two CPU cores", arguments="scale=smoke device=cpu", threads=2)
 ROW = Row(

@@ -136,7 +136,7 @@ def make_picture(root: Path, out: Path, *, frames: int = 6) -> None:
         frames: How many.
     """
     from franka_wm.data.lerobot.pictures import encode_png
-    from franka_wm.report import written_whole
+    from franka_wm.files import atomic_write
 
     info = json.loads((root / "meta" / "info.json").read_text(encoding="utf-8"))
     kinds = {
@@ -150,7 +150,7 @@ def make_picture(root: Path, out: Path, *, frames: int = 6) -> None:
     episode = _first_episode(root, info, name, kind)
     chosen = episode[np.linspace(0, len(episode) - 1, min(frames, len(episode))).round().astype(int)]
     out.parent.mkdir(parents=True, exist_ok=True)
-    with written_whole(out) as path:
+    with atomic_write(out) as path:
         path.write_bytes(encode_png(np.concatenate(list(chosen), axis=1)))
 
 

@@ -75,7 +75,7 @@ def collect(arguments: Sequence[str]) -> int:
     """The verb."""
     import warp as wp
 
-    from franka_wm.training.progress import say
+    from franka_wm.console import say
 
     wp.config.log_level = wp.LOG_WARNING  # its list of compiled modules drowns what there is to say
     if not arguments or arguments[0] in ("--help", "-h"):
@@ -134,10 +134,10 @@ def open_source(options: dict[str, Any], overrides: list[str]) -> Source:
 def _simple(name: str, options: dict[str, Any], overrides: list[str]) -> Source:
     from omegaconf import OmegaConf
 
+    from franka_wm.console import announced, say
     from franka_wm.envs import FrankaConfig, FrankaEnv
     from franka_wm.training import build
     from franka_wm.training.entry import with_scale
-    from franka_wm.training.progress import announced, say
 
     cfg = compose(with_scale(overrides), tuple(OPTIONS))
     seed, smoothness = number(cfg, "seed"), number(cfg, "collector.smoothness", float)
@@ -183,8 +183,8 @@ def _agent(part: str, checkpoint: str, options: dict[str, Any], overrides: list[
     from omegaconf.errors import OmegaConfBaseException
     from yaml import YAMLError
 
+    from franka_wm.console import announced
     from franka_wm.training.load import load_agent
-    from franka_wm.training.progress import announced
 
     changes: dict[str, Any] = {}
     seed, device = None, "auto"
@@ -261,8 +261,8 @@ def gather(
     """
     from torchrl.collectors import Collector
 
-    from franka_wm.training.interrupt import interruptible
-    from franka_wm.training.progress import count, duration, say
+    from franka_wm.console import count, duration, say
+    from franka_wm.interrupt import interruptible
 
     base = getattr(source.env, "base_env", source.env)
     schema = schema_for(base.config, format=format)

@@ -52,8 +52,8 @@ def export(arguments: Sequence[str]) -> int:
     """The verb."""
     from omegaconf import OmegaConf
 
+    from franka_wm.console import announced
     from franka_wm.training.checkpoint import latest_checkpoint, load_checkpoint
-    from franka_wm.training.progress import announced
 
     if not arguments or arguments[0] in ("--help", "-h"):
         print(USAGE)
@@ -84,7 +84,7 @@ def export(arguments: Sequence[str]) -> int:
 
 def tell(done: Exported) -> None:
     """Says what was written and what was not."""
-    from franka_wm.training.progress import say
+    from franka_wm.console import say
 
     left = f"; {done.partial} partial episodes in the buffer were left out" if done.partial else ""
     say(f"dataset: {done.out}   {done.episodes} episodes, {done.frames} steps{left}")

@@ -92,7 +92,7 @@ def publish_dataset(
     Raises:
         UserError: One line: not a dataset, no token, the name is taken, no network.
     """
-    from franka_wm.training.progress import announced, say
+    from franka_wm.console import announced, say
 
     root = Path(root).absolute()
     check_repo_id(repo_id)
@@ -217,7 +217,7 @@ def publish_model(
     Raises:
         UserError: One line.
     """
-    from franka_wm.training.progress import announced, say
+    from franka_wm.console import announced, say
 
     check_repo_id(repo_id)
     with tempfile.TemporaryDirectory() as place:
@@ -310,7 +310,7 @@ def _goes(name: str) -> bool:
 
 
 def _show(files: Sequence[str], root: Path, repo_id: str, private: bool, kind: str) -> None:
-    from franka_wm.training.progress import count, say
+    from franka_wm.console import count, say
 
     size = sum((root / name).stat().st_size for name in files)
     say(f"{kind} {repo_id} ({'private' if private else 'public'}): {len(files)} files, {count(size)}B")

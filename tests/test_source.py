@@ -4,8 +4,8 @@ import json
 from pathlib import Path
 
 import franka_wm.envs.kinematics  # noqa: F401  # what the tests below look for among the imported
-from franka_wm.report import source
-from franka_wm.report.versions import processor, versions, write_finished, write_versions
+from franka_wm import source
+from franka_wm.versions import processor, versions, write_finished, write_versions
 
 CODE = (
     b'"""A text."""\n\nX = 1  # one\n"""What X is."""\n\n\ndef f(a, b):\n    """Adds."""\n    return a + b\n'

@@ -8,11 +8,15 @@ from collections.abc import Iterable, Mapping
 from functools import cache
 from pathlib import Path
 
-import franka_wm
-
-ROOT = Path(franka_wm.__file__).resolve().parents[1]
+ROOT = Path(__file__).resolve().parents[1]
 PARTS = ("franka_wm", "benchmarks", "train.py")
-SHOWS = ("franka_wm/report/", "franka_wm/live/", "benchmarks/results/")
+SHOWS = (
+    "franka_wm/report/",
+    "franka_wm/live/",
+    "franka_wm/source.py",
+    "franka_wm/video.py",
+    "benchmarks/results/",
+)
 """What shows results and does not make them."""
 
 

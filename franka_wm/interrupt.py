@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
 
-from franka_wm.training.progress import say
+from franka_wm.console import say
 
 
 @contextmanager

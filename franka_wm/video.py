@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from franka_wm.errors import UserError
-from franka_wm.report import written_whole
+from franka_wm.files import atomic_write
 
 
 def write_video(frames: Tensor, path: str | Path, fps: int) -> Path:
@@ -35,7 +35,7 @@ def write_video(frames: Tensor, path: str | Path, fps: int) -> Path:
     import av
 
     with (
-        written_whole(path) as temporary,
+        atomic_write(path) as temporary,
         av.open(str(temporary), "w", format="mp4", options={"movflags": "faststart"}) as container,
     ):
         stream = container.add_stream("libx264", rate=fps, options={"crf": "18"})
@@ -58,7 +58,7 @@ def write_gif(frames: Tensor, path: str | Path, fps: int) -> Path:
 
     first, *rest = [Image.fromarray(frame.contiguous().cpu().numpy()) for frame in frames]
     duration_ms = max(20, 10 * round(100 / fps))
-    with written_whole(path) as temporary:
+    with atomic_write(path) as temporary:
         first.save(
             temporary,
             format="GIF",
@@ -88,7 +88,7 @@ def write_png(frame: Tensor, path: str | Path) -> Path:
     _check_frames(frame[None], path, ".png", 1)
     from PIL import Image
 
-    with written_whole(path) as temporary:
+    with atomic_write(path) as temporary:
         Image.fromarray(frame.contiguous().cpu().numpy()).save(temporary, format="PNG", optimize=True)
     return path
 

@@ -9,8 +9,9 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
-import franka_wm
-from franka_wm.report import source, written_whole
+from franka_wm import source
+from franka_wm.files import atomic_write
+from franka_wm.version import __version__
 
 PACKAGES = ("torch", "torchrl", "tensordict", "newton", "warp-lang", "mujoco-warp", "lerobot", "numpy")
 
@@ -25,7 +26,7 @@ def versions(device: Any = None) -> dict[str, Any]:
         Texts and numbers that JSON can hold. A package that is not installed is left out. Outside of a repository the
         commit is that of the environment variable ``FRANKA_WM_COMMIT``, and left out without one.
     """
-    found: dict[str, Any] = {"franka_wm": franka_wm.__version__, "python": platform.python_version()}
+    found: dict[str, Any] = {"franka_wm": __version__, "python": platform.python_version()}
     for name in PACKAGES:
         try:
             found[name] = version(name)
@@ -84,7 +85,7 @@ def _now() -> datetime:
 
 
 def _write(path: Path, found: dict[str, Any]) -> Path:
-    with written_whole(path) as temporary:
+    with atomic_write(path) as temporary:
         temporary.write_text(json.dumps(found, indent=2) + "\n")
     return path
 

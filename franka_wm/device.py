@@ -1,0 +1,32 @@
+"""Devices by name."""
+
+from __future__ import annotations
+
+import torch
+
+from franka_wm.errors import UserError
+
+
+def resolve_device(device: torch.device | str | None) -> torch.device:
+    """``None`` or ``"auto"``: the first GPU, or the CPU where there is none; otherwise the device, checked.
+
+    Raises:
+        UserError: If CUDA is asked for where there is none, or the device is of another kind.
+    """
+    if device is None or device == "auto":
+        device = "cuda" if torch.cuda.is_available() else "cpu"
+    try:
+        device = torch.device(device)
+    except RuntimeError as error:
+        raise UserError(f"device={device!r}: must be auto, cpu, cuda or cuda:K") from error
+    if device.type == "cuda":
+        index = 0 if device.index is None else device.index
+        count = torch.cuda.device_count() if torch.cuda.is_available() else 0
+        if index >= count:
+            raise UserError(
+                f"device={device}: this machine has {count} usable CUDA devices; use device=cpu or auto"
+            )
+        return torch.device("cuda", index)
+    if device.type != "cpu":
+        raise UserError(f"device={device}: Newton runs on cpu and cuda")
+    return torch.device("cpu")
