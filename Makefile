@@ -14,6 +14,7 @@ PYTHON ?=
 ROW ?=
 VENV := .venv
 STAMP := $(VENV)/.installed
+DEV := $(VENV)/.installed-dev
 BIN := $(VENV)/bin
 
 .PHONY: help setup train test results mutation lint format lock clean
@@ -25,45 +26,53 @@ help: ## show the targets
 # The stamp is written last, by a script that stops at the first failure: if it is there and newer than
 # what the installation depends on, the installation is whole.
 $(STAMP): requirements.lock pyproject.toml scripts/setup.sh
-	@PYTHON="$(PYTHON)" scripts/setup.sh "$(VENV)" "$(STAMP)"
+	@PYTHON="$(PYTHON)" scripts/setup.sh "$(VENV)" "$(STAMP)" requirements.lock
 
-setup: $(STAMP) ## make .venv and install the locked packages
+# The packages for tests, linting and documentation hold those for running, at the same versions.
+$(DEV): requirements-dev.lock requirements.lock pyproject.toml scripts/setup.sh
+	@PYTHON="$(PYTHON)" scripts/setup.sh "$(VENV)" "$(DEV)" requirements-dev.lock
+	@touch "$(STAMP)" "$(DEV)"
+
+setup: $(STAMP) ## make .venv and install what running needs
 
 train: $(STAMP) ## train, plan and evaluate; Hydra overrides in ARGS="..."
 	@$(BIN)/python train.py $(ARGS)
 
 # Two processes with a thread each: tests are small, and torch's threads would wait for each other.
-test: $(STAMP) ## run the tests; pytest options in ARGS="..."
+test: $(DEV) ## run the tests; pytest options in ARGS="..."
 	@OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 2 --dist loadfile $(ARGS)
 
 # Numbers come from the files in docs/results/, which runs wrote: benchmarks/results/rows.yaml declares them.
-results: $(STAMP) ## which results are older than the code; ROW=name measures one again
+results: $(DEV) ## which results are older than the code; ROW=name measures one again
 	@if [[ -n "$(ROW)" ]]; then $(BIN)/python -m benchmarks.results run $(ROW) $(ARGS); fi
 	@$(BIN)/python -m benchmarks.results render
 	@$(BIN)/python -m benchmarks.results list
 
 # Not in CI: every mistake runs tests of seconds. Its tool is not locked; nothing else needs it.
-mutation: $(STAMP) ## which small mistakes in the code no test notices (hours; ARGS="--sample 40")
+mutation: $(DEV) ## which small mistakes in the code no test notices (hours; ARGS="--sample 40")
 	@$(BIN)/python -c 'import cosmic_ray' 2>/dev/null || \
 	  $(BIN)/python -m pip install --quiet --disable-pip-version-check cosmic-ray==8.7.0
 	@$(BIN)/python scripts/mutation.py $(ARGS)
 
-lint: $(STAMP) ## ruff check, ruff format --check, pyright
+lint: $(DEV) ## ruff check, ruff format --check, pyright
 	@$(BIN)/ruff check .
 	@$(BIN)/ruff format --check .
 	@$(BIN)/pyright
 
-format: $(STAMP) ## let ruff fix and format the code
+format: $(DEV) ## let ruff fix and format the code
 	@$(BIN)/ruff check --fix .
 	@$(BIN)/ruff format .
 
-# Needs uv, which is installed into .venv for the purpose. Versions already locked stay as they are;
-# `make lock ARGS=--upgrade` takes the newest. The lock must not tie a reader to one package index.
-lock: $(STAMP) ## write requirements.lock anew from pyproject.toml
-	@$(BIN)/python -m pip install --quiet --disable-pip-version-check uv
-	@$(BIN)/uv pip compile pyproject.toml --extra dev --universal --python-version 3.12 --generate-hashes \
-	  --no-emit-index-url --no-emit-find-links --no-annotate --no-header --quiet $(ARGS) -o requirements.lock
-	@if grep -n '://' requirements.lock; then echo 'requirements.lock holds addresses (above)' >&2; exit 1; fi
+# Versions already locked stay as they are; `make lock ARGS=--upgrade` takes the newest. The locks must not tie a
+# reader to one package index.
+COMPILE = $(BIN)/uv pip compile pyproject.toml --group install --universal --python-version 3.12 --generate-hashes \
+  --no-emit-index-url --no-emit-find-links --no-annotate --no-header --quiet $(ARGS)
+
+lock: $(DEV) ## write the requirements*.lock files anew from pyproject.toml
+	@[[ -x $(BIN)/uv ]] || $(BIN)/python -m pip install --quiet --disable-pip-version-check uv
+	@$(COMPILE) --extra view -o requirements.lock
+	@$(COMPILE) --extra dev -c requirements.lock -o requirements-dev.lock
+	@if grep -n '://' requirements*.lock; then echo 'the locks hold addresses (above)' >&2; exit 1; fi
 
 clean: ## remove .venv and what tools left behind; outputs/ and datasets/ stay
 	rm -rf $(VENV) build dist *.egg-info .pytest_cache .ruff_cache .hypothesis

@@ -1,15 +1,17 @@
 #!/usr/bin/env bash
 # Make the virtual environment and install the locked packages and this project into it.
 #
-#   scripts/setup.sh VENV STAMP
+#   scripts/setup.sh VENV STAMP LOCK
 #
-# STAMP is written last, so its presence means a whole installation. PYTHON= names the interpreter to use;
+# LOCK is requirements.lock (what running needs) or requirements-dev.lock (what tests and the documentation need as
+# well). Packages are installed by uv, or by pip where uv cannot be had. STAMP is written last, so its presence means a whole installation. PYTHON= names the interpreter to use;
 # otherwise the usual names are tried, then the versions that pyenv keeps.
 set -euo pipefail
 cd "$(dirname "${BASH_SOURCE[0]}")/.."
 
 venv=$1
 stamp=$2
+lock=$3
 unfinished=$venv/.installing
 log=$venv/setup.log
 
@@ -65,15 +67,27 @@ show_progress() {
     END { if (terminal) printf "\r\033[K" }'
 }
 
-pip() { "$venv/bin/python" -m pip --disable-pip-version-check "$@"; }
+pip() { "$venv/bin/python" -m pip --disable-pip-version-check --no-input "$@"; }
 
-install() { # install TOTAL ARGUMENTS...: pip install, with progress; on failure pip's last words
-  local total=$1
-  shift
-  if ! pip install --no-input --progress-bar off "$@" 2>&1 | tee -a "$log" | show_progress "$total"; then
-    tail -n 15 "$log" >&2
-    fail "pip could not install the packages (its last lines are above, all of them in $log); run the same command again to start over."
-  fi
+stop() { # stop WHO: the last words of the log, and the end
+  tail -n 15 "$log" >&2
+  fail "$1 could not install the packages (its last lines are above, all of them in $log); run the same command again to start over."
+}
+
+# uv itself comes through pip, at the version and with the hashes of the lock.
+install_uv() {
+  awk '/^[A-Za-z0-9]/ { uv = /^uv==/ } uv' "$lock" >"$venv/uv.lock"
+  pip install --require-hashes --no-deps -r "$venv/uv.lock" >>"$log" 2>&1
+}
+
+# One line per large download; the names of small packages are in the log.
+with_uv() {
+  "$venv/bin/uv" --no-progress pip install --python "$venv/bin/python" "$@" 2>&1 | tee -a "$log" |
+    awk '/^(Downloading|Prepared|Installed) / { print "  " $0; fflush() }'
+}
+
+with_pip() {
+  pip install --progress-bar off "$@" 2>&1 | tee -a "$log" | show_progress "$(grep -c '^[A-Za-z0-9]' "$lock")"
 }
 
 if [[ -e $unfinished ]] || ! suits "$venv/bin/python"; then
@@ -89,16 +103,24 @@ if [[ -e $unfinished ]] || ! suits "$venv/bin/python"; then
   touch "$unfinished" # before anything else is in there: a kill from here on is noticed next time
   "$python" -m venv "$venv"
 fi
-rm -f "$stamp"
+rm -f "$venv"/.installed* # the other stamp as well: an installation that stops half-way spoils both
 touch "$unfinished"
 : >"$log"
 # An environment made by uv has no pip.
 "$venv/bin/python" -m pip --version >/dev/null 2>&1 || "$venv/bin/python" -m ensurepip >>"$log" 2>&1
 
-echo "setup: installing the locked packages (about 3 GB to download the first time; log in $log)"
-install "$(grep -c '^[A-Za-z0-9]' requirements.lock)" --require-hashes -r requirements.lock
+echo "setup: installing the packages of $lock (about 3 GB to download the first time; log in $log)"
+tool=with_uv
+if ! install_uv; then
+  echo "setup: uv could not be installed (see $log); using pip instead, which takes several minutes longer"
+  tool=with_pip
+elif ! with_uv --require-hashes -r "$lock"; then
+  echo "setup: uv could not install the packages (see $log); trying pip instead, which takes several minutes longer"
+  tool=with_pip
+fi
+if [[ $tool == with_pip ]]; then with_pip --require-hashes -r "$lock" || stop pip; fi
 # setuptools, which builds the project, is in the lock: nothing is fetched here that the lock does not know.
-install 1 --no-deps --no-build-isolation -e . >/dev/null
+"$tool" --no-deps --no-build-isolation -e . >/dev/null || stop "${tool#with_}"
 
 rm -f "$unfinished"
 touch "$stamp"
