@@ -17,11 +17,11 @@ STAMP := $(VENV)/.installed
 DEV := $(VENV)/.installed-dev
 BIN := $(VENV)/bin
 
-.PHONY: help setup train test results mutation lint format lock clean
+.PHONY: help setup train test test-slow results mutation lint format lock clean
 
 help: ## show the targets
-	@grep -hE '^[a-z]+:.*## ' $(firstword $(MAKEFILE_LIST)) | sed -E 's/:[^#]*## /\t/' | \
-	  while IFS=$$'\t' read -r name text; do printf '  make %-8s %s\n' "$$name" "$$text"; done
+	@grep -hE '^[a-z-]+:.*## ' $(firstword $(MAKEFILE_LIST)) | sed -E 's/:[^#]*## /\t/' | \
+	  while IFS=$$'\t' read -r name text; do printf '  make %-9s %s\n' "$$name" "$$text"; done
 
 # The stamp is written last, by a script that stops at the first failure: if it is there and newer than
 # what the installation depends on, the installation is whole.
@@ -39,8 +39,13 @@ train: $(STAMP) ## train, plan and evaluate; Hydra overrides in ARGS="..."
 	@$(BIN)/python train.py $(ARGS)
 
 # Two processes with a thread each: tests are small, and torch's threads would wait for each other.
-test: $(DEV) ## run the tests; pytest options in ARGS="..."
-	@OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 2 --dist loadfile $(ARGS)
+PYTEST = OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 2 --dist loadfile
+
+test: $(DEV) ## run the quick tests; pytest options in ARGS="..."
+	@$(PYTEST) -m "not slow" $(ARGS)
+
+test-slow: $(DEV) ## run the slow tests, which continuous integration runs as well
+	@$(PYTEST) -m slow $(ARGS)
 
 # Numbers come from the files in docs/results/, which runs wrote: benchmarks/results/rows.yaml declares them.
 results: $(DEV) ## which results are older than the code; ROW=name measures one again

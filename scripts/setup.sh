@@ -80,10 +80,10 @@ install_uv() {
   pip install --require-hashes --no-deps -r "$venv/uv.lock" >>"$log" 2>&1
 }
 
-# One line per large download; the names of small packages are in the log.
+# One line per download of 100 MiB and more; every package is in the log.
 with_uv() {
   "$venv/bin/uv" --no-progress pip install --python "$venv/bin/python" "$@" 2>&1 | tee -a "$log" |
-    awk '/^(Downloading|Prepared|Installed) / { print "  " $0; fflush() }'
+    awk '/^ *Downloading .*\((.*GiB|[0-9]{3,}[.0-9]*MiB)\)/ || /^(Prepared|Installed) / { print "  " $0; fflush() }'
 }
 
 with_pip() {

@@ -6,6 +6,8 @@ import sys
 import tomllib
 from pathlib import Path
 
+import pytest
+
 import franka_wm
 from franka_wm.errors import FrankaError, UserError
 
@@ -32,8 +34,23 @@ def test_version_is_the_one_in_pyproject() -> None:
     assert project["version"] == franka_wm.__version__
 
 
-def test_lock_holds_hashes_and_no_addresses() -> None:
-    lock = (ROOT / "requirements.lock").read_text()
+def locked(name: str) -> dict[str, str]:
+    """Package → version of a lock file."""
+    return dict(re.findall(r"^([A-Za-z0-9._-]+)==([^ ]+)", (ROOT / name).read_text().lower(), re.MULTILINE))
+
+
+def direct(*wanted: str) -> set[str]:
+    """The names of requirements, with those of our own optional parts in place of ``franka-wm[…]``."""
+    extras = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["optional-dependencies"]
+    ours = [w for w in wanted if w.startswith("franka-wm[")]
+    parts = [part for w in ours for part in w.split("[")[1].rstrip("]").split(",")]
+    names = [w for w in wanted if w not in ours] + [w for part in parts for w in extras[part]]
+    return {re.split(r"[\[<>=~! ]", w)[0].lower().replace("_", "-") for w in names}
+
+
+@pytest.mark.parametrize("name", ["requirements.lock", "requirements-dev.lock"])
+def test_lock_holds_hashes_and_no_addresses(name: str) -> None:
+    lock = (ROOT / name).read_text()
     assert "://" not in lock
     assert "--index-url" not in lock
     packages = re.findall(r"^[A-Za-z0-9][^ ]*==", lock, flags=re.MULTILINE)
@@ -42,19 +59,16 @@ def test_lock_holds_hashes_and_no_addresses() -> None:
     assert all("--hash=sha256:" in entry for entry in entries)
 
 
-def test_lock_covers_every_direct_dependency() -> None:
+def test_locks_cover_every_direct_dependency() -> None:
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
-    extras = project["optional-dependencies"]
-    wanted = [*project["dependencies"], *extras["dev"], "setuptools"]
-    ours = [w for w in wanted if w.startswith("franka-wm[")]  # the optional parts that the tests need
-    parts = [part for w in ours for part in w.split("[")[1].rstrip("]").split(",")]
-    assert parts
-    wanted = [w for w in wanted if w not in ours] + [w for part in parts for w in extras[part]]
-    names = {re.split(r"[\[<>=~! ]", w)[0].lower() for w in wanted}
-    locked = {
-        n.lower() for n in re.findall(r"^([A-Za-z0-9._-]+)==", (ROOT / "requirements.lock").read_text(), re.M)
-    }
-    assert names <= locked
+    running = direct(*project["dependencies"], "franka-wm[view]", "setuptools", "uv")
+    assert running <= locked("requirements.lock").keys()
+    everything = running | direct("franka-wm[dev]") | direct(*project["optional-dependencies"]["dev"])
+    assert everything - {"franka-wm"} <= locked("requirements-dev.lock").keys()
+
+
+def test_lock_for_running_is_part_of_the_lock_for_tests() -> None:
+    assert locked("requirements.lock").items() <= locked("requirements-dev.lock").items()
 
 
 def test_user_error_is_one_line_and_a_value_error() -> None:
