@@ -27,8 +27,9 @@ from tensordict import TensorDict
 
 from franka_wm import models
 from franka_wm.envs import FrankaConfig, FrankaEnv
-from franka_wm.planning import MPPI, PlannerPolicy, RewardPlusValue
+from franka_wm.planning import MPPI, RewardPlusValue
 from franka_wm.planning.mcts import MCTS
+from franka_wm.policies import PlannerPolicy
 from franka_wm.training.learner import Learner
 
 NOTES = {

@@ -23,9 +23,9 @@ sys.path.append(sys.path.pop(0))  # this folder last: `lerobot` is the package, 
 import torch
 from common import publish, rate
 
-from franka_wm.data.policies import SmoothRandomPolicy
 from franka_wm.data.replay import make_replay
 from franka_wm.envs import FrankaConfig, FrankaEnv
+from franka_wm.policies.scripted import SmoothRandomPolicy
 
 
 def record(folder: Path, episodes: int, format: str, window: int, batch_size: int) -> tuple[Path, Any]:

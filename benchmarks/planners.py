@@ -22,14 +22,8 @@ from tensordict import TensorDict
 
 from franka_wm import models
 from franka_wm.device import resolve_device
-from franka_wm.planning import (
-    CEM,
-    ICEM,
-    MPPI,
-    GoalImage,
-    GradientPlanner,
-    PlannerPolicy,
-)
+from franka_wm.planning import CEM, ICEM, MPPI, GoalImage, GradientPlanner
+from franka_wm.policies import PlannerPolicy
 
 PLANNERS = {"mppi": MPPI, "cem": CEM, "icem": ICEM, "gradient": GradientPlanner}
 SIZES = {  # latent, encoder, hidden

@@ -17,7 +17,8 @@ from tensordict import TensorDict
 
 from franka_wm import models
 from franka_wm.device import resolve_device
-from franka_wm.planning import MCTS, SearchPolicy
+from franka_wm.planning import MCTS
+from franka_wm.policies import SearchPolicy
 
 MOVES = 15
 

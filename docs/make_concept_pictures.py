@@ -16,12 +16,12 @@ import torch
 from tensordict import TensorDict
 
 from franka_wm import models
-from franka_wm.data.policies import OraclePolicy, SmoothRandomPolicy
 from franka_wm.envs import FrankaConfig, FrankaEnv
 from franka_wm.envs.camera import project
 from franka_wm.live.commanded import KinematicModel, commanded_path
 from franka_wm.models.masks import make_masks
 from franka_wm.planning import registry
+from franka_wm.policies.scripted import OraclePolicy, SmoothRandomPolicy
 from franka_wm.report.bars import bars_figure
 from franka_wm.report.figure import finish_axes, new_figure, save_figure
 from franka_wm.report.frames import mask_figure, strip_figure

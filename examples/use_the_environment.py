@@ -8,8 +8,8 @@ from torchrl.collectors import Collector
 from torchrl.data import LazyTensorStorage, ReplayBuffer
 from torchrl.envs.utils import check_env_specs
 
-from franka_wm.data.policies import OraclePolicy
 from franka_wm.envs import FrankaConfig, FrankaEnv
+from franka_wm.policies.scripted import OraclePolicy
 
 config = FrankaConfig(
     observations=("pixels", "state", "joint_target"),

@@ -74,7 +74,7 @@ def planner_health(policy: Any, observation: TensorDictBase) -> dict[str, Any]:
     """How the planner searches, on held-out states; computed in float32, whatever precision the policy plans in.
 
     Args:
-        policy: A :class:`~franka_wm.planning.PlannerPolicy`.
+        policy: A :class:`~franka_wm.policies.PlannerPolicy`.
         observation: Batch size [E], with what the policy reads; E ≥ 2.
 
     Returns:

@@ -8,7 +8,8 @@ from torch import Tensor
 
 from franka_wm.envs import FrankaConfig, FrankaEnv
 from franka_wm.envs.kinematics import Kinematics
-from franka_wm.planning import MPPI, PlannerPolicy
+from franka_wm.planning import MPPI
+from franka_wm.policies import PlannerPolicy
 
 DAMPING = 1e-3
 """Added to J Jᵀ [m²] by the environment where actions move the tool."""

@@ -173,8 +173,8 @@ def check_arm(checkpoint: str) -> None:
 
 def untrained(options: Options, changes: Mapping[str, Any]) -> Stage:
     """The arm without a checkpoint."""
-    from franka_wm.data.policies import NoopPolicy, OraclePolicy, SmoothRandomPolicy
     from franka_wm.live.commanded import kinematic_planner
+    from franka_wm.policies.scripted import NoopPolicy, OraclePolicy, SmoothRandomPolicy
 
     config = FrankaConfig.from_mapping({**ARM, **changes})
     env = FrankaEnv(config, num_envs=1, device=options.device, seed=options.seed)

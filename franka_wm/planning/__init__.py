@@ -1,10 +1,9 @@
-"""Planners over a plain function `(z, action) -> z'`, and policies that run them.
+"""Planners over a plain function `(z, action) -> z'`, and objectives; `franka_wm.policies` runs them.
 
 Nothing here knows a model family: models enter as callables.
 """
 
 from franka_wm.planning.cem import CEM
-from franka_wm.planning.exploration import ExploringPolicy
 from franka_wm.planning.gradient import GradientPlanner
 from franka_wm.planning.icem import ICEM
 from franka_wm.planning.mcts import MCTS
@@ -17,9 +16,7 @@ from franka_wm.planning.objectives import (
     Smoothness,
     Sum,
 )
-from franka_wm.planning.policy import ModelPolicy, PlannerPolicy
 from franka_wm.planning.sampling import Planner
-from franka_wm.planning.search_policy import SearchPolicy
 
 __all__ = [
     "CEM",
@@ -27,15 +24,11 @@ __all__ = [
     "MCTS",
     "MPPI",
     "ActionPenalty",
-    "ExploringPolicy",
     "GoalDistance",
     "GoalImage",
     "GradientPlanner",
-    "ModelPolicy",
     "Planner",
-    "PlannerPolicy",
     "RewardPlusValue",
-    "SearchPolicy",
     "Smoothness",
     "Sum",
 ]

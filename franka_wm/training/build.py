@@ -13,7 +13,16 @@ from torchrl.data import ReplayBuffer
 from franka_wm import models, planning
 from franka_wm.console import say
 from franka_wm.data.hindsight import Hindsight
-from franka_wm.data.policies import (
+from franka_wm.data.replay import make_replay
+from franka_wm.device import resolve_device
+from franka_wm.envs import FrankaConfig, FrankaEnv, TransformedFrankaEnv
+from franka_wm.envs.config import ACTION_MODES
+from franka_wm.envs.discretize import DiscreteActions
+from franka_wm.errors import UserError
+from franka_wm.planning import registry
+from franka_wm.policies import ExploringPolicy, ModelPolicy, PlannerPolicy, SearchPolicy
+from franka_wm.policies.planner import PRECISIONS
+from franka_wm.policies.scripted import (
     DiscreteOraclePolicy,
     DiscretePolicy,
     NoopPolicy,
@@ -21,14 +30,6 @@ from franka_wm.data.policies import (
     RandomMovesPolicy,
     SmoothRandomPolicy,
 )
-from franka_wm.data.replay import make_replay
-from franka_wm.device import resolve_device
-from franka_wm.envs import FrankaConfig, FrankaEnv, TransformedFrankaEnv
-from franka_wm.envs.config import ACTION_MODES
-from franka_wm.envs.discretize import DiscreteActions
-from franka_wm.errors import UserError
-from franka_wm.planning import ModelPolicy, PlannerPolicy, registry
-from franka_wm.planning.policy import PRECISIONS
 from franka_wm.seeding import derive_seed, evaluation_seed
 from franka_wm.training.spaces import Spaces
 
@@ -318,12 +319,12 @@ def make_policies(
     ``planner`` and ``policy`` where the model has what they need; ``noop`` and ``random`` (smooth random:
     first-order autoregressive); for the arm ``oracle``, inverse kinematics with true geometry, or a search over pairs
     of moves. ``capture``,
-    ``precision`` and ``compile``: of the planner's, see :class:`~franka_wm.planning.PlannerPolicy`.
+    ``precision`` and ``compile``: of the planner's, see :class:`~franka_wm.policies.PlannerPolicy`.
     """
     policies: dict[str, Any] = {}
     discrete = not env.action_spec.dtype.is_floating_point
     if discrete:
-        policies["planner"] = planning.SearchPolicy.for_model(model, planner, capture=capture)
+        policies["planner"] = SearchPolicy.for_model(model, planner, capture=capture)
     elif hasattr(model, "next"):
         policies["planner"] = PlannerPolicy.for_model(
             model, planner, objective=objective, capture=capture, precision=precision, compile=compile
@@ -402,7 +403,7 @@ def explore(cfg: DictConfig, policies: Mapping[str, Any], name: str) -> Any:
     noise, worlds = cfg.collector.get("noise", 0.0), cfg.collector.get("planner_worlds", 0)
     if name != "policy" or not (noise or worlds):
         return policies[name]
-    return planning.ExploringPolicy(
+    return ExploringPolicy(
         policies[name], noise=noise, planner=policies.get("planner"), planner_worlds=worlds
     )
 

@@ -7,7 +7,6 @@ import torch
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
 
-from franka_wm.data.policies import NoopPolicy, OraclePolicy, SmoothRandomPolicy
 from franka_wm.envs import FrankaEnv
 from franka_wm.errors import UserError
 from franka_wm.evaluation.closed_loop import (
@@ -16,6 +15,7 @@ from franka_wm.evaluation.closed_loop import (
     summarize,
 )
 from franka_wm.evaluation.protocol import evaluate_policies, held_out_seeds
+from franka_wm.policies.scripted import NoopPolicy, OraclePolicy, SmoothRandomPolicy
 
 LENGTH = 6
 

@@ -9,8 +9,8 @@ import pytest
 from matplotlib.axes import Axes
 from omegaconf import OmegaConf
 
-from franka_wm.data.policies import NoopPolicy
 from franka_wm.evaluation.report import evaluate_and_report
+from franka_wm.policies.scripted import NoopPolicy
 from franka_wm.report.results import END, read_result
 
 

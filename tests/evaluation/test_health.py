@@ -9,7 +9,8 @@ from tensordict import TensorDict
 from franka_wm.evaluation.health import paired_gain, planner_health, training_diagnostics
 from franka_wm.evaluation.spectrum import collapse_warning, latent_statistics
 from franka_wm.models.tdmpc2 import TDMPC2
-from franka_wm.planning import CEM, ICEM, MPPI, GradientPlanner, PlannerPolicy
+from franka_wm.planning import CEM, ICEM, MPPI, GradientPlanner
+from franka_wm.policies import PlannerPolicy
 
 
 @pytest.fixture

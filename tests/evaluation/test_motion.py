@@ -7,7 +7,6 @@ import torch
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
 
-from franka_wm.data.policies import NoopPolicy, OraclePolicy, SmoothRandomPolicy
 from franka_wm.envs import TransformedFrankaEnv
 from franka_wm.envs.discretize import DiscreteActions
 from franka_wm.envs.external import ExternalConfig, ExternalEnv
@@ -18,6 +17,7 @@ from franka_wm.evaluation.closed_loop import (
     summarize,
 )
 from franka_wm.evaluation.protocol import evaluate_policies
+from franka_wm.policies.scripted import NoopPolicy, OraclePolicy, SmoothRandomPolicy
 
 LENGTH = 8
 

@@ -8,13 +8,13 @@ import pytest
 import torch
 
 from examples.add_a_task import HEIGHT, RaiseTool
-from franka_wm.data.policies import NoopPolicy, OraclePolicy, SmoothRandomPolicy
 from franka_wm.envs import FrankaConfig, FrankaEnv
 from franka_wm.envs.tasks import Reach, Track
 from franka_wm.evaluation.closed_loop import play_episodes, reaches
 from franka_wm.evaluation.protocol import Evaluation, describe, evaluate_policies, numbers_to_log, thresholds
 from franka_wm.evaluation.robustness import verdict_of_success
 from franka_wm.evaluation.tables import robustness_table
+from franka_wm.policies.scripted import NoopPolicy, OraclePolicy, SmoothRandomPolicy
 from franka_wm.report.compare import compare_page
 from franka_wm.report.curves import axis, panel_figure, panels, plot_learning_curves
 from franka_wm.report.page import page

@@ -9,7 +9,6 @@ from types import SimpleNamespace
 import pytest
 import torch
 
-from franka_wm.data.policies import NoopPolicy, SmoothRandomPolicy
 from franka_wm.errors import UserError
 from franka_wm.evaluation.closed_loop import summarize
 from franka_wm.evaluation.protocol import evaluate_agent, held_out_seeds, numbers_to_log
@@ -21,6 +20,7 @@ from franka_wm.evaluation.rollouts import (
     gather_episodes,
     mixture,
 )
+from franka_wm.policies.scripted import NoopPolicy, SmoothRandomPolicy
 from franka_wm.seeding import seeded
 from franka_wm.training.load import load_agent
 

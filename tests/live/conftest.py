@@ -7,9 +7,9 @@ from typing import Any
 
 import pytest
 
-from franka_wm.data.policies import NoopPolicy, OraclePolicy, SmoothRandomPolicy
 from franka_wm.live.commanded import kinematic_planner
 from franka_wm.live.session import Session
+from franka_wm.policies.scripted import NoopPolicy, OraclePolicy, SmoothRandomPolicy
 
 LIVE = {
     "goal_sampling": "reachable",

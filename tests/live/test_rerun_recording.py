@@ -7,10 +7,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from franka_wm.data.policies import OraclePolicy
 from franka_wm.errors import UserError
 from franka_wm.live.commanded import kinematic_planner
 from franka_wm.live.rerun_recording import record_episode
+from franka_wm.policies.scripted import OraclePolicy
 
 rr = pytest.importorskip("rerun", reason="needs the extra rerun")
 

@@ -8,7 +8,8 @@ from torch.nn import functional as F
 
 from franka_wm.models import make
 from franka_wm.models.muzero import MuZero
-from franka_wm.planning import MCTS, SearchPolicy
+from franka_wm.planning import MCTS
+from franka_wm.policies import SearchPolicy
 
 MOVES = 3
 SMALL = dict(

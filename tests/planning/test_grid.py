@@ -16,8 +16,9 @@ from tensordict import TensorDict
 from torch import nn
 
 from franka_wm import models
-from franka_wm.planning import CEM, ICEM, MPPI, GoalDistance, GradientPlanner, PlannerPolicy, RewardPlusValue
+from franka_wm.planning import CEM, ICEM, MPPI, GoalDistance, GradientPlanner, RewardPlusValue
 from franka_wm.planning.objectives import bind
+from franka_wm.policies import PlannerPolicy
 from franka_wm.training.build import OF_THE_POLICY
 
 PLANNERS: dict[str, type] = {"mppi": MPPI, "cem": CEM, "icem": ICEM, "gradient": GradientPlanner}

@@ -7,17 +7,9 @@ from tensordict import TensorDict
 from torchrl.data import Bounded, Composite, Unbounded
 from torchrl.envs import EnvBase, InitTracker, TransformedEnv
 
-from franka_wm.planning import (
-    CEM,
-    ActionPenalty,
-    GoalDistance,
-    GoalImage,
-    PlannerPolicy,
-    RewardPlusValue,
-    Smoothness,
-    Sum,
-)
+from franka_wm.planning import CEM, ActionPenalty, GoalDistance, GoalImage, RewardPlusValue, Smoothness, Sum
 from franka_wm.planning.objectives import bind
+from franka_wm.policies import PlannerPolicy
 
 # Two environments, three candidates, two steps, latents of two numbers.
 E, S, H, D = 2, 3, 2, 2

@@ -10,11 +10,11 @@ import torch
 from omegaconf import DictConfig
 from tensordict import TensorDictBase
 
-from franka_wm.data.policies import NoopPolicy, SmoothRandomPolicy
 from franka_wm.envs.simulation import Simulation
 from franka_wm.evaluation.protocol import held_out_seeds
 from franka_wm.evaluation.report import evaluate_and_report
 from franka_wm.evaluation.rollouts import ROLLOUT_SEED
+from franka_wm.policies.scripted import NoopPolicy, SmoothRandomPolicy
 from franka_wm.seeding import derive_seed, evaluation_seed
 from franka_wm.training import build
 from franka_wm.training.entry import Run

@@ -160,7 +160,7 @@ def _simple(name: str, options: dict[str, Any], overrides: list[str]) -> Source:
     cfg.env.observations = values["observations"]
     import torch
 
-    from franka_wm.data.policies import NoopPolicy, OraclePolicy, SmoothRandomPolicy
+    from franka_wm.policies.scripted import NoopPolicy, OraclePolicy, SmoothRandomPolicy
 
     makers: dict[str, Callable[[], Any]] = {
         "noop": lambda: NoopPolicy(env.action_dim),

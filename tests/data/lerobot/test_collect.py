@@ -30,8 +30,8 @@ from franka_wm.data.lerobot.schema import (
     schema_for,
 )
 from franka_wm.data.lerobot.terminal import read_terminals
-from franka_wm.data.policies import SmoothRandomPolicy
 from franka_wm.errors import UserError
+from franka_wm.policies.scripted import SmoothRandomPolicy
 from franka_wm.seeding import derive_seed
 
 SMALL = [

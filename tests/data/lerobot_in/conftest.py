@@ -24,9 +24,9 @@ from franka_wm.data.lerobot.provenance import describe
 from franka_wm.data.lerobot.schema import schema_for
 from franka_wm.data.lerobot.windows import RecordedWindows
 from franka_wm.data.lerobot.writer import DatasetWriter
-from franka_wm.data.policies import SmoothRandomPolicy
 from franka_wm.data.replay import make_replay
 from franka_wm.envs import FrankaConfig, FrankaEnv
+from franka_wm.policies.scripted import SmoothRandomPolicy
 
 
 @pytest.fixture(scope="session")

@@ -10,9 +10,10 @@ from tensordict import TensorDict
 
 from franka_wm import models
 from franka_wm.errors import CaptureError
-from franka_wm.planning import CEM, MCTS, MPPI, PlannerPolicy, SearchPolicy, capture
-from franka_wm.planning.capture import GraphCache
+from franka_wm.planning import CEM, MCTS, MPPI
 from franka_wm.planning.objectives import ActionPenalty, GoalDistance, Sum
+from franka_wm.policies import PlannerPolicy, SearchPolicy, capture
+from franka_wm.policies.capture import GraphCache
 
 on_gpu = pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
 
@@ -130,7 +131,7 @@ def test_copies_have_no_graphs(recorded):
 def test_a_policy_captures_anew_when_settings_mode_or_planner_change(recorded, monkeypatch):
     model = small_model()
     policy = PlannerPolicy.for_model(model, small(MPPI), explore=False)
-    monkeypatch.setattr("franka_wm.planning.policy.captures", lambda wanted, observation: True)
+    monkeypatch.setattr("franka_wm.policies.planner.captures", lambda wanted, observation: True)
 
     def decide():
         for _ in range(3):
@@ -161,7 +162,7 @@ def test_a_policy_captures_anew_when_its_objective_changes(recorded, monkeypatch
     policy = PlannerPolicy.for_model(
         model, small(MPPI), objective=Sum([(1.0, distance), (1.0, penalty)]), explore=False
     )
-    monkeypatch.setattr("franka_wm.planning.policy.captures", lambda wanted, observation: True)
+    monkeypatch.setattr("franka_wm.policies.planner.captures", lambda wanted, observation: True)
 
     seen = observation(4)
 

@@ -9,11 +9,11 @@ from tensordict.nn import InteractionType, TensorDictModuleBase
 from tensordict.nn.probabilistic import interaction_type
 from torch import Tensor, nn
 
-from franka_wm.planning.capture import GraphCache
 from franka_wm.planning.mcts import MCTS
-from franka_wm.planning.policy import captures
-from franka_wm.planning.settings import settings
 from franka_wm.planning.tree import Recurrent
+from franka_wm.policies.capture import GraphCache
+from franka_wm.policies.planner import captures
+from franka_wm.policies.settings import settings
 
 
 class SearchPolicy(TensorDictModuleBase):

@@ -7,7 +7,7 @@ import numpy as np
 import torch
 from tensordict import TensorDict
 
-from franka_wm.planning.settings import settings
+from franka_wm.policies.settings import settings
 
 
 def numbers(value):

@@ -10,7 +10,8 @@ from torchrl.data import Categorical, Composite, Unbounded
 from torchrl.envs import EnvBase
 from torchrl.envs.utils import ExplorationType, check_env_specs, set_exploration_type
 
-from franka_wm.planning import MCTS, SearchPolicy
+from franka_wm.planning import MCTS
+from franka_wm.policies import SearchPolicy
 
 LEFT, RIGHT, STAY = 0, 1, 2
 

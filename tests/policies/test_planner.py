@@ -11,7 +11,8 @@ from torchrl.envs import EnvBase, InitTracker, TransformedEnv
 from torchrl.envs.utils import ExplorationType, check_env_specs, set_exploration_type
 
 from franka_wm.models import make
-from franka_wm.planning import CEM, ICEM, MPPI, GoalDistance, GradientPlanner, ModelPolicy, PlannerPolicy
+from franka_wm.planning import CEM, ICEM, MPPI, GoalDistance, GradientPlanner
+from franka_wm.policies import ModelPolicy, PlannerPolicy
 
 HORIZON, GOAL = 3, 2.0
 

@@ -12,10 +12,10 @@ from tensordict.nn import InteractionType, TensorDictModuleBase
 from tensordict.nn.probabilistic import interaction_type
 from torch import Tensor, nn
 
-from franka_wm.planning.capture import GraphCache
 from franka_wm.planning.mppi import MPPI, Objective
 from franka_wm.planning.objectives import RewardPlusValue
-from franka_wm.planning.settings import settings
+from franka_wm.policies.capture import GraphCache
+from franka_wm.policies.settings import settings
 
 PRECISIONS = ("float32", "bfloat16")
 """How a model may compute while planning."""
@@ -55,7 +55,7 @@ class PlannerPolicy(TensorDictModuleBase):
     every decision. It sees what the policy reads: other entries that it needs are named by its `in_keys`.
 
     On CUDA the third decision of a kind (so many environments, exploring or not, these settings) is captured as
-    a graph, which the later ones replay; see `franka_wm.planning.capture.GraphCache`. Then weights must be
+    a graph, which the later ones replay; see `franka_wm.policies.capture.GraphCache`. Then weights must be
     changed in place, and planner, model and objective must not read values on the host. Settings of planner and
     objective may be changed at any time, at the price of another graph; a goal that changes with every decision is
     best copied into the objective's tensor.

@@ -9,9 +9,9 @@ import pytest
 import torch
 from tensordict import TensorDict
 
-from franka_wm.data.policies import DiscretePolicy, NoopPolicy, OraclePolicy, SmoothRandomPolicy
 from franka_wm.envs import FrankaEnv
 from franka_wm.errors import UserError
+from franka_wm.policies.scripted import DiscretePolicy, NoopPolicy, OraclePolicy, SmoothRandomPolicy
 from franka_wm.training import build
 
 

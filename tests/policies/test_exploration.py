@@ -6,7 +6,7 @@ from tensordict import TensorDict
 from tensordict.nn import TensorDictModuleBase
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
-from franka_wm.planning import ExploringPolicy
+from franka_wm.policies import ExploringPolicy
 
 WORLDS = 5
 
