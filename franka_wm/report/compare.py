@@ -23,7 +23,7 @@ from franka_wm.report.document import (
 from franka_wm.report.horizon import horizon_figure
 from franka_wm.report.outcome import SHOWN
 from franka_wm.report.page import split_arguments, wants_help
-from franka_wm.report.run import RunFiles, but_for_the_seed, read_run
+from franka_wm.report.run import RunFiles, but_for_the_seed, malformed, read_run
 from franka_wm.report.spectra import spectrum_figure
 from franka_wm.report.table import Table, evaluation_tables, html, is_interval
 
@@ -42,17 +42,18 @@ def compare_page(runs: Sequence[RunFiles]) -> str:
         raise UserError(
             f"compare needs at least two runs, got {len(runs)}: franka-wm compare outputs/RUN outputs/RUN"
         )
-    named = dict(zip(unique_names(runs), runs, strict=True))
-    different = differences({name: run.config for name, run in named.items()})
-    groups = repetitions(named)
-    parts = [
-        Section("result", "Results", _results(named)),
-        Section("curves", "Learning curves", _curves(groups)),
-        Section("horizon", "Open loop", _horizons(named)),
-        Section("latents", "Latent space", _spectra(named)),
-        Section("config", "What differs", _differences(different, list(named))),
-        Section("reproduce", "Reproduce", _reproduce(runs)),
-    ]
+    with malformed(Path(runs[0].folder)):
+        named = dict(zip(unique_names(runs), runs, strict=True))
+        different = differences({name: run.config for name, run in named.items()})
+        groups = repetitions(named)
+        parts = [
+            Section("result", "Results", _results(named)),
+            Section("curves", "Learning curves", _curves(groups)),
+            Section("horizon", "Open loop", _horizons(named)),
+            Section("latents", "Latent space", _spectra(named)),
+            Section("config", "What differs", _differences(different, list(named))),
+            Section("reproduce", "Reproduce", _reproduce(runs)),
+        ]
     count = f"{len(runs)} runs" + (f" in {len(groups)} groups" if len(groups) < len(runs) else "")
     return document(
         "Runs compared",

@@ -10,7 +10,7 @@ from pathlib import Path
 from franka_wm.errors import UserError
 from franka_wm.report.document import document, write_document
 from franka_wm.report.outcome import headline
-from franka_wm.report.run import RunFiles, read_run
+from franka_wm.report.run import RunFiles, malformed, read_run
 from franka_wm.report.sections import sections, warnings
 from franka_wm.version import __version__
 
@@ -19,15 +19,16 @@ FILE = "report.html"
 
 def page(run: RunFiles) -> str:
     """The page of a run as HTML."""
-    known = [run.environment, run.model] if run.config else []
-    known += [] if run.seed is None else [f"seed {run.seed}"]
-    return document(
-        run.name,
-        subtitle=" · ".join(known) or "an evaluation",
-        above=headline(run, warnings(run)),
-        sections=sections(run),
-        below=f"Written by franka_wm {escape(__version__)}.",
-    )
+    with malformed(run.folder):
+        known = [run.environment, run.model] if run.config else []
+        known += [] if run.seed is None else [f"seed {run.seed}"]
+        return document(
+            run.name,
+            subtitle=" · ".join(known) or "an evaluation",
+            above=headline(run, warnings(run)),
+            sections=sections(run),
+            below=f"Written by franka_wm {escape(__version__)}.",
+        )
 
 
 def write_page(folder: str | Path, out: str | Path | None = None) -> Path:

@@ -30,6 +30,7 @@ from pathlib import Path
 from typing import Any
 
 from franka_wm.errors import UserError
+from franka_wm.untrusted import UntrustedFolder
 
 FILE = "evaluation.json"
 END, COMMAND = "the end of training", "franka-wm evaluate"
@@ -71,8 +72,8 @@ def results(folder: str | Path) -> list[Result]:
     Raises:
         UserError: a file that cannot be read, or is of an older form.
     """
-    places = (Path(folder) / "evaluation", Path(folder))
-    found = [read_result(place / FILE) for place in places if (place / FILE).is_file()]
+    run = UntrustedFolder(Path(folder))
+    found = [_result(run, name) for name in (f"evaluation/{FILE}", FILE) if run.path(name)]
     return sorted(found, key=lambda one: -one.episodes)
 
 
@@ -82,7 +83,14 @@ def read_result(path: str | Path) -> Result:
     Raises:
         UserError: it cannot be read, or is of an older form.
     """
-    found = read_object(path)
+    return _result(UntrustedFolder(Path(path).parent), Path(path).name)
+
+
+def _result(folder: UntrustedFolder, name: str) -> Result:
+    path = folder.root / name
+    found = folder.json(name)
+    if found is None:
+        raise UserError(f"{path} is missing; measure the run: franka-wm evaluate checkpoint=RUN")
     protocol, policies = found.get("protocol"), found.get("policies")
     if not isinstance(protocol, Mapping) or not isinstance(policies, Mapping):
         raise UserError(
@@ -92,22 +100,7 @@ def read_result(path: str | Path) -> Result:
     if not all(isinstance(one, Mapping) for one in policies.values()):
         raise UserError(f"{path}: `policies` must hold an object for each policy; measure the run again")
     extras = {name: found[name] for name in EXTRAS if found.get(name)}
-    return Result(Path(path), dict(protocol), dict(policies), extras)
-
-
-def read_object(path: str | Path) -> dict[str, Any]:
-    """A JSON file that holds an object.
-
-    Raises:
-        UserError: it cannot be read, or holds something else.
-    """
-    try:
-        found = json.loads(Path(path).read_text())
-    except (OSError, ValueError) as error:
-        raise UserError(f"{path} cannot be read ({error}); remove it or evaluate the run again.") from error
-    if not isinstance(found, dict):
-        raise UserError(f"{path} holds no object; remove it or evaluate the run again.")
-    return found
+    return Result(path, dict(protocol), dict(policies), extras)
 
 
 def point(

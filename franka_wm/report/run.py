@@ -1,4 +1,4 @@
-"""What lies in a run's folder, read for people: nothing is executed or unpickled, and nothing is needed twice.
+"""What lies in a run's folder, read for people through :mod:`franka_wm.untrusted`.
 
     config.yaml             what was run
     .hydra/overrides.yaml   what was typed after ``train.py``
@@ -16,17 +16,15 @@ All of them are optional; `franka_wm.report.page` shows what there is.
 
 import json
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-import yaml
-from omegaconf import OmegaConf
-from omegaconf.errors import OmegaConfBaseException
-
 from franka_wm.errors import UserError
-from franka_wm.report.results import Result, last_row, read_object, results
+from franka_wm.report.results import Result, last_row, results
+from franka_wm.untrusted import UntrustedFolder, check_image, check_video
 
 SAME_BUT = ("seed", "device", "resume")
 """Runs whose configurations differ in these alone are repetitions of one another."""
@@ -40,7 +38,7 @@ class RunFiles:
 
     Attributes:
         folder: of the run.
-        config: resolved configuration.
+        config: as the run saved it; interpolations are never resolved here.
         overrides: typed after ``train.py``.
         versions: of packages and machine.
         results: of the run's end and of ``franka-wm evaluate``; the one with most episodes, which is shown, first.
@@ -107,18 +105,21 @@ def read_run(folder: str | Path) -> RunFiles:
     run = Path(folder)
     if not run.is_dir():
         raise UserError(f"{run} is not a folder; give the folder of a run, as train.py prints it last.")
-    config = _yaml(run / "config.yaml")
-    # The command's own files first; then what the end of training left.
-    places = [place for place in (run / "evaluation", run) if place.is_dir()]
+    with malformed(run):
+        return _read_run(run)
+
+
+def _read_run(run: Path) -> RunFiles:
+    files = UntrustedFolder(run)
+    config = _config(files)
     found = results(run)
-    timing = next((one for place in places if (one := _json(place / "timing.json"))), {})
     if config is None and not found:
         raise UserError(
             f"{run} holds neither config.yaml nor evaluation.json; give the folder of a run, "
             "as train.py prints it last."
         )
-    rows, counters, version = _history(run)
-    versions = _json(run / "versions.json") or ({"franka_wm": version} if version else {})
+    rows, counters, version = _history(files)
+    versions = files.json("versions.json") or ({"franka_wm": version} if version else {})
     end = last_row(found, ((config or {}).get("evaluation") or {}).get("during") or ())
     numbers = end.keys() - {"env_steps", "time_s"}
     # A logger's files hold it already; a checkpoint was saved before.
@@ -127,13 +128,13 @@ def read_run(folder: str | Path) -> RunFiles:
     return RunFiles(
         folder=run.resolve(),
         config=config or {},
-        overrides=[str(one) for one in _yaml(run / ".hydra" / "overrides.yaml") or []],
+        overrides=[str(one) for one in files.yaml(".hydra/overrides.yaml") or []],
         versions=versions,
         results=found,
         rows=rows,
         counters=counters,
-        pictures={name: p / name for p in reversed(places) for name in PICTURES if (p / name).is_file()},
-        timing=timing,
+        pictures={name: path for name in PICTURES if (path := _picture(files, name)) is not None},
+        timing=files.json("evaluation/timing.json") or files.json("timing.json") or {},
     )
 
 
@@ -143,7 +144,7 @@ def read_config(folder: str | Path) -> dict[str, Any]:
     Raises:
         UserError: It cannot be read.
     """
-    return _yaml(Path(folder) / "config.yaml") or {}
+    return _config(UntrustedFolder(Path(folder))) or {}
 
 
 def but_for_the_seed(config: Mapping[str, Any]) -> str:
@@ -152,32 +153,54 @@ def but_for_the_seed(config: Mapping[str, Any]) -> str:
     return json.dumps(kept, sort_keys=True, default=str) if kept else ""
 
 
+@contextmanager
+def malformed(folder: Path) -> Iterator[None]:
+    """Turn what values of another type or form than documented lead to into one line.
+
+    Raises:
+        UserError: in their place.
+    """
+    try:
+        yield
+    except (ArithmeticError, AttributeError, IndexError, KeyError, TypeError, ValueError) as error:
+        raise UserError(
+            f"{folder} holds values of another form than a run writes ({type(error).__name__}: {error}); "
+            "measure the run again."
+        ) from error
+
+
 # -- files -----------------------------------------------------------------------------------------------
 
 
-def _json(path: Path) -> Any:
-    return read_object(path) if path.is_file() else None
+def _config(files: UntrustedFolder) -> dict[str, Any] | None:
+    found = files.yaml("config.yaml")
+    if found is not None and not isinstance(found, dict):
+        raise UserError(
+            f"{files.root / 'config.yaml'} holds no configuration; remove it or give another run."
+        )
+    return found
 
 
-def _yaml(path: Path) -> Any:
-    if not path.is_file():
-        return None
-    try:
-        return OmegaConf.to_container(OmegaConf.load(path), resolve=True)
-    except (OSError, yaml.YAMLError, OmegaConfBaseException, UnicodeDecodeError) as error:
-        raise UserError(f"{path} cannot be read ({error}); remove it or give another run.") from error
+def _picture(files: UntrustedFolder, name: str) -> Path | None:
+    """An image or video by its name, that of ``franka-wm evaluate`` first; checked, since a page will hold it."""
+    path = files.path(f"evaluation/{name}") or files.path(name)
+    if path is not None:
+        (check_image if name.endswith(".png") else check_video)(path)
+    return path
 
 
-def _history(run: Path) -> tuple[list[dict[str, float]], dict[str, float], str | None]:
+def _history(files: UntrustedFolder) -> tuple[list[dict[str, float]], dict[str, float], str | None]:
     """Rows, counters and the package's version, from the newest checkpoint; rows from ``csv/`` without one."""
-    if any((run / "checkpoints").glob("*/manifest.json")):
+    checkpoints = files.below("checkpoints")
+    if any(checkpoints.root.glob("*/manifest.json")):
         from franka_wm.training.checkpoint import latest_checkpoint, load_checkpoint
 
-        checkpoint = load_checkpoint(latest_checkpoint(run))
+        checkpoints.check_links()
+        checkpoint = load_checkpoint(latest_checkpoint(files.root))
         rows = (checkpoint.extra() or {}).get("rows") or []
         manifest = json.loads((checkpoint.folder / "manifest.json").read_text())
         return list(rows), dict(checkpoint.counters), manifest.get("franka_wm")
-    return csv_rows(run / "csv" / "scalars"), {}, None
+    return csv_rows(files.below("csv/scalars").root), {}, None
 
 
 def csv_rows(folder: str | Path) -> list[dict[str, float]]:
@@ -187,14 +210,16 @@ def csv_rows(folder: str | Path) -> list[dict[str, float]]:
         UserError: a line that is not two numbers.
     """
     rows: dict[float, dict[str, float]] = {}
-    for path in sorted(Path(folder).rglob("*.csv")):
-        name = path.relative_to(folder).with_suffix("").as_posix()
-        for number, line in enumerate(path.read_text().splitlines(), 1):
+    files = UntrustedFolder(Path(folder))
+    for file in files.files("*.csv"):
+        name = file.removesuffix(".csv")
+        for number, line in enumerate((files.text(file) or "").splitlines(), 1):
             try:
                 step, value = map(float, line.split(","))
             except ValueError as error:
                 raise UserError(
-                    f"{path}, line {number}: {line!r} is not `step,value`; remove the line or the file."
+                    f"{files.root / file}, line {number}: {line[:80]!r} is not `step,value`; "
+                    "remove the line or the file."
                 ) from error
             rows.setdefault(step, {"updates": step})[name] = value
     return [rows[step] for step in sorted(rows) if math.isfinite(step)]
