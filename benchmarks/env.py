@@ -56,24 +56,24 @@ def raw_newton(config: FrankaConfig, worlds: int, device: str, seconds: float) -
     sim = Simulation(config, worlds, device)
     sim.reset()
     for _ in range(25):
-        sim.action.uniform_(-1, 1)
+        sim.tensors.action.uniform_(-1, 1)
         sim.step()
 
     def launches() -> None:
-        sim._launch_physics()
-        for camera, _, _, _ in sim._cameras:
+        sim.launch_physics()
+        for camera, _, _, _ in sim.renderer.cameras:
             sim.model.bvh_refit_shapes(sim.newton_state)
-            camera.render(sim.newton_state, sim.warp)
+            camera.render(sim.newton_state, sim.warp, sim.chain)
 
-    graph = sim._capture(launches)
-    return worlds * rate(lambda: sim._replay(graph), seconds=seconds)
+    graph = sim.record(launches)
+    return worlds * rate(lambda: sim.recorder.replay(graph), seconds=seconds)
 
 
 def captured_step(env: FrankaEnv, seconds: float) -> float:
     sim = env.simulation
 
     def step() -> None:
-        sim.action.uniform_(
+        sim.tensors.action.uniform_(
             -1, 1
         )  # a repeated action would drive the arms into their limits, a rare and slow case
         sim.step()
@@ -108,7 +108,7 @@ def measure(name: str, worlds: int, device: str, seconds: float) -> dict:
     env.step_and_maybe_reset(env.rand_action(env.reset()))
     startup = time.perf_counter() - started
     memory = (free - torch.cuda.mem_get_info()[0]) / worlds / 2**10 if on_gpu else float("nan")
-    env.simulation.step_count.random_(0, config.episode_length)
+    env.simulation.tensors.step_count.random_(0, config.episode_length)
     step = captured_step(env, seconds)
     through = collector(env, 16 if on_gpu else 8, seconds)
     broken = env.statistics()["nonfinite"]

@@ -49,7 +49,7 @@ class RaiseTool(Task):
         wp.launch(judge_height, sim.num_envs, inputs, device=sim.device)
 
     def measures(self, sim):
-        return {"height [m]": sim.next_true_state[:, 16]}
+        return {"height [m]": sim.tensors.next_true_state[:, 16]}
 
 
 register("raise_tool", RaiseTool)

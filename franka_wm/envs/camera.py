@@ -6,7 +6,7 @@
 from __future__ import annotations
 
 import math
-from typing import Any
+from typing import TYPE_CHECKING
 
 import newton
 import numpy as np
@@ -14,9 +14,13 @@ import torch
 import warp as wp
 from newton.sensors import SensorCamera
 
-from franka_wm.envs import kernels
 from franka_wm.envs.config import FrankaConfig
+from franka_wm.envs.kernels import images as kernels
 from franka_wm.errors import UserError
+
+if TYPE_CHECKING:
+    from franka_wm.envs.simulation.arrays import Arrays
+    from franka_wm.envs.simulation.build import Chain
 
 BACKGROUND = (0.62, 0.71, 0.80)
 GROUND = (0.34, 0.37, 0.41)
@@ -136,22 +140,31 @@ class Camera:
             kind: self.sensor.allocate_image(views, self.size, self.size, types[kind]) for kind in self.kinds
         }
 
-    def render(self, state: newton.State, arm: Any, *, images: dict[str, wp.array] | None = None) -> None:
+    def render(
+        self,
+        state: newton.State,
+        arrays: Arrays[wp.array],
+        chain: Chain,
+        *,
+        images: dict[str, wp.array] | None = None,
+    ) -> None:
         """Renders the worlds that ``self.views`` names; the others' images stay. Refit the shapes first.
 
         Args:
             state: Where everything is.
-            arm: The simulation's Warp arrays: ``body_q`` of that state (N, bodies), ``poses``, ``brightness``,
-                ``mount`` (the wrist camera in ``tool_body``'s frame) and ``tool_body``.
+            arrays: The simulation's; read are ``poses`` and ``brightness``.
+            chain: Where the wrist camera rides.
             images: Where to; ``self.images`` if not given.
         """
         images = self.images if images is None else images
         device, n, size = self._model.device, self.num_views, self.size
         if self.name == "wrist":
-            inputs = [arm.body_q, arm.tool_body, arm.mount, self.views, self.transforms]
+            bodies = self._model.body_count // self._model.world_count
+            body_q = state.body_q.reshape((self._model.world_count, bodies))
+            inputs = [body_q, chain.tool_body, chain.mount, self.views, self.transforms]
             wp.launch(kernels.aim_wrist, n, inputs, device=device)
         elif self._moves:
-            inputs = [arm.poses, self._turn, self.views, self.transforms]
+            inputs = [arrays.poses, self._turn, self.views, self.transforms]
             wp.launch(kernels.aim_fixed, n, inputs, device=device)
         self.sensor.update(
             state,
@@ -166,7 +179,7 @@ class Camera:
             inputs = [self._shape_index, self._segments, self._segments.shape[0], images["segmentation"]]
             wp.launch(kernels.name_segments, (n, size, size), inputs, device=device)
         if self._brightness and "pixels" in images:
-            inputs = [self.views, arm.brightness, images["pixels"]]
+            inputs = [self.views, arrays.brightness, images["pixels"]]
             wp.launch(kernels.scale_brightness, (n, size, size), inputs, device=device)
 
 

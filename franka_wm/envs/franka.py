@@ -14,7 +14,6 @@ from contextlib import contextmanager
 from pathlib import Path
 
 import torch
-import warp as wp
 from tensordict import TensorDict, TensorDictBase
 from torchrl.data import Binary, Bounded, Composite, Unbounded
 from torchrl.envs import EnvBase
@@ -126,14 +125,16 @@ class FrankaEnv(EnvBase):
             False  # whether finished worlds begin their next episode inside the step that is under way
         )
         self._stack = FrameStack(config.frame_stack) if config.frame_stack > 1 else None
-        self._stacked = [key for key in self.simulation.images if self._stack and key.startswith("pixels")]
+        self._stacked = [
+            key for key in self.simulation.renderer.images if self._stack and key.startswith("pixels")
+        ]
         self._make_specs()
         self._renderers: dict[tuple[int, int], Camera] = {}
 
     def _make_specs(self) -> None:
         n, device, size = self.num_envs, self.device, self.config.image_size
         entries: dict = {}
-        for key in self.simulation.images:
+        for key in self.simulation.renderer.images:
             if key.startswith("depth"):
                 entries[key] = Unbounded(shape=(n, size, size, 1), device=device)
             else:
@@ -170,37 +171,38 @@ class FrankaEnv(EnvBase):
         mask = None if tensordict is None else tensordict.get("_reset", None)
         sim.reset(mask)
         for key in self._stacked:
-            self._stack.restart(key, sim.images[key], sim._reset_mask[: self.num_envs])
+            self._stack.restart(key, sim.renderer.images[key], sim.tensors.mask)
         out = self._present()
-        out["is_init"] = sim._reset_mask[: self.num_envs].clone().unsqueeze(-1)
-        out["success"] = torch.zeros_like(sim.success)
+        out["is_init"] = sim.tensors.mask.clone().unsqueeze(-1)
+        out["success"] = torch.zeros_like(sim.tensors.success)
         for key in ("done", "terminated", "truncated"):
-            out[key] = torch.zeros_like(sim.done)
+            out[key] = torch.zeros_like(sim.tensors.done)
         return TensorDict(out, batch_size=self.batch_size, device=self.device)
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
         sim = self.simulation
         action = tensordict.get("action")
-        if action.shape != sim.action.shape:
+        expected = tuple(sim.tensors.action.shape)
+        if action.shape != expected:
             raise UserError(
-                f"action has shape {tuple(action.shape)}; it must be {tuple(sim.action.shape)}: (worlds, joints)"
+                f"action has shape {tuple(action.shape)}; it must be {expected}: (worlds, joints)"
             )
-        sim.action.copy_(action)
+        sim.tensors.action.copy_(action)
         sim.step(restart=self._restart)
         for key in self._stacked:
-            self._stack.push(key, sim.next_images[key])
+            self._stack.push(key, sim.renderer.next_images[key])
         out = {
-            key: self._picture(key, sim.next_images)
-            if key in sim.images
-            else getattr(sim, f"next_{key}").clone()
+            key: self._picture(key, sim.renderer.next_images)
+            if key in sim.renderer.images
+            else getattr(sim.tensors, f"next_{key}").clone()
             for key in self._observed
         }
         if self._restart:  # the next episode has begun where one has ended
             for key in self._stacked:
-                self._stack.restart(key, sim.images[key], sim.done.squeeze(-1))
+                self._stack.restart(key, sim.renderer.images[key], sim.tensors.done.squeeze(-1))
         for key in ("success", "reward", "done", "terminated", "truncated"):
-            out[key] = getattr(sim, key).clone()
-        out["is_init"] = torch.zeros_like(sim.done)
+            out[key] = getattr(sim.tensors, key).clone()
+        out["is_init"] = torch.zeros_like(sim.tensors.done)
         return TensorDict(out, batch_size=self.batch_size, device=self.device)
 
     def _step_and_maybe_reset(self, tensordict: TensorDictBase) -> tuple[TensorDictBase, TensorDictBase]:
@@ -236,7 +238,9 @@ class FrankaEnv(EnvBase):
     def _present(self) -> dict[str, torch.Tensor]:
         sim = self.simulation
         return {
-            key: self._picture(key, sim.images) if key in sim.images else getattr(sim, key).clone()
+            key: self._picture(key, sim.renderer.images)
+            if key in sim.renderer.images
+            else getattr(sim.tensors, key).clone()
             for key in self._observed
         }
 
@@ -311,12 +315,12 @@ class FrankaEnv(EnvBase):
         """What the worlds observe after something was set by hand."""
         sim = self.simulation
         for key in self._stacked:  # a goal marker may have moved in it
-            self._stack.replace(key, sim.images[key])
+            self._stack.replace(key, sim.renderer.images[key])
         out = self._present()
-        out["is_init"] = sim.step_count == 0
-        out["success"] = torch.zeros_like(sim.success)
+        out["is_init"] = sim.tensors.step_count == 0
+        out["success"] = torch.zeros_like(sim.tensors.success)
         for key in ("done", "terminated", "truncated"):
-            out[key] = torch.zeros_like(sim.done)
+            out[key] = torch.zeros_like(sim.tensors.done)
         return TensorDict(out, batch_size=self.batch_size, device=self.device)
 
     def _set_seed(self, seed: int | None) -> None:
@@ -355,7 +359,7 @@ class FrankaEnv(EnvBase):
     @property
     def goal(self) -> torch.Tensor:
         """(N, 3) [m]."""
-        return self.simulation.goal.clone()
+        return self.simulation.tensors.goal.clone()
 
     @property
     def camera_framing(self) -> tuple[tuple[float, float, float], tuple[float, float, float]]:
@@ -364,43 +368,43 @@ class FrankaEnv(EnvBase):
 
     def joint_positions(self) -> torch.Tensor:
         """(N, 7) [rad]."""
-        return self.simulation.state[:, :7].clone()
+        return self.simulation.tensors.state[:, :7].clone()
 
     def joint_targets(self) -> torch.Tensor:
         """The servo's commanded angles, (N, 7) [rad]."""
-        return self.simulation.joint_target.clone()
+        return self.simulation.tensors.joint_target.clone()
 
     def tool_position(self) -> torch.Tensor:
         """The hand's centre point, (N, 3) [m]."""
-        return self.simulation.state[:, 14:17].clone()
+        return self.simulation.tensors.state[:, 14:17].clone()
 
     def body_positions(self) -> torch.Tensor:
         """Origins of the moving links, (N, bodies, 3) [m]; fixed links are merged into what carries them."""
-        return wp.to_torch(self.simulation.warp.body_q)[..., :3].clone()
+        return self.simulation.tensors.body_q[..., :3].clone()
 
     def state_observation(self) -> torch.Tensor:
         """(N, 20), as under the key ``state``."""
-        return self.simulation.state.clone()
+        return self.simulation.tensors.state.clone()
 
     def goal_distance(self) -> torch.Tensor:
         """Tool to goal, (N,) [m]."""
-        return goal_distance(self.simulation.state)
+        return goal_distance(self.simulation.tensors.state)
 
     def reward(self, action: torch.Tensor) -> torch.Tensor:
         """Reward of having applied ``action`` (N, 7) and being in the present state, (N, 1)."""
         c, sim = self.config, self.simulation
         return reach_reward(
-            sim.true_state,
+            sim.tensors.true_state,
             action,
             kind=c.reward,
             action_penalty=c.action_penalty,
             success_distance=c.success_distance,
-            initial_distance=sim.initial_distance.unsqueeze(-1),
+            initial_distance=sim.tensors.initial_distance.unsqueeze(-1),
         )
 
     def is_finite(self) -> torch.Tensor:
         """(N,) bool: health of each world's present state."""
-        return torch.isfinite(self.simulation.state).all(-1)
+        return torch.isfinite(self.simulation.tensors.state).all(-1)
 
     def observe(self) -> torch.Tensor:
         """The camera's picture now, (N, 3, H, W) float32 in [0, 1] at ``image_size``."""
@@ -426,11 +430,9 @@ class FrankaEnv(EnvBase):
             camera = Camera(self.model, self.config, size=size, num_views=views, samples=samples)
             self._renderers[key] = camera
         sim = self.simulation
-        device = wp.get_device(sim.device)
-        stream = wp.stream_from_torch(torch.cuda.current_stream(self.device)) if device.is_cuda else None
-        with wp.ScopedStream(stream) if stream is not None else wp.ScopedDevice(device):
+        with sim.recorder.on_stream_of_torch():
             self.model.bvh_refit_shapes(sim.newton_state)
-            camera.render(sim.newton_state, sim.warp)
+            camera.render(sim.newton_state, sim.warp, sim.chain)
         return as_torch("pixels", camera.images["pixels"]).clone(memory_format=torch.contiguous_format)
 
     def high_quality_renderer(self, **options):
@@ -457,17 +459,17 @@ class FrankaEnv(EnvBase):
             )
         self.reset(seed=seed)
         sim = self.simulation
-        states, videos, rewards, dones = [sim.state.clone()], [], [], []
-        if "pixels" in sim.images:
-            videos.append(sim.images["pixels"].clone())
+        states, videos, rewards, dones = [sim.tensors.state.clone()], [], [], []
+        if "pixels" in sim.renderer.images:
+            videos.append(sim.renderer.images["pixels"].clone())
         for t in range(actions.shape[1]):
             with self._restarting():
                 step = self._step(TensorDict({"action": actions[:, t]}, batch_size=self.batch_size))
             rewards.append(step["reward"])
             dones.append(step["done"])
-            states.append(sim.next_state.clone())
-            if "pixels" in sim.images:
-                videos.append(sim.next_images["pixels"].clone())
+            states.append(sim.tensors.next_state.clone())
+            if "pixels" in sim.renderer.images:
+                videos.append(sim.renderer.next_images["pixels"].clone())
         state = torch.stack(states, 1)
         out = {
             "state": state,
@@ -487,9 +489,9 @@ class FrankaEnv(EnvBase):
             ``episodes`` (count), ``return``, ``length``, ``success`` (at the end), ``success_once`` (means;
             absent when no episode ended) and ``nonfinite`` (count of broken worlds).
         """
-        sums = self.simulation.statistics.sum(0).tolist()
+        sums = self.simulation.tensors.statistics.sum(0).tolist()
         if clear:
-            self.simulation.statistics.zero_()
+            self.simulation.tensors.statistics.zero_()
         totals = dict(zip(STATISTICS, sums, strict=True))
         out = {"episodes": totals["episodes"], "nonfinite": totals["nonfinite"]}
         if totals["episodes"]:

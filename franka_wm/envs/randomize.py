@@ -11,8 +11,8 @@ import numpy as np
 import warp as wp
 from newton import ModelFlags
 
-from franka_wm.envs import kernels
 from franka_wm.envs.camera import camera_framing
+from franka_wm.envs.kernels import randomization as kernels
 
 if TYPE_CHECKING:
     from franka_wm.envs.simulation import Simulation

@@ -101,7 +101,7 @@ def franka_sequences(
 
     # Drawn on the host, so that every device plays the same sequences.
     generator = torch.Generator().manual_seed(seed)
-    statistics = env.simulation.statistics
+    statistics = env.simulation.tensors.statistics
     before, count = statistics.clone(), statistics[:, STATISTICS.index("nonfinite")]
     kept: dict[str, list[torch.Tensor]] = {"action": [], "joint_q": [], "tool": []}
     if "pixels" in env.config.observations:

@@ -144,13 +144,13 @@ class _Motion:
 
     def start(self) -> None:
         """After the reset."""
-        self._tools = [self.arm.simulation.true_state[:, 14:17].clone()]
+        self._tools = [self.arm.simulation.tensors.true_state[:, 14:17].clone()]
         self._action: Tensor | None = None
 
     def see(self, running: Tensor, after: TensorDictBase) -> None:
         """After a step; ``running`` are the worlds whose first episode it belongs to."""
         sim = self.arm.simulation
-        reached = sim.next_true_state[:, 17:20].norm(dim=-1)
+        reached = sim.tensors.next_true_state[:, 17:20].norm(dim=-1)
         self.distance = torch.where(running, reached, self.distance)
         self.closest = torch.where(running, torch.minimum(reached, self.closest), self.closest)
         succeeds = after.get("success").squeeze(-1)
@@ -158,12 +158,12 @@ class _Motion:
         self.once |= running & succeeds
         for name, value in self.task.measures(sim).items():
             self.measures[name] = torch.where(running, value.float(), self.measures.get(name, 0.0))
-        self._tools = [*self._tools[-3:], sim.next_true_state[:, 14:17].clone()]
+        self._tools = [*self._tools[-3:], sim.tensors.next_true_state[:, 14:17].clone()]
         self.path += running * (self._tools[-1] - self._tools[-2]).norm(dim=-1)
         if len(self._tools) == 4:
             a, b, c, d = self._tools
             self.jerk += running * (d - 3 * c + 3 * b - a).square().sum(-1)
-        action = sim.action.clone()
+        action = sim.tensors.action.clone()
         if self._action is not None:
             self.change += running * (action - self._action).square().mean(-1)
         self._action = action

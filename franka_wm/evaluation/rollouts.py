@@ -90,7 +90,7 @@ def gather_episodes(
         for _ in range(length):
             row: dict[Any, Tensor] = {"valid": running.clone()}
             if arm is not None:
-                row["physical"] = arm.simulation.true_state.clone()
+                row["physical"] = arm.simulation.tensors.true_state.clone()
                 if picture_size and pictures:
                     seen.append(arm.render(picture_size, num_views=pictures).cpu())
             tensordict, following = env.step_and_maybe_reset(policy(tensordict))
@@ -100,7 +100,7 @@ def gather_episodes(
                 for key in (*keys, "reward", "terminated", "done")
             }
             if arm is not None:
-                row["next", "physical"] = arm.simulation.next_true_state.clone()
+                row["next", "physical"] = arm.simulation.tensors.next_true_state.clone()
             running &= ~tensordict.get(("next", "done")).squeeze(-1)
             rows.append(TensorDict(row, batch_size=[env.num_envs], device=env.device))
             tensordict = following

@@ -69,7 +69,9 @@ def record_episode(
     steps = session.arm.config.episode_length if steps is None else steps
     with atomic_write(path) as temporary:
         stream = rr.RecordingStream("franka_wm")
-        stream.save(str(temporary), default_blueprint=_layout(rr, "pixels" in session.arm.simulation.images))
+        stream.save(
+            str(temporary), default_blueprint=_layout(rr, "pixels" in session.arm.simulation.renderer.images)
+        )
         _log_shapes(rr, stream, session)
         frame = session.frame()
         tools = [frame.tool]
@@ -128,8 +130,8 @@ def _log_frame(rr: Any, stream: Any, session: Session, frame: Frame, tools: list
     stream.log("trail", rr.LineStrips3D([tools], radii=0.002, colors=TRAIL))
     paths = [] if frame.path is None else [frame.path]
     stream.log("plan", rr.LineStrips3D(paths, radii=0.004, colors=PATH))
-    if "pixels" in session.arm.simulation.images:
-        stream.log("camera", rr.Image(session.arm.simulation.images["pixels"][0].cpu().numpy()))
+    if "pixels" in session.arm.simulation.renderer.images:
+        stream.log("camera", rr.Image(session.arm.simulation.renderer.images["pixels"][0].cpu().numpy()))
     for joint, angle in enumerate(session.arm.joint_positions()[0].tolist()):
         stream.log(f"joints/{joint + 1}", rr.Scalars(angle))
     stream.log("distance", rr.Scalars(frame.distance))

@@ -14,7 +14,6 @@ from typing import Any
 
 import numpy as np
 import torch
-import warp as wp
 from tensordict import TensorDictBase
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
@@ -133,7 +132,7 @@ class Session:
             after = done["next"]
             self._reward = float(after["reward"])
             self._success = bool(after["success"])
-            self._distance = float(self.arm.simulation.next_true_state[0, 17:20].norm())
+            self._distance = float(self.arm.simulation.tensors.next_true_state[0, 17:20].norm())
             self._steps += 1
             if bool(after["done"]):
                 self._begin_episode()
@@ -379,7 +378,7 @@ class Session:
             episode=self._episode,
             stepped=stepped,
             policy=self._policy,
-            bodies=_host(wp.to_torch(self.arm.simulation.warp.body_q)[0]),
+            bodies=_host(self.arm.simulation.tensors.body_q[0]),
             tool=_host(self.arm.tool_position()[0]),
             goal=_host(self.arm.goal[0]),
             path=None if self._path is None else _host(self._path[0]),

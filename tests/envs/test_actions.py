@@ -137,7 +137,7 @@ def test_latency_shifts_the_response(delta: FrankaEnv, late: FrankaEnv, random_a
     delays = set()
     for seed in range(6):
         got = play(late, actions, seed)
-        delay = late.simulation._delay.tolist()
+        delay = late.simulation.tensors.delay.tolist()
         delays |= set(delay)
         shifted = torch.zeros_like(actions)
         for world, k in enumerate(delay):
@@ -155,7 +155,7 @@ def test_a_late_joint_position_leaves_the_arm_where_it_is(small_env) -> None:
     start = env.reset(seed=0)["state"][:, :7]
     hold = 2 * (start - lower) / (upper - lower) - 1
     data = play(env, hold[:, None].expand(3, 5, 7))
-    assert (env.simulation._delay > 0).any()
+    assert (env.simulation.tensors.delay > 0).any()
     torch.testing.assert_close(
         data["next", "joint_target"], start[:, None].expand(3, 5, 7), atol=1e-4, rtol=0
     )

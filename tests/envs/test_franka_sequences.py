@@ -46,10 +46,10 @@ def test_sequences_have_the_shapes_promised_and_replay(env: FrankaEnv) -> None:
 
 def test_without_pixels_there_is_no_video_and_statistics_stay() -> None:
     env = FrankaEnv(replace(CONFIG, observations=("state",)), num_envs=2, device="cpu")
-    before = env.simulation.statistics.clone()
+    before = env.simulation.tensors.statistics.clone()
     data = franka_sequences(env, 3, 7)
     assert "video" not in data.keys()  # noqa: SIM118
-    assert torch.equal(env.simulation.statistics, before)
+    assert torch.equal(env.simulation.tensors.statistics, before)
 
 
 def test_actions_are_those_of_the_mode() -> None:

@@ -125,7 +125,7 @@ def test_some_worlds_can_be_reset(actions: np.ndarray) -> None:
     assert np.array_equal(before[[0, 2]], after[[0, 2]])
     assert not np.array_equal(before[1], after[1])
     # The masked world's clock started again, the others' did not.
-    assert view.env.simulation.step_count.squeeze(-1).tolist() == [1, 0, 1]
+    assert view.env.simulation.tensors.step_count.squeeze(-1).tolist() == [1, 0, 1]
 
 
 def test_results_are_not_overwritten_by_the_next_step(actions: np.ndarray) -> None:

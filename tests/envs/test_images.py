@@ -142,7 +142,7 @@ def test_the_marker_is_where_the_goal_is_seen(env: FrankaEnv) -> None:
 
 def test_goal_pixels_show_the_arm_at_the_goal(env: FrankaEnv, first: TensorDictBase) -> None:
     env.reset(seed=0)
-    goal_q = env.simulation.goal_q.clone()
+    goal_q = env.simulation.tensors.goal_q.clone()
     assert torch.equal(pose(env, goal_q), first["goal_pixels"])
     assert ((env.kinematics.forward(goal_q) - first["goal"]).norm(dim=-1) < 0.01).all()
     assert not torch.equal(first["goal_pixels"], first["pixels"])
@@ -152,7 +152,7 @@ def test_goal_pixels_show_the_arm_at_the_goal(env: FrankaEnv, first: TensorDictB
 def test_goal_pixels_of_a_fixed_goal(small_env) -> None:
     env = small_env(2, observations=("goal_pixels", "state"), image_size=16)
     observed = env.reset(seed=0)
-    reached = env.kinematics.forward(env.simulation.goal_q)
+    reached = env.kinematics.forward(env.simulation.tensors.goal_q)
     assert ((reached - torch.tensor(env.config.goal)).norm(dim=-1) < 0.01).all()
     assert torch.equal(observed["goal_pixels"][0], observed["goal_pixels"][1])
 
@@ -167,7 +167,7 @@ def test_goal_pixels_at_the_end_of_an_episode(env: FrankaEnv, random_actions) ->
         played, root = step(env, root, actions[:, t])
         assert torch.equal(played["next", "goal_pixels"], old)
     assert played["next", "done"].all()
-    assert torch.equal(root["goal_pixels"], pose(env, env.simulation.goal_q.clone()))
+    assert torch.equal(root["goal_pixels"], pose(env, env.simulation.tensors.goal_q.clone()))
     assert not torch.equal(root["goal"], played["next", "goal"])
     assert all(not torch.equal(root["goal_pixels"][k], old[k]) for k in range(N))
 
@@ -249,10 +249,10 @@ def test_goal_pictures_of_every_camera(small_env) -> None:
     env = small_env(N, goal_sampling="reachable", **options)
     first = env.reset(seed=0)
     state = env.get_state()
-    q = env.simulation.goal_q.clone()
+    q = env.simulation.tensors.goal_q.clone()
     state["joint_q"] = q
     newton.eval_fk(env.model, wp.from_torch(q.flatten()), env.state.joint_qd, env.state)
-    state["body_q"] = wp.to_torch(env.simulation.warp.body_q).clone()
+    state["body_q"] = env.simulation.tensors.body_q.clone()
     there = env.set_state(state)
     for camera in ("", "_side", "_wrist"):
         assert torch.equal(there[f"pixels{camera}"], first[f"goal_pixels{camera}"]), camera

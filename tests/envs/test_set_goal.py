@@ -72,7 +72,7 @@ def test_goal_pictures_show_the_new_goal(small_env) -> None:
     )
     before = env.reset(seed=2)
     now = env.set_goal(before["goal"].flip(0))
-    reached = env.kinematics.forward(env.simulation.goal_q)
+    reached = env.kinematics.forward(env.simulation.tensors.goal_q)
     torch.testing.assert_close(reached, now["goal"], rtol=0, atol=2e-3)
     assert (now["goal_pixels"] != before["goal_pixels"]).any()
     assert torch.equal(now["pixels"], before["pixels"]), "the arm has not moved"

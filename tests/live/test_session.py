@@ -136,7 +136,7 @@ def test_reward_and_distance_are_the_environments(make_session) -> None:
     frame = play(session, 3)
     arm = session.arm
     assert frame.distance == pytest.approx(float(arm.goal_distance()[0]), abs=1e-6)
-    assert frame.reward == pytest.approx(float(arm.simulation.reward[0]), abs=1e-6)
+    assert frame.reward == pytest.approx(float(arm.simulation.tensors.reward[0]), abs=1e-6)
     np.testing.assert_allclose(frame.bodies[:, :3], arm.body_positions()[0], atol=1e-6)
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 import torch
-import warp as wp
 
 from franka_wm.live.shapes import Shape, arm_shapes, wxyz
 
@@ -45,7 +44,7 @@ def test_they_are_where_the_simulation_has_the_arm(small_env) -> None:
     env = small_env(1)
     env.reset(seed=4)
     shapes = arm_shapes(env.model)
-    bodies = wp.to_torch(env.simulation.warp.body_q)[0].numpy()
+    bodies = env.simulation.tensors.body_q[0].numpy()
     points = corners(shapes, bodies)
     assert abs(points[:, 2].min()) < 1e-3
     tool = env.tool_position()[0].numpy()
@@ -54,7 +53,7 @@ def test_they_are_where_the_simulation_has_the_arm(small_env) -> None:
     now = env.reset(seed=4)
     for _ in range(5):
         now = env.step_and_maybe_reset(now.set("action", moved))[1]
-    after = corners(shapes, wp.to_torch(env.simulation.warp.body_q)[0].numpy())
+    after = corners(shapes, env.simulation.tensors.body_q[0].numpy())
     assert np.abs(after - points).max() > 0.05
 
 

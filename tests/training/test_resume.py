@@ -358,7 +358,7 @@ def test_other_worlds_start_new_episodes_and_say_so(make: Callable[..., Trainer]
     assert "of another configuration; they start new episodes" in said
     arm = getattr(other.env, "base_env", other.env)
     assert arm.get_state()["episode"].eq(-1).all()
-    assert arm.simulation._seed.item() != first.cfg.seed
+    assert arm.simulation.tensors.seed.item() != first.cfg.seed
 
 
 def test_other_simulators_start_new_episodes_and_say_so(train, tmp_path: Path, capsys) -> None:

@@ -1,15 +1,16 @@
+# pyright: reportAttributeAccessIssue=false, reportIndexIssue=false, reportArgumentType=false, reportOperatorIssue=false, reportCallIssue=false
+# (Kernels are Warp's language: pyright knows neither its arrays nor its vectors.)
 """Reach: bring the tool to a goal that stands still."""
 
-from __future__ import annotations
-
+# Warp reads annotations as types: no `from __future__ import annotations` here.
 from typing import TYPE_CHECKING
 
 import torch
 import warp as wp
 from tensordict import TensorDict, TensorDictBase
 
-from franka_wm.envs import kernels
 from franka_wm.envs.config import HOME, FrankaConfig
+from franka_wm.envs.kernels import JOINTS, chain_forward, episode_rng
 from franka_wm.envs.tasks import Task
 
 if TYPE_CHECKING:
@@ -51,6 +52,99 @@ def reach_reward(
     return value - action_penalty * effort
 
 
+@wp.kernel(enable_backward=False)
+def fixed_goal(
+    mask: wp.array[wp.bool],
+    fixed: wp.array[float],
+    pose: wp.array[float],
+    goal_q: wp.array2d[float],
+    goal: wp.array2d[float],
+):
+    world = wp.tid()
+    if mask[world]:
+        for i in range(3):
+            goal[world, i] = fixed[i]
+        for j in range(JOINTS):
+            goal_q[world, j] = pose[j]
+
+
+@wp.kernel(enable_backward=False)
+def reachable_goal(
+    mask: wp.array[wp.bool],
+    seed: wp.array[int],
+    episode: wp.array[int],
+    home: wp.array[float],
+    noise: float,
+    lower: wp.array[float],
+    upper: wp.array[float],
+    parent_frames: wp.array[wp.transformf],
+    child_frames: wp.array[wp.transformf],
+    axes: wp.array[wp.vec3f],
+    tool_frame: wp.array[wp.transformf],
+    goal_q: wp.array2d[float],
+    goal: wp.array2d[float],
+):
+    """The tool position of a random pose around home; poses in the ground or in the base are drawn again."""
+    world = wp.tid()
+    if not mask[world]:
+        return
+    rng = episode_rng(seed[0], world, episode[world], 1)
+    found = bool(False)
+    for _attempt in range(32):
+        if not found:
+            for j in range(JOINTS):
+                goal_q[world, j] = wp.clamp(home[j] + wp.randf(rng, -noise, noise), lower[j], upper[j])
+            tool = chain_forward(goal_q, world, parent_frames, child_frames, axes, tool_frame)
+            if tool[2] > 0.10 and wp.sqrt(tool[0] * tool[0] + tool[1] * tool[1]) > 0.25:
+                for i in range(3):
+                    goal[world, i] = tool[i]
+                found = True
+    if not found:  # one in 10^12 episodes at the default noise: the home pose is a goal, too
+        for j in range(JOINTS):
+            goal_q[world, j] = home[j]
+        tool = chain_forward(goal_q, world, parent_frames, child_frames, axes, tool_frame)
+        for i in range(3):
+            goal[world, i] = tool[i]
+
+
+@wp.kernel(enable_backward=False)
+def note_initial_distance(
+    mask: wp.array[wp.bool], state: wp.array2d[float], initial_distance: wp.array[float]
+):
+    world = wp.tid()
+    if mask[world]:
+        initial_distance[world] = wp.length(wp.vec3f(state[world, 17], state[world, 18], state[world, 19]))
+
+
+@wp.kernel(enable_backward=False)
+def judge_reach(
+    state: wp.array2d[float],
+    action: wp.array2d[float],
+    kind: int,
+    penalty: float,
+    success_distance: float,
+    initial_distance: wp.array[float],
+    reward: wp.array2d[float],
+    success: wp.array2d[wp.bool],
+):
+    """Reward and success. ``kind``: 0 dense, 1 sparse, 2 normalized."""
+    world = wp.tid()
+    distance = wp.length(wp.vec3f(state[world, 17], state[world, 18], state[world, 19]))
+    effort = float(0.0)
+    for j in range(action.shape[1]):
+        a = wp.clamp(action[world, j], -1.0, 1.0)
+        if wp.isfinite(action[world, j]):
+            effort += a * a
+    solved = distance < success_distance
+    value = -wp.tanh(distance)
+    if kind == 1:
+        value = wp.where(solved, 1.0, 0.0)
+    if kind == 2:
+        value = wp.max(1.0 - distance / wp.max(initial_distance[world], success_distance), -1.0)
+    reward[world, 0] = value - penalty * effort / float(action.shape[1])
+    success[world, 0] = solved
+
+
 class Reach(Task):
     """Bring the tool to the goal and keep it there.
 
@@ -78,12 +172,12 @@ class Reach(Task):
         """Not where a subclass judges otherwise."""
         return type(self).judge is Reach.judge
 
-    def reset(self, sim: Simulation, mask: wp.array) -> None:
+    def reset(self, sim: "Simulation", mask: wp.array) -> None:
         self.choose(sim, mask, sim.warp.task_goal)
 
-    def choose(self, sim: Simulation, mask: wp.array, goal: wp.array) -> None:
+    def choose(self, sim: "Simulation", mask: wp.array, goal: wp.array) -> None:
         """Writes the masked worlds' goals into ``goal`` (N, 3) and poses that reach them into ``goal_q``."""
-        w, n = sim.warp, sim.num_envs
+        w, c, n = sim.warp, sim.chain, sim.num_envs
         if self.config.goal_sampling == "fixed":
             if self._fixed is None:
                 point = torch.tensor(self.config.goal, dtype=torch.float32)
@@ -94,14 +188,14 @@ class Reach(Task):
                     wp.array(self.config.goal, dtype=float, device=sim.device),
                     wp.from_torch(pose),
                 )
-            wp.launch(kernels.fixed_goal, n, [mask, *self._fixed, w.goal_q, goal], device=sim.device)
+            wp.launch(fixed_goal, n, [mask, *self._fixed, w.goal_q, goal], device=sim.device)
             return
         wp.launch(
-            kernels.reachable_goal,
+            reachable_goal,
             n,
             [
-                mask, w.seed, w.episode, w.home, self.config.goal_noise, w.lower, w.upper,
-                w.parent_frames, w.child_frames, w.axes, w.tool_frame, w.goal_q, goal,
+                mask, w.seed, w.episode, c.home, self.config.goal_noise, c.lower, c.upper,
+                c.parent_frames, c.child_frames, c.axes, c.tool_frame, w.goal_q, goal,
             ],
             device=sim.device,
         )  # fmt: skip
@@ -136,15 +230,15 @@ class Reach(Task):
         out.set(("next", "terminated"), reached & c.terminate_on_success)
         return out
 
-    def begin(self, sim: Simulation, mask: wp.array) -> None:
+    def begin(self, sim: "Simulation", mask: wp.array) -> None:
         if self.config.reward == "normalized":
             inputs = [mask, sim.warp.true_state, sim.warp.initial_distance]
-            wp.launch(kernels.note_initial_distance, sim.num_envs, inputs, device=sim.device)
+            wp.launch(note_initial_distance, sim.num_envs, inputs, device=sim.device)
 
-    def judge(self, sim: Simulation) -> None:
+    def judge(self, sim: "Simulation") -> None:
         w, c = sim.warp, self.config
         wp.launch(
-            kernels.judge_reach,
+            judge_reach,
             sim.num_envs,
             [
                 w.next_true_state, w.action, REWARDS[c.reward], c.action_penalty, c.success_distance,

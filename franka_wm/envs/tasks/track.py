@@ -1,17 +1,45 @@
+# pyright: reportIndexIssue=false, reportArgumentType=false, reportOperatorIssue=false, reportCallIssue=false
+# (Kernels are Warp's language: pyright knows neither its arrays nor its vectors.)
 """Track: keep the tool on a goal that moves."""
 
-from __future__ import annotations
-
+# Warp reads annotations as types: no `from __future__ import annotations` here.
 from typing import TYPE_CHECKING
 
 import warp as wp
 
-from franka_wm.envs import kernels
 from franka_wm.envs.config import FrankaConfig
+from franka_wm.envs.kernels import episode_rng
 from franka_wm.envs.tasks.reach import Reach
 
 if TYPE_CHECKING:
     from franka_wm.envs.simulation import Simulation
+
+
+@wp.kernel(enable_backward=False)
+def circle_goal(
+    mask: wp.array[wp.bool],
+    everywhere: bool,
+    seed: wp.array[int],
+    episode: wp.array[int],
+    step_count: wp.array2d[int],
+    phase: wp.array[float],
+    ahead: int,
+    dt: float,
+    radius: float,
+    period: float,
+    center: wp.array2d[float],
+    goal: wp.array2d[float],
+):
+    """The goal on an upright circle that faces the robot, at the time of ``step_count`` + ``ahead``."""
+    world = wp.tid()
+    if everywhere or mask[world]:
+        if not everywhere:  # a new episode; kept, so that a state can be continued in another world
+            rng = episode_rng(seed[0], world, episode[world], 6)
+            phase[world] = wp.randf(rng, 0.0, 2.0 * wp.pi)
+        angle = phase[world] + 2.0 * wp.pi * float(step_count[world, 0] + ahead) * dt / period
+        goal[world, 0] = center[world, 0]
+        goal[world, 1] = center[world, 1] + radius * wp.cos(angle)
+        goal[world, 2] = wp.max(center[world, 2] + radius * wp.sin(angle), 0.05)
 
 
 class Track(Reach):
@@ -26,19 +54,17 @@ class Track(Reach):
         super().__init__(config)
         self._center: wp.array | None = None
 
-    def reset(self, sim: Simulation, mask: wp.array) -> None:
+    def reset(self, sim: "Simulation", mask: wp.array) -> None:
         self.choose(sim, mask, sim.warp.goal_center)
         self._move(sim, mask, everywhere=False, ahead=0)
 
-    def advance(self, sim: Simulation) -> None:
-        self._move(
-            sim, sim.warp.arms_mask, everywhere=True, ahead=1
-        )  # the step is counted after the observation
+    def advance(self, sim: "Simulation") -> None:
+        self._move(sim, sim.warp.mask, everywhere=True, ahead=1)  # the step is counted after the observation
 
-    def _move(self, sim: Simulation, mask: wp.array, *, everywhere: bool, ahead: int) -> None:
+    def _move(self, sim: "Simulation", mask: wp.array, *, everywhere: bool, ahead: int) -> None:
         w, c = sim.warp, self.config
         wp.launch(
-            kernels.circle_goal,
+            circle_goal,
             sim.num_envs,
             [
                 mask, everywhere, w.seed, w.episode, w.step_count, w.phase, ahead, 1.0 / c.fps, c.track_radius,

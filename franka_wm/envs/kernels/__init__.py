@@ -1,0 +1,13 @@
+"""The Warp kernels of a control step, by concern. One thread per world unless a kernel says otherwise.
+
+``servo`` turns actions into joint targets, ``observation`` reads the arm, ``episodes`` ends and begins episodes,
+``randomization`` draws what each episode has anew, ``images`` aims cameras and places images.
+The kernels of a task are in the task's file.
+
+Python numbers given to a captured launch are frozen into the graph, so whatever may change (seed, masks,
+counters) lives in device arrays.
+"""
+
+from franka_wm.envs.kernels.functions import JOINTS, STATE, chain_forward, episode_rng
+
+__all__ = ["JOINTS", "STATE", "chain_forward", "episode_rng"]

@@ -1,0 +1,103 @@
+# pyright: reportIndexIssue=false, reportArgumentType=false, reportOperatorIssue=false, reportCallIssue=false
+# pyright: reportAttributeAccessIssue=false, reportAssignmentType=false, reportReturnType=false
+# (Kernels are Warp's language: pyright knows neither its arrays nor its vectors.)
+"""What each episode draws anew.
+
+A generator must be advanced where it lives: a function that took it would advance a copy, and every draw
+would be the same one.
+"""
+
+# Warp reads annotations as types: no `from __future__ import annotations` here.
+import warp as wp
+
+from franka_wm.envs.kernels.functions import episode_rng
+
+
+@wp.kernel(enable_backward=False)
+def draw_looks(
+    mask: wp.array[wp.bool],
+    seed: wp.array[int],
+    episode: wp.array[int],
+    color: float,
+    brightness: float,
+    eye: wp.vec3f,
+    at: wp.vec3f,
+    eye_noise: float,
+    at_noise: float,
+    latency: int,
+    shapes: int,
+    plain: wp.array2d[wp.vec3f],
+    # outputs
+    colors: wp.array2d[wp.vec3f],
+    level: wp.array[float],
+    poses: wp.array[wp.transformf],
+    delay: wp.array[int],
+):
+    """Colours, brightness, camera and delay of the masked worlds' new episodes."""
+    world = wp.tid()
+    if not mask[world]:
+        return
+    rng = episode_rng(seed[0], world, episode[world], 4)
+    level[world] = 1.0 + wp.randf(rng, -brightness, brightness)
+    e = (
+        eye
+        + wp.vec3f(wp.randf(rng, -1.0, 1.0), wp.randf(rng, -1.0, 1.0), wp.randf(rng, -1.0, 1.0)) * eye_noise
+    )
+    t = at + wp.vec3f(wp.randf(rng, -1.0, 1.0), wp.randf(rng, -1.0, 1.0), wp.randf(rng, -1.0, 1.0)) * at_noise
+    back = wp.normalize(e - t)
+    right = wp.normalize(wp.cross(wp.vec3f(0.0, 0.0, 1.0), back))
+    up = wp.cross(back, right)
+    poses[world] = wp.transformf(e, wp.quat_from_matrix(wp.matrix_from_cols(right, up, back)))
+    delay[world] = wp.min(int(wp.randf(rng) * float(latency + 1)), latency)
+    if color > 0.0:
+        for k in range(shapes):
+            c = plain[world, k]
+            for i in range(3):
+                c[i] = wp.clamp(c[i] + wp.randf(rng, -color, color), 0.0, 1.0)
+            colors[world, k] = c
+
+
+@wp.kernel(enable_backward=False)
+def any_masked(mask: wp.array[wp.bool], found: wp.array[int]):
+    if mask[wp.tid()]:
+        found[0] = 1
+
+
+@wp.kernel(enable_backward=False)
+def draw_dynamics(
+    mask: wp.array[wp.bool],
+    seed: wp.array[int],
+    episode: wp.array[int],
+    gains: float,
+    armature_width: float,
+    friction_most: float,
+    mass_width: float,
+    plain_ke: wp.array2d[float],
+    plain_kd: wp.array2d[float],
+    plain_armature: wp.array2d[float],
+    plain_mass: wp.array2d[float],
+    plain_inertia: wp.array2d[wp.mat33f],
+    # outputs
+    ke: wp.array2d[float],
+    kd: wp.array2d[float],
+    armature: wp.array2d[float],
+    friction: wp.array2d[float],
+    mass: wp.array2d[float],
+    inertia: wp.array2d[wp.mat33f],
+):
+    """Servo, joints and links of the masked worlds' new episodes."""
+    world = wp.tid()
+    if not mask[world]:
+        return
+    rng = episode_rng(seed[0], world, episode[world], 5)
+    for j in range(ke.shape[1]):
+        ke[world, j] = plain_ke[world, j] * (1.0 + wp.randf(rng, -gains, gains))
+        kd[world, j] = plain_kd[world, j] * (1.0 + wp.randf(rng, -gains, gains))
+        armature[world, j] = plain_armature[world, j] * (1.0 + wp.randf(rng, -armature_width, armature_width))
+        drawn = wp.randf(rng)
+        if friction_most > 0.0:
+            friction[world, j] = friction_most * drawn
+    for b in range(mass.shape[1]):
+        f = 1.0 + wp.randf(rng, -mass_width, mass_width)
+        mass[world, b] = plain_mass[world, b] * f
+        inertia[world, b] = plain_inertia[world, b] * f

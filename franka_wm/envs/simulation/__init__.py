@@ -1,0 +1,10 @@
+"""N worlds in Newton, and the one captured graph that steps them.
+
+``build`` makes model, solver and the arrays of the robot; ``arrays`` holds what a step reads and writes; ``graph``
+records and replays; ``images`` renders; ``state`` saves and restores; ``simulator`` says in which order.
+"""
+
+from franka_wm.envs.simulation.arrays import STATISTICS, Arrays
+from franka_wm.envs.simulation.simulator import Simulation
+
+__all__ = ["STATISTICS", "Arrays", "Simulation"]

@@ -1,0 +1,176 @@
+# pyright: reportArgumentType=false
+# (Newton's annotations do not say what a built model always has.)
+"""Everything that a step reads and writes, by name: fixed memory that torch and Warp share."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields, replace
+
+import newton
+import torch
+import warp as wp
+
+from franka_wm.envs.camera import camera_framing, look_at
+from franka_wm.envs.config import NUM_JOINTS, STATE_DIM, FrankaConfig
+
+STATISTICS = ("episodes", "return", "length", "success", "success_once", "nonfinite")
+"""Columns of :attr:`Arrays.statistics`; all but the first and last are sums over finished episodes."""
+
+
+@dataclass(frozen=True)
+class Arrays[T]:
+    """The arrays of N worlds, one row for each: as torch tensors or as Warp arrays, over the same memory.
+
+    The next launch overwrites them, so clone what is kept. The 20 numbers of a state are joints 7 [rad], velocities
+    7 [rad/s], tool 3 [m], tool − goal 3 [m].
+
+    Attributes:
+        action: (N, A), written before a step; not clipped.
+        applied: (N, A) what of it arrives at the arm: late and noisy, if asked for.
+        state, joint_target, goal: The present observation, (N, 20), (N, 7) [rad], (N, 3) [m].
+        next_state, next_joint_target, next_goal: What the last step led to, before any reset.
+        true_state, next_true_state: (N, 20) without observation noise; the same memory where there is none.
+        reward, success: Of the last step, (N, 1) float and bool: what a task writes.
+        terminated, truncated, done: Of the last step, (N, 1) bool.
+        step_count: (N, 1) int32, steps done in the episode.
+        episode_return, episode_success: Of the episode so far, (N, 1): sum of rewards; any success.
+        statistics: (N, 6) float64, see :data:`STATISTICS`.
+        task_goal: (N, 3) the goal of the episode [m], which ``goal`` and ``state`` observe.
+        goal_q: (N, 7) joints that reach it [rad].
+        goal_center, phase: (N, 3) [m] and (N,) [rad], of the circle that a moving goal follows.
+        initial_distance: (N,) tool to goal at the start of the episode [m], or what else a task notes there.
+        target: (N, 7) what the servo was told last [rad].
+        history: (N, latency + 1, A), actions not yet applied; a ring.
+        delay: (N,) int32, delay of this episode's actions [steps].
+        brightness: (N,) factor of this episode's images.
+        poses: (N,) transforms, (N, 7) in torch: the front camera of this episode.
+        broken: (N,) bool: the last step was no longer finite.
+        seed: (1,) int32; with world and ``episode`` it decides all randomness.
+        episode: (N,) int32, number of the episode, from 0.
+        reset_mask: (N + 1,) bool: which worlds begin their next episode; the last entry is Newton's global world.
+        mask: (N,) bool: the worlds' part of it.
+        joint_q, joint_qd, control: (N, 7) Newton's joints [rad], [rad/s] and set points [rad].
+        body_q: (N, B) transforms, (N, B, 7) in torch: Newton's frames of the moving links.
+        origins, directions: (N, 7) vectors, (N, 7, 3) in torch: scratch memory of the differential inverse kinematics.
+    """
+
+    action: T
+    applied: T
+    state: T
+    joint_target: T
+    goal: T
+    next_state: T
+    next_joint_target: T
+    next_goal: T
+    true_state: T
+    next_true_state: T
+    reward: T
+    success: T
+    terminated: T
+    truncated: T
+    done: T
+    step_count: T
+    episode_return: T
+    episode_success: T
+    statistics: T
+    task_goal: T
+    goal_q: T
+    goal_center: T
+    phase: T
+    initial_distance: T
+    target: T
+    history: T
+    delay: T
+    brightness: T
+    poses: T
+    broken: T
+    seed: T
+    episode: T
+    reset_mask: T
+    mask: T
+    joint_q: T
+    joint_qd: T
+    control: T
+    body_q: T
+    origins: T
+    directions: T
+
+    def __iter__(self):
+        return (getattr(self, field.name) for field in fields(self))
+
+
+def allocate(
+    config: FrankaConfig, model: newton.Model, state: newton.State, control: newton.Control, seed: int
+) -> tuple[Arrays[torch.Tensor], Arrays[wp.array]]:
+    """The arrays of all worlds in torch and in Warp; those of Newton's state and control are views of these."""
+    n, device = model.world_count, str(wp.device_to_torch(model.device))
+    actions, slots = config.action_dim, config.randomization.action_latency + 1
+
+    def zeros(*shape: int, dtype: torch.dtype = torch.float32) -> torch.Tensor:
+        return torch.zeros(shape, dtype=dtype, device=device)
+
+    def flags(*shape: int) -> torch.Tensor:
+        return zeros(*shape, dtype=torch.bool)
+
+    def newtons(array: wp.array, *size: int) -> torch.Tensor:
+        return wp.to_torch(array).view(n, -1, *size)
+
+    observed, next_observed = zeros(n, STATE_DIM), zeros(n, STATE_DIM)
+    noisy = bool(config.randomization.observation_noise)
+    framing = torch.tensor(list(look_at(*camera_framing(config))), device=device)
+    reset_mask = flags(n + 1)
+    tensors = Arrays(
+        action=zeros(n, actions),
+        applied=zeros(n, actions),
+        state=observed,
+        joint_target=zeros(n, NUM_JOINTS),
+        goal=zeros(n, 3),
+        next_state=next_observed,
+        next_joint_target=zeros(n, NUM_JOINTS),
+        next_goal=zeros(n, 3),
+        # Without noise what is seen is what is true: the same memory, and no launch between them.
+        true_state=zeros(n, STATE_DIM) if noisy else observed,
+        next_true_state=zeros(n, STATE_DIM) if noisy else next_observed,
+        reward=zeros(n, 1),
+        success=flags(n, 1),
+        terminated=flags(n, 1),
+        truncated=flags(n, 1),
+        done=flags(n, 1),
+        step_count=zeros(n, 1, dtype=torch.int32),
+        episode_return=zeros(n, 1),
+        episode_success=flags(n, 1),
+        statistics=zeros(n, len(STATISTICS), dtype=torch.float64),
+        task_goal=zeros(n, 3),
+        goal_q=zeros(n, NUM_JOINTS),
+        goal_center=zeros(n, 3),
+        phase=zeros(n),
+        initial_distance=torch.ones(n, device=device),
+        target=zeros(n, NUM_JOINTS),
+        history=zeros(n, slots, actions),
+        delay=zeros(n, dtype=torch.int32),
+        brightness=torch.ones(n, device=device),
+        poses=framing.repeat(n, 1),
+        broken=flags(n),
+        seed=torch.full((1,), as_int32(seed), dtype=torch.int32, device=device),
+        episode=torch.full((n,), -1, dtype=torch.int32, device=device),
+        reset_mask=reset_mask,
+        mask=reset_mask[:n],
+        joint_q=newtons(state.joint_q),
+        joint_qd=newtons(state.joint_qd),
+        control=newtons(control.joint_target_q),
+        body_q=newtons(state.body_q, 7),
+        origins=zeros(n, NUM_JOINTS, 3),
+        directions=zeros(n, NUM_JOINTS, 3),
+    )
+    warp = Arrays(*map(wp.from_torch, tensors))
+    return tensors, replace(
+        warp,
+        **{name: wp.from_torch(getattr(tensors, name), wp.transformf) for name in ("poses", "body_q")},
+        **{name: wp.from_torch(getattr(tensors, name), wp.vec3f) for name in ("origins", "directions")},
+    )
+
+
+def as_int32(seed: int) -> int:
+    """Any Python integer as the 32-bit one that Warp's generator takes."""
+    seed &= 0xFFFFFFFF
+    return seed - (1 << 32) if seed >= 1 << 31 else seed

@@ -1,0 +1,265 @@
+# pyright: reportArgumentType=false, reportAttributeAccessIssue=false, reportCallIssue=false
+# pyright: reportOptionalMemberAccess=false
+# (Warp's annotations know neither vectors nor shapes as tuples.)
+"""``Simulation``: N worlds, stepped and reset. Each step is one graph launch, on CUDA and on the CPU:
+
+    actions → servo targets → physics → observation → task → ends of episodes → images
+            → masked reset → observation → images of the worlds that were reset
+
+Without the second line, for who resets finished worlds by himself, it is another graph.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from pathlib import Path
+
+import newton
+import torch
+import warp as wp
+
+from franka_wm.envs.config import NUM_JOINTS, FrankaConfig
+from franka_wm.envs.kernels import episodes, observation, servo
+from franka_wm.envs.kinematics import Kinematics
+from franka_wm.envs.randomize import Randomizer
+from franka_wm.envs.simulation import state as worlds
+from franka_wm.envs.simulation.arrays import allocate, as_int32
+from franka_wm.envs.simulation.build import Chain, build_model, make_solver
+from franka_wm.envs.simulation.graph import Recorder
+from franka_wm.envs.simulation.images import Renderer
+from franka_wm.envs.tasks import Task, make_task
+
+
+class Simulation:
+    """N simulated arms. Knows nothing of TorchRL.
+
+    Args:
+        config: The arm and its task.
+        num_envs: Number of worlds, N.
+        device: ``"cpu"`` or ``"cuda:k"``.
+        seed: Decides, with world and episode number, all randomness.
+        urdf_path: Overrides the robot that the config names.
+        task: What is asked of the arm; the config's if not given.
+
+    Attributes:
+        tensors, warp: Everything that a step reads and writes, as torch tensors and as Warp arrays over the same
+            memory (:class:`~franka_wm.envs.simulation.arrays.Arrays`).
+        chain: The robot as kernels read it.
+        renderer: Cameras, and the images of the present and of the last step.
+        model, newton_state, control, solver: Newton's.
+    """
+
+    def __init__(
+        self,
+        config: FrankaConfig,
+        num_envs: int,
+        device: str,
+        *,
+        seed: int = 0,
+        urdf_path: str | Path | None = None,
+        task: Task | None = None,
+    ):
+        self.config = config
+        self.num_envs = num_envs
+        self.device = device
+        self.model, self.robot = build_model(config, num_envs, device, urdf_path)
+        self.solver = make_solver(self.model, config)
+        self._in_place = isinstance(self.solver, newton.solvers.SolverMuJoCo)
+        self.newton_state = self.model.state()
+        self._spare_state = None if self._in_place else self.model.state()
+        self.control = self.model.control()
+        self.kinematics = Kinematics(self.robot, device)
+        self.chain = Chain.of(self.robot, config, device)
+        self.task = make_task(config) if task is None else task
+        self.tensors, self.warp = allocate(config, self.model, self.newton_state, self.control, seed)
+        self.randomizer = Randomizer(self)
+        self.recorder = Recorder(device)
+        self.renderer = Renderer(self)
+        self._dt = 1.0 / (config.fps * config.substeps)
+        newton.eval_fk(self.model, self.model.joint_q, self.model.joint_qd, self.newton_state)
+        self._step_graphs: dict[bool, wp.Graph] = {}
+        self._reset_graph: wp.Graph | None = None
+
+    # -- what a user of this class calls ------------------------------------------------------------------
+
+    def step(self, *, restart: bool = True) -> None:
+        """One control step of all worlds with ``tensors.action``; one graph launch, no host sync.
+
+        Args:
+            restart: Whether finished worlds begin their next episode at once. Where they do not, they stay
+                ``done`` until :meth:`reset` begins it.
+        """
+        if restart not in self._step_graphs:
+            self._step_graphs[restart] = self.record(
+                self._launch_step_and_restart if restart else self._launch_step
+            )
+        self.recorder.replay(self._step_graphs[restart])
+
+    def reset(self, mask: torch.Tensor | None = None) -> None:
+        """Starts the next episode where ``mask`` (N,) is true, or everywhere; other worlds are untouched."""
+        if mask is None:
+            self.tensors.mask.fill_(True)
+        else:
+            self.tensors.mask.copy_(mask.reshape(self.num_envs))
+        self._reset_masked()
+
+    def set_seed(self, seed: int) -> None:
+        """The next reset of each world is its episode 0 of this seed."""
+        self.tensors.seed.fill_(as_int32(seed))
+        self.tensors.episode.fill_(-1)
+
+    def get_state(self) -> dict[str, torch.Tensor]:
+        """A copy of everything that the worlds' futures depend on, by name, each (N, …)."""
+        return worlds.read(self)
+
+    def set_state(self, state: Mapping[str, torch.Tensor]) -> None:
+        """Puts all worlds where :meth:`get_state` found them; its arrays have N rows.
+
+        Raises:
+            UserError: An array is missing or has another shape; nothing is changed then.
+        """
+        worlds.write(self, state)
+        self._observe_anew()
+        if self.renderer.images:
+            self.renderer.show_all()
+
+    def set_goal(self, goal: torch.Tensor) -> None:
+        """Moves every world's goal to ``goal`` (N, 3) [m], until its next reset; no host sync.
+
+        A goal that moves goes on from there: its circle is moved along.
+        """
+        t = self.tensors
+        t.goal_center.add_(goal - t.task_goal)
+        t.task_goal.copy_(goal)
+        t.goal_q.copy_(self.kinematics.solve(goal, t.goal_q, iterations=24))
+        self._observe_anew()
+        self.renderer.show_goal()
+
+    def record(self, launches: Callable[[], None]) -> wp.Graph:
+        """A graph of what ``launches`` launches, for :meth:`Recorder.replay`; the worlds stay as they are."""
+
+        def reset_everywhere() -> None:
+            self.tensors.mask.fill_(True)
+            self._launch_reset_and_observe()
+
+        arrays = [*self.warp, self.newton_state.body_qd, *worlds.solver_memory(self).values()]
+        arrays += [*self.randomizer.arrays(), *self.renderer.arrays()]
+        # MuJoCo's copy of the physical values is not among the arrays.
+        return self.recorder.record(launches, arrays, reset_everywhere, self.randomizer.apply)
+
+    # -- the graph ----------------------------------------------------------------------------------------
+
+    def _reset_masked(self) -> None:
+        if self._reset_graph is None:
+            self._reset_graph = self.record(self._launch_reset_and_observe)
+        self.recorder.replay(self._reset_graph)
+
+    def _observe_anew(self) -> None:
+        """The present observation after the arrays behind it were written by hand; resets no world."""
+        self.tensors.reset_mask.zero_()
+        self._reset_masked()
+
+    def _launch_step_and_restart(self) -> None:
+        self._launch_control_step()
+        self._launch_reset_and_observe()
+
+    def _launch_step(self) -> None:
+        w = self.warp
+        self._launch_control_step()
+        self._launch_observe(w.true_state, w.joint_target, w.goal)
+        self._launch_noise(w.true_state, w.state)
+
+    def _launch_control_step(self) -> None:
+        cfg, w = self.config, self.warp
+        self._launch_action()
+        self.launch_physics()
+        self.task.advance(self)
+        self._launch_observe(w.next_true_state, w.next_joint_target, w.next_goal)
+        self._launch(
+            observation.catch_nonfinite,
+            w.true_state, w.joint_target, w.next_true_state, w.next_joint_target, w.target, w.joint_q, w.joint_qd,
+            w.broken,
+        )  # fmt: skip
+        self.task.judge(self)
+        self._launch(
+            episodes.end_step,
+            w.reward, w.success, w.broken, cfg.episode_length, cfg.terminate_on_success,
+            w.step_count, w.episode_return, w.episode_success, w.statistics,
+            w.terminated, w.truncated, w.done, w.reset_mask,
+        )  # fmt: skip
+        self._launch_noise(w.next_true_state, w.next_state)
+        self.renderer.launch_step()
+
+    def _launch_action(self) -> None:
+        cfg, w, c = self.config, self.warp, self.chain
+        action = w.action
+        if cfg.randomization.action_latency or cfg.randomization.action_noise:
+            noise = float(cfg.randomization.action_noise)
+            inputs = [w.action, w.seed, w.episode, w.step_count, w.delay, noise, w.history, w.applied]
+            self._launch(servo.perceive_action, *inputs)
+            action = w.applied
+        if cfg.action_mode == "ee_delta":
+            self._launch(
+                servo.apply_tool_action,
+                action, cfg.ee_scale, cfg.action_scale, c.lower, c.upper, c.lead, c.parent_frames,
+                c.child_frames, c.axes, c.tool_frame, w.joint_q, w.origins, w.directions, w.target, w.control,
+            )  # fmt: skip
+        else:
+            absolute = cfg.action_mode == "joint_position"
+            inputs = [absolute, cfg.action_scale, c.lower, c.upper, c.lead, w.joint_q, w.target, w.control]
+            self._launch_joints(servo.apply_joint_action, action, *inputs)
+
+    def launch_physics(self) -> None:
+        """The physics of one control step."""
+        state, spare, w = self.newton_state, self._spare_state, self.warp
+        for _ in range(self.config.substeps):
+            if self.config.limit_velocity:
+                q = state.joint_q.reshape((self.num_envs, NUM_JOINTS))
+                self._launch_joints(servo.limit_speed, w.target, self.chain.lead, q, w.control)
+            if spare is None:
+                self.solver.step(state, state, self.control, None, self._dt)
+            else:
+                state.clear_forces()
+                self.solver.step(state, spare, self.control, None, self._dt)
+                state, spare = spare, state
+
+    def _launch_reset_and_observe(self) -> None:
+        cfg, w, c = self.config, self.warp, self.chain
+        if self._in_place:
+            self.solver.reset(self.newton_state, w.reset_mask)
+        self._launch(
+            episodes.reset_pose,
+            w.mask, w.seed, c.home, cfg.pose_noise, c.lower, c.upper, w.episode, w.joint_q, w.joint_qd,
+            w.target, w.control, w.step_count, w.episode_return, w.episode_success, w.history,
+            cfg.action_mode == "joint_position",
+        )  # fmt: skip
+        self.randomizer.launch(w.mask)
+        self.task.reset(self, w.mask)
+        self.launch_forward_kinematics(w.mask)
+        self._launch_observe(w.true_state, w.joint_target, w.goal)
+        self.task.begin(self, w.mask)
+        self._launch_noise(w.true_state, w.state)
+        self.renderer.launch_reset()
+
+    def _launch_observe(self, state: wp.array, joint_target: wp.array, goal: wp.array) -> None:
+        w, c = self.warp, self.chain
+        inputs = [w.joint_q, w.joint_qd, w.body_q, c.tool_body, c.tool_frame, w.target, w.task_goal]
+        self._launch(observation.observe, *inputs, state, joint_target, goal)
+
+    def _launch_noise(self, state: wp.array, out: wp.array) -> None:
+        noise, w = self.config.randomization.observation_noise, self.warp
+        if noise:
+            self._launch(observation.blur_state, w.seed, w.episode, w.step_count, float(noise), state, out)
+
+    def launch_forward_kinematics(self, mask: wp.array) -> None:
+        """Frames of the links of the masked worlds from their joints."""
+        s = self.newton_state
+        newton.eval_fk(self.model, s.joint_q, s.joint_qd, s, mask=mask)
+
+    def _launch(self, kernel: wp.Kernel, *inputs) -> None:
+        """One thread for each world."""
+        wp.launch(kernel, self.num_envs, inputs, device=self.device)
+
+    def _launch_joints(self, kernel: wp.Kernel, *inputs) -> None:
+        """One thread for each joint of each world."""
+        wp.launch(kernel, (self.num_envs, NUM_JOINTS), inputs, device=self.device)
