@@ -10,17 +10,21 @@ from __future__ import annotations
 import hydra
 from omegaconf import DictConfig
 
-from franka_wm.training.entry import one_line_errors, run_command
+from franka_wm.commands.entry import one_line_errors, run_command
 
 
 @hydra.main(version_base="1.3", config_path="conf", config_name="config")
 @one_line_errors
 def main(cfg: DictConfig) -> None:
     """One run: build, train, evaluate, report."""
-    from franka_wm.evaluation.report import evaluate_and_report
+    from franka_wm.console import say
+    from franka_wm.evaluation.health import diagnose_training
+    from franka_wm.evaluation.protocol import during_training, evaluate_run
+    from franka_wm.report.end_of_run import report_run
+    from franka_wm.report.page import write_page
     from franka_wm.training import build
-    from franka_wm.training.entry import finish, start
     from franka_wm.training.learner import Learner
+    from franka_wm.training.run import start
     from franka_wm.training.stages import pretrain
     from franka_wm.training.trainer import Trainer
 
@@ -40,30 +44,32 @@ def main(cfg: DictConfig) -> None:
         cfg=run.cfg,
         folder=run.folder,
         loggers=run.loggers,
-        evaluate=run.evaluation_during_training(judge, judged),
+        evaluate=during_training(judge, judged, **run.during),
         spaces=spaces,
         validation=run.validation,
-        diagnose=run.diagnose,
+        diagnose=diagnose_training,
     )
     if run.checkpoint is not None:
         trainer.restore(run.checkpoint)
     trainer.fit()
-    if not trainer.interrupted and judged:
-        evaluate_and_report(
+    if trainer.interrupted:
+        run.stop()
+    if judged:
+        found = evaluate_run(run.cfg, run.folder, judge, judged, counters=trainer.counters)
+        report_run(
             run.cfg,
             run.folder,
             judge,
             judged,
+            found,
             rows=trainer.rows,
-            counters={
-                "updates": trainer.learner.updates,
-                "env_steps": trainer.env_steps,
-                "seconds": trainer.seconds,
-            },
             log=trainer.record,
             log_video=run.log_video,
         )
-    finish(run, trainer)
+    run.close()
+    say(f"page:    {write_page(run.folder)}")
+    run.export(trainer.experience)
+    say(f"results: {run.folder}")
 
 
 if __name__ == "__main__":

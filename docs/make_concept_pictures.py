@@ -18,6 +18,7 @@ from tensordict import TensorDict
 from franka_wm import models
 from franka_wm.envs import FrankaConfig, FrankaEnv
 from franka_wm.envs.camera import project
+from franka_wm.evaluation.projection import principal_components
 from franka_wm.live.commanded import KinematicModel, commanded_path
 from franka_wm.models.masks import make_masks
 from franka_wm.planning import registry
@@ -25,7 +26,6 @@ from franka_wm.policies.scripted import OraclePolicy, SmoothRandomPolicy
 from franka_wm.report.bars import bars_figure
 from franka_wm.report.figure import finish_axes, new_figure, save_figure
 from franka_wm.report.frames import mask_figure, strip_figure
-from franka_wm.report.spectra import principal_components
 from franka_wm.report.style import BLUE, GREY, VERMILION, policy_colour, policy_name, series_style
 
 OUT = Path(__file__).parent / "images"

@@ -17,8 +17,8 @@ import yaml
 
 from benchmarks.results.rows import Row
 from franka_wm.errors import UserError
+from franka_wm.evaluation.results import read_result
 from franka_wm.files import atomic_write
-from franka_wm.report.results import read_result
 from franka_wm.report.run import SAME_BUT, read_config
 from franka_wm.source import ROOT
 from franka_wm.versions import PACKAGES

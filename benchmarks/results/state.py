@@ -77,7 +77,7 @@ def composed(typed: tuple[str, ...]) -> dict[str, Any] | str:
     from omegaconf import OmegaConf
     from omegaconf.errors import OmegaConfBaseException
 
-    import franka_wm.training.entry  # noqa: F401  # registers what conf/config.yaml resolves
+    import franka_wm.training.run  # noqa: F401  # registers what conf/config.yaml resolves
 
     try:
         with initialize_config_dir(str(ROOT / "conf"), version_base="1.3"):

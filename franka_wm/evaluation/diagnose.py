@@ -28,6 +28,7 @@ from franka_wm.evaluation.open_loop import (
     value_calibration,
 )
 from franka_wm.evaluation.probes import probe
+from franka_wm.evaluation.projection import principal_components
 from franka_wm.evaluation.protocol import Evaluation
 from franka_wm.evaluation.rollouts import (
     ROLLOUT_SEED,
@@ -39,7 +40,6 @@ from franka_wm.evaluation.rollouts import (
     mixture,
 )
 from franka_wm.evaluation.spectrum import spectrum
-from franka_wm.report.spectra import principal_components
 from franka_wm.seeding import derive_seed, seeded
 
 EPISODES = 48

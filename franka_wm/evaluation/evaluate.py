@@ -13,8 +13,11 @@ from franka_wm.evaluation import diagnose
 from franka_wm.evaluation.decoder import Imagined
 from franka_wm.evaluation.open_loop import NothingToPredictError
 from franka_wm.evaluation.protocol import EPISODES, Evaluation, describe, evaluate_agent, protocol
+from franka_wm.evaluation.results import COMMAND, to_json
 from franka_wm.evaluation.robustness import check_shiftable, note, robustness
-from franka_wm.evaluation.tables import (
+from franka_wm.files import atomic_write
+from franka_wm.report.diagnostics import (
+    evaluation_markdown,
     horizon_table,
     interval,
     number,
@@ -23,8 +26,6 @@ from franka_wm.evaluation.tables import (
     terminal,
     timing_table,
 )
-from franka_wm.files import atomic_write
-from franka_wm.report.results import COMMAND, to_json
 from franka_wm.report.table import Table, evaluation_tables, markdown
 
 WORLDS = 256
@@ -164,7 +165,7 @@ def run(options: Options) -> dict[str, Any]:
     for title, table in tables.items():
         console.print(terminal(table, title))
     text = "\n".join(
-        [evaluation.markdown(), *(f"### {t}\n\n{markdown(table)}" for t, table in tables.items())]
+        [evaluation_markdown(evaluation), *(f"### {t}\n\n{markdown(table)}" for t, table in tables.items())]
     )
     _write(options.out, results, text, evaluation, None if imagined is None else imagined[0])
     say(f"results: {options.out}")

@@ -14,7 +14,7 @@ from franka_wm.evaluation.closed_loop import evaluating
 from franka_wm.evaluation.intervals import bootstrap_mean
 from franka_wm.evaluation.open_loop import correlation
 from franka_wm.evaluation.rollouts import embedding
-from franka_wm.evaluation.spectrum import latent_statistics
+from franka_wm.evaluation.spectrum import collapse_warning, latent_statistics
 
 SAMPLES = 512
 """Latents that :func:`training_diagnostics` looks at, at most."""
@@ -134,3 +134,11 @@ def paired_gain(planner: TensorDictBase, prior: TensorDictBase) -> dict[str, Any
     """
     names = [name for name in ("return", "final_distance") if name in planner.keys()]  # noqa: SIM118
     return {name: bootstrap_mean((planner.get(name) - prior.get(name)).cpu()).as_dict() for name in names}
+
+
+def diagnose_training(model: Any, batch: Any) -> tuple[dict[str, float], str | None]:
+    """Whether latents collapse and values drift: numbers to log, and a warning."""
+    numbers = training_diagnostics(model, batch)
+    if not numbers:
+        return {}, "the model's latents are no longer finite; lower trainer.lr"
+    return numbers, collapse_warning(numbers)

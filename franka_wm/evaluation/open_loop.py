@@ -9,9 +9,9 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from franka_wm.evaluation.calibration import calibration_bins
 from franka_wm.evaluation.intervals import Interval, bootstrap_ratio
 from franka_wm.evaluation.rollouts import embedding
-from franka_wm.report.calibration import calibration_bins
 
 PAIRS = 2000
 """Random pairs of states that a rank correlation is measured over."""

@@ -5,11 +5,13 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any, cast
 
 import torch
 from tensordict import TensorDict
 
+from franka_wm import console
 from franka_wm.errors import UserError
 from franka_wm.evaluation.closed_loop import (
     THRESHOLDS,
@@ -19,8 +21,8 @@ from franka_wm.evaluation.closed_loop import (
     reaches,
     summarize,
 )
-from franka_wm.report.results import point
-from franka_wm.report.table import evaluation_tables, markdown
+from franka_wm.evaluation.results import END, FILE, point, to_json
+from franka_wm.files import atomic_write
 from franka_wm.seeding import derive_seed, seeded
 from franka_wm.version import __version__
 from franka_wm.versions import processor
@@ -49,6 +51,7 @@ class Evaluation:
         seeds: Of the episodes.
         seconds: Name → median time of a decision for all worlds at once [s]; depends on the machine.
         worlds: How many that is.
+        protocol: How it was measured, of a run: what :func:`protocol` says.
     """
 
     policies: dict[str, dict[str, Any]]
@@ -56,17 +59,7 @@ class Evaluation:
     seeds: list[int]
     seconds: dict[str, float] = field(default_factory=dict)
     worlds: int = 0
-
-    def markdown(self) -> str:
-        """The tables, and under them how they were measured."""
-        parts = [markdown(table) for table in evaluation_tables(self.policies) if table.rows]
-        count = next(iter(self.policies.values()))["episodes"]
-        seeds = ", ".join(map(str, self.seeds))
-        worlds = f" of {self.worlds} worlds" if self.worlds else ""
-        parts.append(
-            f"{count} episodes per policy, the same for all, on held-out seeds ({seeds}){worlds}.\n{INTERVALS}\n"
-        )
-        return "\n".join(parts)
+    protocol: dict[str, Any] = field(default_factory=dict)
 
 
 def evaluate_agent(
@@ -148,7 +141,7 @@ def protocol(
         cfg: The run's configuration.
         env: Evaluation worlds.
         evaluation: What was found.
-        by: Who measured: :data:`~franka_wm.report.results.END` or :data:`~franka_wm.report.results.COMMAND`.
+        by: Who measured: :data:`~franka_wm.evaluation.results.END` or :data:`~franka_wm.evaluation.results.COMMAND`.
         counters: Of the training: ``updates``, ``env_steps``, ``seconds``.
     """
     arm = arm_of(env) is not None
@@ -204,3 +197,38 @@ def describe(name: str, summary: Mapping[str, Any]) -> str:
         return f"  {name}: final distance {100 * summary['final_distance']['mean']:.2f} cm"
     success = f"success {100 * summary['success']['mean']:.0f} %, " if "success" in summary else ""
     return f"  {name}: {success}return {summary['return']['mean']:.2f}"
+
+
+def during_training(
+    env: Any, policies: Mapping[str, Any], *, names: Sequence[str], episodes: int | None
+) -> Callable[[], dict[str, float]]:
+    """A function for the trainer: plays the policies in ``names`` and returns numbers to log."""
+    chosen = {name: policies[name] for name in names if name in policies}
+    return lambda: numbers_to_log(env, chosen, episodes=episodes)
+
+
+def evaluate_run(
+    cfg: Any,
+    folder: Path,
+    env: Any,
+    policies: Mapping[str, Any],
+    *,
+    counters: Mapping[str, float],
+    say: Callable[[str], Any] = console.say,
+) -> Evaluation:
+    """The end of a run: every policy over the same held-out episodes, and ``evaluation.json`` in the run's folder.
+
+    Args:
+        cfg: The run's configuration.
+        folder: Of the run.
+        env: Evaluation worlds; as many episodes.
+        policies: By name.
+        counters: ``updates``, ``env_steps``, ``seconds`` of the training.
+        say: Takes lines for the terminal.
+    """
+    say(f"evaluating over {env.num_envs} held-out episodes …")
+    found = evaluate_policies(env, policies, report=lambda name, r: say(describe(name, r)))
+    found.protocol = protocol(cfg, env, found, by=END, counters=counters)
+    with atomic_write(folder / FILE) as path:
+        path.write_text(to_json({"protocol": found.protocol, "policies": found.policies}))
+    return found

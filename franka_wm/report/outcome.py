@@ -4,10 +4,10 @@ import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+from franka_wm.evaluation.results import Result
 from franka_wm.report import style
 from franka_wm.report.bars import bars_figure
 from franka_wm.report.document import cards, chart, facts, folded, scrolling, tiles, warning
-from franka_wm.report.results import Result
 from franka_wm.report.run import RunFiles
 from franka_wm.report.table import Table, evaluation_tables, html, is_interval
 

@@ -3,7 +3,7 @@
     config.yaml             what was run
     .hydra/overrides.yaml   what was typed after ``train.py``
     versions.json           packages and machine, as `franka_wm.versions` writes them
-    evaluation.json         results, as :mod:`franka_wm.report.results` describes them
+    evaluation.json         results, as :mod:`franka_wm.evaluation.results` describes them
     checkpoints/…           counters and the logged rows; without a checkpoint, rows come from ``csv/``
     video.mp4, last_frame.png, imagined.mp4, imagined.png, masks.png    pictures
     evaluation/             what ``franka-wm evaluate`` wrote: evaluation.json, timing.json and pictures. Of two
@@ -23,7 +23,7 @@ from pathlib import Path
 from typing import Any
 
 from franka_wm.errors import UserError
-from franka_wm.report.results import Result, last_row, results
+from franka_wm.evaluation.results import Result, last_row, results
 from franka_wm.untrusted import UntrustedFolder, check_image, check_video
 
 SAME_BUT = ("seed", "device", "resume")

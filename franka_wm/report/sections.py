@@ -8,6 +8,7 @@ from typing import Any
 
 from omegaconf import OmegaConf
 
+from franka_wm.evaluation.results import COMMAND, END
 from franka_wm.report import style
 from franka_wm.report.bars import bars_figure
 from franka_wm.report.calibration import calibration_figure
@@ -27,7 +28,6 @@ from franka_wm.report.document import (
 )
 from franka_wm.report.horizon import horizon_figure
 from franka_wm.report.outcome import number, plain, result
-from franka_wm.report.results import COMMAND, END
 from franka_wm.report.run import RunFiles
 from franka_wm.report.spectra import latent_figure, spectrum_figure
 from franka_wm.report.table import html, is_interval, nested_table

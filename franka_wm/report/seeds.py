@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Any
 
 from franka_wm.errors import UserError
-from franka_wm.report.results import Result, results
+from franka_wm.evaluation.results import Result, results
 from franka_wm.report.run import but_for_the_seed, read_config
 from franka_wm.report.style import centimetres
 

@@ -16,7 +16,6 @@ from franka_wm.training.learner import PRECISIONS, SCHEDULES
 from franka_wm.training.loggers import check_loggers
 from franka_wm.training.room import planned_steps
 from franka_wm.training.spaces import Spaces
-from franka_wm.training.stages import check_pretrain
 
 METRICS = ("l2", "l1", "cosine")
 
@@ -222,3 +221,19 @@ def _check_names(option: str, names: Any, known: Sequence[str]) -> None:
     unknown = [name for name in names if name not in known]
     if unknown:
         raise UserError(f"{option}: no {unknown[0]!r}; choose from {', '.join(known)}")
+
+
+def check_pretrain(cfg: Any) -> None:
+    """What can be refused before a run.
+
+    Raises:
+        UserError: The model takes no pretrained encoder.
+    """
+    if cfg.pretrain.kind == "none":
+        return
+    if cfg.pretrain.kind != "encoder":
+        raise UserError(f"pretrain.kind={cfg.pretrain.kind!r}: must be none or encoder")
+    if "encoder_from" not in cfg.model:
+        raise UserError(
+            f"pretrain: model={cfg.model.name} takes no pretrained encoder; use action_world_model or tdmpc2_pixels"
+        )

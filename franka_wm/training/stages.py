@@ -7,21 +7,18 @@ can be gained by making them easier.
 from __future__ import annotations
 
 import gc
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from omegaconf import open_dict
 
 from franka_wm.console import say
-from franka_wm.errors import UserError
 from franka_wm.seeding import derive_seed
 from franka_wm.training import build
 from franka_wm.training.checkpoint import FIRST_STAGE
 from franka_wm.training.learner import Learner
+from franka_wm.training.run import Run
 from franka_wm.training.spaces import Spaces
 from franka_wm.training.trainer import Trainer
-
-if TYPE_CHECKING:
-    from franka_wm.training.entry import Run
 
 
 def pretrain(run: Run, env: Any, experience: Any, spaces: Spaces) -> None:
@@ -79,19 +76,3 @@ def pretrain(run: Run, env: Any, experience: Any, spaces: Spaces) -> None:
     gc.collect()  # these hold one another, and the second stage needs the memory of the first one's replay
     cfg.model.encoder_from = str(run.folder.absolute() / FIRST_STAGE / "checkpoints" / "latest")
     say("second stage: dynamics on the frozen encoder")
-
-
-def check_pretrain(cfg: Any) -> None:
-    """What can be refused before a run.
-
-    Raises:
-        UserError: The model takes no pretrained encoder.
-    """
-    if cfg.pretrain.kind == "none":
-        return
-    if cfg.pretrain.kind != "encoder":
-        raise UserError(f"pretrain.kind={cfg.pretrain.kind!r}: must be none or encoder")
-    if "encoder_from" not in cfg.model:
-        raise UserError(
-            f"pretrain: model={cfg.model.name} takes no pretrained encoder; use action_world_model or tdmpc2_pixels"
-        )

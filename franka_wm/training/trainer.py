@@ -335,10 +335,15 @@ class Trainer:
             model=self.model,
             optimizer=self.learner.optimizer,
             config=self._config(),
-            counters={"env_steps": self.env_steps, "updates": self.learner.updates, "seconds": self.seconds},
+            counters=self.counters,
             replay=replay,
             extra={"rows": self.rows, "spaces": self.spaces.as_dict(), "moment": self._moment()},
         )
+
+    @property
+    def counters(self) -> dict[str, float]:
+        """How far the run is: ``env_steps``, ``updates``, ``seconds`` of training."""
+        return {"env_steps": self.env_steps, "updates": self.learner.updates, "seconds": self.seconds}
 
     def _config(self) -> DictConfig:
         """The configuration, so that the checkpoint alone rebuilds the model, without what it was started from."""

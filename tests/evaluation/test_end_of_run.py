@@ -9,9 +9,10 @@ import pytest
 from matplotlib.axes import Axes
 from omegaconf import OmegaConf
 
-from franka_wm.evaluation.report import evaluate_and_report
+from franka_wm.evaluation.protocol import evaluate_run
+from franka_wm.evaluation.results import END, read_result
 from franka_wm.policies.scripted import NoopPolicy
-from franka_wm.report.results import END, read_result
+from franka_wm.report.end_of_run import report_run
 
 
 @pytest.mark.parametrize("during", [["policy"], []])
@@ -37,18 +38,11 @@ def test_the_table_is_the_curves_last_point(
 
     monkeypatch.setattr(Axes, "plot", record)
     counters = {"updates": 9, "env_steps": 120, "seconds": 3.5}
-    results = evaluate_and_report(
-        cfg,
-        tmp_path,
-        env,
-        {"policy": NoopPolicy(), "noop": NoopPolicy()},
-        rows=[before],
-        counters=counters,
-        say=lambda text: None,
-        log=logged.append,
-    )
+    policies = {"policy": NoopPolicy(), "noop": NoopPolicy()}
+    results = evaluate_run(cfg, tmp_path, env, policies, counters=counters, say=lambda text: None)
+    report_run(cfg, tmp_path, env, policies, results, rows=[before], log=logged.append)
     found = read_result(tmp_path / "evaluation.json")
-    assert json.loads((tmp_path / "evaluation.json").read_text()) == results
+    assert json.loads((tmp_path / "evaluation.json").read_text())["policies"] == results.policies
     assert found.told == f"{END}, 3 episodes" and found.protocol["seed"] == 7
     assert [found.protocol[k] for k in ("updates", "env_steps", "training_seconds")] == [9, 120, 3.5]
     table = found.policies["policy"]

@@ -12,13 +12,13 @@ from franka_wm.envs import FrankaConfig, FrankaEnv
 from franka_wm.envs.tasks import Reach, Track
 from franka_wm.evaluation.closed_loop import play_episodes, reaches
 from franka_wm.evaluation.protocol import Evaluation, describe, evaluate_policies, numbers_to_log, thresholds
+from franka_wm.evaluation.results import END, last_row
 from franka_wm.evaluation.robustness import verdict_of_success
-from franka_wm.evaluation.tables import robustness_table
 from franka_wm.policies.scripted import NoopPolicy, OraclePolicy, SmoothRandomPolicy
 from franka_wm.report.compare import compare_page
 from franka_wm.report.curves import axis, panel_figure, panels, plot_learning_curves
+from franka_wm.report.diagnostics import evaluation_markdown, robustness_table
 from franka_wm.report.page import page
-from franka_wm.report.results import END, last_row
 from franka_wm.report.run import read_run
 from franka_wm.report.seeds import seeds_table, summary
 from tests.conftest import SMALL
@@ -85,7 +85,7 @@ def test_no_distance_is_shown_anywhere(env: FrankaEnv, found: Evaluation) -> Non
     for summary_ in found.policies.values():
         assert {"success", "success_once", "return", "measures", "episodes"} <= set(summary_)
         assert "final_distance" not in summary_ and set(summary_["success"]) == {"mean", "low", "high"}
-    text = found.markdown()
+    text = evaluation_markdown(found)
     assert text.startswith("| policy | success [%] | height [m] | return | episodes |")
     assert "distance [cm]" not in text and "once [%]" in text
     assert describe("planner", found.policies["planner"]).startswith("  planner: success ")

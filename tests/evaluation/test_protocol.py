@@ -21,6 +21,7 @@ from franka_wm.evaluation.rollouts import (
     mixture,
 )
 from franka_wm.policies.scripted import NoopPolicy, SmoothRandomPolicy
+from franka_wm.report.diagnostics import evaluation_markdown
 from franka_wm.seeding import seeded
 from franka_wm.training.load import load_agent
 
@@ -32,7 +33,7 @@ def test_twice_gives_the_same_numbers(agent) -> None:
     second = evaluate_agent(agent, episodes=6, timing=False)
     assert set(first.policies) == {"planner", "policy", "noop", "random", "oracle"}
     assert first.policies == second.policies
-    assert first.markdown() == second.markdown()
+    assert evaluation_markdown(first) == evaluation_markdown(second)
     for name, episodes in first.episodes.items():
         assert (episodes == second.episodes[name]).all(), name
     assert first.policies["random"] != first.policies["noop"]
@@ -103,7 +104,7 @@ def test_what_cannot_be_evaluated(agent) -> None:
 
 def test_the_table_names_its_intervals(agent) -> None:
     noop = {"noop": agent.policies["noop"]}
-    text = evaluate_agent(agent, episodes=6, policies=noop, timing=False).markdown()
+    text = evaluation_markdown(evaluate_agent(agent, episodes=6, policies=noop, timing=False))
     for word in ("doing nothing", "6 episodes", "bootstrap", "Wilson", str(held_out_seeds(1)[0])):
         assert word in text, word
 

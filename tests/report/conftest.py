@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 import torch
 
-from franka_wm.report.results import END
+from franka_wm.evaluation.results import END
 from franka_wm.video import write_png, write_video
 
 

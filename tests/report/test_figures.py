@@ -13,14 +13,16 @@ from matplotlib.colors import to_hex
 from PIL import Image
 
 from franka_wm.errors import UserError
+from franka_wm.evaluation.calibration import calibration_bins
+from franka_wm.evaluation.projection import principal_components
 from franka_wm.report import style
 from franka_wm.report.bars import bars_figure
-from franka_wm.report.calibration import calibration_bins, calibration_figure
+from franka_wm.report.calibration import calibration_figure
 from franka_wm.report.curves import panel_figure, seed_bands, seeds_figure
 from franka_wm.report.figure import inline_svg, save_figure
 from franka_wm.report.frames import beside, hide_patches, mask_figure, strip_figure
 from franka_wm.report.horizon import horizon_figure
-from franka_wm.report.spectra import latent_figure, principal_components, spectrum_figure
+from franka_wm.report.spectra import latent_figure, spectrum_figure
 from franka_wm.report.style import DARK, LIGHT, PALETTE, THEMES
 
 

@@ -11,10 +11,10 @@ import pytest
 
 from franka_wm import cli
 from franka_wm.errors import UserError
+from franka_wm.evaluation.results import COMMAND
 from franka_wm.report import document
 from franka_wm.report.compare import compare_page, differences, repetitions, unique_names
 from franka_wm.report.page import page, write_page
-from franka_wm.report.results import COMMAND
 from franka_wm.report.run import csv_rows, read_run
 from franka_wm.versions import versions, write_versions
 from tests.report.conftest import extras, policy

@@ -5,7 +5,7 @@ import json
 import pytest
 
 from franka_wm.errors import UserError
-from franka_wm.report.results import END
+from franka_wm.evaluation.results import END
 from franka_wm.report.seeds import read_evaluation, runs_of, seeds_table, summary
 
 

@@ -14,7 +14,7 @@ from franka_wm.envs import FrankaConfig
 from franka_wm.errors import UserError
 from franka_wm.training import build
 from franka_wm.training.check import check
-from franka_wm.training.entry import Run
+from franka_wm.training.run import Run
 from franka_wm.training.spaces import Spaces
 
 ROOT = Path(__file__).resolve().parents[2]

@@ -11,13 +11,12 @@ from omegaconf import DictConfig
 from tensordict import TensorDictBase
 
 from franka_wm.envs.simulation import Simulation
-from franka_wm.evaluation.protocol import held_out_seeds
-from franka_wm.evaluation.report import evaluate_and_report
+from franka_wm.evaluation.protocol import during_training, evaluate_run, held_out_seeds
 from franka_wm.evaluation.rollouts import ROLLOUT_SEED
 from franka_wm.policies.scripted import NoopPolicy, SmoothRandomPolicy
 from franka_wm.seeding import derive_seed, evaluation_seed
 from franka_wm.training import build
-from franka_wm.training.entry import Run
+from franka_wm.training.run import Run
 
 EPISODES = 12
 
@@ -70,11 +69,9 @@ def meet(a: torch.Tensor, b: torch.Tensor) -> bool:
 
 def test_no_episode_of_the_evaluation_occurs_in_training(run: Run, worlds, trained) -> None:
     watching = Watching()
-    during = run.evaluation_during_training(worlds[1], {"policy": watching})
+    during = during_training(worlds[1], {"policy": watching}, **run.during)
     assert during()
-    evaluate_and_report(
-        run.cfg, run.folder, worlds[1], {"policy": watching}, rows=[], counters={}, say=lambda text: None
-    )
+    evaluate_run(run.cfg, run.folder, worlds[1], {"policy": watching}, counters={}, say=lambda text: None)
     evaluated = torch.cat(watching.starts)
     assert len(evaluated) >= 2 * run.cfg.evaluation.episodes
     assert not meet(evaluated, trained)

@@ -20,9 +20,9 @@ from franka_wm import models
 from franka_wm.errors import UserError
 from franka_wm.training import build
 from franka_wm.training.check import check
-from franka_wm.training.entry import _CLAIMED, Run, claim
 from franka_wm.training.learner import Learner
 from franka_wm.training.load import load_agent
+from franka_wm.training.run import _CLAIMED, Run, claim
 from franka_wm.training.stages import pretrain
 from franka_wm.training.trainer import Trainer
 
@@ -160,7 +160,7 @@ def test_no_world_and_no_data(composed) -> None:
 
 def test_one_run_in_a_folder(tmp_path: Path) -> None:
     """The second process is refused while the first one lives."""
-    code = "import sys; from pathlib import Path; from franka_wm.training.entry import claim; claim(Path(sys.argv[1]))"
+    code = "import sys; from pathlib import Path; from franka_wm.training.run import claim; claim(Path(sys.argv[1]))"
     command = [sys.executable, "-c", code, str(tmp_path)]
     claim(tmp_path)
     refused = subprocess.run(command, capture_output=True, text=True)

@@ -18,8 +18,8 @@ from franka_wm.envs import FrankaEnv
 from franka_wm.errors import UserError
 from franka_wm.training import build, room
 from franka_wm.training.checkpoint import latest_checkpoint, load_checkpoint
-from franka_wm.training.entry import Run
 from franka_wm.training.learner import Learner
+from franka_wm.training.run import Run
 from franka_wm.training.trainer import Trainer
 
 N, CAPACITY = 4, 50

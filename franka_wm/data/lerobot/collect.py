@@ -134,10 +134,10 @@ def open_source(options: dict[str, Any], overrides: list[str]) -> Source:
 def _simple(name: str, options: dict[str, Any], overrides: list[str]) -> Source:
     from omegaconf import OmegaConf
 
+    from franka_wm.commands.entry import with_scale
     from franka_wm.console import announced, say
     from franka_wm.envs import FrankaConfig, FrankaEnv
     from franka_wm.training import build
-    from franka_wm.training.entry import with_scale
 
     cfg = compose(with_scale(overrides), tuple(OPTIONS))
     seed, smoothness = number(cfg, "seed"), number(cfg, "collector.smoothness", float)

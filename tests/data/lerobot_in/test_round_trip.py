@@ -11,7 +11,7 @@ from tensordict import TensorDictBase
 
 from franka_wm.training import build
 from franka_wm.training.check import check
-from franka_wm.training.entry import Run
+from franka_wm.training.run import Run
 
 KEYS = ["pixels", "state", "joint_target", "goal"]
 FLAGS = ["reward", "done", "terminated", "truncated", "success"]

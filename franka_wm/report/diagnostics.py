@@ -6,8 +6,9 @@ import math
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
+from franka_wm.evaluation.protocol import INTERVALS, Evaluation
 from franka_wm.report.style import centimetres, policy_name
-from franka_wm.report.table import Table
+from franka_wm.report.table import Table, evaluation_tables, markdown
 
 if TYPE_CHECKING:
     from rich.table import Table as RichTable
@@ -25,6 +26,18 @@ def terminal(table: Table, title: str | None = None) -> RichTable:
     for row in table.rows:
         rich.add_row(*map(escape, row))
     return rich
+
+
+def evaluation_markdown(found: Evaluation) -> str:
+    """The tables of the policies, and under them how they were measured."""
+    parts = [markdown(table) for table in evaluation_tables(found.policies) if table.rows]
+    count = next(iter(found.policies.values()))["episodes"]
+    seeds = ", ".join(map(str, found.seeds))
+    worlds = f" of {found.worlds} worlds" if found.worlds else ""
+    parts.append(
+        f"{count} episodes per policy, the same for all, on held-out seeds ({seeds}){worlds}.\n{INTERVALS}\n"
+    )
+    return "\n".join(parts)
 
 
 def interval(value: Mapping[str, float], scale: float = 1.0, digits: int = 2) -> str:

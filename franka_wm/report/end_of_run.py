@@ -1,4 +1,4 @@
-"""The end of a run: table, ``evaluation.json``, curves, video."""
+"""What a run shows at its end: table, curves, video."""
 
 from __future__ import annotations
 
@@ -11,59 +11,47 @@ from omegaconf import DictConfig
 
 from franka_wm.envs.camera import project
 from franka_wm.evaluation.closed_loop import arm_of, play_episodes, reaches
-from franka_wm.evaluation.protocol import describe, evaluate_policies, held_out_seeds, protocol
-from franka_wm.evaluation.tables import terminal
+from franka_wm.evaluation.protocol import Evaluation, held_out_seeds
+from franka_wm.evaluation.results import FILE, Result, last_row
 from franka_wm.files import atomic_write
 from franka_wm.report.curves import axis, plot_learning_curves
-from franka_wm.report.results import END, Result, last_row, to_json
+from franka_wm.report.diagnostics import evaluation_markdown, terminal
 from franka_wm.report.table import evaluation_tables
 from franka_wm.seeding import seeded
+from franka_wm.training.build import make_evaluation_env
 from franka_wm.video import draw_marker, tile_frames, write_png, write_video
 
 
-def evaluate_and_report(
+def report_run(
     cfg: DictConfig,
     folder: Path,
     env: Any,
     policies: Mapping[str, Any],
+    found: Evaluation,
     *,
     rows: Sequence[Mapping[str, float]],
-    counters: Mapping[str, float],
-    say: Any = print,
     log: Callable[[Mapping[str, float]], Any] | None = None,
     log_video: Callable[[str, torch.Tensor, int], None] | None = None,
-) -> dict[str, Any]:
-    """Evaluates every policy on the same held-out episodes and writes what a run leaves behind.
+) -> None:
+    """Writes what a run leaves behind for people, and prints the table.
 
-    Writes ``evaluation.json``, ``evaluation.md``, ``curves.png`` and, of the arm, ``video.mp4`` and ``last_frame.png``
-    into ``folder``, and prints the table. Policies may be any; the table shows what there is.
+    Writes ``evaluation.md``, ``curves.png`` and, of the arm, ``video.mp4`` and ``last_frame.png`` into ``folder``.
 
     Args:
         cfg: The run's configuration.
-        folder: Of the run.
-        env: Evaluation worlds; as many episodes.
+        folder: Of the run; :func:`~franka_wm.evaluation.protocol.evaluate_run` has written its results there.
+        env: Evaluation worlds.
         policies: By name.
+        found: What they reached.
         rows: What training logged.
-        counters: ``updates``, ``env_steps``, ``seconds`` of the training.
         log: Called with the numbers of the curves' last point, which are those of the table.
         log_video: Called with name, film and frames per second.
-
-    Returns:
-        The content of ``evaluation.json``.
     """
     from rich.console import Console
 
-    say(f"evaluating over {env.num_envs} held-out episodes …")
-    found = evaluate_policies(env, policies, report=lambda name, r: say(describe(name, r)))
-    results = {
-        "protocol": protocol(cfg, env, found, by=END, counters=counters),
-        "policies": found.policies,
-    }
-    with atomic_write(folder / "evaluation.json") as path:
-        path.write_text(to_json(results))
     with atomic_write(folder / "evaluation.md") as path:
-        path.write_text(found.markdown())
-    last = last_row([Result(path, **results)], cfg.evaluation.during)
+        path.write_text(evaluation_markdown(found))
+    last = last_row([Result(folder / FILE, found.protocol, found.policies)], cfg.evaluation.during)
     drawn = [*rows, last]
     if log is not None and last:
         log({name: value for name, value in last.items() if name.startswith("eval/")})
@@ -77,7 +65,6 @@ def evaluate_and_report(
         if log_video is not None:
             log_video(f"eval/{name}", frames, round(arm.config.fps))
     Console(width=120).print(terminal(evaluation_tables(found.policies)[0]))
-    return results
 
 
 def acting(policies: Mapping[str, Any]) -> str:
@@ -87,8 +74,6 @@ def acting(policies: Mapping[str, Any]) -> str:
 
 def film(cfg: DictConfig, folder: Path, policy: Any) -> torch.Tensor:
     """``video.mp4`` and ``last_frame.png``: episodes of one policy, the goal drawn as a ring."""
-    from franka_wm.training.build import make_evaluation_env
-
     env = make_evaluation_env(cfg, num_envs=cfg.evaluation.video_episodes)
     arm = arm_of(env)
     assert arm is not None

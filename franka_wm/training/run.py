@@ -1,84 +1,36 @@
-"""What surrounds a run: scale by device, one-line errors, folders, loggers, the last line."""
+"""A run: its folder, its configuration, the checkpoint that it goes on from, its loggers and its worlds."""
 
 from __future__ import annotations
 
 import fcntl
-import functools
+import importlib
 import logging
 import re
 import sys
 import tempfile
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, NoReturn
 
+import torch
+from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf
 
 from franka_wm.console import announced, say
+from franka_wm.data.lerobot.export import export_run
+from franka_wm.device import resolve_device
 from franka_wm.errors import FrankaError, UserError
 from franka_wm.seeding import derive_seed, seeded
+from franka_wm.training import build
+from franka_wm.training.check import check
+from franka_wm.training.checkpoint import latest_checkpoint, load_checkpoint
+from franka_wm.training.loggers import close_loggers, log_config, log_video, make_loggers
+from franka_wm.training.spaces import Spaces
+from franka_wm.versions import write_finished, write_versions
 
 INTERRUPTED = 130
 """Exit status after Ctrl-C, as shells expect."""
-
-
-# -- the command line ---------------------------------------------------------------------------------------
-
-
-def run_command(main: Callable[[], Any]) -> None:
-    """Runs a Hydra main: chooses the scale by device, and turns bad input into one line and exit status 1."""
-    import warp as wp
-
-    wp.config.log_level = wp.LOG_WARNING  # its list of compiled modules drowns what a run has to say
-    arguments = sys.argv[1:]
-    asks_hydra = any(a.startswith("-") and a not in ("-m", "--multirun") for a in arguments)
-    if not asks_hydra:
-        sys.argv[1:] = arguments = with_scale(arguments)
-        problem = check_command(arguments)
-        if problem is not None:
-            fail(problem)
-    main()
-
-
-def one_line_errors(main: Callable[[DictConfig], Any]) -> Callable[[DictConfig], Any]:
-    """Inside Hydra's own wrapper, which would print a traceback for what is the user's to mend."""
-
-    @functools.wraps(main)
-    def wrapped(cfg: DictConfig) -> Any:
-        try:
-            return main(cfg)
-        except FrankaError as error:
-            fail(str(error))
-        except KeyboardInterrupt:
-            print(
-                "stopped; what was saved is in the run's folder: python train.py resume=FOLDER",
-                file=sys.stderr,
-            )
-            sys.exit(INTERRUPTED)
-
-    return wrapped
-
-
-def fail(message: str) -> None:
-    """Says what is wrong and exits with status 1."""
-    print(f"error: {message}", file=sys.stderr, flush=True)
-    sys.exit(1)
-
-
-def with_scale(arguments: list[str]) -> list[str]:
-    """Adds ``scale=gpu`` or ``scale=laptop`` where none, or ``scale=auto``, is given."""
-    given = next((a for a in arguments if a.startswith("scale=")), None)
-    if given not in (None, "scale=auto"):
-        return arguments
-    import torch
-
-    device = next((a.split("=", 1)[1] for a in arguments if a.startswith("device=")), "auto")
-    on_gpu = device.startswith("cuda") or (device == "auto" and torch.cuda.is_available())
-    scale = "gpu" if on_gpu else "laptop"
-    if not any(a.startswith("resume=") for a in arguments):
-        say(f"scale={scale}, by the device; choose with scale=laptop, gpu or smoke")
-    return [a for a in arguments if a != given] + [f"scale={scale}"]
 
 
 def run_name(resume: str | None, env: str, seed: Any) -> str:
@@ -95,50 +47,12 @@ def run_name(resume: str | None, env: str, seed: Any) -> str:
 OmegaConf.register_new_resolver("run_name", run_name, replace=True)  # for conf/config.yaml
 
 
-def check_command(arguments: list[str]) -> str | None:
-    """What is wrong with the overrides or the folder they write to, in one line; ``None`` if nothing is."""
-    from hydra import compose, initialize_config_dir
-    from hydra.core.global_hydra import GlobalHydra
-    from hydra.errors import HydraException
-    from omegaconf.errors import OmegaConfBaseException
-
-    from franka_wm.training.check import check
-
-    if any(a in ("-m", "--multirun") for a in arguments):
-        return None  # sweeps are resolved by Hydra itself
-    folder = str(Path(sys.argv[0]).resolve().parent / "conf")
-    try:
-        with initialize_config_dir(folder, version_base="1.3"):
-            cfg = compose("config", overrides=arguments)
-        import_plugins(cfg)
-        if cfg.resume is None:
-            check(cfg)
-        else:
-            _, cfg = resumed(cfg, arguments)
-            check(cfg)
-    except FrankaError as error:
-        return str(error)
-    except (HydraException, OmegaConfBaseException) as error:
-        lines = [
-            line.strip() for line in str(error).splitlines() if line.strip() and "object_type" not in line
-        ]
-        noise = ("full_key:", "Config search path", "Set the env", "provider=")
-        lines = [line for line in lines if not line.startswith(noise)]
-        return "; ".join(lines) + "; python train.py --help lists every option"
-    finally:
-        GlobalHydra.instance().clear()
-    chosen = next((a.split("=", 1)[1] for a in arguments if a.startswith("hydra.run.dir=")), "outputs")
-    return unwritable(Path(chosen)) or occupied(Path(chosen), cfg.resume)
-
-
 def import_plugins(cfg: DictConfig) -> None:
     """Imports the modules that ``cfg.plugins`` names; they register tasks, models and planners of the user's.
 
     Raises:
         UserError: There is no such module.
     """
-    import importlib
-
     for name in cfg.plugins:
         if str(Path.cwd()) not in sys.path:
             sys.path.insert(0, str(Path.cwd()))  # as for python -m: modules beside the one who starts the run
@@ -171,8 +85,6 @@ def occupied(folder: Path, resume: str | None) -> str | None:
 
     A run that goes on from there may.
     """
-    from franka_wm.training.checkpoint import latest_checkpoint
-
     place = folder.resolve()
     if resume is not None and place in (Path(resume).resolve(), *Path(resume).resolve().parents):
         return None
@@ -184,9 +96,6 @@ def occupied(folder: Path, resume: str | None) -> str | None:
         f"hydra.run.dir={folder}: a run has left its weights there ({found}); go on with it by resume={folder}, or "
         "choose another folder"
     )
-
-
-# -- a run --------------------------------------------------------------------------------------------------
 
 
 @dataclass
@@ -205,8 +114,6 @@ class Run:
 
         A run on recorded data trains in no world; without an environment (``env=none``) none judges it either.
         """
-        from franka_wm.training import build
-
         if self.cfg.env.kind == "none":
             return None, None
         gathers = not build.is_offline(self.cfg)
@@ -227,9 +134,6 @@ class Run:
 
     def build_experience(self, env: Any) -> tuple[Any, Any]:
         """Where batches come from, and what a model must know of it: ``sample()`` and its :class:`Spaces`."""
-        from franka_wm.training import build
-        from franka_wm.training.spaces import Spaces
-
         if not build.is_offline(self.cfg):
             hindsight = build.make_hindsight(self.cfg, env)
             return build.make_replay_buffer(self.cfg, env.device, hindsight), self.as_saved(
@@ -255,20 +159,16 @@ class Run:
     @property
     def device(self) -> Any:
         """Where the run computes."""
-        from franka_wm.device import resolve_device
-
         return resolve_device(self.cfg.device)
 
     def learner_options(self, cfg: DictConfig | None = None) -> dict[str, Any]:
         """Arguments of the learner; ``cfg`` is another than the run's for a first stage."""
         cfg = self.cfg if cfg is None else cfg
         trainer = cfg.trainer
-        from franka_wm.training.build import learning_rate, schedule
-
         names = ("grad_clip", "capture", "compile", "precision")
-        kind, warmup = schedule(cfg)
+        kind, warmup = build.schedule(cfg)
         return {name: trainer[name] for name in names} | {
-            "lr": learning_rate(cfg),
+            "lr": build.learning_rate(cfg),
             "total_updates": trainer.updates,
             "schedule": kind,
             "warmup": warmup,
@@ -276,37 +176,37 @@ class Run:
 
     def log_video(self, name: str, frames: Any, fps: int) -> None:
         """A film (T, H, W, 3) uint8 to every logger that takes films."""
-        from franka_wm.training.loggers import log_video
-
         log_video(self.loggers, name, frames, fps=fps, step=self.cfg.trainer.updates)
 
     def stop(self) -> NoReturn:
         """The last line of a run that was interrupted and has saved; exits with 130."""
-        from franka_wm.training.loggers import close_loggers
-
         close_loggers(self.loggers)
         say(f"stopped; go on with: python train.py resume={self.folder}")
         sys.exit(INTERRUPTED)
 
-    def diagnose(self, model: Any, batch: Any) -> tuple[dict[str, float], str | None]:
-        """Whether latents collapse and values drift: numbers to log, and a warning."""
-        from franka_wm.evaluation.health import training_diagnostics
-        from franka_wm.evaluation.spectrum import collapse_warning
+    def close(self) -> None:
+        """Closes the loggers, and says in the run's folder that it has ended, and what it took."""
+        close_loggers(self.loggers)
+        write_finished(self.folder)
 
-        numbers = training_diagnostics(model, batch)
-        if not numbers:
-            return {}, "the model's latents are no longer finite; lower trainer.lr"
-        return numbers, collapse_warning(numbers)
+    def export(self, experience: Callable[[], Any]) -> None:
+        """What ``export`` in the configuration asks for: the replay's whole episodes as a LeRobot dataset.
 
-    def evaluation_during_training(
-        self, env: Any, policies: Mapping[str, Any]
-    ) -> Callable[[], dict[str, float]]:
-        """A function that plays the policies of ``evaluation.during`` and returns numbers to log."""
-        from franka_wm.evaluation.protocol import numbers_to_log
+        Args:
+            experience: Gives the replay, oldest step first; called only if something is exported.
+        """
+        if self.cfg.export.kind == "none":
+            return
+        export_run(build.plain(self.cfg), experience(), folder=self.folder)
 
-        chosen = {name: policies[name] for name in self.cfg.evaluation.during if name in policies}
-        episodes = self.cfg.evaluation.get("during_episodes")  # checkpoints of earlier versions have none
-        return lambda: numbers_to_log(env, chosen, episodes=episodes)
+    @property
+    def during(self) -> dict[str, Any]:
+        """What is evaluated while training: names of policies, and episodes."""
+        evaluation = self.cfg.evaluation
+        return {
+            "names": list(evaluation.during),
+            "episodes": evaluation.get("during_episodes"),  # checkpoints of earlier versions have none
+        }
 
 
 def start(cfg: DictConfig) -> Run:
@@ -315,13 +215,6 @@ def start(cfg: DictConfig) -> Run:
     Raises:
         UserError: One line, before anything is built or written.
     """
-    import torch
-    from hydra.core.hydra_config import HydraConfig
-
-    from franka_wm.device import resolve_device
-    from franka_wm.training.check import check
-    from franka_wm.versions import write_versions
-
     folder = Path(HydraConfig.get().runtime.output_dir)
     checkpoint = None
     import_plugins(cfg)  # those of the command line: what a checkpoint names is never imported
@@ -369,8 +262,6 @@ def resumed(cfg: DictConfig, overrides: list[str]) -> tuple[Any, DictConfig]:
     Raises:
         UserError: The command line asks for another group than the checkpoint was made with.
     """
-    from franka_wm.training.checkpoint import latest_checkpoint, load_checkpoint
-
     checkpoint = load_checkpoint(latest_checkpoint(str(cfg.resume)))
     saved = checkpoint.config
     if "whole_run" in saved:  # the checkpoint is a first stage's
@@ -393,36 +284,7 @@ def resumed(cfg: DictConfig, overrides: list[str]) -> tuple[Any, DictConfig]:
 
 def open_loggers(cfg: DictConfig, folder: Path) -> list[Any]:
     """The loggers that ``cfg.logger`` names; each is told the configuration."""
-    from franka_wm.training.build import plain
-    from franka_wm.training.loggers import log_config, make_loggers
-
-    options = plain(cfg.logger)
+    options = build.plain(cfg.logger)
     loggers = make_loggers(options.pop("names"), folder, **options)
-    log_config(loggers, plain(cfg))
+    log_config(loggers, build.plain(cfg))
     return loggers
-
-
-def export_experience(run: Run, trainer: Any) -> None:
-    """What ``export`` in the configuration asks for: the replay's whole episodes as a LeRobot dataset."""
-    if run.cfg.export.kind == "none":
-        return
-    from franka_wm.data.lerobot.export import export_run
-    from franka_wm.training.build import plain
-
-    export_run(plain(run.cfg), trainer.experience(), folder=run.folder)
-
-
-def finish(run: Run, trainer: Any) -> None:
-    """Closes the loggers, writes the run's page, exports, says the last line; exits with 130 after Ctrl-C."""
-    from franka_wm.training.loggers import close_loggers
-    from franka_wm.versions import write_finished
-
-    if trainer.interrupted:
-        run.stop()
-    close_loggers(run.loggers)
-    write_finished(run.folder)
-    from franka_wm.report.page import write_page
-
-    say(f"page:    {write_page(run.folder)}")
-    export_experience(run, trainer)
-    say(f"results: {run.folder}")

@@ -1,0 +1,104 @@
+"""The command line of ``train.py``: the scale by the device, overrides checked early, errors in one line."""
+
+from __future__ import annotations
+
+import functools
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import warp as wp
+from omegaconf import DictConfig
+
+from franka_wm.console import say
+from franka_wm.errors import FrankaError
+from franka_wm.training.check import check
+from franka_wm.training.run import INTERRUPTED, import_plugins, occupied, resumed, unwritable
+
+
+def run_command(main: Callable[[], Any]) -> None:
+    """Runs a Hydra main: chooses the scale by device, and turns bad input into one line and exit status 1."""
+    wp.config.log_level = wp.LOG_WARNING  # its list of compiled modules drowns what a run has to say
+    arguments = sys.argv[1:]
+    asks_hydra = any(a.startswith("-") and a not in ("-m", "--multirun") for a in arguments)
+    if not asks_hydra:
+        sys.argv[1:] = arguments = with_scale(arguments)
+        problem = check_command(arguments)
+        if problem is not None:
+            fail(problem)
+    main()
+
+
+def one_line_errors(main: Callable[[DictConfig], Any]) -> Callable[[DictConfig], Any]:
+    """Inside Hydra's own wrapper, which would print a traceback for what is the user's to mend."""
+
+    @functools.wraps(main)
+    def wrapped(cfg: DictConfig) -> Any:
+        try:
+            return main(cfg)
+        except FrankaError as error:
+            fail(str(error))
+        except KeyboardInterrupt:
+            print(
+                "stopped; what was saved is in the run's folder: python train.py resume=FOLDER",
+                file=sys.stderr,
+            )
+            sys.exit(INTERRUPTED)
+
+    return wrapped
+
+
+def fail(message: str) -> None:
+    """Says what is wrong and exits with status 1."""
+    print(f"error: {message}", file=sys.stderr, flush=True)
+    sys.exit(1)
+
+
+def with_scale(arguments: list[str]) -> list[str]:
+    """Adds ``scale=gpu`` or ``scale=laptop`` where none, or ``scale=auto``, is given."""
+    given = next((a for a in arguments if a.startswith("scale=")), None)
+    if given not in (None, "scale=auto"):
+        return arguments
+    import torch
+
+    device = next((a.split("=", 1)[1] for a in arguments if a.startswith("device=")), "auto")
+    on_gpu = device.startswith("cuda") or (device == "auto" and torch.cuda.is_available())
+    scale = "gpu" if on_gpu else "laptop"
+    if not any(a.startswith("resume=") for a in arguments):
+        say(f"scale={scale}, by the device; choose with scale=laptop, gpu or smoke")
+    return [a for a in arguments if a != given] + [f"scale={scale}"]
+
+
+def check_command(arguments: list[str]) -> str | None:
+    """What is wrong with the overrides or the folder they write to, in one line; ``None`` if nothing is."""
+    from hydra import compose, initialize_config_dir
+    from hydra.core.global_hydra import GlobalHydra
+    from hydra.errors import HydraException
+    from omegaconf.errors import OmegaConfBaseException
+
+    if any(a in ("-m", "--multirun") for a in arguments):
+        return None  # sweeps are resolved by Hydra itself
+    folder = str(Path(sys.argv[0]).resolve().parent / "conf")
+    try:
+        with initialize_config_dir(folder, version_base="1.3"):
+            cfg = compose("config", overrides=arguments)
+        import_plugins(cfg)
+        if cfg.resume is None:
+            check(cfg)
+        else:
+            _, cfg = resumed(cfg, arguments)
+            check(cfg)
+    except FrankaError as error:
+        return str(error)
+    except (HydraException, OmegaConfBaseException) as error:
+        lines = [
+            line.strip() for line in str(error).splitlines() if line.strip() and "object_type" not in line
+        ]
+        noise = ("full_key:", "Config search path", "Set the env", "provider=")
+        lines = [line for line in lines if not line.startswith(noise)]
+        return "; ".join(lines) + "; python train.py --help lists every option"
+    finally:
+        GlobalHydra.instance().clear()
+    chosen = next((a.split("=", 1)[1] for a in arguments if a.startswith("hydra.run.dir=")), "outputs")
+    return unwritable(Path(chosen)) or occupied(Path(chosen), cfg.resume)
