@@ -83,7 +83,7 @@ install_uv() {
 # One line per download of 100 MiB and more; every package is in the log.
 with_uv() {
   "$venv/bin/uv" --no-progress pip install --python "$venv/bin/python" "$@" 2>&1 | tee -a "$log" |
-    awk '/^ *Downloading .*\((.*GiB|[0-9]{3,}[.0-9]*MiB)\)/ || /^(Prepared|Installed) / { print "  " $0; fflush() }'
+    awk '/^ *Downloading .*\((.*GiB|[0-9][0-9][0-9][.0-9]*MiB)\)/ || /^(Prepared|Installed) / { print "  " $0; fflush() }'
 }
 
 with_pip() {
