@@ -12,12 +12,13 @@ SHELL := /bin/bash
 ARGS ?=
 PYTHON ?=
 ROW ?=
+REPOSITORY ?=
 VENV := .venv
 STAMP := $(VENV)/.installed
 DEV := $(VENV)/.installed-dev
 BIN := $(VENV)/bin
 
-.PHONY: help setup train test test-slow results mutation lint format lock clean
+.PHONY: help setup train test test-slow results mutation lint format lock wheel audit clean
 
 help: ## show the targets
 	@grep -hE '^[a-z-]+:.*## ' $(firstword $(MAKEFILE_LIST)) | sed -E 's/:[^#]*## /\t/' | \
@@ -78,6 +79,17 @@ lock: $(DEV) ## write the requirements*.lock files anew from pyproject.toml
 	@$(COMPILE) --extra view -o requirements.lock
 	@$(COMPILE) --extra dev -c requirements.lock -o requirements-dev.lock
 	@if grep -n '://' requirements*.lock; then echo 'the locks hold addresses (above)' >&2; exit 1; fi
+
+# With the repository's address, README's pictures and links work on a package index: setup.py says how.
+wheel: $(DEV) ## build dist/*.whl; REPOSITORY=https://… for a package index
+	@rm -rf build # of an earlier wheel: files that are gone would come back
+	@REPOSITORY="$(REPOSITORY)" $(BIN)/python -m build --wheel --no-isolation --outdir dist .
+
+# Its tool is not locked; nothing else needs it. Needs the network, and the answer changes from day to day.
+audit: $(DEV) ## known vulnerabilities of the locked packages, and sbom.json (CycloneDX)
+	@$(BIN)/python -m pip install --quiet --disable-pip-version-check pip-audit==2.10.1
+	@$(BIN)/pip-audit --strict --disable-pip --require-hashes -r requirements-dev.lock
+	@$(BIN)/pip-audit --strict --disable-pip --require-hashes -r requirements.lock -f cyclonedx-json -o sbom.json
 
 clean: ## remove .venv and what tools left behind; outputs/ and datasets/ stay
 	rm -rf $(VENV) build dist *.egg-info .pytest_cache .ruff_cache .hypothesis

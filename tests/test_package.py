@@ -1,12 +1,15 @@
 """The package as a whole: what importing it costs, and what its files promise."""
 
 import re
+import runpy
 import subprocess
 import sys
 import tomllib
+from importlib.metadata import version
 from pathlib import Path
 
 import pytest
+import yaml
 
 import franka_wm
 from franka_wm.errors import FrankaError, UserError
@@ -29,9 +32,48 @@ def test_report_does_not_load_what_it_may_not_need() -> None:
     assert done.stdout.strip() == "[]"
 
 
-def test_version_is_the_one_in_pyproject() -> None:
-    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
-    assert project["version"] == franka_wm.__version__
+def test_version_is_written_once_and_cited() -> None:
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())
+    assert "version" in project["project"]["dynamic"]
+    assert project["tool"]["setuptools"]["dynamic"]["version"] == {"attr": "franka_wm.version.__version__"}
+    assert version("franka-wm") == franka_wm.__version__
+    assert yaml.safe_load((ROOT / "CITATION.cff").read_text())["version"] == franka_wm.__version__
+    assert f"\n## {franka_wm.__version__}" in (ROOT / "CHANGELOG.md").read_text()
+
+
+def test_readme_on_an_index_has_whole_addresses_or_none() -> None:
+    shown = runpy.run_path(str(ROOT / "setup.py"), run_name="metadata")
+    text = (ROOT / "README.md").read_text()
+    images = re.findall(r"!\[[^\]]*\]\((docs/images/[a-z]+\.png)\)", text)
+    assert images
+
+    hosted = shown["readme"](text, "https://example.org/us/it")
+    links = re.findall(r"\]\(([^)]+)\)", hosted)
+    assert all(link.startswith(("https://", "#")) for link in links)
+    assert f"(https://example.org/us/it/raw/HEAD/{images[0]})" in hosted
+    assert "[docs/tasks.md](https://example.org/us/it/blob/HEAD/docs/tasks.md)" in shown["readme"](
+        "[docs/tasks.md](docs/tasks.md)", "https://example.org/us/it"
+    )
+    assert all(
+        url.startswith("https://example.org/us/it")
+        for url in shown["addresses"]("https://example.org/us/it").values()
+    )
+
+    unknown = shown["readme"](text, "")
+    assert "docs/images" not in unknown
+    assert all(link.startswith(("https://", "#")) for link in re.findall(r"\]\(([^)]+)\)", unknown))
+    assert shown["addresses"]("") == {}
+
+
+def test_workflow_runs_what_ci_runs_with_pinned_actions() -> None:
+    workflow = yaml.safe_load((ROOT / ".github/workflows/ci.yml").read_text())
+    steps = [step for job in workflow["jobs"].values() for step in job["steps"]]
+    assert {"run": ".ci/run"} in steps
+    actions = [step["uses"] for step in steps if "uses" in step]
+    assert actions and all(re.fullmatch(r"actions/[a-z-]+@[0-9a-f]{40}", action) for action in actions)
+    targets = set(re.findall(r"^([a-z-]+):", (ROOT / "Makefile").read_text(), re.MULTILINE))
+    commands = (ROOT / ".ci/run").read_text() + (ROOT / "CONTRIBUTING.md").read_text()
+    assert set(re.findall(r"^make ([a-z-]+)", commands, re.MULTILINE)) <= targets
 
 
 def locked(name: str) -> dict[str, str]:
