@@ -18,7 +18,7 @@ STAMP := $(VENV)/.installed
 DEV := $(VENV)/.installed-dev
 BIN := $(VENV)/bin
 
-.PHONY: help setup train test test-slow results mutation lint format lock wheel audit clean
+.PHONY: help setup train test test-slow results mutation lint format lock docs wheel audit clean
 
 help: ## show the targets
 	@grep -hE '^[a-z-]+:.*## ' $(firstword $(MAKEFILE_LIST)) | sed -E 's/:[^#]*## /\t/' | \
@@ -79,6 +79,11 @@ lock: $(DEV) ## write the requirements*.lock files anew from pyproject.toml
 	@$(COMPILE) --extra view -o requirements.lock
 	@$(COMPILE) --extra dev -c requirements.lock -o requirements-dev.lock
 	@if grep -n '://' requirements*.lock; then echo 'the locks hold addresses (above)' >&2; exit 1; fi
+
+# Warnings are errors: a link that leads nowhere, a page that no one can reach. The variable silences an advertisement.
+docs: $(DEV) ## the documentation as a site, in site/
+	@NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --quiet
+	@echo "open site/index.html"
 
 # With the repository's address, README's pictures and links work on a package index: setup.py says how.
 wheel: $(DEV) ## build dist/*.whl; REPOSITORY=https://… for a package index

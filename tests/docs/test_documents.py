@@ -1,0 +1,162 @@
+"""What the documents promise: links lead somewhere, code blocks run, commands compose."""
+
+import ast
+import importlib
+import re
+import shlex
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from hydra.core.override_parser.overrides_parser import OverridesParser
+
+ROOT = Path(__file__).resolve().parents[2]
+GROUPS = ("*.md", "docs/*.md", "docs/models/*.md", "docs/reference/*.md", ".github/*.md")
+DOCUMENTS = sorted(file for pattern in GROUPS for file in ROOT.glob(pattern))
+NAMES = [file.relative_to(ROOT).as_posix() for file in DOCUMENTS]
+
+FENCE = re.compile(r"^```(\w*)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
+LINK = re.compile(r"(?<!`)\[[^\]]*\]\(([^)\s]+)\)")
+
+
+def blocks(name: str, language: str) -> list[str]:
+    """The code blocks of one language in a document."""
+    return [code for found, code in FENCE.findall((ROOT / name).read_text()) if found == language]
+
+
+# -- links ------------------------------------------------------------------------------------------------
+
+
+def anchors(document: Path) -> set[str]:
+    """The fragments that a Markdown file's headings answer to, as GitHub makes them."""
+    text = FENCE.sub("", document.read_text())
+    headings = re.findall(r"^#{1,6} (.+?)#*$", text, re.MULTILINE)
+    plain = [re.sub(r"\[([^\]]*)\]\([^)]*\)", r"\1", heading).strip().lower() for heading in headings]
+    return {re.sub(r"[^\w\- ]", "", heading).replace(" ", "-") for heading in plain}
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_links_lead_somewhere(name: str) -> None:
+    document = ROOT / name
+    targets = [t for t in LINK.findall(FENCE.sub("", document.read_text())) if not re.match(r"\w+:", t)]
+    lost = []
+    for target in targets:
+        path, _, fragment = target.partition("#")
+        file = (document.parent / path).resolve() if path else document
+        if not file.exists() or (fragment and file.suffix == ".md" and fragment not in anchors(file)):
+            lost.append(target)
+    assert lost == []
+
+
+def test_every_page_is_in_the_navigation() -> None:
+    navigation = (ROOT / "mkdocs.yml").read_text().partition("\nnav:")[2].partition("\nexclude_docs")[0]
+    pages = {file.relative_to(ROOT / "docs").as_posix() for file in (ROOT / "docs").rglob("*.md")}
+    assert {page for page in pages if page not in navigation} == set()
+
+
+# -- Python -----------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", [name for name in NAMES if blocks(name, "python")])
+def test_python_blocks_name_what_exists(name: str) -> None:
+    for code in blocks(name, "python"):
+        for node in ast.walk(ast.parse(code)):
+            if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("franka_wm"):
+                module = importlib.import_module(node.module or "")
+                missing = [alias.name for alias in node.names if not hasattr(module, alias.name)]
+                missing = [m for m in missing if not importlib.util.find_spec(f"{node.module}.{m}")]
+                assert missing == [], node.module
+
+
+def test_readme_collects(capsys: pytest.CaptureFixture[str]) -> None:
+    """Two worlds in place of 1,024; otherwise as it stands there."""
+    (code,) = blocks("README.md", "python")
+    assert code.count("1024") >= 3
+    exec(compile(code.replace("1024", "2"), "README.md", "exec"), {})
+    lines = capsys.readouterr().out.strip().splitlines()
+    assert len(lines) == 10 and all("torch.Size([2, 16, 64, 64, 3])" in line for line in lines)
+
+
+def test_models_page_makes_a_model() -> None:
+    (code,) = blocks("docs/models.md", "python")
+    scope: dict[str, Any] = {}
+    exec(compile(code.partition("model = models.load")[0], "docs/models.md", "exec"), scope)
+    z = scope["model"].encode({"state": torch.zeros(2, 20)})
+    assert scope["model"].next(z, torch.zeros(2, 7)).shape == z.shape
+
+
+def test_planning_page_plans() -> None:
+    class Integrator:
+        def next(self, z: torch.Tensor, action: torch.Tensor) -> torch.Tensor:
+            return z + action
+
+    (code,) = blocks("docs/planning.md", "python")
+    scope = {"model": Integrator(), "z": torch.zeros(2, 7), "goal": torch.full((2, 7), 0.5)}
+    scope |= {"last": None, "starts": None}
+    exec(compile(code, "docs/planning.md", "exec"), scope)
+    assert (scope["plan"]["action"].mean(-1) > 0.05).all()
+
+
+def test_reports_page_draws(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    (code,) = blocks("docs/reports.md", "python")
+    exec(compile(code, "docs/reports.md", "exec"), {})
+    assert {file.name for file in tmp_path.iterdir()} == {"horizon.pdf", "horizon-dark.png"}
+
+
+# -- commands ---------------------------------------------------------------------------------------------
+
+
+def commands(program: str) -> Iterator[tuple[str, list[str]]]:
+    """(document, arguments) of every documented call of ``program``, comments and continuations resolved."""
+    for name in NAMES:
+        for code in blocks(name, "bash"):
+            for line in code.replace("\\\n", " ").splitlines():
+                if line.startswith(program + " "):
+                    yield name, shlex.split(line, comments=True)[len(program.split()) :]
+
+
+TRAIN = [*commands("python train.py"), *commands("franka-wm train")]
+VERBS = list(commands("franka-wm"))
+
+
+def choices(overrides: list[str]) -> Iterator[list[str]]:
+    """What a sweep would run: every value of a list ``a=1,2``, the other lists at their first."""
+    parsed = OverridesParser.create().parse_overrides(overrides)
+    values = [
+        [f"{o.input_line.partition('=')[0]}={v}" for v in o.sweep_string_iterator()]
+        if o.is_sweep_override()
+        else [o.input_line]
+        for o in parsed
+    ]
+    first = [options[0] for options in values]
+    yield first
+    for k, options in enumerate(values):
+        for option in options[1:]:
+            yield [*first[:k], option, *first[k + 1 :]]
+
+
+@pytest.mark.parametrize(("name", "arguments"), TRAIN, ids=[f"{n}: {' '.join(a)}" for n, a in TRAIN])
+def test_documented_training_composes(
+    name: str, arguments: list[str], composed: Callable[..., Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(ROOT)
+    flags = [a for a in arguments if a.startswith("-")]
+    assert set(flags) <= {"--multirun", "-m", "--help"}
+    for overrides in choices([a for a in arguments if not a.startswith("-")]):
+        assert "env" in composed(*overrides)
+
+
+def test_documented_verbs_exist() -> None:
+    from franka_wm.cli import VERBS as known
+
+    assert len(VERBS) > 20
+    assert {f"{name}: {a[0]}" for name, a in VERBS if a[0] not in known and not a[0].startswith("-")} == set()
+
+
+def test_documented_make_targets_exist() -> None:
+    targets = set(re.findall(r"^([a-z-]+):", (ROOT / "Makefile").read_text(), re.MULTILINE))
+    named = {(name, a[0]) for name, a in commands("make") if a and "=" not in a[0]}
+    assert named and {(name, target) for name, target in named if target not in targets} == set()
