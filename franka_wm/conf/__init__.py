@@ -1,0 +1,54 @@
+"""The configuration: ``config.yaml``, a folder for each group, and what their ``${…}`` call.
+
+Importing this registers the resolvers, which any Hydra command that composes these files needs.
+"""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from typing import Any
+
+from omegaconf import DictConfig, OmegaConf
+
+from franka_wm.errors import UserError
+
+FOLDER = Path(__file__).resolve().parent
+"""Where the files are, in a checkout as in an installed package."""
+
+SCALES = ("smoke", "laptop", "gpu")
+"""The columns of ``${at_scale:…}`` and ``${at_size:…}``."""
+
+
+def _column(option: str, chosen: Any, values: tuple[Any, ...]) -> Any:
+    if chosen not in SCALES:
+        raise UserError(
+            f"{option}={chosen}: must be one of {', '.join(SCALES)}; a scale of your own begins with "
+            "`defaults: [laptop, _self_]`, or one of the others"
+        )
+    return dict(zip(SCALES, values, strict=True))[chosen]
+
+
+def at_scale(*values: Any, _root_: DictConfig) -> Any:
+    """``${at_scale:1,2,3}``: 1 with ``scale=smoke``, 2 with ``laptop``, 3 with ``gpu``."""
+    return _column("scale", _root_.scale, values)
+
+
+def at_size(*values: Any, _root_: DictConfig) -> Any:
+    """The same by ``size``, which is the scale's unless it is given."""
+    return _column("size", _root_.size, values)
+
+
+def run_name(resume: str | None, env: str, seed: Any) -> str:
+    """What a run's folder is called, after its time: as the run that it goes on from, else by environment and seed."""
+    parts = Path(resume or "").parts
+    if parts and parts[-1] == "checkpoints":
+        parts = parts[:-1]
+    elif len(parts) > 1 and parts[-2] == "checkpoints":
+        parts = parts[:-2]
+    name = re.sub(r"^\d\d-\d\d-\d\d-", "", parts[-1]) if parts else ""
+    return name.strip("/. ") or f"{env}-{seed}"
+
+
+for resolver in (at_scale, at_size, run_name):
+    OmegaConf.register_new_resolver(resolver.__name__, resolver, replace=True)
