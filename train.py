@@ -13,7 +13,7 @@ from omegaconf import DictConfig
 from franka_wm.commands.entry import one_line_errors, run_command
 
 
-@hydra.main(version_base="1.3", config_path="conf", config_name="config")
+@hydra.main(version_base="1.3", config_path="franka_wm/conf", config_name="config")
 @one_line_errors
 def main(cfg: DictConfig) -> None:
     """One run: build, train, evaluate, report."""

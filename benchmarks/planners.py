@@ -1,6 +1,6 @@
 """Planning time: encode, plan, act, with rewards and a terminal value, by every planner of continuous actions.
 
-    python benchmarks/planners.py                          each with the numbers of its file in conf/planner
+    python benchmarks/planners.py                          each with its numbers at scale=gpu
     python benchmarks/planners.py --planners mppi cem --sizes laptop --envs 1 16
     python benchmarks/planners.py --sizes lewm --planners cem           to a goal picture
 
@@ -12,7 +12,6 @@ from __future__ import annotations
 
 import argparse
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 import torch
@@ -21,6 +20,7 @@ from omegaconf import OmegaConf
 from tensordict import TensorDict
 
 from franka_wm import models
+from franka_wm.conf import compose
 from franka_wm.device import resolve_device
 from franka_wm.planning import CEM, ICEM, MPPI, GoalImage, GradientPlanner
 from franka_wm.policies import PlannerPolicy
@@ -34,9 +34,9 @@ SIZES = {  # latent, encoder, hidden
 
 
 def make_planner(name: str) -> Any:
-    """The planner as `planner=NAME` sets it up."""
-    file = Path(__file__).resolve().parents[1] / "conf" / "planner" / f"{name}.yaml"
-    settings = dict(OmegaConf.to_container(OmegaConf.load(file)))  # type: ignore[arg-type]
+    """The planner as `planner=NAME scale=gpu` sets it up."""
+    cfg = compose(f"planner={name}", "scale=gpu")
+    settings = dict(OmegaConf.to_container(cfg.planner, resolve=True))  # type: ignore[arg-type]
     for key in ("name", "precision", "compile"):
         settings.pop(key)
     return PLANNERS[name](action_dim=7, **settings)

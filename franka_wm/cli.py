@@ -20,7 +20,7 @@ from franka_wm.version import __version__
 
 # verb -> (module:function, arguments, what it does in one line)
 VERBS: dict[str, tuple[str, str, str]] = {
-    "list": ("franka_wm.cli:show_list", "", "environments, robots, tasks, models and planners"),
+    "list": ("franka_wm.cli:show_list", "", "environments, robots, tasks, models, planners and experiments"),
     "evaluate": (
         "franka_wm.evaluation.evaluate:main",
         "checkpoint=… [key=value …]",
@@ -71,7 +71,7 @@ ROBOTS = {
 
 PACKAGE = Path(__file__).parent
 CHECKOUT = PACKAGE.parent
-"""Top of the repository, where ``conf`` and ``benchmarks`` are, if the package runs from one."""
+"""Top of the repository, where ``benchmarks`` is, if the package runs from one."""
 
 USAGE, INTERRUPTED = 2, 130
 
@@ -134,26 +134,23 @@ def show_list(arguments: list[str]) -> None:
     """Prints one line for each thing that can be named in a configuration."""
     if arguments and arguments[0] not in ("--help", "-h"):
         raise UserError(f"list takes no arguments, got {arguments[0]!r}")
-    from franka_wm.models import available
-
     sections = {
         "environments (env=)": options("env"),
         "robots (env.robot=)": ROBOTS | options("env/robot"),
         "tasks (env.task=)": tasks(),
-        "models (model=)": options("model") or available(),
+        "models (model=)": options("model"),
         "planners (planner=)": options("planner"),
+        "experiments (experiment=)": options("experiment"),
     }
     for title, entries in sections.items():
         print(title)
         for name, line in entries.items():
             print(f"  {name:24s} {line}".rstrip())
-        if not entries:
-            print("  in conf/ of a checkout of the repository, which this installation is not")
 
 
 def options(group: str) -> dict[str, str]:
     """The options of a configuration group: file name → its first comment line."""
-    return {file.stem: _first_comment(file) for file in sorted((CHECKOUT / "conf" / group).glob("*.yaml"))}
+    return {file.stem: _first_comment(file) for file in sorted((PACKAGE / "conf" / group).glob("*.yaml"))}
 
 
 def _first_comment(file: Path) -> str:

@@ -11,6 +11,7 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parents[1]
 PARTS = ("franka_wm", "benchmarks", "train.py")
 SHOWS = (
+    "franka_wm/conf/",  # compared by value
     "franka_wm/report/",
     "franka_wm/live/",
     "franka_wm/source.py",

@@ -9,10 +9,9 @@ from typing import Any
 import pytest
 import torch
 import warp as wp
-from hydra import compose, initialize_config_dir
-from hydra.core.global_hydra import GlobalHydra
 from omegaconf import DictConfig
 
+from franka_wm import conf
 from franka_wm.envs import FrankaConfig, FrankaEnv
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -42,13 +41,7 @@ def small_env() -> Callable[..., FrankaEnv]:
 @pytest.fixture(scope="session")
 def composed() -> Callable[..., DictConfig]:
     """The configuration that ``python train.py …`` would run with."""
-
-    def make(*overrides: str) -> DictConfig:
-        GlobalHydra.instance().clear()
-        with initialize_config_dir(str(ROOT / "conf"), version_base="1.3"):
-            return compose("config", overrides=list(overrides))
-
-    return make
+    return conf.compose
 
 
 @pytest.fixture(scope="session")

@@ -17,10 +17,11 @@ from hydra.core.global_hydra import GlobalHydra
 from omegaconf import OmegaConf
 
 from franka_wm.commands.entry import check_command, with_scale
+from franka_wm.conf import run_name
 from franka_wm.errors import FrankaError
 from franka_wm.report.run import read_run
 from franka_wm.training.checkpoint import latest_checkpoint, load_checkpoint
-from franka_wm.training.run import occupied, run_name
+from franka_wm.training.run import occupied
 
 TRAIN = Path(__file__).resolve().parents[1] / "train.py"
 LENGTH = 20

@@ -11,7 +11,7 @@ from benchmarks.results.records import check_arguments
 from benchmarks.results.rows import Row
 from franka_wm.errors import FrankaError
 from franka_wm.report.run import SAME_BUT
-from franka_wm.source import ROOT, differing
+from franka_wm.source import differing
 
 Record = Mapping[str, Any]
 
@@ -71,22 +71,17 @@ def stale(records: Sequence[Record]) -> list[str]:
 @cache
 def composed(typed: tuple[str, ...]) -> dict[str, Any] | str:
     """The configuration of a command, as it is now, without what repetitions differ in; or why there is none."""
-    from hydra import compose, initialize_config_dir
-    from hydra.core.global_hydra import GlobalHydra
     from hydra.errors import HydraException
     from omegaconf import OmegaConf
     from omegaconf.errors import OmegaConfBaseException
 
-    import franka_wm.training.run  # noqa: F401  # registers what conf/config.yaml resolves
+    from franka_wm import conf
 
     try:
-        with initialize_config_dir(str(ROOT / "conf"), version_base="1.3"):
-            cfg = compose("config", overrides=list(typed))
+        cfg = conf.compose(*typed)
         found = OmegaConf.to_container(cfg, resolve=True)
     except (HydraException, OmegaConfBaseException) as error:
         return str(error).splitlines()[0]
-    finally:
-        GlobalHydra.instance().clear()
     assert isinstance(found, dict)
     return {str(name): value for name, value in found.items() if name not in SAME_BUT}
 

@@ -11,6 +11,7 @@ from typing import Any
 import warp as wp
 from omegaconf import DictConfig
 
+from franka_wm import conf
 from franka_wm.console import say
 from franka_wm.errors import FrankaError
 from franka_wm.training.check import check
@@ -72,17 +73,13 @@ def with_scale(arguments: list[str]) -> list[str]:
 
 def check_command(arguments: list[str]) -> str | None:
     """What is wrong with the overrides or the folder they write to, in one line; ``None`` if nothing is."""
-    from hydra import compose, initialize_config_dir
-    from hydra.core.global_hydra import GlobalHydra
     from hydra.errors import HydraException
     from omegaconf.errors import OmegaConfBaseException
 
     if any(a in ("-m", "--multirun") for a in arguments):
         return None  # sweeps are resolved by Hydra itself
-    folder = str(Path(sys.argv[0]).resolve().parent / "conf")
     try:
-        with initialize_config_dir(folder, version_base="1.3"):
-            cfg = compose("config", overrides=arguments)
+        cfg = conf.compose(*arguments)
         import_plugins(cfg)
         if cfg.resume is None:
             check(cfg)
@@ -98,7 +95,5 @@ def check_command(arguments: list[str]) -> str | None:
         noise = ("full_key:", "Config search path", "Set the env", "provider=")
         lines = [line for line in lines if not line.startswith(noise)]
         return "; ".join(lines) + "; python train.py --help lists every option"
-    finally:
-        GlobalHydra.instance().clear()
     chosen = next((a.split("=", 1)[1] for a in arguments if a.startswith("hydra.run.dir=")), "outputs")
     return unwritable(Path(chosen)) or occupied(Path(chosen), cfg.resume)

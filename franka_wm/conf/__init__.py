@@ -1,6 +1,7 @@
 """The configuration: ``config.yaml``, a folder for each group, and what their ``${…}`` call.
 
-Importing this registers the resolvers, which any Hydra command that composes these files needs.
+Importing this registers the resolvers, which any Hydra command that composes these files needs. The folder ``conf`` at
+the top of a checkout is this one.
 """
 
 from __future__ import annotations
@@ -14,10 +15,26 @@ from omegaconf import DictConfig, OmegaConf
 from franka_wm.errors import UserError
 
 FOLDER = Path(__file__).resolve().parent
-"""Where the files are, in a checkout as in an installed package."""
 
 SCALES = ("smoke", "laptop", "gpu")
 """The columns of ``${at_scale:…}`` and ``${at_size:…}``."""
+
+
+def compose(*overrides: str) -> DictConfig:
+    """The configuration that ``python train.py OVERRIDE …`` runs with.
+
+    Raises:
+        HydraException, OmegaConfBaseException: An override that cannot be.
+    """
+    import hydra
+    from hydra.core.global_hydra import GlobalHydra
+
+    GlobalHydra.instance().clear()
+    try:
+        with hydra.initialize_config_dir(str(FOLDER), version_base="1.3"):
+            return hydra.compose("config", overrides=list(overrides))
+    finally:
+        GlobalHydra.instance().clear()
 
 
 def _column(option: str, chosen: Any, values: tuple[Any, ...]) -> Any:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import fcntl
 import importlib
 import logging
-import re
 import sys
 import tempfile
 from collections.abc import Callable
@@ -31,20 +30,6 @@ from franka_wm.versions import write_finished, write_versions
 
 INTERRUPTED = 130
 """Exit status after Ctrl-C, as shells expect."""
-
-
-def run_name(resume: str | None, env: str, seed: Any) -> str:
-    """What a run's folder is called, after its time: as the run that it goes on from, else by environment and seed."""
-    parts = Path(resume or "").parts
-    if parts and parts[-1] == "checkpoints":
-        parts = parts[:-1]
-    elif len(parts) > 1 and parts[-2] == "checkpoints":
-        parts = parts[:-2]
-    name = re.sub(r"^\d\d-\d\d-\d\d-", "", parts[-1]) if parts else ""
-    return name.strip("/. ") or f"{env}-{seed}"
-
-
-OmegaConf.register_new_resolver("run_name", run_name, replace=True)  # for conf/config.yaml
 
 
 def import_plugins(cfg: DictConfig) -> None:

@@ -6,7 +6,6 @@ To add a family: a line in CASES, `"name": learned("name", ...)`.
 # pyright: reportArgumentType=false, reportCallIssue=false, reportAttributeAccessIssue=false
 from collections.abc import Callable
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import pytest
@@ -16,6 +15,7 @@ from tensordict import TensorDict
 from torch import nn
 
 from franka_wm import models
+from franka_wm.conf import compose
 from franka_wm.planning import CEM, ICEM, MPPI, GoalDistance, GradientPlanner, RewardPlusValue
 from franka_wm.planning.objectives import bind
 from franka_wm.policies import PlannerPolicy
@@ -153,16 +153,19 @@ def case(request):
     return CASES[request.param]()
 
 
-def planner_settings(root: Path, name: str) -> dict:
-    """What conf/planner says, but for what is the policy's."""
-    settings = dict(OmegaConf.to_container(OmegaConf.load(root / f"conf/planner/{name}.yaml")))
+def planner_settings(name: str) -> dict:
+    """What `planner=NAME` says at the scale of its paper, but for what is the policy's."""
+    scale = "laptop" if name == "icem" else "gpu"
+    settings = dict(
+        OmegaConf.to_container(compose(f"planner={name}", f"scale={scale}").planner, resolve=True)
+    )
     return {key: value for key, value in settings.items() if key not in OF_THE_POLICY}
 
 
 @pytest.fixture(params=PLANNERS)
 def planner(request, case, root):
     """With the numbers of its file in conf/planner."""
-    settings = planner_settings(root, request.param)
+    settings = planner_settings(request.param)
     assert settings.pop("name") == request.param
     return PLANNERS[request.param](action_dim=case.action_dim, **settings)
 
@@ -212,7 +215,7 @@ def test_closed_loop_beats_doing_nothing(name, which, root):
     """The toys are their own worlds: what is executed counts, not what was imagined."""
     torch.manual_seed(0)
     case = CASES[name]()
-    settings = planner_settings(root, which)
+    settings = planner_settings(which)
     settings.pop("name")
     planner = PLANNERS[which](action_dim=case.action_dim, **settings)
     policy = PlannerPolicy.for_model(case.model, planner, objective=case.objective, explore=False)

@@ -6,6 +6,7 @@ import re
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+from franka_wm import conf
 from franka_wm.errors import UserError
 
 
@@ -67,24 +68,13 @@ def compose(overrides: Sequence[str], options: Sequence[str] = ()) -> Any:
     Raises:
         UserError: One line, for an override that Hydra refuses.
     """
-    from hydra import compose, initialize_config_dir
-    from hydra.core.global_hydra import GlobalHydra
     from hydra.errors import HydraException
     from omegaconf.errors import OmegaConfBaseException
 
-    from franka_wm.cli import CHECKOUT
-
-    folder = CHECKOUT / "conf"
-    if not folder.is_dir():
-        raise UserError("conf/ is in a checkout of the repository, which this installation is not")
     try:
-        GlobalHydra.instance().clear()
-        with initialize_config_dir(str(folder), version_base="1.3"):
-            return compose("config", overrides=list(overrides))
+        return conf.compose(*overrides)
     except (HydraException, OmegaConfBaseException) as error:
-        raise UserError(explain(str(error), allowed=_allowed(folder, str(error), options))) from error
-    finally:
-        GlobalHydra.instance().clear()
+        raise UserError(explain(str(error), allowed=_allowed(str(error), options))) from error
 
 
 _MISSING = re.compile(r"Could not find '([^']+)/([^'/]+)'")
@@ -109,18 +99,14 @@ def explain(message: str, *, allowed: Sequence[str] = ()) -> str:
     return "; ".join(line for line in lines if not line.startswith(noise))
 
 
-def _allowed(folder: Any, message: str, options: Sequence[str]) -> list[str]:
+def _allowed(message: str, options: Sequence[str]) -> list[str]:
     """The keys beside the one that an override names in vain; at the top, the verb's own, too."""
-    from hydra import compose, initialize_config_dir
-    from hydra.core.global_hydra import GlobalHydra
     from omegaconf import DictConfig, OmegaConf
 
     unknown = _UNKNOWN.search(message)
     if unknown is None:
         return []
-    GlobalHydra.instance().clear()
-    with initialize_config_dir(str(folder), version_base="1.3"):
-        node: Any = compose("config", overrides=["scale=laptop"])
+    node: Any = conf.compose()
     place = unknown[1].rpartition(".")[0] if "/" not in unknown[1] and "@" not in unknown[1] else ""
     found = OmegaConf.select(node, place) if place else node
     if isinstance(found, DictConfig):

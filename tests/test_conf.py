@@ -1,0 +1,106 @@
+"""The configuration's files: everything composes, columns follow scale and size, experiments are what was measured."""
+
+from __future__ import annotations
+
+import shlex
+from itertools import product
+from pathlib import Path
+
+import pytest
+import yaml
+from omegaconf import OmegaConf
+from omegaconf.errors import OmegaConfBaseException
+
+from franka_wm.conf import FOLDER, SCALES, compose
+
+ROOT = Path(__file__).resolve().parents[1]
+ROWS = {
+    "discrete_actions": "muzero-gpu",
+    "cartpole": "cartpole-cpu",
+    "images_fixed": "images-fixed-gpu",
+    "images": "images-goal-gpu",
+    "goal_image": "lewm-gpu",
+    "two_stages": "action-world-model-gpu",
+    "control_suite": "reacher-hard-gpu",
+}
+"""Experiment → the row of the results that measured it."""
+OF_MEASURING = ("evaluation.episodes", "trainer.checkpoint_replay", "device")
+
+
+def options(group: str) -> list[str]:
+    return sorted(path.stem for path in (FOLDER / group).glob("*.yaml"))
+
+
+def flat(cfg: object, name: str = "") -> dict[str, object]:
+    """Every value, resolved, by its dotted name."""
+    values = OmegaConf.to_container(cfg, resolve=True) if OmegaConf.is_config(cfg) else cfg  # type: ignore[arg-type]
+    if not isinstance(values, dict) or not values:
+        return {name: values}
+    return {k: v for key, value in values.items() for k, v in flat(value, f"{name}.{key}".strip(".")).items()}
+
+
+@pytest.mark.parametrize("scale", SCALES)
+@pytest.mark.parametrize("model", options("model"))
+def test_every_model_at_every_scale(scale: str, model: str) -> None:
+    values = flat(compose(f"model={model}", f"scale={scale}"))
+    assert values["scale"] == values["size"] == scale
+    assert values["model.name"] == model.removesuffix("_pixels").replace("vjepa", "jepa").replace(
+        "lejepa", "jepa"
+    )
+    assert not [value for value in values.values() if isinstance(value, str) and "${" in value]
+
+
+@pytest.mark.parametrize("scale", SCALES)
+def test_every_planner_and_first_stage_at_every_scale(scale: str) -> None:
+    for group in ("planner", "pretrain"):
+        for name in options(group):
+            assert flat(compose(f"{group}={name}", f"scale={scale}"))["scale"] == scale
+
+
+@pytest.mark.parametrize("name", options("experiment"))
+def test_an_experiment_is_its_measured_row(name: str) -> None:
+    rows = yaml.safe_load((ROOT / "benchmarks" / "results" / "rows.yaml").read_text(encoding="utf-8"))
+    row = rows["rows"][ROWS[name]]
+    section = shlex.split(rows["sections"][row["section"]]["arguments"])
+    scale = next(word for word in section if word.startswith("scale="))
+    measured = flat(compose(*section, *shlex.split(row["arguments"])))
+    named = flat(compose(f"experiment={name}", scale))
+    assert {k: v for k, v in named.items() if k not in OF_MEASURING} == {
+        k: v for k, v in measured.items() if k not in OF_MEASURING
+    }
+
+
+@pytest.mark.parametrize(("name", "scale"), list(product(options("experiment"), SCALES)))
+def test_every_experiment_at_every_scale(name: str, scale: str) -> None:
+    assert flat(compose(f"experiment={name}", f"scale={scale}"))["scale"] == scale
+
+
+def test_what_is_typed_wins_over_what_is_tuned() -> None:
+    typed = ("env=gym", "model=muzero", "planner=gumbel", "scale=laptop")
+    assert compose(*typed).model.n_step == 50
+    assert compose(*typed, "model.n_step=7").model.n_step == 7
+    assert compose(*typed, "~tuned/task").model.n_step == 5
+    assert compose("experiment=cartpole", "trainer.updates=9").trainer.updates == 9
+
+
+def test_a_model_of_another_size() -> None:
+    cfg = compose("scale=gpu", "size=laptop")
+    assert (cfg.model.latent_dim, cfg.trainer.updates, cfg.model.lr) == (128, 12_000, 6.0e-4)
+
+
+def test_a_scale_of_ones_own(tmp_path: Path) -> None:
+    own = tmp_path / "scale" / "mine.yaml"
+    own.parent.mkdir()
+    own.write_text("# @package _global_\ndefaults: [laptop, _self_]\ntrainer: {updates: 77}\n")
+    cfg = compose(f"hydra.searchpath=[file://{tmp_path}]", "scale=mine")
+    assert (cfg.trainer.updates, cfg.model.latent_dim) == (77, 128)
+
+
+def test_an_unknown_size_says_which_there_are() -> None:
+    with pytest.raises(OmegaConfBaseException, match="size=huge: must be one of smoke, laptop, gpu"):
+        OmegaConf.to_container(compose("size=huge"), resolve=True)
+
+
+def test_a_pretrained_encoder_has_the_scales_size() -> None:
+    cfg = compose("pretrain=vjepa", "model=action_world_model", "scale=smoke")
+    assert (cfg.pretrain.updates, cfg.pretrain.model.encoder_width, cfg.pretrain.model.window) == (10, 24, 8)
