@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import contextlib
-import io
+import threading
 import time
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from datetime import datetime
 from pathlib import Path
 from typing import Any
@@ -14,8 +13,9 @@ from typing import Any
 import numpy as np
 
 from franka_wm.errors import UserError
+from franka_wm.live.gate import Gate, is_number
 from franka_wm.live.scene import Scene
-from franka_wm.live.session import Frame, Session
+from franka_wm.live.session import SPEEDS, Frame, Session
 from franka_wm.live.settings import Setting
 from franka_wm.live.shapes import arm_shapes
 from franka_wm.report.style import BLUE, VERMILION, policy_name
@@ -25,6 +25,8 @@ HOST = "127.0.0.1"
 
 HISTORY = 10.0
 """How far back the plots look, in simulated time [s]."""
+PENDING = 8
+"""Requests of browsers that may wait for the session at once; further ones are ignored."""
 REDRAW = 0.2
 """Least time between two pictures of the plots and the status [s]; the arm moves in every step."""
 
@@ -70,10 +72,12 @@ class Page:
     ):
         viser = import_viser()
         self.session, self.folder = session, Path(folder)
-        with contextlib.redirect_stdout(
-            io.StringIO()
-        ):  # its banner; whoever serves the page says where it is
-            self.server = viser.ViserServer(host=HOST, port=port, label=title, verbose=False)
+        self.gate = Gate()
+        self.server = self.gate.serve(
+            lambda: viser.ViserServer(host=HOST, port=port, label=title, verbose=False)
+        )
+        self._closed = False
+        self._pending = threading.BoundedSemaphore(PENDING)
         arm = session.arm
         first = session.frame()
         self.scene = Scene(
@@ -101,10 +105,23 @@ class Page:
     def address(self) -> str:
         return f"http://{HOST}:{self.port}"
 
-    def close(self) -> None:
-        """Stops the session's thread and the server."""
-        self.session.stop()
-        self.server.stop()
+    def close(self, timeout: float | None = None) -> bool:
+        """Stops the server and the session's thread, and takes no more requests.
+
+        Args:
+            timeout: How long to wait for the present step, and again for requests being carried out [s]; for ever
+                if None.
+
+        Returns:
+            Whether all of them ended in time; if not, the server still runs, and the process is to be ended.
+        """
+        ended = self.session.stop(timeout)
+        if not self._closed:
+            self._closed = True
+            ended &= all(self._pending.acquire(timeout=timeout) for _ in range(PENDING))
+        if ended:
+            self.server.stop()
+        return ended
 
     # -- controls ----------------------------------------------------------------------------------------
 
@@ -113,24 +130,29 @@ class Page:
         red, green, blue = (int(BLUE[i : i + 2], 16) for i in (1, 3, 5))
         gui.configure_theme(show_logo=False, show_share_button=False, brand_color=(red, green, blue))
         self._status = gui.add_markdown("")
-        self._play = gui.add_button("Play", icon="player-play")
-        self._play.on_click(lambda _: self.toggle())
+        self._play = self._allow(gui.add_button("Play", icon="player-play"), is_click)
+        self._play.on_click(lambda _: self._try(self.toggle))
         others = {"One step": self._step_once, "New episode": session.reset}
-        group = gui.add_button_group("", list(others))
+        group = self._allow(gui.add_button_group("", list(others)), is_one_of(others))
         group.on_click(lambda event: self._try(others[event.target.value]))
         names = {policy_name(name): name for name in session.policies}
-        self._policy = gui.add_dropdown(
-            "acts",
-            list(names),
-            initial_value=policy_name(session.policy),
-            hint="Who decides what the arm does",
+        self._policy = self._allow(
+            gui.add_dropdown(
+                "policy",
+                list(names),
+                initial_value=policy_name(session.policy),
+                hint="Who decides what the arm does",
+            ),
+            is_one_of(names),
         )
         self._policy.on_update(lambda event: self._try(lambda: session.set_policy(names[event.target.value])))
-        speed = gui.add_slider("speed", 0.1, 1.0, 0.1, 1.0, hint="1: as fast as the real arm")
+        speed = gui.add_slider("speed", *SPEEDS, 0.1, 1.0, hint="1: as fast as the real arm")
+        self._allow(speed, lambda value: is_number(value, *SPEEDS))
         speed.on_update(lambda event: setattr(session, "speed", float(event.target.value)))
         keep = gui.add_checkbox(
             "keep the goal", session.keep_goal, hint="A dragged goal outlives the episode"
         )
+        self._allow(keep, lambda value: isinstance(value, bool))
         keep.on_update(lambda event: setattr(session, "keep_goal", bool(event.target.value)))
         empty = (np.zeros(1), np.zeros(1))
         self._distance = self._plot("distance to the goal [cm]", empty, VERMILION)
@@ -140,8 +162,11 @@ class Page:
                 for setting in session.settings:
                     self._add_slider(setting)
         with gui.add_folder("Record", expand_by_default=False):
-            self._kind = gui.add_dropdown("as", ("video", "dataset"), initial_value="video", hint=KINDS)
+            kinds = ("video", "dataset")
+            self._kind = gui.add_dropdown("as", kinds, initial_value="video", hint=KINDS)
+            self._allow(self._kind, is_one_of(kinds))
             self._record = gui.add_button("Record", icon="player-record", color="gray")
+            self._allow(self._record, is_click)
             self._record.on_click(lambda _: self._try(self.toggle_recording))
 
     def _add_slider(self, setting: Setting) -> None:
@@ -154,6 +179,7 @@ class Page:
         )
         self._sliders[setting.name] = slider
         whole = isinstance(setting.value, int)
+        self._allow(slider, lambda value: is_number(value, setting.low, setting.high))
 
         def moved(event: Any) -> None:
             if event.client is None:  # put back by us
@@ -174,6 +200,9 @@ class Page:
             height=115,
             padding=(10, 18, 0, 0),
         )
+
+    def _allow(self, control: Any, check: Callable[[Any], bool]) -> Any:
+        return self.gate.allow(control, check)
 
     def _step_once(self) -> None:
         self.session.pause()
@@ -204,10 +233,15 @@ class Page:
 
     def _try(self, action: Callable[[], Any]) -> None:
         """Does what a browser asked for; what cannot be done is said there."""
+        if not self._pending.acquire(blocking=False):
+            self.gate.ignore(f"a request while {PENDING} others wait")
+            return
         try:
             action()
         except UserError as error:
             self._notify("That did not work", str(error), colour="red")
+        finally:
+            self._pending.release()
 
     def _notify(self, title: str, body: str, *, colour: Any = "green") -> None:
         for client in self.server.get_clients().values():
@@ -248,6 +282,17 @@ class Page:
             full = " (full: stop and save)" if frame.recording_full else ""
             lines.append(f"recording: {frame.recording / fps:.1f} s{full}")
         return "  \n".join(lines)
+
+
+def is_click(value: Any) -> bool:
+    """Whether a value is what a pressed button sends."""
+    return value is True
+
+
+def is_one_of(choices: Iterable[str]) -> Callable[[Any], bool]:
+    """A check for the values of a menu."""
+    known = frozenset(choices)
+    return lambda value: isinstance(value, str) and value in known
 
 
 def draw(plot: Any, seconds: np.ndarray, values: np.ndarray, *, steps: float) -> None:

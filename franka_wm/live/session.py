@@ -22,7 +22,14 @@ from franka_wm.envs import FrankaEnv
 from franka_wm.errors import UserError
 from franka_wm.live.commanded import commanded_path
 from franka_wm.live.recorder import DatasetRecorder, VideoRecorder
-from franka_wm.live.settings import Setting, planner_settings, rebuilt
+from franka_wm.live.settings import Setting, planner_settings, rebuilt, work
+
+SPEEDS = (0.1, 1.0)
+"""Slowest and fastest, as shares of the environment's own rate."""
+FARTHEST = 5.0
+"""Largest coordinate of a goal [m]: many times the arm's reach."""
+BUDGET = 1.0
+"""Longest decision that a planner's settings may lead to [s]: while it plans, nothing else is heard."""
 
 PREFERRED = ("planner", "oracle", "noop")
 """Which policy starts, the first one that there is."""
@@ -96,7 +103,7 @@ class Session:
             raise UserError(f"a live session simulates one world, the environment has {self.arm.num_envs}")
         self.policies = dict(policies)
         self.keep_goal, self.seed = keep_goal, seed
-        self.speed = 1.0
+        self._speed = 1.0
         self.error: Exception | None = None
         self._lock = threading.RLock()
         self._playing, self._stopping = threading.Event(), threading.Event()
@@ -108,7 +115,7 @@ class Session:
         self._reward = self._decision = 0.0
         self._success = False
         self._pinned: torch.Tensor | None = None
-        self._asked: Sequence[float] | None = None
+        self._asked: torch.Tensor | None = None
         self._path: torch.Tensor | None = None
         self._policy = policy or next((name for name in PREFERRED if name in self.policies), "")
         self._check_policy(self._policy)
@@ -154,20 +161,28 @@ class Session:
     def set_goal(self, goal: Sequence[float]) -> Frame:
         """Moves the goal to a point (x, y, z) [m].
 
+        Distance and success are judged anew, also while paused.
+
         Raises:
-            UserError: Not three finite numbers.
+            UserError: Not three finite numbers, or farther away than `FARTHEST`.
         """
+        point = self._checked(goal)
         with self._lock:
-            point = torch.tensor([float(x) for x in goal], dtype=torch.float32, device=self.arm.device)
             self._place_goal(point)
             self._pinned = point
             self._distance = float(self.arm.goal_distance()[0])
+            if self.arm.simulation.task.goal_distance:
+                self._success = self._distance < self.arm.config.success_distance
             frame = self._frame()
         return self._tell(frame)
 
     def ask_goal(self, goal: Sequence[float]) -> None:
-        """:meth:`set_goal` by the thread, as soon as it can; of several goals only the last one counts."""
-        self._asked = goal
+        """:meth:`set_goal` by the thread, as soon as it can; of several goals only the last one counts.
+
+        Raises:
+            UserError: As for :meth:`set_goal`, at once.
+        """
+        self._asked = self._checked(goal)
 
     def set_policy(self, name: str) -> Frame:
         """From the next step on, ``name`` acts; what another one remembered is dropped.
@@ -186,13 +201,39 @@ class Session:
         """Rebuilds the planner with other settings; its present plan is dropped.
 
         Raises:
-            UserError: There is no planner, or it refuses the values; the present one stays.
+            UserError: There is no planner, a value is outside of its slider, a decision would take longer than
+                `BUDGET`, or the planner refuses the values; the present one stays.
         """
         with self._lock:
             if self.planner is None:
                 raise UserError("this session has no planner; give a checkpoint")
-            self.policies["planner"].planner = rebuilt(self.planner, **changes)
+            for setting in self.settings:
+                if not setting.low <= changes.get(setting.name, setting.value) <= setting.high:
+                    raise UserError(
+                        f"{setting.name}={changes[setting.name]:g}: must be from {setting.low:g} to {setting.high:g}"
+                    )
+            other = rebuilt(self.planner, **changes)
+            more = work(other) / work(self.planner)
+            if more > 1 and (expected := more * self._planning_time()) > BUDGET:
+                raise UserError(
+                    f"a decision would take about {expected:.1f} s, and at most {BUDGET:g} s is allowed here; "
+                    "first make another setting smaller"
+                )
+            self.policies["planner"].planner = other
             self._forget()
+
+    @torch.no_grad()
+    def _planning_time(self, decisions: int = 3) -> float:
+        """Shortest of a few decisions of the present planner [s]: the first may still allocate or compile."""
+        times = []
+        with set_exploration_type(ExplorationType.DETERMINISTIC):
+            for _ in range(decisions):
+                self._synchronize()
+                began = time.perf_counter()
+                self.policies["planner"](self._now.clone())
+                self._synchronize()
+                times.append(time.perf_counter() - began)
+        return min(times)
 
     # -- what is so --------------------------------------------------------------------------------------
 
@@ -214,6 +255,21 @@ class Session:
     @property
     def playing(self) -> bool:
         return self._playing.is_set()
+
+    @property
+    def speed(self) -> float:
+        """Share of the environment's own rate, within `SPEEDS`.
+
+        Raises:
+            UserError: Set to anything else.
+        """
+        return self._speed
+
+    @speed.setter
+    def speed(self, value: float) -> None:
+        if not SPEEDS[0] <= value <= SPEEDS[1]:  # NaN is not, either
+            raise UserError(f"speed={value}: must be from {SPEEDS[0]:g} to {SPEEDS[1]:g}")
+        self._speed = float(value)
 
     @property
     def period(self) -> float:
@@ -298,12 +354,21 @@ class Session:
             self._thread = threading.Thread(target=self._run, name="franka-live", daemon=True)
             self._thread.start()
 
-    def stop(self) -> None:
-        """Ends the thread, after the step that it is in."""
+    def stop(self, timeout: float | None = None) -> bool:
+        """Ends the thread, after the step that it is in.
+
+        Args:
+            timeout: How long to wait for that step [s]; for ever if None.
+
+        Returns:
+            Whether it ended in time; otherwise it ends by itself after the step.
+        """
         self._stopping.set()
-        if self._thread is not None and self._thread is not threading.current_thread():
-            self._thread.join()
-        self._thread = None
+        thread, self._thread = self._thread, None
+        if thread is None or thread is threading.current_thread():
+            return True
+        thread.join(timeout)
+        return not thread.is_alive()
 
     def _run(self) -> None:
         due = time.perf_counter()
@@ -311,7 +376,7 @@ class Session:
             while not self._stopping.is_set():
                 goal, self._asked = self._asked, None
                 if goal is not None:
-                    self.set_goal(goal)
+                    self.set_goal(goal.tolist())
                 if not self._playing.wait(timeout=0.03):
                     due = time.perf_counter()
                     continue
@@ -325,6 +390,13 @@ class Session:
             self._playing.clear()
 
     # -- parts -------------------------------------------------------------------------------------------
+
+    def _checked(self, goal: Sequence[float]) -> torch.Tensor:
+        """(3,) on the environment's device."""
+        point = torch.tensor([float(x) for x in goal], dtype=torch.float32)
+        if point.shape != (3,) or not bool((point.abs() <= FARTHEST).all()):  # NaN is not, either
+            raise UserError(f"goal {tuple(goal)}: must be three numbers, none beyond ±{FARTHEST:g} m")
+        return point.to(self.arm.device)
 
     def _check_policy(self, name: str) -> None:
         if name not in self.policies:

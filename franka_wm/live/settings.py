@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import inspect
+import math
 from dataclasses import dataclass
 from typing import Any
 
@@ -60,6 +61,12 @@ def rebuilt(planner: Any, **changes: Any) -> Any:
         return type(planner)(**(values | changes))
     except (AttributeError, TypeError, ValueError) as error:
         raise UserError(f"{type(planner).__name__}: {error}") from error
+
+
+def work(planner: Any) -> float:
+    """How many steps of the model a decision takes, up to a factor that settings do not change."""
+    counts = ("horizon", "num_samples", "iterations", "num_simulations")
+    return math.prod(getattr(planner, name, 1) for name in counts)
 
 
 def _parameters(planner: Any) -> list[str]:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, fields
@@ -38,6 +40,9 @@ ARM: dict[str, Any] = {
     "substeps": 4,
 }
 """Without a checkpoint: what ``env=reach`` sets. Repeated here, since an installed package has no ``conf``."""
+
+GRACE = 1.0
+"""After Ctrl-C the process ends by itself within this time [s], or is ended."""
 
 ENDLESS = {"episode_length": 1_000_000, "terminate_on_success": False}
 """While somebody watches, an episode ends when they ask for another."""
@@ -219,9 +224,13 @@ def serve(stage: Stage, options: Options) -> None:
         end = float("inf") if options.seconds is None else time.monotonic() + options.seconds
         while time.monotonic() < end and session.error is None:
             time.sleep(min(0.2, max(0.0, end - time.monotonic())))
-    except KeyboardInterrupt:
-        pass  # the way to end it
-    finally:
         page.close()
+    except KeyboardInterrupt:  # the way to end it, also while a long decision or a slow disk holds a thread
+        hurry = threading.Timer(GRACE, os._exit, (130,))
+        hurry.daemon = True
+        hurry.start()
+        if not page.close(timeout=0.3 * GRACE):
+            os._exit(130)  # Python would wait for the thread, or hang on its own way out
+        hurry.cancel()
     if session.error is not None:
         raise session.error

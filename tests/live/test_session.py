@@ -92,7 +92,7 @@ def test_a_setting_that_cannot_be_leaves_the_planner_as_it_is(make_session) -> N
     session = make_session(policy="planner")
     before = session.planner
     with pytest.raises(UserError, match="num_elites must not exceed"):
-        session.set_planner(num_samples=4)
+        session.set_planner(num_elites=200)
     with pytest.raises(UserError, match="MPPI has no setting 'sharpness'"):
         session.set_planner(sharpness=1.0)
     assert session.planner is before

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import builtins
 import re
+import signal
 import socket
 import subprocess
 import sys
+import time
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -164,11 +166,11 @@ def test_it_serves_this_machine_only_and_ends_in_time(
     real = page.Page
 
     class Watched(real):
-        def close(self) -> None:
+        def close(self, timeout: float | None = None) -> bool:
             here = reachable("127.0.0.1", self.port)
             served.append((self.server.get_host(), self.port, here, outside(self.port)))
             steps.append(self.session.frame().steps)
-            super().close()
+            return super().close(timeout)
 
     steps: list[int] = []
     monkeypatch.setattr(page, "Page", Watched)
@@ -240,6 +242,37 @@ def test_an_exception_while_it_plays_ends_it(monkeypatch: pytest.MonkeyPatch) ->
     stage.policies["noop"] = broken
     with pytest.raises(UserError, match="the oracle is out"):
         view.serve(stage, view.parse(["policy=noop", "port=0"]))
+
+
+BUSY = """
+import signal
+import time
+from franka_wm.live import view
+signal.signal(signal.SIGINT, signal.default_int_handler)  # may have been inherited as ignored
+stage = view.build(view.parse({cheap!r}))
+real = stage.policies["noop"]
+def slow(tensordict):
+    print("deciding", flush=True)
+    time.sleep(60)
+    return real(tensordict)
+stage.policies["noop"] = slow
+view.serve(stage, view.parse(["policy=noop", "port=0"]))
+"""
+
+
+def test_ctrl_c_ends_it_within_two_seconds_whatever_it_is_doing() -> None:
+    script = BUSY.format(cheap=list(CHEAP))
+    with subprocess.Popen([sys.executable, "-c", script], stdout=subprocess.PIPE, text=True) as process:
+        assert process.stdout is not None
+        while "deciding" not in process.stdout.readline():
+            assert process.poll() is None
+        process.send_signal(signal.SIGINT)
+        started = time.monotonic()
+        try:
+            process.wait(timeout=10)
+        finally:
+            process.kill()
+        assert time.monotonic() - started < 2.0
 
 
 def test_rerun_writes_an_episode(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
