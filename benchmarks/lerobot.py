@@ -28,7 +28,8 @@ import torch
 from common import publish
 from torchrl.collectors import Collector
 
-from franka_wm.data.lerobot.collect import OPTIONS, Source, gather, open_source
+from franka_wm.commands.collect import OPTIONS, open_source
+from franka_wm.data.lerobot.collect import Source, gather
 from franka_wm.data.lerobot.episodes import Episode, EpisodeCutter
 from franka_wm.data.lerobot.provenance import describe
 from franka_wm.data.lerobot.schema import FORMATS, Schema, schema_for

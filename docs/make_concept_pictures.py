@@ -85,7 +85,7 @@ def dataset() -> None:
     """One recorded episode, as LeRobot's own reader gives it back."""
     from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
-    from franka_wm.data.lerobot.collect import collect
+    from franka_wm.commands.collect import collect
 
     with tempfile.TemporaryDirectory() as folder:
         root = Path(folder) / "reach"

@@ -15,9 +15,10 @@ import warp as wp
 from selenium import webdriver
 from selenium.webdriver.chrome.service import Service
 
+from franka_wm.commands.view import parse
 from franka_wm.live.page import Page
 from franka_wm.live.session import Session
-from franka_wm.live.view import build, parse
+from franka_wm.live.view import build
 
 PICTURE = Path(__file__).parent / "images" / "live.png"
 FLAGS = (

@@ -29,7 +29,7 @@ def test_use_the_environment(root: Path) -> None:
 
 
 def test_train_from_a_dataset(root: Path, tmp_path: Path) -> None:
-    from franka_wm.cli import main
+    from franka_wm.commands.main import main
 
     made = ["collect", f"out={tmp_path}/set", "episodes=12", "policy=smooth", "env=reach", "num_envs=4"]
     assert main([*made, "env.episode_length=10", "env.substeps=1"]) == 0

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from franka_wm import cli
+from franka_wm.commands import main as cli
 from franka_wm.errors import UserError
 from franka_wm.untrusted import MOST_JSON, MOST_YAML, UntrustedFolder, check_image, check_video
 

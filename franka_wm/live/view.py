@@ -1,35 +1,20 @@
-"""``franka-wm view``: an arm in the browser, or an episode for the Rerun viewer."""
+"""One world and who can act in it, shown in the browser or recorded for the Rerun viewer."""
 
 from __future__ import annotations
 
 import os
 import threading
 import time
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, fields
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from typing import Any
-
-from omegaconf import OmegaConf
-from omegaconf.errors import OmegaConfBaseException
 
 from franka_wm.console import announced, say
 from franka_wm.envs import FrankaConfig, FrankaEnv
 from franka_wm.errors import UserError
-
-USAGE = """usage: franka-wm view [key=value …]
-
-An arm in the browser, on this machine only: drag its goal, switch policies, move the planner's settings.
-
-  checkpoint=FOLDER   a run's folder, a checkpoint in it, or hf:user/name; without one the arm is moved by
-                      a planner that knows its geometry, inverse kinematics, random actions, or not at all
-  policy=NAME         who acts first: planner, policy, oracle, random, noop
-  port=8080           of http://127.0.0.1; 0 takes a free one
-  out=FOLDER          where recordings go: videos and LeRobot datasets (the present folder)
-  seconds=S           ends after so long; without it, Ctrl-C ends it
-  seed=0  device=auto
-  env.KEY=VALUE       a field of the environment's configuration; episodes have no end unless
-                      env.episode_length is given
-  rerun=FILE.rrd      no page: writes one episode for the Rerun viewer (rerun FILE.rrd)"""
+from franka_wm.live.commanded import kinematic_planner
+from franka_wm.policies.scripted import NoopPolicy, OraclePolicy, SmoothRandomPolicy
+from franka_wm.training.load import find_checkpoint, load_agent
 
 ARM: dict[str, Any] = {
     "observations": ("state", "joint_target"),
@@ -53,7 +38,18 @@ EPISODE = 50
 
 @dataclass
 class Options:
-    """The command line, checked."""
+    """What to show, and how.
+
+    Attributes:
+        checkpoint: A run's folder, a checkpoint, or ``hf:user/name``; ``None``: the arm without an agent.
+        policy: Who acts first.
+        port: Of the page on this machine; 0 takes a free one.
+        out: Where recordings go.
+        seconds: Ends after so long.
+        seed, device: Of the world.
+        rerun: File for the Rerun viewer instead of a page.
+        env: Fields of the environment's configuration to change.
+    """
 
     checkpoint: str | None = None
     policy: str | None = None
@@ -64,64 +60,6 @@ class Options:
     device: str = "auto"
     rerun: str | None = None
     env: dict[str, Any] = field(default_factory=dict)
-
-
-def parse(arguments: Sequence[str]) -> Options:
-    """``key=value`` arguments as :class:`Options`.
-
-    Raises:
-        UserError: An argument that is none of them, or a value that cannot be.
-    """
-    options = Options()
-    known = {f.name for f in fields(Options)}
-    numbers: Mapping[str, Callable[[str], Any]] = {"port": int, "seed": int, "seconds": float}
-    for argument in arguments:
-        key, equals, value = argument.partition("=")
-        key = key.lstrip("-")
-        if equals and key.startswith("env."):
-            try:
-                given: Any = OmegaConf.to_container(OmegaConf.from_dotlist([argument]))
-                options.env |= given["env"]
-            except OmegaConfBaseException as error:
-                raise UserError(f"{argument}: {error}") from error
-            continue
-        if not equals or not value or key == "env" or key not in known:
-            raise UserError(
-                f"view: {argument!r} is not key=value with a key that it knows; see franka-wm view --help"
-            )
-        try:
-            setattr(options, key, numbers.get(key, str)(value))
-        except ValueError as error:
-            raise UserError(f"view: {argument}: must be a number") from error
-    if not 0 <= options.port <= 65535:
-        raise UserError(f"view: port={options.port}: must be from 0 to 65535")
-    if options.rerun is not None and not options.rerun.endswith(".rrd"):
-        raise UserError(f"view: rerun={options.rerun}: must end in .rrd")
-    if options.seconds is not None and not 0 < options.seconds < float("inf"):
-        raise UserError(f"view: seconds={options.seconds:g}: must be above 0 and finite")
-    return options
-
-
-def view(arguments: Sequence[str]) -> None:
-    """The verb.
-
-    Raises:
-        UserError: Bad arguments, a missing extra, or a checkpoint that cannot be shown.
-    """
-    if any(argument in ("--help", "-h") for argument in arguments):
-        print(USAGE)
-        return
-    import warp as wp
-
-    wp.config.log_level = wp.LOG_WARNING  # its list of compiled modules drowns what there is to say
-    options = parse(arguments)
-    if options.rerun is not None:
-        record(options)
-        return
-    from franka_wm.live.page import import_viser
-
-    import_viser()  # before anything that takes time
-    serve(build(options), options)
 
 
 @dataclass
@@ -153,8 +91,6 @@ def build(options: Options) -> Stage:
     with announced("building the arm; on a machine's first start this compiles kernels for a minute or two"):
         if options.checkpoint is None:
             return untrained(options, changes)
-        from franka_wm.training.load import load_agent
-
         agent = load_agent(
             options.checkpoint, num_envs=1, device=options.device, env_changes=changes, seed=options.seed
         )
@@ -168,8 +104,6 @@ def check_arm(checkpoint: str) -> None:
     Raises:
         UserError: It does not, or there is none.
     """
-    from franka_wm.training.load import find_checkpoint
-
     env = find_checkpoint(checkpoint).config.env
     if env.kind != "franka":
         what = "recorded data alone" if env.kind == "none" else f"another environment ({env.kind})"
@@ -178,8 +112,6 @@ def check_arm(checkpoint: str) -> None:
 
 def untrained(options: Options, changes: Mapping[str, Any]) -> Stage:
     """The arm without a checkpoint."""
-    from franka_wm.live.commanded import kinematic_planner
-    from franka_wm.policies.scripted import NoopPolicy, OraclePolicy, SmoothRandomPolicy
 
     config = FrankaConfig.from_mapping({**ARM, **changes})
     env = FrankaEnv(config, num_envs=1, device=options.device, seed=options.seed)

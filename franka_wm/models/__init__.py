@@ -80,19 +80,3 @@ def make(name: str, **overrides: Any) -> Any:
         ValueError: no family has this name; the message lists those that exist.
     """
     return family(name)(**overrides)
-
-
-def load(folder: str, *, device: str = "cpu") -> Any:
-    """A trained model from a checkpoint alone, in evaluation mode: no environment is built.
-
-    Args:
-        folder: a run's folder, a checkpoint in it, or `hf:user/name` on the Hugging Face Hub.
-        device: where the weights go.
-
-    Raises:
-        UserError: no checkpoint there, or a damaged one.
-    """
-    # Checkpoints belong to the room above; this is the door that users know, opened when it is used.
-    from franka_wm.training.load import load_model
-
-    return load_model(folder, device=device)

@@ -18,12 +18,10 @@ from franka_wm.report.document import (
     document,
     folded,
     scrolling,
-    write_document,
 )
 from franka_wm.report.horizon import horizon_figure
 from franka_wm.report.outcome import SHOWN
-from franka_wm.report.page import split_arguments, wants_help
-from franka_wm.report.run import RunFiles, but_for_the_seed, malformed, read_run
+from franka_wm.report.run import RunFiles, but_for_the_seed, malformed
 from franka_wm.report.spectra import spectrum_figure
 from franka_wm.report.table import Table, evaluation_tables, html, is_interval
 
@@ -116,16 +114,6 @@ def repetitions(runs: Mapping[str, RunFiles]) -> dict[str, dict[str, RunFiles]]:
         # Runs without a configuration are known to be the same as nothing.
         groups.setdefault(but_for_the_seed(run.config) or name, {})[name] = run
     return {next(iter(group)): group for group in groups.values()}
-
-
-def compare(arguments: list[str]) -> None:
-    """``franka-wm compare RUN RUN … [out=compare.html]``: writes a page that shows runs side by side."""
-    usage = "compare RUN RUN … [out=compare.html]"
-    if wants_help(arguments, usage):
-        return
-    folders, options = split_arguments(arguments, {"out"}, usage)
-    text = compare_page([read_run(folder) for folder in folders])
-    print(write_document(text, Path(options.get("out", FILE))))
 
 
 # -- sections --------------------------------------------------------------------------------------------

@@ -92,3 +92,57 @@ def robustness_table(
             cells = ["" if r[name] is None else interval(r[name], scale) for name in change]
             rows.append([shift, policy_name(policy), *cells, interval(r["success"], 100, 0), r["verdict"]])
     return Table(["shift", "policy", *what, success, "verdict"], rows)
+
+
+def diagnostic_tables(results: Mapping[str, Any], config: Any) -> dict[str, Table]:
+    """Title → table, of what there is in the results beside the policies."""
+    tables = {}
+    if "curves" in results.get("open_loop", {}):
+        tables["Open loop: error of predicted latents"] = horizon_table(results["open_loop"])
+    if results.get("probes"):
+        tables["Probes"] = probe_table(results["probes"])
+    found = findings(results)
+    if found:
+        tables["What else was found"] = Table(
+            ["quantity", "value"], [[name, text] for name, text in found.items()]
+        )
+    if results.get("robustness"):
+        few = results.get("protocol", {}).get("robustness note")
+        tables["Robustness" + (f" ({few})" if few else "")] = robustness_table(
+            results["robustness"], config.success_distance
+        )
+    return tables
+
+
+def findings(results: Mapping[str, Any]) -> dict[str, str]:
+    """Single numbers as text: ranks, calibration, planner, spectrum."""
+    out: dict[str, str] = {}
+    ahead, value, health = (results.get(name, {}) for name in ("open_loop", "calibration", "health"))
+    if "not_measured" in ahead:
+        out["open loop, not measured"] = ahead["not_measured"]
+    if "rank_correlation" in ahead:
+        out["rank correlation of latent cost and tool distance, within episodes"] = interval(
+            ahead["rank_correlation"]
+        )
+        out["… across episodes"] = interval(ahead["rank_correlation_across_episodes"])
+    if "decoder" in ahead:
+        errors = ahead["decoder"]
+        share = errors["error"] / max(errors["mean_picture"], 1e-12)
+        out["decoder's error / that of the mean picture"] = number(share)
+    if value:
+        line = f"return = {number(value['slope'])} · value + {number(value['intercept'])}"
+        out["value calibration (exact: 1, 0)"] = line
+        out["… bias, value − return"] = number(value["bias"])
+        out["… correlation"] = number(value["correlation"])
+    out |= {
+        name: interval(found, 1, 3) if isinstance(found, Mapping) else f"{found:.4g}"
+        for name, found in health.items()
+        if name != "warnings"
+    }
+    spectrum = results.get("spectrum", {})
+    for name in ("rankme", "effective_rank", "feature_std", "mean_cosine", "dimensions"):
+        if name in spectrum:
+            out[f"latents: {name.replace('_', ' ')}"] = f"{spectrum[name]:.4g}"
+    if spectrum:
+        out["latents: collapse"] = spectrum["warning"] or "no sign of it"
+    return out

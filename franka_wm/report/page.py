@@ -7,7 +7,6 @@ What it shows is what lies in the run's folder: :mod:`franka_wm.report.run` says
 from html import escape
 from pathlib import Path
 
-from franka_wm.errors import UserError
 from franka_wm.report.document import document, write_document
 from franka_wm.report.outcome import headline
 from franka_wm.report.run import RunFiles, malformed, read_run
@@ -46,40 +45,3 @@ def write_page(folder: str | Path, out: str | Path | None = None) -> Path:
     """
     run = read_run(folder)
     return write_document(page(run), Path(folder) / FILE if out is None else out)
-
-
-def report(arguments: list[str]) -> None:
-    """``franka-wm report RUN [out=…]``: writes the page of a run."""
-    usage = "report RUN [out=PAGE.html]"
-    if wants_help(arguments, usage):
-        return
-    folders, options = split_arguments(arguments, {"out"}, usage)
-    if len(folders) != 1:
-        raise UserError(f"report needs one folder of a run, got {len(folders)}: franka-wm report outputs/RUN")
-    print(write_page(folders[0], options.get("out")))
-
-
-def wants_help(arguments: list[str], usage: str) -> bool:
-    """Prints the usage if that is what is asked for."""
-    asked = any(argument in ("--help", "-h") for argument in arguments)
-    if asked:
-        print(f"usage: franka-wm {usage}")
-    return asked
-
-
-def split_arguments(arguments: list[str], options: set[str], usage: str) -> tuple[list[str], dict[str, str]]:
-    """Folders, and what stands as ``name=value``.
-
-    Raises:
-        UserError: an option that does not exist.
-    """
-    folders, given = [], {}
-    for argument in arguments:
-        name, equals, value = argument.partition("=")
-        if equals and name in options:
-            given[name] = value
-        elif argument.startswith("-") or (equals and not Path(argument).exists()):
-            raise UserError(f"unknown option {argument!r}; usage: franka-wm {usage}")
-        else:
-            folders.append(argument)
-    return folders, given

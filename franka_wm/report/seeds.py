@@ -6,7 +6,6 @@ from typing import Any
 
 from franka_wm.errors import UserError
 from franka_wm.evaluation.results import Result, results
-from franka_wm.report.run import but_for_the_seed, read_config
 from franka_wm.report.style import centimetres
 
 
@@ -76,31 +75,3 @@ def _mean(summary: Any, path: Sequence[str]) -> float:
     for name in path:
         summary = summary[name]
     return summary["mean"]
-
-
-def summary(arguments: list[str]) -> None:
-    """``franka-wm summary RUN RUN …`` or ``franka-wm summary SWEEP``: runs of different seeds in one table.
-
-    Runs that differ in more than their seed get a table for each configuration.
-    """
-    if not arguments or arguments[0].startswith("-"):
-        raise UserError(
-            "summary needs folders of runs: franka-wm summary outputs/RUN outputs/RUN …, or multirun/SWEEP"
-        )
-    groups: dict[str, dict[Path, Result]] = {}
-    for folder in arguments:
-        for run in runs_of(folder):
-            groups.setdefault(but_for_the_seed(read_config(run)), {})[run] = read_evaluation(run)
-    for group in groups.values():
-        found = list(group.values())
-        counts = sorted({one.episodes for one in found})
-        runs = f"{len(found)} run{'s' * (len(found) > 1)}"
-        if len(groups) > 1:
-            runs += f" ({', '.join(run.name for run in group)})"
-        episodes = f"{counts[0]}" if len(counts) == 1 else f"{counts[0]} to {counts[-1]}"
-        print(f"{runs} of {episodes} episodes each: mean over runs (lowest – highest run)")
-        by = sorted({str(one.protocol.get("by", one.path)) for one in found})
-        print(f"measured by {' and '.join(by)}; of a run measured twice, what rests on more episodes\n")
-        print(seeds_table([one.policies for one in found]))
-        if len(groups) > 1:
-            print()

@@ -82,7 +82,7 @@ def test_readme_collects(capsys: pytest.CaptureFixture[str]) -> None:
 def test_models_page_makes_a_model() -> None:
     (code,) = blocks("docs/models.md", "python")
     scope: dict[str, Any] = {}
-    exec(compile(code.partition("model = models.load")[0], "docs/models.md", "exec"), scope)
+    exec(compile(code.partition("model = franka_wm.load")[0], "docs/models.md", "exec"), scope)
     z = scope["model"].encode({"state": torch.zeros(2, 20)})
     assert scope["model"].next(z, torch.zeros(2, 7)).shape == z.shape
 
@@ -150,7 +150,7 @@ def test_documented_training_composes(
 
 
 def test_documented_verbs_exist() -> None:
-    from franka_wm.cli import VERBS as known
+    from franka_wm.commands.main import VERBS as known
 
     assert len(VERBS) > 20
     assert {f"{name}: {a[0]}" for name, a in VERBS if a[0] not in known and not a[0].startswith("-")} == set()

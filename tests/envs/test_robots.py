@@ -14,7 +14,7 @@ import pytest
 import torch
 from torchrl.envs.utils import check_env_specs
 
-from franka_wm import cli
+from franka_wm.commands import main as cli
 from franka_wm.envs import FrankaConfig, FrankaEnv
 from franka_wm.envs.robots import SOURCES, Source, load_robot, meshes, sources
 from franka_wm.errors import UserError

@@ -8,6 +8,7 @@ import pytest
 import torch
 
 from examples.add_a_task import HEIGHT, RaiseTool
+from franka_wm.commands.summary import summary
 from franka_wm.envs import FrankaConfig, FrankaEnv
 from franka_wm.envs.tasks import Reach, Track
 from franka_wm.evaluation.closed_loop import play_episodes, reaches
@@ -20,7 +21,7 @@ from franka_wm.report.curves import axis, panel_figure, panels, plot_learning_cu
 from franka_wm.report.diagnostics import evaluation_markdown, robustness_table
 from franka_wm.report.page import page
 from franka_wm.report.run import read_run
-from franka_wm.report.seeds import seeds_table, summary
+from franka_wm.report.seeds import seeds_table
 from tests.conftest import SMALL
 
 LENGTH = 10

@@ -15,7 +15,8 @@ from types import SimpleNamespace
 import pytest
 from omegaconf import OmegaConf
 
-from franka_wm import cli
+from franka_wm.commands import main as cli
+from franka_wm.commands.view import parse
 from franka_wm.envs import FrankaConfig
 from franka_wm.errors import UserError
 from franka_wm.live import view
@@ -24,12 +25,10 @@ CHEAP = ["env.substeps=2", "device=cpu"]
 
 
 def test_arguments() -> None:
-    options = view.parse(
-        ["port=0", "policy=noop", "seconds=2.5", "env.goal=[0.3,0,0.5]", "env.episode_length=20"]
-    )
+    options = parse(["port=0", "policy=noop", "seconds=2.5", "env.goal=[0.3,0,0.5]", "env.episode_length=20"])
     assert (options.port, options.policy, options.seconds) == (0, "noop", 2.5)
     assert options.env == {"goal": [0.3, 0, 0.5], "episode_length": 20}
-    assert view.parse([]) == view.Options()
+    assert parse([]) == view.Options()
 
 
 @pytest.mark.parametrize(
@@ -57,11 +56,9 @@ def test_bad_arguments_are_one_line(argument: str, said: str, capsys: pytest.Cap
 def test_a_checkpoint_of_another_environment_is_refused_before_anything_is_built(
     kind: str, what: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    from franka_wm.training import load
-
     found = SimpleNamespace(config=OmegaConf.create({"env": {"kind": kind}}))
-    monkeypatch.setattr(load, "find_checkpoint", lambda folder: found)
-    monkeypatch.setattr(load, "load_agent", lambda *a, **k: pytest.fail("built"))
+    monkeypatch.setattr(view, "find_checkpoint", lambda folder: found)
+    monkeypatch.setattr(view, "load_agent", lambda *a, **k: pytest.fail("built"))
     assert cli.main(["view", "checkpoint=run"]) == 1
     captured = capsys.readouterr()
     assert what in captured.err and "the live page shows the arm only" in captured.err
@@ -212,7 +209,7 @@ def test_a_checkpoint_brings_its_own_planner_and_policy(root: Path, tmp_path: Pa
     train = [sys.executable, "train.py", "scale=smoke", "device=cpu", f"hydra.run.dir={tmp_path / 'run'}"]
     done = subprocess.run(train, cwd=root, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
-    stage = view.build(view.parse([f"checkpoint={tmp_path / 'run'}", "device=cpu"]))
+    stage = view.build(parse([f"checkpoint={tmp_path / 'run'}", "device=cpu"]))
     assert stage.title.startswith("tdmpc2, ")
     assert stage.steps == 50
     assert stage.env.config.episode_length > 1000, "nobody asked for the episode to end"
@@ -234,14 +231,14 @@ def test_a_checkpoint_brings_its_own_planner_and_policy(root: Path, tmp_path: Pa
 
 
 def test_an_exception_while_it_plays_ends_it(monkeypatch: pytest.MonkeyPatch) -> None:
-    stage = view.build(view.parse([*CHEAP, "policy=noop", "port=0"]))
+    stage = view.build(parse([*CHEAP, "policy=noop", "port=0"]))
 
     def broken(_tensordict):
         raise UserError("the oracle is out")
 
     stage.policies["noop"] = broken
     with pytest.raises(UserError, match="the oracle is out"):
-        view.serve(stage, view.parse(["policy=noop", "port=0"]))
+        view.serve(stage, parse(["policy=noop", "port=0"]))
 
 
 BUSY = """

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from franka_wm import cli
+from franka_wm.commands import main as cli
 from franka_wm.errors import UserError
 from franka_wm.evaluation.results import COMMAND
 from franka_wm.report import document

@@ -4,9 +4,10 @@ import json
 
 import pytest
 
+from franka_wm.commands.summary import summary
 from franka_wm.errors import UserError
 from franka_wm.evaluation.results import END
-from franka_wm.report.seeds import read_evaluation, runs_of, seeds_table, summary
+from franka_wm.report.seeds import read_evaluation, runs_of, seeds_table
 
 
 def evaluation(distance: float, success: float) -> dict:

@@ -16,7 +16,7 @@ import torch
 from omegaconf import DictConfig
 from torchrl.data import LazyTensorStorage
 
-from franka_wm import models
+import franka_wm
 from franka_wm.errors import UserError
 from franka_wm.training import build
 from franka_wm.training.check import check
@@ -87,7 +87,7 @@ def test_every_family_trains_and_comes_back(family: str, train) -> None:
     folder, _, trainer = train(f"model={family}", *FAMILIES[family])
     metrics = [row for row in trainer.rows if "loss" in row]
     assert metrics and all(torch.tensor(row["loss"]).isfinite() for row in metrics)
-    model = models.load(str(folder))
+    model = franka_wm.load(str(folder))
     assert not model.training
     batch = trainer.replay.sample()
     trainer.model.eval()
@@ -108,7 +108,7 @@ def test_two_stages(train) -> None:
     folder, _, trainer = train(
         "model=action_world_model", "pretrain=jepa", "pretrain.updates=4", *FAMILIES["action_world_model"]
     )
-    first = models.load(str(folder / "pretrained"))
+    first = franka_wm.load(str(folder / "pretrained"))
     learned = trainer.model.encoder.network.state_dict()
     assert learned
     taught = first.target_encoder.state_dict()
@@ -118,7 +118,7 @@ def test_two_stages(train) -> None:
     frozen = [p for p in trainer.model.encoder.parameters() if p.requires_grad]
     assert frozen == []
     shutil.rmtree(folder / "pretrained")
-    again = models.load(str(folder))
+    again = franka_wm.load(str(folder))
     batch = trainer.replay.sample()
     trainer.model.eval()
     with torch.no_grad():

@@ -18,7 +18,7 @@ import torch
 from safetensors.torch import load_file
 from tensordict import TensorDictBase
 
-from franka_wm.cli import main
+from franka_wm.commands.main import main
 from franka_wm.training import build
 from franka_wm.training.checkpoint import Checkpoint, latest_checkpoint, load_checkpoint
 from franka_wm.training.learner import Learner

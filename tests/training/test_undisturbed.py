@@ -10,7 +10,7 @@ import pytest
 import torch
 from safetensors.torch import load_file
 
-from franka_wm.cli import main
+from franka_wm.commands.main import main
 from franka_wm.seeding import seeded
 from franka_wm.training.checkpoint import Checkpoint
 from franka_wm.training.trainer import evaluation_period

@@ -14,7 +14,6 @@ _PUBLIC = {
     "read_terminals": "terminal",
     "export_replay": "export",
     "publish_dataset": "publish",
-    "publish_model": "publish",
     "download": "hub",
 }
 

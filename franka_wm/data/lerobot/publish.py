@@ -1,69 +1,25 @@
-"""``franka-wm publish``: a dataset or a trained model to the Hugging Face Hub, privately unless told otherwise."""
+"""Datasets to the Hugging Face Hub, privately unless told otherwise."""
 
 from __future__ import annotations
 
 import contextlib
-import hashlib
 import json
-import shutil
 import tempfile
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from franka_wm.data.lerobot.card import PICTURE, dataset_card, make_picture, model_card
-from franka_wm.data.lerobot.command import split
+from franka_wm.data.lerobot.card import PICTURE, dataset_card, make_picture
 from franka_wm.data.lerobot.hub import check_repo_id, explained
-from franka_wm.data.lerobot.paths import shortened, without_paths
+from franka_wm.data.lerobot.paths import without_paths
 from franka_wm.data.lerobot.provenance import read_provenance
 from franka_wm.data.lerobot.schema import PROVENANCE
 from franka_wm.errors import UserError
-
-OPTIONS: dict[str, Any] = {
-    "root": "",
-    "checkpoint": "",
-    "repo_id": "",
-    "private": True,
-    "license": "apache-2.0",
-    "update": False,
-    "dry_run": False,
-}
-
-USAGE = """usage: franka-wm publish root=DATASET repo_id=USER/NAME [key=value …]
-       franka-wm publish checkpoint=RUN repo_id=USER/NAME [key=value …]
-
-  root=DATASET         a LeRobot dataset on disk
-  checkpoint=RUN       a run's folder, or a checkpoint in it: weights, configuration and evaluation go, no replay
-  repo_id=USER/NAME    where it goes
-  private=true         who may see it; private=false: everybody
-  license=apache-2.0   as the Hub names licenses
-  update=true          the repository exists already: replace what is in it
-  dry_run=true         (or --dry-run) show what would go, send nothing
-
-Needs a token that may write: hf auth login, or the variable HF_TOKEN."""
 
 VERSION_TAG = "v3.0"
 """LeRobot loads the revision of this name from the Hub."""
 
 README = "README.md"
-
-
-def publish(arguments: Sequence[str]) -> int:
-    """The verb."""
-    if not arguments or arguments[0] in ("--help", "-h"):
-        print(USAGE)
-        return 0
-    options, _ = split("publish", arguments, OPTIONS)
-    if bool(options["root"]) == bool(options["checkpoint"]):
-        raise UserError("publish: give root=DATASET or checkpoint=RUN, one of them")
-    if not options["repo_id"]:
-        raise UserError("publish: give repo_id=USER/NAME")
-    shared = {key: options[key] for key in ("private", "license", "update", "dry_run")}
-    if options["root"]:
-        publish_dataset(options["root"], options["repo_id"], **shared)
-    else:
-        publish_model(options["checkpoint"], options["repo_id"], **shared)
-    return 0
 
 
 def publish_dataset(
@@ -97,20 +53,20 @@ def publish_dataset(
     root = Path(root).absolute()
     check_repo_id(repo_id)
     _check_dataset(root)
-    api = None if dry_run else _api(repo_id)
+    api = None if dry_run else hub_client(repo_id)
     with tempfile.TemporaryDirectory() as place:
         staged = stage_dataset(root, Path(place), repo_id=repo_id, license=license)
-        files = _files(staged)
-        _show(files, staged, repo_id, private, "dataset")
+        files = files_of(staged)
+        show_files(files, staged, repo_id, private, "dataset")
         if (root / README).is_file():
             say(f"the card above goes in the place of {root / README}, which stays as it is on this machine")
         if api is None:
             say("dry run: nothing was sent")
             return
         with explained(repo_id):
-            _check_name(api, repo_id, "dataset", update)
+            check_name(api, repo_id, "dataset", update)
             with announced(f"sending {len(files)} files"):
-                _send(api, staged, repo_id, "dataset", private, update)
+                send(api, staged, repo_id, "dataset", private, update)
                 _tag(api, repo_id)
     say(f"published: {api.endpoint}/datasets/{repo_id} ({'private' if private else 'public'})")
 
@@ -166,7 +122,7 @@ def stage_dataset(root: Path, place: Path, *, repo_id: str, license: str) -> Pat
         UserError: A link in the dataset leads to what is not part of it.
     """
     _check_links(root)
-    for name in _files(root):
+    for name in files_of(root):
         (place / name).parent.mkdir(parents=True, exist_ok=True)
         if name not in (README, PROVENANCE, PICTURE):
             (place / name).symlink_to(root / name)
@@ -199,107 +155,10 @@ def _check_links(root: Path) -> None:
             )
 
 
-def publish_model(
-    checkpoint: str | Path,
-    repo_id: str,
-    *,
-    private: bool = True,
-    license: str = "apache-2.0",
-    update: bool = False,
-    dry_run: bool = False,
-) -> None:
-    """Sends a trained model: what ``load_agent("hf:user/name")`` needs, the evaluation, and a card.
-
-    Args:
-        checkpoint: A run's folder, or a checkpoint in it.
-        repo_id, private, license, update, dry_run: As for :func:`publish_dataset`.
-
-    Raises:
-        UserError: One line.
-    """
-    from franka_wm.console import announced, say
-
-    check_repo_id(repo_id)
-    with tempfile.TemporaryDirectory() as place:
-        staged = stage_model(Path(checkpoint), Path(place), repo_id=repo_id, license=license)
-        files = _files(staged)
-        _show(files, staged, repo_id, private, "model")
-        if dry_run:
-            say("dry run: nothing was sent")
-            return
-        api = _api(repo_id)
-        with explained(repo_id):
-            _check_name(api, repo_id, "model", update)
-            with announced(f"sending {len(files)} files"):
-                _send(api, staged, repo_id, "model", private, update)
-        say(f"published: {api.endpoint}/{repo_id} ({'private' if private else 'public'})")
-
-
-def stage_model(checkpoint: Path, place: Path, *, repo_id: str, license: str) -> Path:
-    """A checkpoint without what only training needs: no optimiser, no replay, no random states, no absolute paths.
-
-    Args:
-        checkpoint: A run's folder, or a checkpoint in it.
-        place: An empty folder.
-        repo_id, license: For the card.
-
-    Returns:
-        ``place``, which is a checkpoint now.
-    """
-    from omegaconf import OmegaConf
-
-    from franka_wm.training.checkpoint import latest_checkpoint, load_checkpoint
-
-    opened = load_checkpoint(latest_checkpoint(checkpoint))
-    manifest = json.loads((opened.folder / "manifest.json").read_text(encoding="utf-8"))
-    kept = ("model.safetensors", "counters.json", "extra.json", "extra.safetensors")
-    for name in kept:
-        if name in manifest["files"]:
-            shutil.copyfile(opened.folder / name, place / name)
-    config = without_paths(OmegaConf.to_container(opened.config), clear=True)
-    if "resume" in config:
-        config["resume"] = None
-    OmegaConf.save(OmegaConf.create(config), place / "config.yaml")
-    if (place / "extra.json").is_file():
-        _copy_json(place / "extra.json", place / "extra.json")
-    manifest["files"] = {
-        path.name: {
-            "bytes": path.stat().st_size,
-            "sha256": hashlib.sha256(path.read_bytes()).hexdigest(),
-        }
-        for path in sorted(place.iterdir())
-    }
-    (place / "manifest.json").write_text(json.dumps(manifest, indent=1), encoding="utf-8")
-    run = opened.folder.parent.parent if opened.folder.parent.name == "checkpoints" else opened.folder
-    written = run / "evaluation"  # where the verb evaluate puts them; a published model has them at its top
-    written = written if (written / "evaluation.md").is_file() else run
-    if (written / "evaluation.json").is_file():
-        _copy_json(written / "evaluation.json", place / "evaluation.json")
-    if (written / "evaluation.md").is_file():
-        text = (written / "evaluation.md").read_text(encoding="utf-8")
-        (place / "evaluation.md").write_text(shortened(text), encoding="utf-8")
-    card = model_card(place, repo_id=repo_id, license=license)
-    (place / README).write_text(card, encoding="utf-8")
-    return place
-
-
-def _copy_json(source: Path, target: Path) -> None:
-    """Unchanged, unless there are absolute paths in it."""
-    text = source.read_text(encoding="utf-8")
-    try:
-        value = json.loads(text)
-    except ValueError as error:
-        raise UserError(
-            f"publish: {source} cannot be read ({error}); write it again, or remove it"
-        ) from error
-    cleaned = without_paths(value)
-    target.write_text(text if cleaned == value else json.dumps(cleaned, indent=1), encoding="utf-8")
-
-
 # -- the Hub -------------------------------------------------------------------------------------------------------
 
 
-def _files(root: Path) -> list[str]:
+def files_of(root: Path) -> list[str]:
     """What goes, relative to ``root``: everything but recorders' scratch and what is hidden."""
     names = [path.relative_to(root).as_posix() for path in sorted(root.rglob("*")) if path.is_file()]
     return [name for name in names if _goes(name)]
@@ -309,7 +168,7 @@ def _goes(name: str) -> bool:
     return not name.startswith(("images/", ".")) and "/." not in name
 
 
-def _show(files: Sequence[str], root: Path, repo_id: str, private: bool, kind: str) -> None:
+def show_files(files: Sequence[str], root: Path, repo_id: str, private: bool, kind: str) -> None:
     from franka_wm.console import count, say
 
     size = sum((root / name).stat().st_size for name in files)
@@ -318,7 +177,7 @@ def _show(files: Sequence[str], root: Path, repo_id: str, private: bool, kind: s
         say(f"  {name}   {count((root / name).stat().st_size)}B")
 
 
-def _api(repo_id: str) -> Any:
+def hub_client(repo_id: str) -> Any:
     """The Hub's client; the token is its own business."""
     from huggingface_hub import HfApi, constants, get_token
 
@@ -329,15 +188,15 @@ def _api(repo_id: str) -> Any:
     return HfApi()
 
 
-def _check_name(api: Any, repo_id: str, kind: str, update: bool) -> None:
+def check_name(api: Any, repo_id: str, kind: str, update: bool) -> None:
     if not update and api.repo_exists(repo_id=repo_id, repo_type=kind):
         raise UserError(
             f"publish: {repo_id} exists already; choose another repo_id, or replace what is there with update=true"
         )
 
 
-def _send(api: Any, folder: Path, repo_id: str, kind: str, private: bool, update: bool) -> None:
-    """All of a staged folder, which has what :func:`_files` lists and no more, in one commit. What an
+def send(api: Any, folder: Path, repo_id: str, kind: str, private: bool, update: bool) -> None:
+    """All of a staged folder, which has what :func:`files_of` lists and no more, in one commit. What an
     earlier version left there goes in it: readers would take it for ours."""
     api.create_repo(repo_id=repo_id, private=private, repo_type=kind, exist_ok=update)
     api.upload_folder(

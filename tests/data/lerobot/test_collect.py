@@ -12,8 +12,9 @@ import pytest
 import torch
 from torchrl.collectors import Collector
 
-from franka_wm.cli import main
-from franka_wm.data.lerobot.collect import OPTIONS, gather, open_source
+from franka_wm.commands.collect import OPTIONS, open_source
+from franka_wm.commands.main import main
+from franka_wm.data.lerobot.collect import gather
 from franka_wm.data.lerobot.export import export_replay
 from franka_wm.data.lerobot.provenance import read_provenance
 from franka_wm.data.lerobot.schema import (

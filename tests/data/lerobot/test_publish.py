@@ -16,10 +16,11 @@ from omegaconf import OmegaConf
 
 from franka_wm.data.lerobot.hub import check_repo_id, explained
 from franka_wm.data.lerobot.paths import shortened, without_paths
-from franka_wm.data.lerobot.publish import stage_dataset, stage_model
+from franka_wm.data.lerobot.publish import stage_dataset
 from franka_wm.data.lerobot.schema import PROVENANCE
 from franka_wm.errors import UserError
 from franka_wm.training.checkpoint import load_checkpoint, save_checkpoint
+from franka_wm.training.publish import stage_model
 
 
 def _fake_hub():
@@ -53,7 +54,7 @@ def publish(hub, tmp_path):
         env |= {"HF_TOKEN": token} if token else {}
         env |= {"HF_HUB_OFFLINE": "1"} if offline else {}
         return subprocess.run(
-            [sys.executable, "-m", "franka_wm.cli", "publish", *arguments],
+            [sys.executable, "-m", "franka_wm.commands.main", "publish", *arguments],
             capture_output=True,
             text=True,
             env=env,
@@ -214,7 +215,7 @@ def test_the_card_of_anothers_dataset_claims_nothing(copy, tmp_path) -> None:
     ],
 )
 def test_a_broken_dataset_is_one_line(text, says, copy, capsys) -> None:
-    from franka_wm.cli import main
+    from franka_wm.commands.main import main
 
     (copy / "meta" / "info.json").write_text(text)
     assert main(["publish", f"root={copy}", "repo_id=user/arm", "--dry-run"]) == 1
@@ -268,7 +269,7 @@ def test_what_is_missing_is_one_line(hub, publish, dataset, tmp_path) -> None:
     ],
 )
 def test_bad_arguments_are_one_line(arguments, says, capsys, tmp_path, monkeypatch) -> None:
-    from franka_wm.cli import main
+    from franka_wm.commands.main import main
 
     monkeypatch.chdir(tmp_path)
     assert main(["publish", *arguments]) == 1

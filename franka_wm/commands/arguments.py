@@ -4,10 +4,14 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 from franka_wm import conf
 from franka_wm.errors import UserError
+
+CHECKOUT = Path(__file__).parents[2]
+"""Top of the repository, where ``benchmarks`` is, if the package runs from one."""
 
 
 def split(
@@ -129,3 +133,29 @@ def number(cfg: Any, key: str, kind: type[int] | type[float] = int) -> Any:
     if isinstance(value, bool) or not isinstance(value, int if kind is int else int | float):
         raise UserError(f"{key}={value}: must be a {'whole ' if kind is int else ''}number")
     return kind(value)
+
+
+def wants_help(arguments: list[str], usage: str) -> bool:
+    """Prints the usage if that is what is asked for."""
+    asked = any(argument in ("--help", "-h") for argument in arguments)
+    if asked:
+        print(f"usage: franka-wm {usage}")
+    return asked
+
+
+def split_arguments(arguments: list[str], options: set[str], usage: str) -> tuple[list[str], dict[str, str]]:
+    """Folders, and what stands as ``name=value``.
+
+    Raises:
+        UserError: an option that does not exist.
+    """
+    folders, given = [], {}
+    for argument in arguments:
+        name, equals, value = argument.partition("=")
+        if equals and name in options:
+            given[name] = value
+        elif argument.startswith("-") or (equals and not Path(argument).exists()):
+            raise UserError(f"unknown option {argument!r}; usage: franka-wm {usage}")
+        else:
+            folders.append(argument)
+    return folders, given

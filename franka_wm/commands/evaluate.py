@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from franka_wm.console import announced, say
 from franka_wm.errors import UserError
 from franka_wm.evaluation import diagnose
 from franka_wm.evaluation.decoder import Imagined
@@ -17,16 +18,13 @@ from franka_wm.evaluation.results import COMMAND, to_json
 from franka_wm.evaluation.robustness import check_shiftable, note, robustness
 from franka_wm.files import atomic_write
 from franka_wm.report.diagnostics import (
+    diagnostic_tables,
     evaluation_markdown,
-    horizon_table,
-    interval,
-    number,
-    probe_table,
-    robustness_table,
     terminal,
     timing_table,
 )
-from franka_wm.report.table import Table, evaluation_tables, markdown
+from franka_wm.report.table import evaluation_tables, markdown
+from franka_wm.training.load import load_agent
 
 WORLDS = 256
 """Simulated at once, at most; more episodes are played in rounds."""
@@ -129,9 +127,6 @@ def run(options: Options) -> dict[str, Any]:
     """
     from rich.console import Console
 
-    from franka_wm.console import announced, say
-    from franka_wm.training.load import load_agent
-
     check_folder(options.out)
     console = Console(width=120)
     with announced(f"loading {options.checkpoint} and building {min(options.episodes, WORLDS)} worlds"):
@@ -228,60 +223,6 @@ def _shift(agent: Any, options: Options, results: dict[str, Any], say: Say) -> N
     if note(episodes):
         results["protocol"]["robustness note"] = note(episodes)
         say(f"note: {note(episodes)}")
-
-
-def diagnostic_tables(results: Mapping[str, Any], config: Any) -> dict[str, Table]:
-    """Title → table, of what there is in the results beside the policies."""
-    tables = {}
-    if "curves" in results.get("open_loop", {}):
-        tables["Open loop: error of predicted latents"] = horizon_table(results["open_loop"])
-    if results.get("probes"):
-        tables["Probes"] = probe_table(results["probes"])
-    found = findings(results)
-    if found:
-        tables["What else was found"] = Table(
-            ["quantity", "value"], [[name, text] for name, text in found.items()]
-        )
-    if results.get("robustness"):
-        few = results.get("protocol", {}).get("robustness note")
-        tables["Robustness" + (f" ({few})" if few else "")] = robustness_table(
-            results["robustness"], config.success_distance
-        )
-    return tables
-
-
-def findings(results: Mapping[str, Any]) -> dict[str, str]:
-    """Single numbers as text: ranks, calibration, planner, spectrum."""
-    out: dict[str, str] = {}
-    ahead, value, health = (results.get(name, {}) for name in ("open_loop", "calibration", "health"))
-    if "not_measured" in ahead:
-        out["open loop, not measured"] = ahead["not_measured"]
-    if "rank_correlation" in ahead:
-        out["rank correlation of latent cost and tool distance, within episodes"] = interval(
-            ahead["rank_correlation"]
-        )
-        out["… across episodes"] = interval(ahead["rank_correlation_across_episodes"])
-    if "decoder" in ahead:
-        errors = ahead["decoder"]
-        share = errors["error"] / max(errors["mean_picture"], 1e-12)
-        out["decoder's error / that of the mean picture"] = number(share)
-    if value:
-        line = f"return = {number(value['slope'])} · value + {number(value['intercept'])}"
-        out["value calibration (exact: 1, 0)"] = line
-        out["… bias, value − return"] = number(value["bias"])
-        out["… correlation"] = number(value["correlation"])
-    out |= {
-        name: interval(found, 1, 3) if isinstance(found, Mapping) else f"{found:.4g}"
-        for name, found in health.items()
-        if name != "warnings"
-    }
-    spectrum = results.get("spectrum", {})
-    for name in ("rankme", "effective_rank", "feature_std", "mean_cosine", "dimensions"):
-        if name in spectrum:
-            out[f"latents: {name.replace('_', ' ')}"] = f"{spectrum[name]:.4g}"
-    if spectrum:
-        out["latents: collapse"] = spectrum["warning"] or "no sign of it"
-    return out
 
 
 def _write(

@@ -9,10 +9,12 @@ from types import SimpleNamespace
 import pytest
 import torch
 
-from franka_wm import cli
+from franka_wm.commands import evaluate
+from franka_wm.commands import main as cli
+from franka_wm.commands.evaluate import default_folder, parse, to_json
 from franka_wm.errors import UserError
-from franka_wm.evaluation import diagnose, evaluate
-from franka_wm.evaluation.evaluate import default_folder, parse, to_json
+from franka_wm.evaluation import diagnose
+from franka_wm.report import diagnostics
 
 POLICIES = {"planner", "policy", "noop", "random", "oracle"}
 
@@ -100,7 +102,7 @@ def test_results_that_cannot_be_written_are_refused_before_playing(out: str, tmp
 
 
 def test_shifting_what_is_no_arm_is_refused_before_playing(tmp_path: Path, monkeypatch, capsys) -> None:
-    monkeypatch.setattr("franka_wm.training.load.load_agent", lambda *a, **k: SimpleNamespace(env=object()))
+    monkeypatch.setattr(evaluate, "load_agent", lambda *a, **k: SimpleNamespace(env=object()))
     monkeypatch.setattr(evaluate, "evaluate_agent", lambda *a, **k: pytest.fail("played"))
     arguments = ["checkpoint=gym", f"out={tmp_path}/out", "robustness=true"]
     monkeypatch.setattr(evaluate, "protocol", lambda *a: pytest.fail("went on"))
@@ -119,7 +121,7 @@ def test_latents_that_never_change_are_said(agent, monkeypatch) -> None:
     assert evaluate._look_ahead(agent, held, None, results, said.append) is None  # type: ignore[arg-type]
     assert "no latent changes within 1 steps" in results["open_loop"]["not_measured"]
     assert sum("warning: open loop not measured" in line for line in said) == 1
-    assert "no latent changes" in evaluate.findings(results)["open loop, not measured"]
+    assert "no latent changes" in diagnostics.findings(results)["open loop, not measured"]
 
 
 def test_help(capsys) -> None:

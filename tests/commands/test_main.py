@@ -7,12 +7,12 @@ from pathlib import Path
 import pytest
 
 import franka_wm
-from franka_wm import cli
+from franka_wm.commands import main as cli
 
 
 def test_listing_imports_neither_simulator_nor_torch() -> None:
     code = (
-        "import sys; from franka_wm import cli; assert cli.main(['list']) == 0;"
+        "import sys; from franka_wm.commands import main as cli; assert cli.main(['list']) == 0;"
         "print([m for m in ('torch', 'newton', 'warp', 'torchrl', 'hydra', 'numpy') if m in sys.modules])"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
@@ -125,7 +125,7 @@ def test_outside_a_checkout_bench_says_so_and_list_still_lists(
 
 
 def test_list_into_a_closed_pipe_leaves_no_traceback() -> None:
-    command = f"{sys.executable} -m franka_wm.cli list | true"
+    command = f"{sys.executable} -m franka_wm.commands.main list | true"
     done = subprocess.run(["bash", "-c", command], capture_output=True, text=True, check=False)
     assert "Traceback" not in done.stderr
     assert "BrokenPipe" not in done.stderr

@@ -15,49 +15,54 @@ import sys
 from importlib import import_module
 from pathlib import Path
 
+from franka_wm.commands.arguments import CHECKOUT
 from franka_wm.errors import FrankaError, UserError
 from franka_wm.version import __version__
 
 # verb -> (module:function, arguments, what it does in one line)
 VERBS: dict[str, tuple[str, str, str]] = {
-    "list": ("franka_wm.cli:show_list", "", "environments, robots, tasks, models, planners and experiments"),
+    "list": (
+        "franka_wm.commands.main:show_list",
+        "",
+        "environments, robots, tasks, models, planners and experiments",
+    ),
     "evaluate": (
-        "franka_wm.evaluation.evaluate:main",
+        "franka_wm.commands.evaluate:main",
         "checkpoint=… [key=value …]",
         "judge a checkpoint on held-out episodes: success, predictions, latents, robustness",
     ),
-    "summary": ("franka_wm.report.seeds:summary", "RUN … | SWEEP", "runs of several seeds in one table"),
+    "summary": ("franka_wm.commands.summary:summary", "RUN … | SWEEP", "runs of several seeds in one table"),
     "report": (
-        "franka_wm.report.page:report",
+        "franka_wm.commands.report:report",
         "RUN [out=…]",
         "a run's page: report.html, one self-contained file",
     ),
     "compare": (
-        "franka_wm.report.compare:compare",
+        "franka_wm.commands.compare:compare",
         "RUN RUN … [out=…]",
         "several runs side by side on one page",
     ),
     "view": (
-        "franka_wm.live.view:view",
+        "franka_wm.commands.view:view",
         "[checkpoint=RUN]",
         "an arm in the browser: drag its goal; view --help",
     ),
     "collect": (
-        "franka_wm.data.lerobot.collect:collect",
+        "franka_wm.commands.collect:collect",
         "out=FOLDER …",
         "gather a LeRobot dataset with any policy",
     ),
     "export": (
-        "franka_wm.data.lerobot.export:export",
+        "franka_wm.commands.export:export",
         "source=RUN out=…",
         "a run's replay as a LeRobot dataset",
     ),
     "publish": (
-        "franka_wm.data.lerobot.publish:publish",
+        "franka_wm.commands.publish:publish",
         "root=… repo_id=…",
         "a dataset or a model to the Hub",
     ),
-    "bench": ("franka_wm.cli:bench", "NAME [options]", "run a benchmark of this checkout"),
+    "bench": ("franka_wm.commands.main:bench", "NAME [options]", "run a benchmark of this checkout"),
 }
 
 # The values of FrankaConfig.robot, which lives in a package that imports the simulator.
@@ -69,9 +74,7 @@ ROBOTS = {
     "urdf": "a URDF of your own: urdf_path=…",
 }
 
-PACKAGE = Path(__file__).parent
-CHECKOUT = PACKAGE.parent
-"""Top of the repository, where ``benchmarks`` is, if the package runs from one."""
+PACKAGE = Path(__file__).parents[1]
 
 USAGE, INTERRUPTED = 2, 130
 

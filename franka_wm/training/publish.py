@@ -1,0 +1,110 @@
+"""Trained models to the Hugging Face Hub, privately unless told otherwise."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import shutil
+import tempfile
+from pathlib import Path
+
+from omegaconf import OmegaConf
+
+from franka_wm.console import announced, say
+from franka_wm.data.lerobot.card import model_card
+from franka_wm.data.lerobot.hub import check_repo_id, explained
+from franka_wm.data.lerobot.paths import shortened, without_paths
+from franka_wm.data.lerobot.publish import README, check_name, files_of, hub_client, send, show_files
+from franka_wm.errors import UserError
+from franka_wm.training.checkpoint import latest_checkpoint, load_checkpoint
+
+
+def publish_model(
+    checkpoint: str | Path,
+    repo_id: str,
+    *,
+    private: bool = True,
+    license: str = "apache-2.0",
+    update: bool = False,
+    dry_run: bool = False,
+) -> None:
+    """Sends a trained model: what ``load_agent("hf:user/name")`` needs, the evaluation, and a card.
+
+    Args:
+        checkpoint: A run's folder, or a checkpoint in it.
+        repo_id, private, license, update, dry_run: As for :func:`publish_dataset`.
+
+    Raises:
+        UserError: One line.
+    """
+    check_repo_id(repo_id)
+    with tempfile.TemporaryDirectory() as place:
+        staged = stage_model(Path(checkpoint), Path(place), repo_id=repo_id, license=license)
+        files = files_of(staged)
+        show_files(files, staged, repo_id, private, "model")
+        if dry_run:
+            say("dry run: nothing was sent")
+            return
+        api = hub_client(repo_id)
+        with explained(repo_id):
+            check_name(api, repo_id, "model", update)
+            with announced(f"sending {len(files)} files"):
+                send(api, staged, repo_id, "model", private, update)
+        say(f"published: {api.endpoint}/{repo_id} ({'private' if private else 'public'})")
+
+
+def stage_model(checkpoint: Path, place: Path, *, repo_id: str, license: str) -> Path:
+    """A checkpoint without what only training needs: no optimiser, no replay, no random states, no absolute paths.
+
+    Args:
+        checkpoint: A run's folder, or a checkpoint in it.
+        place: An empty folder.
+        repo_id, license: For the card.
+
+    Returns:
+        ``place``, which is a checkpoint now.
+    """
+    opened = load_checkpoint(latest_checkpoint(checkpoint))
+    manifest = json.loads((opened.folder / "manifest.json").read_text(encoding="utf-8"))
+    kept = ("model.safetensors", "counters.json", "extra.json", "extra.safetensors")
+    for name in kept:
+        if name in manifest["files"]:
+            shutil.copyfile(opened.folder / name, place / name)
+    config = without_paths(OmegaConf.to_container(opened.config), clear=True)
+    if "resume" in config:
+        config["resume"] = None
+    OmegaConf.save(OmegaConf.create(config), place / "config.yaml")
+    if (place / "extra.json").is_file():
+        _copy_json(place / "extra.json", place / "extra.json")
+    manifest["files"] = {
+        path.name: {
+            "bytes": path.stat().st_size,
+            "sha256": hashlib.sha256(path.read_bytes()).hexdigest(),
+        }
+        for path in sorted(place.iterdir())
+    }
+    (place / "manifest.json").write_text(json.dumps(manifest, indent=1), encoding="utf-8")
+    run = opened.folder.parent.parent if opened.folder.parent.name == "checkpoints" else opened.folder
+    written = run / "evaluation"  # where the verb evaluate puts them; a published model has them at its top
+    written = written if (written / "evaluation.md").is_file() else run
+    if (written / "evaluation.json").is_file():
+        _copy_json(written / "evaluation.json", place / "evaluation.json")
+    if (written / "evaluation.md").is_file():
+        text = (written / "evaluation.md").read_text(encoding="utf-8")
+        (place / "evaluation.md").write_text(shortened(text), encoding="utf-8")
+    card = model_card(place, repo_id=repo_id, license=license)
+    (place / README).write_text(card, encoding="utf-8")
+    return place
+
+
+def _copy_json(source: Path, target: Path) -> None:
+    """Unchanged, unless there are absolute paths in it."""
+    text = source.read_text(encoding="utf-8")
+    try:
+        value = json.loads(text)
+    except ValueError as error:
+        raise UserError(
+            f"publish: {source} cannot be read ({error}); write it again, or remove it"
+        ) from error
+    cleaned = without_paths(value)
+    target.write_text(text if cleaned == value else json.dumps(cleaned, indent=1), encoding="utf-8")
