@@ -13,10 +13,10 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from franka_wm.models import register
+from franka_wm.models import WorldModel, register
 
 
-class Linear(nn.Module):
+class Linear(WorldModel):
     """z = W s; z' = A z + B a; reward and value are small networks. Value targets are one-step, with γ."""
 
     def __init__(
@@ -74,12 +74,6 @@ class Linear(nn.Module):
         }
         total = torch.stack(tuple(parts.values())).sum()
         return TensorDict({"loss": total} | {k: v.detach() for k, v in parts.items()}, batch_size=[])
-
-    def parameter_groups(self, lr: float) -> list[dict]:
-        return [{"name": "model", "clip": "model", "params": list(self.parameters()), "lr": lr}]
-
-    def after_update(self) -> None:
-        """No targets to move."""
 
 
 register("linear", Linear, line="linear latents, an example")

@@ -1,7 +1,7 @@
 """Families of latent world models, by name.
 
-Every family is a `torch.nn.Module` with `encode(observation) -> z`, `next(z, action) -> z'` and
-`loss(batch) -> TensorDict`, and, where it has them, `reward(z, action)`, `value(z)` and `policy(z)`.
+Every family is a `WorldModel` (`franka_wm.models.base`): `encode(observation) -> z` and `loss(batch) -> TensorDict`,
+and the optional abilities that it defines, such as `next(z, action) -> z'`, `reward(z, action)` or `policy(z)`.
 To add one, write one file here and one line in `_FAMILIES`, or call `register` with a class of your own. A family
 is imported when it is made.
 """
@@ -9,7 +9,12 @@ is imported when it is made.
 from importlib import import_module
 from typing import Any
 
-# name -> (module, class, what it is in one line)
+from franka_wm.errors import UserError
+from franka_wm.models.base import WorldModel
+
+__all__ = ["WorldModel", "available", "family", "make", "register"]
+
+# name -> (module, class, one line of description)
 _FAMILIES: dict[str, tuple[str, str, str]] = {
     "tdmpc2": (
         "franka_wm.models.tdmpc2",
@@ -19,12 +24,12 @@ _FAMILIES: dict[str, tuple[str, str, str]] = {
     "muzero": (
         "franka_wm.models.muzero",
         "MuZero",
-        "MuZero: a latent model for tree search over a few discrete moves",
+        "MuZero: a latent model for tree search over a few discrete actions",
     ),
     "jepa": (
         "franka_wm.models.jepa",
         "JEPA",
-        "JEPA: pretrains a vision encoder from pictures alone (I-JEPA, V-JEPA, LeJEPA)",
+        "JEPA: pretrains a vision encoder from images alone (I-JEPA, V-JEPA, LeJEPA)",
     ),
     "lewm": (
         "franka_wm.models.lewm",
@@ -37,28 +42,33 @@ _FAMILIES: dict[str, tuple[str, str, str]] = {
         "V-JEPA 2-AC: transformer dynamics over the tokens of a pretrained encoder",
     ),
 }
-_REGISTERED: dict[str, tuple[type, str]] = {}
+_REGISTERED: dict[str, tuple[type[WorldModel], str]] = {}
 
 
-def register(name: str, cls: type, *, line: str = "") -> None:
+def register(name: str, cls: type[WorldModel], *, line: str = "") -> None:
     """Make a family of one's own known, for this process.
 
     Args:
         name: what `model.name` will say.
-        cls: a `torch.nn.Module` with the methods above.
-        line: what it is.
+        cls: subclass of `WorldModel`.
+        line: one line of description.
+
+    Raises:
+        UserError: `cls` is no subclass of `WorldModel`.
     """
+    if not issubclass(cls, WorldModel):
+        raise UserError(f"model {name!r}: {cls.__name__} must be a subclass of franka_wm.models.WorldModel")
     _REGISTERED[name] = (cls, line)
 
 
 def available() -> dict[str, str]:
-    """The families that `make` knows: name -> one line of description."""
+    """Families that `make` knows: name -> one line of description."""
     ours = {name: line for name, (_, _, line) in _FAMILIES.items()}
     return ours | {name: line for name, (_, line) in _REGISTERED.items()}
 
 
-def family(name: str) -> type:
-    """The class of the family `name`.
+def family(name: str) -> type[WorldModel]:
+    """Class of the family `name`.
 
     Raises:
         ValueError: no family has this name; the message lists those that exist.
@@ -71,7 +81,7 @@ def family(name: str) -> type:
     return getattr(import_module(module), cls)
 
 
-def make(name: str, **overrides: Any) -> Any:
+def make(name: str, **overrides: Any) -> WorldModel:
     """Build the model family `name`; `overrides` go to its constructor.
 
     The sizes known only at run time (for example `observation_sizes`, `action_dim`) are overrides too.

@@ -10,7 +10,8 @@ from safetensors import SafetensorError, safe_open
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from franka_wm.models.vision import Architecture, ConvEncoder, ViT, check_pictures, vit_size
+from franka_wm.models.images import check_images
+from franka_wm.models.vision import Architecture, ConvEncoder, ViT, vit_size
 
 IMAGENET_MEAN, IMAGENET_STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
 _WEIGHTS = ("model.safetensors", "checkpoints/latest/model.safetensors")
@@ -211,7 +212,7 @@ class HuggingFaceEncoder(nn.Module):
 
     def maps(self, pictures: Tensor) -> Tensor:
         """(N, height, width, 3) uint8 -> feature maps (N, width, rows, columns)."""
-        x = check_pictures(pictures).permute(0, 3, 1, 2).to(self.mean.dtype).div(255.0)
+        x = check_images(pictures).permute(0, 3, 1, 2).to(self.mean.dtype).div(255.0)
         if x.shape[-2:] != self.size:
             x = F.interpolate(x, size=self.size, mode="bilinear", antialias=True)
         hidden = self.model(pixel_values=(x - self.mean) / self.std).last_hidden_state

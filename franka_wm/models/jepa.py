@@ -1,20 +1,31 @@
 """Joint-embedding predictive pretraining of vision encoders from pictures alone: I-JEPA, V-JEPA, LeJEPA."""
 
-import copy
-import math
+from __future__ import annotations
+
 from collections.abc import Mapping
-from typing import Any
+from typing import ClassVar, Literal
 
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from franka_wm.models.groups import decay_groups
-from franka_wm.models.masks import make_masks
-from franka_wm.models.parts import initialize
+from franka_wm.models.base import WorldModel
+from franka_wm.models.ema import ema_update, frozen_copy
+from franka_wm.models.groups import ParameterGroup, decay_groups
+from franka_wm.models.images import (
+    ImageSize,
+    check_image_sizes,
+    random_crops,
+    shared_image_size,
+    stack_cameras,
+)
+from franka_wm.models.layers import initialize
+from franka_wm.models.masks import Sampler, make_masks
+from franka_wm.models.options import COEFFICIENT, FRACTION, POSITIVE, Range
 from franka_wm.models.regularizers import (
     CollapseGuard,
+    CollapseName,
     ProjectionMLP,
     feature_std,
     participation_ratio,
@@ -22,22 +33,21 @@ from franka_wm.models.regularizers import (
 from franka_wm.models.vision import (
     Block,
     ViT,
-    check_image_sizes,
-    check_pictures,
     sincos_grid,
     token_codes,
     vit_size,
 )
+from franka_wm.models.windows import check_windows
 
 # recipe -> (guard, masks, clips, tubelet): what it takes where nothing else is asked for
-RECIPES: dict[str, tuple[str, str | None, bool, int]] = {
+RECIPES: dict[str, tuple[CollapseName, str | None, bool, int]] = {
     "ijepa": ("ema", "multiblock", False, 1),
     "vjepa": ("ema", "tube", True, 2),
     "lejepa": ("sigreg", None, False, 1),
 }
 
 
-class JEPA(nn.Module):
+class JEPA(WorldModel):
     """An encoder of pictures or clips, trained to predict embeddings instead of pixels. No actions.
 
     Three recipes:
@@ -89,15 +99,27 @@ class JEPA(nn.Module):
         ValueError: a setting that cannot work.
     """
 
+    ranges: ClassVar[Mapping[str, Range]] = {
+        **dict.fromkeys(
+            ("encoder_width", "encoder_depth", "encoder_heads", "patch_size", "tubelet"), POSITIVE
+        ),
+        **dict.fromkeys(("predictor_width", "predictor_depth", "predictor_heads", "projection"), POSITIVE),
+        **dict.fromkeys(("ema_steps", "guard_directions", "global_views"), POSITIVE),
+        **dict.fromkeys(("guard_coef", "weight_decay"), COEFFICIENT),
+        **dict.fromkeys(("ema_start", "ema_end"), FRACTION),
+        "local_views": Range(0),
+        "mask_ratio": Range(0, 1, without_low=True, without_high=True),
+    }
+
     def __init__(
         self,
         *,
-        image_sizes: Mapping[str, tuple[int, int, int]] | None = None,
+        image_sizes: Mapping[str, ImageSize] | None = None,
         observation_sizes: Mapping[str, int] | None = None,
         action_dim: int | None = None,
         episode_length: int | None = None,
-        recipe: str = "ijepa",
-        collapse: str | None = None,
+        recipe: Literal["ijepa", "vjepa", "lejepa"] = "ijepa",
+        collapse: CollapseName | None = None,
         masks: str | None = None,
         mask_ratio: float | None = None,
         clips: bool | None = None,
@@ -110,7 +132,7 @@ class JEPA(nn.Module):
         predictor_width: int = 192,
         predictor_depth: int = 6,
         predictor_heads: int = 6,
-        features: str = "mean",
+        features: Literal["mean", "flat"] = "mean",
         ema_start: float = 0.996,
         ema_end: float = 1.0,
         ema_steps: int = 100_000,
@@ -123,23 +145,16 @@ class JEPA(nn.Module):
         local_scale: tuple[float, float] = (0.05, 0.3),
         weight_decay: float = 0.05,
     ) -> None:
+        self.validate(locals())
         super().__init__()
-        if recipe not in RECIPES:
-            raise ValueError(f"unknown recipe {recipe!r} of JEPA; available: {', '.join(RECIPES)}")
         if observation_sizes:
             raise ValueError(
-                f"JEPA reads pictures only, got vectors {', '.join(observation_sizes)}: set observations=[pixels]"
+                f"JEPA reads images only, got vectors {', '.join(observation_sizes)}: set observations=[pixels]"
             )
-        if features not in ("mean", "flat"):
-            raise ValueError(f"features must be mean or flat, got {features!r}")
-        if not 0.0 <= ema_start <= ema_end <= 1.0 or ema_steps < 1:
-            raise ValueError(
-                f"need 0 <= ema_start <= ema_end <= 1 and ema_steps >= 1, got {ema_start}, {ema_end}, {ema_steps}"
-            )
-        self.image_sizes, size = one_size(image_sizes or {})
-        self.observation_sizes: dict[str, int] = {}
-        self.observation_keys = list(self.image_sizes)
-        self.action_dim = action_dim
+        if ema_start > ema_end:
+            raise ValueError(f"ema_start must be at most ema_end, got {ema_start} and {ema_end}")
+        self.image_sizes = check_image_sizes(image_sizes)
+        size = shared_image_size(self.image_sizes)
         guard, sampler, as_clips, own_tubelet = RECIPES[recipe]
         self.recipe, self.features, self.weight_decay = recipe, features, weight_decay
         self.collapse = guard if collapse is None else collapse
@@ -165,10 +180,6 @@ class JEPA(nn.Module):
         if recipe == "lejepa":
             if masks is not None:
                 raise ValueError("the recipe lejepa crops instead of masking: leave masks at null")
-            if global_views < 1 or local_views < 0:
-                raise ValueError(
-                    f"need global_views >= 1 and local_views >= 0, got {global_views}, {local_views}"
-                )
             for name, (low, high) in (("global_scale", global_scale), ("local_scale", local_scale)):
                 if not 0.0 < low <= high <= 1.0:
                     raise ValueError(f"{name} must be a range within (0, 1], got [{low}, {high}]")
@@ -190,9 +201,9 @@ class JEPA(nn.Module):
             )
         self.target_encoder = self.target_projector = None
         if self.collapse == "ema":
-            self.target_encoder = _frozen_copy(self.encoder)
+            self.target_encoder = frozen_copy(self.encoder)
             if recipe == "lejepa":
-                self.target_projector = _frozen_copy(self.projector)
+                self.target_projector = frozen_copy(self.projector)
         self.register_buffer("updates", torch.zeros(()))
         if recipe != "lejepa":
             # Fails here, not at the first update, if the sampler does not fit; clips may have any length later.
@@ -210,9 +221,9 @@ class JEPA(nn.Module):
 
         Of the teacher where there is one, as published, else of the encoder. No gradient.
         """
-        pictures = stack_views(observation, self.image_sizes)
-        leading = pictures.shape[:-3]
-        tokens = self.best_encoder(pictures.reshape(-1, *pictures.shape[-3:]))
+        images = stack_cameras(observation, self.image_sizes)
+        leading = images.shape[:-3]
+        tokens = self.best_encoder(images.reshape(-1, *images.shape[-3:]))
         x = tokens.mean(1) if self.features == "mean" else tokens.flatten(1)
         return x.reshape(*leading, -1).flatten(-2)
 
@@ -222,10 +233,6 @@ class JEPA(nn.Module):
         return self.encoder if self.target_encoder is None else self.target_encoder
 
     # ------------------------------------------------------------------ training
-
-    def forward(self, batch: TensorDictBase) -> TensorDict:
-        """Same as `loss`, for wrappers that call the module."""
-        return self.loss(batch)
 
     def loss(self, batch: TensorDictBase) -> TensorDict:
         """Loss of a batch of windows; call `backward` once on the entry `loss`.
@@ -242,8 +249,7 @@ class JEPA(nn.Module):
         Raises:
             ValueError: the batch size is not [B, H], or windows shorter than a tubelet.
         """
-        if len(batch.batch_size) != 2:
-            raise ValueError(f"a batch of windows has batch size [B, H], got {list(batch.batch_size)}")
+        check_windows(batch)
         clips = self._as_clips(batch)
         step = self._loss_of_views if self.recipe == "lejepa" else self._loss_of_masks
         prediction, guard, pooled = step(clips)
@@ -271,7 +277,7 @@ class JEPA(nn.Module):
             ema_update(self.target_projector, self.projector, self.ema())
         self.updates.add_(1.0)
 
-    def parameter_groups(self, lr: float) -> list[dict[str, Any]]:
+    def parameter_groups(self, lr: float) -> list[ParameterGroup]:
         """Parameter groups for AdamW; the teacher is in none."""
         return decay_groups(self.parameters(), lr, weight_decay=self.weight_decay)
 
@@ -279,16 +285,16 @@ class JEPA(nn.Module):
 
     def _as_clips(self, batch: TensorDictBase) -> Tensor:
         """(N, T, height, width, C) from windows [B, H]: each camera's clip, or picture, by itself."""
-        pictures = stack_views(batch, self.image_sizes)  # (B, H, V, height, width, C)
+        images = stack_cameras(batch, self.image_sizes)  # (B, H, V, height, width, C)
         if not self.clips:
-            return pictures.flatten(0, 2).unsqueeze(1)
+            return images.flatten(0, 2).unsqueeze(1)
         tubelet = self.encoder.tubelet
-        frames = pictures.shape[1] // tubelet * tubelet
+        frames = images.shape[1] // tubelet * tubelet
         if frames == 0:
-            raise ValueError(f"clips need windows of at least {tubelet} frames, got {pictures.shape[1]}")
-        return pictures[:, :frames].transpose(1, 2).flatten(0, 1)
+            raise ValueError(f"clips need windows of at least {tubelet} frames, got {images.shape[1]}")
+        return images[:, :frames].transpose(1, 2).flatten(0, 1)
 
-    def _sampler(self, frames: int) -> Any:
+    def _sampler(self, frames: int) -> Sampler:
         assert self.masks is not None
         options = {} if self.mask_ratio is None or self.masks == "multiblock" else {"ratio": self.mask_ratio}
         return make_masks(self.masks, (frames // self.encoder.tubelet, *self.encoder.grid), **options)
@@ -384,74 +390,3 @@ class MaskedPredictor(nn.Module):
         for block in self.blocks:
             x = block(x)
         return self.leave(self.norm(x[:, -asked:])).unflatten(0, (count, groups))
-
-
-# -- shared with the other families of pictures ----------------------------------------------------------
-
-
-def one_size(
-    image_sizes: Mapping[str, tuple[int, int, int]],
-) -> tuple[dict[str, tuple[int, int, int]], tuple[int, int, int]]:
-    """Checked sizes, and the one that all of them have.
-
-    Raises:
-        ValueError: none, or several different ones.
-    """
-    sizes = check_image_sizes(image_sizes)
-    if not sizes:
-        raise ValueError("image_sizes needs at least one picture: set observations=[pixels]")
-    if len(set(sizes.values())) > 1:
-        raise ValueError(f"all pictures must have one size to share an encoder, got {sizes}")
-    return sizes, next(iter(sizes.values()))
-
-
-def stack_views(observation: TensorDictBase, keys: Mapping[str, Any]) -> Tensor:
-    """The pictures of all keys, (..., V, height, width, C) uint8."""
-    return torch.stack([check_pictures(observation.get(key)) for key in keys], dim=-4)
-
-
-def random_crops(clips: Tensor, count: int, scale: tuple[float, float], size: tuple[int, int]) -> Tensor:
-    """Random crops of clips, resized bilinearly; all frames of a clip are cropped alike.
-
-    Args:
-        clips: (N, T, height, width, C) uint8.
-        count: crops of each clip.
-        scale: range of a crop's area, relative to the picture; its aspect ratio is in [3/4, 4/3].
-        size: (height, width) of the result.
-
-    Returns:
-        (count, N, T, *size, C) uint8.
-    """
-    n, frames, height, width, channels = clips.shape
-    device = clips.device
-    u = torch.rand(4, count * n, device=device)
-    area = scale[0] + (scale[1] - scale[0]) * u[0]
-    ratio = torch.exp(math.log(4 / 3) * (2.0 * u[1] - 1.0))
-    part = [(area * ratio).sqrt().clamp(max=1.0), (area / ratio).sqrt().clamp(max=1.0)]  # of x and y
-    centre = [(1.0 - p) * (2.0 * v - 1.0) for p, v in zip(part, u[2:], strict=True)]
-    zero = torch.zeros_like(area)
-    theta = torch.stack((part[0], zero, centre[0], zero, part[1], centre[1]), -1).view(-1, 2, 3)
-    images = clips.permute(0, 1, 4, 2, 3).reshape(n, frames * channels, height, width).float()
-    images = images.expand(count, -1, -1, -1, -1).flatten(0, 1)
-    grid = F.affine_grid(theta, [count * n, frames * channels, *size], align_corners=False)
-    crops = F.grid_sample(images, grid, padding_mode="border", align_corners=False)
-    crops = crops.round().clamp(0, 255).to(torch.uint8).view(count, n, frames, channels, *size)
-    return crops.permute(0, 1, 2, 4, 5, 3)
-
-
-def _frozen_copy(module: Any) -> Any:
-    return copy.deepcopy(module).requires_grad_(False)
-
-
-def ema_update(slow: nn.Module, live: nn.Module, keep: Tensor) -> None:
-    """Move the parameters of `slow` to `keep` · slow + (1 - `keep`) · live; `keep` () on the device.
-
-    Floating-point buffers (running statistics) follow at once.
-    """
-    targets = [p.data for p in slow.parameters()]
-    change = torch._foreach_sub([p.detach() for p in live.parameters()], targets)  # pyright: ignore[reportPrivateImportUsage]
-    torch._foreach_mul_(change, 1.0 - keep)  # pyright: ignore[reportPrivateImportUsage]
-    torch._foreach_add_(targets, change)  # pyright: ignore[reportPrivateImportUsage]
-    for a, b in zip(slow.buffers(), live.buffers(), strict=True):
-        if a.is_floating_point():
-            a.copy_(b)

@@ -1,17 +1,22 @@
 """LeWorldModel: an action-conditioned JEPA trained end to end, kept from collapsing by SIGReg alone."""
 
+from __future__ import annotations
+
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, ClassVar
 
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from franka_wm.models.groups import decay_groups
-from franka_wm.models.jepa import one_size, stack_views
-from franka_wm.models.memory import Memory
-from franka_wm.models.parts import TwoHotSymlog, initialize, mlp
+from franka_wm.errors import UserError
+from franka_wm.models.groups import ParameterGroup, decay_groups
+from franka_wm.models.history import FrameHistory, HistoryWorldModel
+from franka_wm.models.images import ImageSize, check_image_sizes, shared_image_size, stack_cameras
+from franka_wm.models.layers import TwoHotSymlog, initialize, mlp, unit_gain, zero_head
+from franka_wm.models.normalizer import ObservationNormalizer
+from franka_wm.models.options import COEFFICIENT, FRACTION, POSITIVE, Range, with_defaults
 from franka_wm.models.regularizers import (
     ProjectionMLP,
     SIGReg,
@@ -20,11 +25,11 @@ from franka_wm.models.regularizers import (
     participation_ratio,
 )
 from franka_wm.models.transformer import CausalTransformer, block_causal_mask, hide_invalid
-from franka_wm.models.vectors import Vectors
 from franka_wm.models.vision import ViT, vit_size
+from franka_wm.models.windows import check_windows, window_of
 
 
-class LeWorldModel(nn.Module):
+class LeWorldModel(HistoryWorldModel):
     """Encoder and action-conditioned predictor of embeddings, one loss for both (LeWorldModel, after LeJEPA,
     Balestriero & LeCun 2025, arXiv:2511.08544).
 
@@ -34,7 +39,7 @@ class LeWorldModel(nn.Module):
     last `history` embeddings with the actions through AdaLN-zero.
 
     z holds the last `history` frames' embeddings, the actions between them and who is real (see
-    `franka_wm.models.memory`), so `next(z, action)` needs nothing else. Distances to a goal are measured on
+    `franka_wm.models.history`), so `next(z, action)` needs nothing else. Distances to a goal are measured on
     `embed(z)`, the newest embedding. BatchNorm uses the batch's statistics in `loss` alone, and there in
     training mode alone: planning never depends on what else is in the batch.
 
@@ -76,10 +81,24 @@ class LeWorldModel(nn.Module):
         ValueError: a setting that cannot work.
     """
 
+    ranges: ClassVar[Mapping[str, Range]] = {
+        **dict.fromkeys(
+            ("action_dim", "embed_dim", "state_embed_dim", "state_hidden_dim", "history"), POSITIVE
+        ),
+        **dict.fromkeys(("encoder_width", "encoder_depth", "encoder_heads", "patch_size"), POSITIVE),
+        **dict.fromkeys(
+            ("projector_hidden", "predictor_width", "predictor_depth", "predictor_heads"), POSITIVE
+        ),
+        **dict.fromkeys(("predictor_head_dim", "predictor_mlp", "sigreg_directions", "rollout"), POSITIVE),
+        **dict.fromkeys(("sigreg_coef", "infonce_coef", "inverse_coef", "weight_decay"), COEFFICIENT),
+        "discount": FRACTION,
+        "dropout": Range(0, 1, without_high=True),
+    }
+
     def __init__(
         self,
         *,
-        image_sizes: Mapping[str, tuple[int, int, int]] | None = None,
+        image_sizes: Mapping[str, ImageSize] | None = None,
         observation_sizes: Mapping[str, int] | None = None,
         action_dim: int,
         episode_length: int | None = None,
@@ -108,28 +127,22 @@ class LeWorldModel(nn.Module):
         discount: float = 0.99,
         weight_decay: float = 1e-3,
     ) -> None:
+        self.validate(locals())
         super().__init__()
         if not image_sizes and not observation_sizes:
             raise ValueError("give observation_sizes or image_sizes: there is nothing to read")
-        if rollout < 1:
-            raise ValueError(f"rollout must be at least 1, got {rollout}")
-        if min(sigreg_coef, infonce_coef, inverse_coef) < 0.0:
-            raise ValueError("sigreg_coef, infonce_coef and inverse_coef must not be negative")
-        if not 0.0 <= discount <= 1.0:
-            raise ValueError(f"discount must be in [0, 1], got {discount}")
-        self.vectors = Vectors(observation_sizes or {})
+        self.vectors = ObservationNormalizer(observation_sizes)
         self.observation_sizes, self.action_dim = self.vectors.sizes, action_dim
+        self.image_sizes = check_image_sizes(image_sizes)
         self.sigreg_coef, self.infonce_coef, self.rollout = sigreg_coef, infonce_coef, rollout
         self.inverse_coef = inverse_coef
         self.weight_decay, self.discount = weight_decay, discount
-        self.image_sizes: dict[str, tuple[int, int, int]] = {}
         self.encoder = self.projector = self.state_encoder = None
         self.image_part = self.state_part = 0
-        if image_sizes:
-            self.image_sizes, size = one_size(image_sizes)
+        if self.image_sizes:
             shape = vit_size(encoder_size, width=encoder_width, depth=encoder_depth, heads=encoder_heads)
             self.encoder = ViT(
-                image_size=size,
+                image_size=shared_image_size(self.image_sizes),
                 patch_size=patch_size,
                 width=shape.width,
                 depth=shape.depth,
@@ -141,18 +154,17 @@ class LeWorldModel(nn.Module):
                 shape.width * len(self.image_sizes), embed_dim, hidden=projector_hidden
             )
         if self.observation_sizes:
-            self.state_part = state_embed_dim if image_sizes else embed_dim
-            self.state_encoder = mlp(self.vectors.size, (state_hidden_dim, state_hidden_dim), self.state_part)
-            _spread(self.state_encoder)
-        self.observation_keys = [*self.observation_sizes, *self.image_sizes]
+            self.state_part = state_embed_dim if self.image_sizes else embed_dim
+            hidden = (state_hidden_dim, state_hidden_dim)
+            self.state_encoder = unit_gain(mlp(self.vectors.size, hidden, self.state_part))
         frame = self.image_part + self.state_part
-        self.memory = Memory(history=history, frame_dim=frame, action_dim=action_dim)
-        self.latent_dim = self.memory.size
+        self.history = FrameHistory(length=history, frame_dim=frame, action_dim=action_dim)
+        self.latent_dim = self.history.size
         width = frame if predictor_width is None else predictor_width
         self.lift = nn.Identity() if predictor_width is None else nn.Linear(frame, width)
         self.action_encoder = nn.Sequential(nn.Linear(action_dim, width), nn.SiLU(), nn.Linear(width, width))
         initialize(self.action_encoder)
-        _spread(self.action_encoder)
+        unit_gain(self.action_encoder)
         self.predictor = CausalTransformer(
             width=width,
             depth=predictor_depth,
@@ -168,79 +180,49 @@ class LeWorldModel(nn.Module):
         if inverse_coef:
             seen = (history + 1) * (self.image_part or frame)
             self.inverse_head = mlp(seen, (512, 512), history * action_dim)
-        self.reward_probe = None
+        self.reward_probe, self.has_reward = None, reward_head
         if reward_head:
             self.two_hot = TwoHotSymlog()
-            self.reward_probe = mlp(self.latent_dim + action_dim, (256, 256), self.two_hot.bins)
-            nn.init.zeros_(self.reward_probe[-1].weight)  # type: ignore[arg-type]
-            self.reward = self._reward  # there only where it can be asked
+            self.reward_probe = zero_head(self.latent_dim + action_dim, (256, 256), self.two_hot.bins)
+
+    @classmethod
+    def validate(cls, options: Mapping[str, Any], *, window: int | None = None) -> None:
+        super().validate(options, window=window)
+        given = with_defaults(cls, options)
+        inverse, history = given["inverse_coef"], given["history"]
+        if inverse and window is not None and window < history:
+            raise UserError(
+                f"model.inverse_coef={inverse}: reads the actions of windows of model.history={history} transitions, "
+                f"and they have {window}; use replay.window={history}, or model.inverse_coef=0"
+            )
 
     # ------------------------------------------------------------------ what a planner uses
 
-    @staticmethod
-    def refusal(settings: Mapping[str, Any], window: int) -> str | None:
-        """Why a run with these options (``conf/model``) cannot learn from windows of so many transitions."""
-        history = settings.get("history", 3)
-        if not settings.get("inverse_coef", 0.0) or window >= history:
-            return None
-        return (
-            f"model.inverse_coef={settings['inverse_coef']}: reads the actions of windows of model.history={history} "
-            f"transitions, and they have {window}; use replay.window={history}, or model.inverse_coef=0"
-        )
-
-    def set_observation_statistics(self, mean: Tensor, std: Tensor) -> None:
-        """Standardise state vectors from now on, see `Vectors.set_statistics`."""
-        self.vectors.set_statistics(mean, std)
-
-    def encode(self, observation: TensorDictBase) -> Tensor:
-        """The z (..., latent_dim) of an episode's first observation: a history of one frame."""
-        return self.memory.start(self._frame(observation))
-
-    def observe(
-        self, observation: TensorDictBase, previous_z: Tensor, action: Tensor, is_init: Tensor
-    ) -> Tensor:
-        """The z after `action` led to `observation`.
-
-        Args:
-            observation: batch size [E].
-            previous_z: (E, latent_dim), before the action.
-            action: (E, action_dim).
-            is_init: (E, 1) bool; where True the observation is an episode's first, and z that of `encode`.
-        """
-        frame = self._frame(observation)
-        pushed = self.memory.push(previous_z, action, frame)
-        return torch.where(is_init, self.memory.start(frame), pushed)
-
     def next(self, z: Tensor, action: Tensor) -> Tensor:
-        """z (..., latent_dim) and actions (..., action_dim) -> next z (..., latent_dim)."""
-        frames, actions, valid = (x.reshape(-1, *x.shape[z.dim() - 1 :]) for x in self.memory.split(z))
-        flat = action.reshape(-1, self.action_dim)
-        actions = torch.cat((actions, flat.unsqueeze(1).to(actions.dtype)), dim=1)
-        mask = block_causal_mask(self.memory.history, device=z.device)
+        """Next z (..., latent_dim) after actions (..., action_dim) in z (..., latent_dim)."""
+        frames, actions, valid = self.unpack(z, action)
+        mask = block_causal_mask(self.history.length, device=z.device)
         predicted = self._predict(frames, actions, hide_invalid(mask, valid), training=False)[:, -1]
-        return self.memory.push(z, action, predicted.view(*z.shape[:-1], -1))
+        return self.history.push(z, action, predicted.view(*z.shape[:-1], -1))
 
     def embed(self, z: Tensor) -> Tensor:
         """What goals are compared on: the newest frame's embedding (..., embed_dim)."""
-        return self._comparable(self.memory.last(z))
+        return self._comparable(self.history.last(z))
 
     def encode_goal(self, observation: TensorDictBase) -> Tensor:
         """The embedding (..., embed_dim) of a goal: of its pictures where the model reads any (state vectors
         are not needed then), else of its state vectors."""
         if self.image_sizes:
             return self._picture(observation, batch_statistics=False)
-        return self._comparable(self._frame(observation))
+        return self._comparable(self.encode_frame(observation))
 
-    def _reward(self, z: Tensor, action: Tensor) -> Tensor:
-        """Expected reward (..., 1) of an action in z; the attribute `reward` with `reward_head` only."""
-        assert self.reward_probe is not None
+    def reward(self, z: Tensor, action: Tensor) -> Tensor:
+        """Expected reward (..., 1) of an action in z, of a model with `reward_head`."""
+        if self.reward_probe is None:
+            raise NotImplementedError("this model was built without reward_head=true: it has no reward")
         return self.two_hot.decode(self.reward_probe(torch.cat((z, action), dim=-1)))
 
     # ------------------------------------------------------------------ training
-
-    def forward(self, batch: TensorDictBase) -> TensorDict:
-        """Same as `loss`, for wrappers that call the module."""
-        return self.loss(batch)
 
     def loss(self, batch: TensorDictBase) -> TensorDict:
         """Loss of a batch of windows; call `backward` once on the entry `loss`.
@@ -259,13 +241,12 @@ class LeWorldModel(nn.Module):
         Raises:
             ValueError: the batch size is not [B, H], or with `inverse_coef` H is below `history`.
         """
-        if len(batch.batch_size) != 2:
-            raise ValueError(f"a batch of windows has batch size [B, H], got {list(batch.batch_size)}")
+        check_windows(batch)
         action = batch.get("action")
-        frames = self._frame(window_of(batch, self.observation_keys), batch_statistics=self.training)
+        frames = self.encode_frame(window_of(batch, self.observation_keys), batch_statistics=self.training)
         frames = frames.float()  # (B, H+1, F)
 
-        cut = self.memory.windows
+        cut = self.history.windows
         before, after, actions = cut(frames[:, :-1]), cut(frames[:, 1:]), cut(action)
         mask = block_causal_mask(before.shape[1], device=before.device)
         predicted = self._predict(before, actions, mask, training=self.training).float()
@@ -281,7 +262,7 @@ class LeWorldModel(nn.Module):
         if self.inverse_head is not None:
             extra["loss_inverse"] = self.inverse_coef * self._inverse_loss(before, after, actions)
         if self.reward_probe is not None:
-            z = self.memory.gather(frames[:, :-1].detach(), action)
+            z = self.history.gather(frames[:, :-1].detach(), action)
             logits = self.reward_probe(torch.cat((z, action.to(z.dtype)), dim=-1))
             extra["loss_reward"] = self.two_hot.loss(logits.float(), batch.get(("next", "reward"))).mean()
         for value in extra.values():
@@ -297,24 +278,21 @@ class LeWorldModel(nn.Module):
             }
         return TensorDict({"loss": total, **metrics}, batch_size=[])
 
-    def parameter_groups(self, lr: float) -> list[dict[str, Any]]:
-        """Parameter groups for AdamW."""
+    def parameter_groups(self, lr: float) -> list[ParameterGroup]:
+        """Groups for AdamW: matrices with weight decay, the rest without."""
         return decay_groups(self.parameters(), lr, weight_decay=self.weight_decay)
-
-    def after_update(self) -> None:
-        """Nothing: there is no teacher."""
 
     # ------------------------------------------------------------------ pieces
 
     def _picture(self, observation: TensorDictBase, *, batch_statistics: bool) -> Tensor:
         assert self.encoder is not None and self.projector is not None
-        pictures = stack_views(observation, self.image_sizes)  # (..., V, height, width, C)
-        tokens = self.encoder(pictures.flatten(0, -4))[:, 0]
-        x = tokens.reshape(*pictures.shape[:-4], -1)
+        images = stack_cameras(observation, self.image_sizes)  # (..., V, height, width, C)
+        tokens = self.encoder(images.flatten(0, -4))[:, 0]
+        x = tokens.reshape(*images.shape[:-4], -1)
         return self.projector(x, batch_statistics=batch_statistics)
 
-    def _frame(self, observation: TensorDictBase, *, batch_statistics: bool = False) -> Tensor:
-        """Observations (...) -> a frame's embedding (..., F): the picture's, then the state's."""
+    def encode_frame(self, observation: TensorDictBase, *, batch_statistics: bool = False) -> Tensor:
+        """Embeddings (..., F) of observations (...): the image's, then the state's."""
         parts = []
         if self.encoder is not None:
             parts.append(self._picture(observation, batch_statistics=batch_statistics))
@@ -341,9 +319,9 @@ class LeWorldModel(nn.Module):
     def _inverse_loss(self, before: Tensor, after: Tensor, actions: Tensor) -> Tensor:
         """Squared error of a window's actions as its embeddings tell them."""
         assert self.inverse_head is not None
-        if actions.shape[1] < self.memory.history:
+        if actions.shape[1] < self.history.length:
             raise ValueError(
-                f"inverse_coef needs windows of at least history={self.memory.history} transitions, got "
+                f"inverse_coef needs windows of at least history={self.history.length} transitions, got "
                 f"{actions.shape[1]}"
             )
         frames = self._comparable(torch.cat((before, after[:, -1:]), dim=1))
@@ -352,25 +330,8 @@ class LeWorldModel(nn.Module):
 
     def _rollout_loss(self, frames: Tensor, action: Tensor) -> Tensor:
         """Squared error of predictions fed back, from the second step on, at the end of the windows."""
-        horizon = action.shape[1]
-        start = max(0, horizon - self.rollout)
-        z = self.memory.gather(frames[:, : start + 1], action)[:, -1]
-        predicted = []
-        for t in range(start, horizon):
-            z = self.next(z, action[:, t])
-            predicted.append(self.memory.last(z))
-        return F.mse_loss(torch.stack(predicted, 1)[:, 1:], frames[:, start + 2 :])
-
-
-def window_of(batch: TensorDictBase, keys: list[str]) -> TensorDict:
-    """The H+1 observations of windows [B, H]: the roots, and the last of `next`."""
-    after, (count, horizon) = batch.get("next"), batch.batch_size
-    window = {key: torch.cat((batch.get(key), after.get(key)[:, -1:]), dim=1) for key in keys}
-    return TensorDict(window, batch_size=[count, horizon + 1])
-
-
-def _spread(network: nn.Sequential) -> None:
-    """Weights of unit gain: where no normalisation follows, those of std 0.02 would start with no signal."""
-    last = network[-1]
-    assert isinstance(last, nn.Linear)
-    nn.init.xavier_uniform_(last.weight)
+        steps = min(self.rollout, action.shape[1])
+        if steps < 2:
+            return frames.new_zeros(())
+        predicted = self.feed_back(frames, action, steps)[:, 1:]
+        return F.mse_loss(predicted, frames[:, frames.shape[1] - steps + 1 :])

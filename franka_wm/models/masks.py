@@ -7,6 +7,7 @@ nearest to a random centre in a metric that has the block's aspect ratio, which 
 """
 
 import math
+from collections.abc import Callable
 from typing import NamedTuple
 
 import torch
@@ -22,7 +23,9 @@ class Masks(NamedTuple):
     targets: Tensor
 
 
-class _Sampler:
+class Sampler:
+    """Draws `Masks` for tokens on a grid (time slots, rows, columns)."""
+
     def __init__(self, grid: tuple[int, int, int]) -> None:
         if len(grid) != 3 or min(grid) < 1:
             raise ValueError(f"a grid of tokens is (time slots, rows, columns), each at least 1, got {grid}")
@@ -31,7 +34,13 @@ class _Sampler:
         self.places = self.rows * self.columns
         self.tokens = self.slots * self.places
 
-    def _distances(self, count: int, blocks: int, area: float, aspect: tuple[float, float], device) -> Tensor:
+    def __call__(self, count: int, device: torch.device | str) -> Masks:
+        """Masks of `count` entries."""
+        raise NotImplementedError
+
+    def _distances(
+        self, count: int, blocks: int, area: float, aspect: tuple[float, float], device: torch.device | str
+    ) -> Tensor:
         """How far each place is from each of some random blocks, (count, blocks, places); tiny noise breaks ties.
 
         The block of this area, inside the grid, is where the distance is below one half.
@@ -55,7 +64,7 @@ class _Sampler:
         return (start.unsqueeze(-1) + places.unsqueeze(-2)).flatten(-2)
 
 
-class MultiBlock(_Sampler):
+class MultiBlock(Sampler):
     """I-JEPA's masks (arXiv:2301.08243): predict `targets` blocks from one large block less these.
 
     In clips a block covers its places in every time slot.
@@ -102,7 +111,7 @@ class MultiBlock(_Sampler):
         return Masks(self._over_time(seen), self._over_time(targets))
 
 
-class Tube(_Sampler):
+class Tube(Sampler):
     """V-JEPA's masks (arXiv:2404.08471): blocks of places hidden for the whole clip.
 
     The union of `blocks` random blocks, grown or cut to exactly `ratio` of the places, is predicted from
@@ -132,7 +141,7 @@ class Tube(_Sampler):
         return Masks(self._over_time(seen), self._over_time(hidden).unsqueeze(1))
 
 
-class Temporal(_Sampler):
+class Temporal(Sampler):
     """Predict whole time slots from the others.
 
     Args:
@@ -159,7 +168,7 @@ class Temporal(_Sampler):
         return Masks(tokens[:, :cut].flatten(1), tokens[:, cut:].reshape(count, 1, -1))
 
 
-class Random(_Sampler):
+class Random(Sampler):
     """Predict `ratio` of all tokens, drawn independently, from the others (MAE, arXiv:2111.06377).
 
     Raises:
@@ -175,10 +184,15 @@ class Random(_Sampler):
         return Masks(order[:, self.hidden :], order[:, : self.hidden].unsqueeze(1))
 
 
-SAMPLERS = {"multiblock": MultiBlock, "tube": Tube, "temporal": Temporal, "random": Random}
+SAMPLERS: dict[str, Callable[..., Sampler]] = {
+    "multiblock": MultiBlock,
+    "tube": Tube,
+    "temporal": Temporal,
+    "random": Random,
+}
 
 
-def make_masks(name: str, grid: tuple[int, int, int], **options) -> MultiBlock | Tube | Temporal | Random:
+def make_masks(name: str, grid: tuple[int, int, int], **options: float) -> Sampler:
     """The sampler `name` for a grid (time slots, rows, columns); `options` go to its constructor.
 
     Raises:

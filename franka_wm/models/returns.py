@@ -1,9 +1,12 @@
-"""How far returns are discounted, and how large they can be."""
+"""Discounts of returns, and how large returns can be."""
 
 import math
 
+import torch
+from torch import Tensor
+
 PUBLISHED_RANGE = 10.0
-"""Of two-hot codes, to both sides of zero in symlog space: rewards and values from -22,025 to 22,025."""
+"""Range of two-hot codes to both sides of zero in symlog space: rewards and values from -22,025 to 22,025."""
 
 
 def value_range(
@@ -12,12 +15,12 @@ def value_range(
     reward_bounds: tuple[float, float] | None,
     discount: float,
 ) -> tuple[float, float]:
-    """The range of a two-hot code of rewards and values, in symlog space.
+    """Range of a two-hot code of rewards and values, in symlog space.
 
-    A number given for an end is that end. Where rewards are bounded, discounted returns are by max |reward| / (1 -
-    discount), and so are single rewards and bootstrapped targets: the code reaches 5 % further, since its outermost
-    points are reached by certain predictions alone. It reaches as far to the other side, so that a head
-    which starts at zero first predicts zero. Otherwise the range is the published one, ±10.
+    A number given for an end is that end. Where rewards are bounded, discounted returns are bounded by
+    max |reward| / (1 - discount), and so are single rewards and bootstrapped targets. The code reaches 5 % further,
+    because only certain predictions reach its outermost points. It is symmetric, so that a head which starts at zero
+    first predicts zero. Where rewards are not bounded, the range is the published one, ±10.
 
     Args:
         low, high: the ends, None: derived.
@@ -38,8 +41,25 @@ def value_range(
     return -limit if low is None else low, limit if high is None else high
 
 
+def discount_per_step(
+    discount: float | None, episode_length: int | None, *, default: float | None = None
+) -> float:
+    """`discount` where it is given, else that of the episodes' length, else `default`.
+
+    Raises:
+        ValueError: none of the three is known.
+    """
+    if discount is not None:
+        return float(discount)
+    if episode_length is not None:
+        return episode_discount(episode_length)
+    if default is None:
+        raise ValueError("give episode_length, from which the discount follows, or discount itself")
+    return default
+
+
 def episode_discount(episode_length: int) -> float:
-    """The discount per step for episodes of T steps: clamp((T/5 - 1) / (T/5), 0.95, 0.995) (TD-MPC2).
+    """Discount per step for episodes of T steps: clamp((T/5 - 1) / (T/5), 0.95, 0.995) (TD-MPC2).
 
     Raises:
         ValueError: T below 1.
@@ -48,3 +68,43 @@ def episode_discount(episode_length: int) -> float:
         raise ValueError(f"episode_length must be at least 1, got {episode_length}")
     fifth = episode_length / 5.0
     return min(max((fifth - 1.0) / fifth, 0.95), 0.995)
+
+
+def n_step_returns(
+    reward: Tensor,
+    terminated: Tensor,
+    bootstrap: Tensor,
+    *,
+    discount: float,
+    steps: int,
+    ends: Tensor | None = None,
+) -> Tensor:
+    """n-step returns of the H steps of windows, each within its window and episode.
+
+    Step t sums n = `steps` discounted rewards and adds the discounted `bootstrap` of the step that follows. Near
+    the end of an episode that terminated, what is left of the rewards is all. Near any other end, also the window's,
+    it bootstraps from the last step, however near that is.
+
+    Args:
+        reward, bootstrap: (B, H, 1).
+        terminated: (B, H, 1) bool; the last transition of the episode decides.
+        ends: (B, 1) int64 in 1 … H, number of transitions that belong to the episode; None: all H.
+
+    Returns:
+        (B, H, 1); without meaning past the end.
+    """
+    length, device = reward.shape[1], reward.device
+    if ends is None:
+        ends = torch.full((reward.shape[0], 1), length, device=device)
+    over = terminated[..., 0].gather(1, ends - 1)
+    step = torch.arange(length, device=device)
+    stop = torch.minimum(step + steps, ends - 1 + over.long())  # (B, H): the first step not summed
+    ahead = step - step.unsqueeze(-1)  # (H, H): steps from t, in rows, to k
+    base = torch.full((), discount, device=device, dtype=reward.dtype)
+    power = base ** ahead.clamp_min(0).to(reward.dtype)
+    summed = power * ((ahead >= 0) & (step < stop.unsqueeze(-1)))  # (B, H, H)
+    # After a termination there is no bootstrap: `stop` is then past the last step.
+    last = power * ((step == stop.unsqueeze(-1)) & (step < ends).unsqueeze(1))
+    # Not a matrix product: autocast would round the targets.
+    rewards, values = reward.transpose(1, 2), bootstrap.transpose(1, 2)  # (B, 1, H)
+    return (summed * rewards + last * values).sum(-1, keepdim=True)

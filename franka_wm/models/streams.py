@@ -7,16 +7,16 @@ from types import TracebackType
 import torch
 from torch import Tensor
 
-_LANES: dict[tuple[torch.device, int], torch.cuda.Stream] = {}
+_STREAMS: dict[tuple[torch.device, int], torch.cuda.Stream] = {}
 
 
-class beside:
-    """What runs inside is launched on another CUDA stream, beside what follows. Off CUDA nothing is different.
+class side_stream:
+    """Launch what runs inside on another CUDA stream, at the same time as what follows. Off CUDA it does nothing.
 
-    Small products of matrices leave most of a large GPU idle, and what does not depend on each other may share it. In
-    a captured graph such parts are branches. The backward pass of each part runs on its own stream, too::
+    Small matrix products leave most of a large GPU idle, so independent parts may share it. In a captured graph such
+    parts are branches. The backward pass of each part runs on its own stream, too::
 
-        with beside(x) as part:
+        with side_stream(x) as part:
             y = f(x)
         z = g(x)
         part.join(y)
@@ -24,22 +24,22 @@ class beside:
 
     Args:
         *inputs: tensors from outside that are read inside. Their memory is not used again before that.
-        lane: parts that are open at the same time need lanes of their own.
+        lane: number of the stream. Parts that are open at the same time need lanes of their own.
     """
 
     def __init__(self, *inputs: Tensor, lane: int = 0) -> None:
         self.inputs, self.lane = inputs, lane
         self.stream: torch.cuda.Stream | None = None
 
-    def __enter__(self) -> beside:
+    def __enter__(self) -> side_stream:
         if torch.compiler.is_compiling() or self.inputs[0].device.type != "cuda":
             return self
         device = self.inputs[0].device
-        if (device, self.lane) not in _LANES:
-            _LANES[device, self.lane] = torch.cuda.Stream(device)
-            # Parts share parameters, whose gradients are summed on one stream: meant, and waited for by autograd.
+        if (device, self.lane) not in _STREAMS:
+            _STREAMS[device, self.lane] = torch.cuda.Stream(device)
+            # Parts share parameters. Autograd sums their gradients on one stream and waits for the others.
             torch.autograd.graph.set_warn_on_accumulate_grad_stream_mismatch(False)
-        self.stream = _LANES[device, self.lane]
+        self.stream = _STREAMS[device, self.lane]
         self.outside = torch.cuda.current_stream(device)
         self.stream.wait_stream(self.outside)
         for tensor in self.inputs:
@@ -55,7 +55,7 @@ class beside:
             self.context.__exit__(kind, error, trace)
 
     def join(self, *outputs: Tensor) -> None:
-        """What follows waits for the part, and may read `outputs`, which it made."""
+        """Let what follows wait for the part; it may then read `outputs`, which the part made."""
         if self.stream is None:
             return
         self.outside.wait_stream(self.stream)

@@ -1,23 +1,38 @@
 """TD-MPC2: a latent world model without decoder (Hansen, Su & Wang, ICLR 2024, arXiv:2310.16828)."""
 
+from __future__ import annotations
+
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, ClassVar, Literal
 
 import torch
 from tensordict import TensorDict, TensorDictBase
-from torch import Tensor, nn
+from torch import Tensor
 from torch.nn import functional as F
 
-from franka_wm.models.parts import Ensemble, GaussianPolicy, RunningScale, SimNorm, TwoHotSymlog, mlp
-from franka_wm.models.pixel_encoder import PixelEncoder
-from franka_wm.models.returns import episode_discount, value_range
-from franka_wm.models.streams import beside
-from franka_wm.models.vectors import copy_statistics
-from franka_wm.models.vision import RandomShift, check_image_sizes, check_pictures
+from franka_wm.errors import UserError
+from franka_wm.models.groups import ParameterGroup
+from franka_wm.models.images import ImageSize, check_images
+from franka_wm.models.layers import (
+    Ensemble,
+    GaussianPolicy,
+    RunningScale,
+    SimNorm,
+    TwoHotSymlog,
+    mlp,
+    zero_head,
+)
+from franka_wm.models.normalizer import concatenate
+from franka_wm.models.options import COEFFICIENT, POSITIVE, Range, with_defaults
+from franka_wm.models.returns import discount_per_step, value_range
+from franka_wm.models.simplicial import SimplicialWorldModel
+from franka_wm.models.streams import side_stream
+from franka_wm.models.windows import check_windows, window_of
 
 
-class TDMPC2(nn.Module):
+class TDMPC2(SimplicialWorldModel):
     """Encoder, dynamics, reward, Q-ensemble and policy over one latent space, trained together.
 
     z = h(s);  z' = d(z, a);  r = R(z, a);  q = Q(z, a);  a = π(z). Where episodes may terminate, a head on z' says
@@ -76,14 +91,21 @@ class TDMPC2(nn.Module):
         ValueError: a size or coefficient that cannot work, or neither `episode_length` nor `discount`.
     """
 
-    observation_mean: Tensor
-    observation_std: Tensor
+    ranges: ClassVar[Mapping[str, Range]] = {
+        **dict.fromkeys(("action_dim", "latent_dim", "simnorm_dim", "encoder_dim"), POSITIVE),
+        **dict.fromkeys(("encoder_layers", "hidden_dim", "value_members", "channels"), POSITIVE),
+        **dict.fromkeys(("consistency_coef", "reward_coef", "value_coef", "termination_coef"), COEFFICIENT),
+        **dict.fromkeys(("num_q", "bins"), Range(2)),
+        **dict.fromkeys(("discount", "dropout"), Range(0, 1, without_high=True)),
+        "tau": Range(0, 1, without_low=True),
+        "random_shift": Range(0),
+    }
 
     def __init__(
         self,
         *,
         observation_sizes: Mapping[str, int] | None = None,
-        image_sizes: Mapping[str, tuple[int, int, int]] | None = None,
+        image_sizes: Mapping[str, ImageSize] | None = None,
         action_dim: int,
         episode_length: int | None = None,
         discount: float | None = None,
@@ -117,67 +139,34 @@ class TDMPC2(nn.Module):
         encoder_grid: int | None = 4,
         freeze_encoder: bool = False,
     ) -> None:
-        super().__init__()
-        sizes = {str(key): int(size) for key, size in (observation_sizes or {}).items()}
-        self.image_sizes = check_image_sizes(image_sizes or {})
-        if (not sizes and not self.image_sizes) or min(sizes.values(), default=1) < 1:
-            raise ValueError(f"observation_sizes needs at least one key, each of size 1 or more, got {sizes}")
-        if action_dim < 1:
-            raise ValueError(f"action_dim must be at least 1, got {action_dim}")
-        if simnorm_dim < 1 or latent_dim % simnorm_dim:
-            raise ValueError(f"simnorm_dim must divide latent_dim, got {simnorm_dim} and {latent_dim}")
-        if encoder_layers < 1:
-            raise ValueError(f"encoder_layers must be at least 1, got {encoder_layers}")
-        if num_q < 2:
-            raise ValueError(f"num_q must be at least 2 (targets are the minimum of two), got {num_q}")
-        if not 0.0 <= dropout < 1.0:
-            raise ValueError(f"dropout must be in [0, 1), got {dropout}")
-        if not 0.0 < tau <= 1.0:
-            raise ValueError(f"tau must be in (0, 1], got {tau}")
-        if value_members is not None and not 1 <= value_members <= num_q:
-            raise ValueError(f"value_members must be from 1 to num_q={num_q} or None, got {value_members}")
-        self.value_members = value_members
-        self.observation_sizes, self.action_dim, self.latent_dim, self.num_q = (
-            sizes,
-            action_dim,
-            latent_dim,
-            num_q,
+        self.validate(locals())
+        pretrained = encoder_from is not None or encoder_architecture is not None
+        if (pretrained and not image_sizes) or (freeze_encoder and not pretrained):
+            raise ValueError("encoder_from needs images, and freeze_encoder needs encoder_from")
+        super().__init__(
+            observation_sizes=observation_sizes,
+            image_sizes=image_sizes,
+            latent_dim=latent_dim,
+            simnorm_dim=simnorm_dim,
+            encoder_dim=encoder_dim,
+            encoder_layers=encoder_layers,
+            channels=channels,
+            random_shift=random_shift,
+            encoder_from=encoder_from,
+            encoder_architecture=encoder_architecture,
+            encoder_grid=encoder_grid,
+            freeze_encoder=freeze_encoder,
         )
-        self.observation_keys = [*sizes, *self.image_sizes]
-        self.discount = _discount(discount, episode_length)
+        self.discount = discount_per_step(discount, episode_length)
+        self.action_dim, self.num_q, self.value_members = action_dim, num_q, value_members
         self.rho, self.tau, self.encoder_lr_scale = rho, tau, encoder_lr_scale
         self.consistency_coef, self.reward_coef = consistency_coef, reward_coef
         self.value_coef, self.entropy_coef = value_coef, entropy_coef
         self.terminates, self.termination_coef = terminates, termination_coef
 
-        observation_dim, hidden = sum(sizes.values()), (hidden_dim, hidden_dim)
-        pretrained = encoder_from is not None or encoder_architecture is not None
-        if (pretrained and not self.image_sizes) or (freeze_encoder and not pretrained):
-            raise ValueError("encoder_from needs pictures, and freeze_encoder needs encoder_from")
-        if self.image_sizes:
-            self.encoder: nn.Module = PixelEncoder(
-                image_sizes=self.image_sizes,
-                observation_dim=observation_dim,
-                hidden=(encoder_dim,) * max(1, encoder_layers - 1),
-                latent_dim=latent_dim,
-                simnorm_dim=simnorm_dim,
-                channels=channels,
-                encoder_from=encoder_from,
-                architecture=encoder_architecture,
-                grid=encoder_grid,
-                freeze=freeze_encoder,
-            )
-        else:
-            self.encoder = mlp(
-                observation_dim,
-                (encoder_dim,) * (encoder_layers - 1),
-                latent_dim,
-                output=SimNorm(simnorm_dim),
-            )
-        self.random_shift = RandomShift(random_shift)
+        hidden = (hidden_dim, hidden_dim)
         self.dynamics = mlp(latent_dim + action_dim, hidden, latent_dim, output=SimNorm(simnorm_dim))
-        self.reward_head = mlp(latent_dim + action_dim, hidden, bins)
-        nn.init.zeros_(self.reward_head[-1].weight)  # type: ignore[arg-type]  # first prediction: exactly 0
+        self.reward_head = zero_head(latent_dim + action_dim, hidden, bins)
         self.q_ensemble = Ensemble(
             members=num_q,
             in_features=latent_dim + action_dim,
@@ -195,43 +184,16 @@ class TDMPC2(nn.Module):
         self.two_hot = TwoHotSymlog(bins, *value_range(value_low, value_high, reward_bounds, self.discount))
         self.termination_head = mlp(latent_dim, hidden, 1) if terminates else None
         self.scale = RunningScale(tau)
-        self.register_buffer("observation_mean", torch.zeros(observation_dim))
-        self.register_buffer("observation_std", torch.ones(observation_dim))
+
+    @classmethod
+    def validate(cls, options: Mapping[str, Any], *, window: int | None = None) -> None:
+        super().validate(options, window=window)
+        given = with_defaults(cls, options)
+        members, num_q = given.get("value_members"), given.get("num_q")
+        if members is not None and num_q is not None and members > num_q:
+            raise UserError(f"model.value_members={members}: must be at most model.num_q={num_q}, or null")
 
     # ------------------------------------------------------------------ what a planner and a policy use
-
-    @torch.no_grad()
-    def set_observation_statistics(self, mean: Tensor, std: Tensor) -> None:
-        """Standardise observations at the encoder's input from now on: (s - mean) / std.
-
-        An addition to the paper: joint angles [rad], velocities [rad/s] and positions [m] differ in size by
-        orders of magnitude. The statistics are saved with the weights and are never trained. A feature of
-        zero standard deviation is centred only.
-
-        Args:
-            mean, std: (sum of `observation_sizes`), in the order of `observation_sizes`, in the units of the
-                observations.
-
-        Raises:
-            ValueError: a wrong shape, a value that is not finite, or a negative standard deviation.
-        """
-        copy_statistics(self.observation_mean, self.observation_std, mean, std)
-
-    def encode(self, observation: TensorDictBase) -> Tensor:
-        """Observations with keys `observation_sizes`, each (..., size), and `image_sizes`, each
-        (..., height, width, C) uint8 -> latents (..., latent_dim)."""
-        pictures = {key: check_pictures(observation.get(key)) for key in self.image_sizes}
-        vectors = None
-        if self.observation_sizes:
-            x = torch.cat([observation.get(key) for key in self.observation_sizes], dim=-1)
-            vectors = self._standardise(x)
-        return self._encode(vectors, pictures)
-
-    def rebuild_overrides(self) -> dict[str, Any]:
-        """Constructor arguments that replace those which read other files or depend on the environment, so that the
-        model's own weights rebuild it: JSON-able."""
-        encoder = self.encoder.rebuild() if isinstance(self.encoder, PixelEncoder) else {}
-        return encoder | self.two_hot.rebuild()
 
     def next(self, z: Tensor, action: Tensor) -> Tensor:
         """Latents (..., latent_dim) and actions (..., action_dim) -> next latents (..., latent_dim)."""
@@ -299,12 +261,9 @@ class TDMPC2(nn.Module):
 
     # ------------------------------------------------------------------ training
 
-    def forward(self, batch: TensorDictBase) -> TensorDict:
-        """Same as `loss`, for wrappers that call the module."""
-        return self.loss(batch)
-
     parts_of_loss = ("_encode_window", "_td_target", "_unroll", "_model_losses", "_policy_loss", "_metrics")
-    """Methods that `loss` calls, and that are compiled one by one: what runs side by side must not be one program."""
+    """Methods that `loss` calls. They are compiled one by one, because what runs side by side on a GPU must not become
+    one program."""
 
     def loss(
         self, batch: TensorDictBase, *, parts: Mapping[str, Callable[..., Any]] | None = None
@@ -331,8 +290,7 @@ class TDMPC2(nn.Module):
         Raises:
             ValueError: the batch size is not [B, H].
         """
-        if len(batch.batch_size) != 2:
-            raise ValueError(f"a batch of windows has batch size [B, H], got {list(batch.batch_size)}")
+        check_windows(batch)
         call = {name: getattr(self, name) for name in self.parts_of_loss} | dict(parts or {})
         # Time leads from here on: (H, B, ...).
         action, reward, terminated = (
@@ -346,11 +304,11 @@ class TDMPC2(nn.Module):
         encoded = call["_encode_window"](batch)  # (H+1, B, D), one call
         after = encoded[1:].detach()
         # Targets, model and policy need each other's inputs only: on CUDA they run side by side.
-        with beside(after, reward, terminated) as targets, torch.no_grad():
+        with side_stream(after, reward, terminated) as targets, torch.no_grad():
             target = call["_td_target"](after, reward, terminated)
         predicted = call["_unroll"](encoded[0], action)  # (H+1, B, D)
         detached = predicted.detach()
-        with beside(detached, weight, lane=1) as policy:
+        with side_stream(detached, weight, lane=1) as policy:
             policy_loss, entropy = call["_policy_loss"](detached, weight)
         targets.join(target)
         consistency, reward_loss, value_loss, q_logits, reward_logits = call["_model_losses"](
@@ -389,12 +347,8 @@ class TDMPC2(nn.Module):
         }
         return TensorDict({"loss": total, **metrics}, batch_size=[])
 
-    def parameter_groups(self, lr: float) -> list[dict[str, Any]]:
-        """Parameter groups for Adam; every parameter that is trained is in exactly one.
-
-        Besides Adam's own options each group has a `name`, and a `clip`: gradient norms are clipped (at 20,
-        as published) over all groups with the same `clip` together.
-        """
+    def parameter_groups(self, lr: float) -> list[ParameterGroup]:
+        """Groups for Adam: encoder, policy and the rest. Norms of the policy's gradients are clipped apart."""
         encoder, policy = list(self.encoder.parameters()), list(self.policy_head.parameters())
         apart = {id(parameter) for parameter in (*encoder, *policy)}
         encoder = [parameter for parameter in encoder if parameter.requires_grad]
@@ -409,31 +363,24 @@ class TDMPC2(nn.Module):
         """Move the target Q-functions by `tau`; call once after each optimiser step."""
         self.q_ensemble.update_target(self.tau)
 
+    def compiled_loss(self) -> Callable[[TensorDictBase], TensorDict]:
+        """`loss` with each of `parts_of_loss` compiled."""
+        if type(self).loss is not TDMPC2.loss:  # a subclass with a loss of its own
+            return super().compiled_loss()
+        return partial(
+            self.loss, parts={name: torch.compile(getattr(self, name)) for name in self.parts_of_loss}
+        )
+
     # ------------------------------------------------------------------ pieces
 
-    def _standardise(self, x: Tensor) -> Tensor:
-        return (x.to(self.observation_mean.dtype) - self.observation_mean) / self.observation_std
-
-    def _encode(self, vectors: Tensor | None, pictures: Mapping[str, Tensor]) -> Tensor:
-        if not self.image_sizes:
-            return self.encoder(vectors)
-        return self.encoder(pictures, vectors)
-
     def _encode_window(self, batch: TensorDictBase) -> Tensor:
-        """Latents (H+1, B, D) of the H+1 observations of windows [B, H]; pictures are shifted in training."""
-        vectors = self._standardise(self._window(batch)) if self.observation_sizes else None
-        after = batch.get("next")
-        pictures = {}
-        for key in self.image_sizes:
-            window = torch.cat((batch.get(key), after.get(key)[:, -1:]), dim=1)
-            pictures[key] = self.random_shift(check_pictures(window)).transpose(0, 1)
-        return self._encode(vectors, pictures)
-
-    def _window(self, batch: TensorDictBase) -> Tensor:
-        """The H+1 observations of windows [B, H], time first: (H+1, B, observation_dim)."""
-        last = batch.get("next")[:, -1:]
-        window = [torch.cat((batch.get(key), last.get(key)), dim=1) for key in self.observation_sizes]
-        return torch.cat(window, dim=-1).transpose(0, 1)
+        """Latents (H+1, B, D) of the H+1 observations of windows [B, H]; images are shifted in training."""
+        window = window_of(batch, self.observation_keys)
+        sizes = self.observation_sizes
+        vectors = concatenate(window, sizes).transpose(0, 1) if sizes else None
+        images = {key: check_images(window.get(key)) for key in self.image_sizes}
+        images = {key: self.random_shift(image).transpose(0, 1) for key, image in images.items()}
+        return self.encode_parts(images, vectors)
 
     def _random_pair(self, device: torch.device) -> Tensor:
         # Ranking noise draws without replacement, on the device; torch.randperm may wait for the host.
@@ -483,13 +430,3 @@ class TDMPC2(nn.Module):
         )  # not squashed: the bonus never pulls actions inwards
         loss = -(weight * (self.scale(q) + self.entropy_coef * scaled_entropy)).mean()
         return loss, -log_prob.mean()
-
-
-def _discount(discount: float | None, episode_length: int | None) -> float:
-    if discount is not None:
-        if not 0.0 <= discount < 1.0:
-            raise ValueError(f"discount must be in [0, 1), got {discount}")
-        return float(discount)
-    if episode_length is None:
-        raise ValueError("give episode_length, from which the discount follows, or discount itself")
-    return episode_discount(episode_length)

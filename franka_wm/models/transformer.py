@@ -9,7 +9,8 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from franka_wm.models.attention import attention
-from franka_wm.models.parts import mlp
+from franka_wm.models.layers import zero_head
+from franka_wm.models.vision import sincos
 
 
 def block_causal_mask(frames: int, tokens: int = 1, device: torch.device | None = None) -> Tensor:
@@ -194,20 +195,94 @@ class CausalTransformer(nn.Module):
 
 
 class MLPDynamics(nn.Module):
-    """The next frame from a memory and an action, by an MLP that predicts the change.
+    """The next frame from a history and an action, by an MLP that predicts the change.
 
-    (z (..., memory_dim), last frame (..., frame_dim), action (..., action_dim)) -> (..., frame_dim).
+    (z (..., history_dim), last frame (..., frame_dim), action (..., action_dim)) -> (..., frame_dim).
     Starts as "nothing changes".
 
     Args:
-        memory_dim: size of z, see `franka_wm.models.memory`.
+        history_dim: size of z, see `franka_wm.models.history`.
         hidden: width of each hidden layer.
     """
 
-    def __init__(self, *, memory_dim: int, frame_dim: int, action_dim: int, hidden: tuple[int, ...]) -> None:
+    def __init__(self, *, history_dim: int, frame_dim: int, action_dim: int, hidden: tuple[int, ...]) -> None:
         super().__init__()
-        self.network = mlp(memory_dim + action_dim, hidden, frame_dim)
-        nn.init.zeros_(self.network[-1].weight)  # type: ignore[arg-type]
+        self.network = zero_head(history_dim + action_dim, hidden, frame_dim)
 
     def forward(self, z: Tensor, frame: Tensor, action: Tensor) -> Tensor:
         return frame + self.network(torch.cat((z, action), dim=-1))
+
+
+class TokenDynamics(nn.Module):
+    """Block-causal transformer over [action, state, tokens] of several frames; predicts the frame after each.
+
+    Every token attends to all tokens of its own and earlier frames. Predicts the change, and starts with none.
+
+    Args:
+        tokens, token_dim: of the pictures of one frame.
+        state_dim: size of the state vector; 0: no state token.
+        action_dim: size of an action.
+        width, depth, heads, dropout: of the transformer.
+    """
+
+    place: Tensor
+
+    def __init__(
+        self,
+        *,
+        tokens: int,
+        token_dim: int,
+        state_dim: int,
+        action_dim: int,
+        width: int,
+        depth: int,
+        heads: int,
+        dropout: float = 0.0,
+    ) -> None:
+        super().__init__()
+        if width % (2 * heads):
+            raise ValueError(
+                f"predictor_width must be a multiple of 2 · predictor_heads, got {width} and {heads}"
+            )
+        self.tokens, self.token_dim, self.state_dim = tokens, token_dim, state_dim
+        self.feature_dim = tokens * token_dim
+        self.per_frame = tokens + 1 + (1 if state_dim else 0)
+        self.enter = nn.Linear(token_dim, width)
+        self.enter_action = nn.Linear(action_dim, width)
+        self.enter_state = nn.Linear(state_dim, width) if state_dim else None
+        self.transformer = CausalTransformer(
+            width=width, depth=depth, heads=heads, head_dim=width // heads, hidden=4 * width, dropout=dropout
+        )
+        self.leave = nn.Linear(width, token_dim)
+        self.leave_state = nn.Linear(width, state_dim) if state_dim else None
+        for layer in (self.leave, self.leave_state):
+            if layer is not None:
+                nn.init.zeros_(layer.weight)
+                nn.init.zeros_(layer.bias)
+        self.register_buffer("place", sincos(torch.arange(self.per_frame), width), persistent=False)
+
+    def forward(
+        self, frames: Tensor, actions: Tensor, valid: Tensor | None, *, dropout: bool = False
+    ) -> Tensor:
+        """Frames (N, K, F), the action taken at each (N, K, A) -> the frame after each (N, K, F).
+
+        Args:
+            valid: (N, K), 1 where the frame is real; None: all are.
+        """
+        count, steps = frames.shape[:2]
+        features = frames[..., : self.feature_dim].unflatten(-1, (self.tokens, self.token_dim))
+        parts = [self.enter_action(actions.to(frames.dtype)).unsqueeze(2)]
+        if self.enter_state is not None:
+            parts.append(self.enter_state(frames[..., self.feature_dim :]).unsqueeze(2))
+        parts.append(self.enter(features))
+        x = (torch.cat(parts, dim=2) + self.place).flatten(1, 2)
+        mask = block_causal_mask(steps, self.per_frame, device=x.device)
+        if valid is not None:
+            mask = hide_invalid(mask, valid, self.per_frame)
+        time = torch.arange(steps, device=x.device).repeat_interleave(self.per_frame)
+        x = self.transformer(x, time, mask, dropout=dropout).view(count, steps, self.per_frame, -1)
+        after = (features + self.leave(x[:, :, -self.tokens :])).flatten(-2)
+        if self.leave_state is None:
+            return after
+        state = frames[..., self.feature_dim :] + self.leave_state(x[:, :, 1])
+        return torch.cat((after, state), dim=-1)

@@ -6,79 +6,18 @@ normalised here. Everything is device-side tensor code with static shapes.
 
 import math
 from collections.abc import Mapping
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
 from franka_wm.models.attention import attention
-from franka_wm.models.parts import initialize
+from franka_wm.models.images import check_images
+from franka_wm.models.layers import initialize
 
 SIZES = {"tiny": (192, 12, 3), "small": (384, 12, 6)}
 """Published sizes of vision transformers: width, depth, heads (arXiv:2012.12877, table 1)."""
-
-
-def check_pictures(pictures: Tensor) -> Tensor:
-    """`pictures` itself.
-
-    Raises:
-        ValueError: they are not uint8. A float picture says nothing about its range.
-    """
-    if pictures.dtype != torch.uint8:
-        raise ValueError(
-            f"pictures must be uint8 of shape (..., height, width, channels), got {pictures.dtype}"
-        )
-    return pictures
-
-
-def check_image_sizes(image_sizes: Mapping[str, Any]) -> dict[str, tuple[int, int, int]]:
-    """Picture key -> (height, width, channels), as plain integers.
-
-    Raises:
-        ValueError: a size that is not three numbers of at least 1.
-    """
-    sizes = {}
-    for key, size in image_sizes.items():
-        values = tuple(int(n) for n in size)
-        if len(values) != 3 or min(values) < 1:
-            raise ValueError(f"image_sizes[{key!r}] must be (height, width, channels), got {size}")
-        sizes[str(key)] = values
-    return sizes
-
-
-class RandomShift(nn.Module):
-    """Shift pictures by up to `pad` pixels in each direction, edges repeated (DrQ, arXiv:2004.13649).
-
-    (N, ..., height, width, channels) -> the same shape and dtype: each of the N entries gets its own shift,
-    and all pictures inside an entry (the frames of a window, say) the same one, so that motion between them
-    is kept. Acts in training mode only. Drawn on the device, as one gather.
-
-    Raises:
-        ValueError: `pad` is negative.
-    """
-
-    def __init__(self, pad: int = 3) -> None:
-        super().__init__()
-        if pad < 0:
-            raise ValueError(f"pad must be at least 0, got {pad}")
-        self.pad = pad
-
-    def forward(self, pictures: Tensor) -> Tensor:
-        if not self.training or self.pad == 0:
-            return pictures
-        count, (height, width, channels) = pictures.shape[0], pictures.shape[-3:]
-        device = pictures.device
-        flat = pictures.reshape(count, -1, height * width, channels)
-        shift = torch.randint(-self.pad, self.pad + 1, (2, count, 1), device=device)
-        # An index past an edge is the edge's: that is what padding by repetition holds there.
-        rows = (torch.arange(height, device=device) + shift[0]).clamp(0, height - 1)
-        columns = (torch.arange(width, device=device) + shift[1]).clamp(0, width - 1)
-        index = (rows.unsqueeze(-1) * width + columns.unsqueeze(-2)).reshape(count, 1, -1, 1)
-        return flat.gather(2, index.expand(-1, flat.shape[1], -1, channels)).reshape(pictures.shape)
-
-    def extra_repr(self) -> str:
-        return f"pad={self.pad}"
 
 
 class ConvEncoder(nn.Module):
@@ -123,7 +62,7 @@ class ConvEncoder(nn.Module):
     def maps(self, pictures: Tensor) -> Tensor:
         """(N, height, width, C) uint8 -> feature maps (N, channels, rows, columns)."""
         weight = self.network[0].weight
-        x = check_pictures(pictures).permute(0, 3, 1, 2).to(weight.dtype).div(255.0).sub(0.5)  # type: ignore[arg-type]
+        x = check_images(pictures).permute(0, 3, 1, 2).to(weight.dtype).div(255.0).sub(0.5)  # type: ignore[arg-type]
         return self.network(x)
 
     def forward(self, pictures: Tensor) -> Tensor:
@@ -305,7 +244,7 @@ class ViT(nn.Module):
         """
         if clips.dim() == 4:
             clips = clips.unsqueeze(1).expand(-1, self.tubelet, -1, -1, -1)
-        x, code = self._patches(check_pictures(clips))
+        x, code = self._patches(check_images(clips))
         if keep is not None:
             x = x.gather(1, keep.unsqueeze(-1).expand(-1, -1, x.shape[-1]))
             code = code[keep]

@@ -1,38 +1,88 @@
-"""What a planner maximises: callables `(trajectory (E, S, H+1, D), actions (E, S, H, A)) -> scores (E, S)`.
+"""Objectives: what a planner maximises.
 
-E environments, S candidates, H steps. The trajectory starts at the current latent. They are classes rather
-than closures so that a policy that holds one can be copied and sent to another process.
+A planner is given a `Score`: (trajectory (E, S, H+1, D), actions (E, S, H, A)) -> scores (E, S), higher is better, for
+E environments, S candidates and H steps. The trajectory starts at the current latent.
 
-An objective that depends on the present observation (a goal picture, the last action) has
-`bind(tensordict) -> Objective`, which is called at every decision; `bind` below does so for any objective.
-Its `in_keys` name the entries that it cannot do without.
+An `Objective` makes the score of each decision. One that depends on the present observation (a goal image, the last
+action) overrides `bind`. A plain function with the signature of a score is an objective that never changes.
+Objectives are classes rather than closures, so that a policy that holds one can be copied and sent to another process.
 """
+
+from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, Literal, get_args
+from typing import Literal, Protocol, get_args
 
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 from torch.nn import functional as F
 
-Objective = Callable[[Tensor, Tensor], Tensor]
+Score = Callable[[Tensor, Tensor], Tensor]
+"""(trajectory (E, S, H+1, D), actions (E, S, H, A)) -> scores (E, S)."""
 
 Metric = Literal["l2", "l1", "cosine"]
 """`l2`: squared Euclidean, Σ (x - g)². `l1`: Σ |x - g|. `cosine`: 1 - cos(x, g), between 0 and 2."""
 
 
-def bind(objective: Any, tensordict: TensorDictBase) -> Objective:
-    """The objective for the present decision: `objective.bind(tensordict)` where there is such a method.
+class Objective:
+    """Base class of objectives: a score that stays as it is, unless a method says otherwise."""
 
-    Args:
-        tensordict: what the policy was given, of batch size [E].
-    """
-    return objective.bind(tensordict) if hasattr(objective, "bind") else objective
+    in_keys: Sequence[str] = ()
+    """Entries of the observation that `bind` cannot do without."""
+
+    def __call__(self, trajectory: Tensor, actions: Tensor) -> Tensor:
+        """Scores (E, S) of trajectories (E, S, H+1, D) and actions (E, S, H, A)."""
+        raise NotImplementedError
+
+    def bind(self, tensordict: TensorDictBase) -> Score:
+        """Score of the present decision.
+
+        Args:
+            tensordict: what the policy was given, of batch size [E].
+        """
+        return self
+
+    def compiled(self) -> Objective:
+        """The same objective, with what it calls compiled by `torch.compile`; unchanged by default."""
+        return self
 
 
-class RewardPlusValue:
+class FunctionObjective(Objective):
+    """A plain function as an objective."""
+
+    def __init__(self, function: Score) -> None:
+        self.function = function
+
+    def __call__(self, trajectory: Tensor, actions: Tensor) -> Tensor:
+        return self.function(trajectory, actions)
+
+
+def as_objective(objective: Objective | Score) -> Objective:
+    """`objective` itself, or a plain function wrapped."""
+    return objective if isinstance(objective, Objective) else FunctionObjective(objective)
+
+
+def bind(objective: Objective | Score, tensordict: TensorDictBase) -> Score:
+    """Score of the present decision, see `Objective.bind`."""
+    return as_objective(objective).bind(tensordict)
+
+
+class ReturnModel(Protocol):
+    """What `RewardPlusValue.of` asks of a world model."""
+
+    has_reward: bool
+    has_value: bool
+    terminates: bool
+    discount: float
+
+    def reward(self, z: Tensor, action: Tensor) -> Tensor: ...
+    def value(self, z: Tensor) -> Tensor: ...
+    def terminated(self, z: Tensor) -> Tensor: ...
+
+
+class RewardPlusValue(Objective):
     """Discounted rewards of the H steps plus the discounted value of the last latent.
 
     score = Σ_{t<H} γ^t · reward(z_t, a_t) + γ^H · value(z_H). The value is that of the latent after the last
@@ -61,12 +111,19 @@ class RewardPlusValue:
         self.reward, self.value, self.discount, self.terminated = reward, value, discount, terminated
 
     @classmethod
-    def of(cls, model: Any) -> "RewardPlusValue":
-        """Of a model with `reward`, `value` and `discount`; with its `terminated`, if it says `terminates`."""
-        ends = model.terminated if getattr(model, "terminates", False) else None
-        return cls(model.reward, model.value, model.discount, ends)
+    def of(cls, model: ReturnModel) -> RewardPlusValue:
+        """Rewards plus value of a model; with its `terminated`, if it `terminates`.
 
-    def compiled(self) -> "RewardPlusValue":
+        Raises:
+            ValueError: the model lacks reward, value or discount.
+        """
+        there = {"reward": model.has_reward, "value": model.has_value, "discount": model.discount >= 0.0}
+        lacking = [name for name, has in there.items() if not has]
+        if lacking:
+            raise ValueError(f"{type(model).__name__} has no {', '.join(lacking)}")
+        return cls(model.reward, model.value, model.discount, model.terminated if model.terminates else None)
+
+    def compiled(self) -> RewardPlusValue:
         """The same, with what it calls compiled by `torch.compile`."""
         ends = self.terminated
         return RewardPlusValue(
@@ -90,7 +147,7 @@ class RewardPlusValue:
         return score
 
 
-class GoalDistance:
+class GoalDistance(Objective):
     """Minus the distance to a goal, summed over the rollout or at its end only.
 
     The current latent, which no action can change, is left out. Summing rewards arriving early and staying.
@@ -135,7 +192,7 @@ class GoalDistance:
         return (F.cosine_similarity(reached, goal, dim=-1) - 1.0).sum(-1)
 
 
-class GoalImage:
+class GoalImage(Objective):
     """Minus the distance to what the goal's picture, or its pictures from several cameras, look like to the model.
 
     They are encoded once per decision, by `bind`; planning then is `GoalDistance`.
@@ -189,7 +246,7 @@ class GoalImage:
         raise ValueError("a GoalImage has no goal yet: plan with its bind(tensordict)")
 
 
-class Sum:
+class Sum(Objective):
     """Weighted sum of objectives: Σ weight · score. `bind` binds every term.
 
     Args:
@@ -199,7 +256,7 @@ class Sum:
         ValueError: no terms, or a weight that is not finite.
     """
 
-    def __init__(self, terms: Sequence[tuple[float, Objective]]) -> None:
+    def __init__(self, terms: Sequence[tuple[float, Objective | Score]]) -> None:
         if not terms:
             raise ValueError("a Sum needs at least one (weight, objective)")
         for weight, objective in terms:
@@ -207,18 +264,16 @@ class Sum:
                 raise ValueError(
                     f"the weight of {type(objective).__name__} in a Sum must be finite, got {weight}"
                 )
-        self.terms = [(float(weight), objective) for weight, objective in terms]
-        self.in_keys = [key for _, objective in terms for key in getattr(objective, "in_keys", ())]
+        self.terms = [(float(weight), as_objective(objective)) for weight, objective in terms]
+        self.in_keys = [key for _, objective in self.terms for key in objective.in_keys]
 
-    def compiled(self) -> "Sum":
-        """The same, with every term compiled that can be."""
-        return Sum(
-            [(weight, one.compiled() if hasattr(one, "compiled") else one) for weight, one in self.terms]  # pyright: ignore[reportFunctionMemberAccess]
-        )
+    def compiled(self) -> Sum:
+        """The same sum of compiled terms."""
+        return Sum([(weight, objective.compiled()) for weight, objective in self.terms])
 
-    def bind(self, tensordict: TensorDictBase) -> "Sum":
+    def bind(self, tensordict: TensorDictBase) -> Sum:
         """The same sum of bound terms."""
-        return Sum([(weight, bind(objective, tensordict)) for weight, objective in self.terms])
+        return Sum([(weight, objective.bind(tensordict)) for weight, objective in self.terms])
 
     def __call__(self, trajectory: Tensor, actions: Tensor) -> Tensor:
         (weight, objective), *rest = self.terms
@@ -228,7 +283,7 @@ class Sum:
         return score
 
 
-class ActionPenalty:
+class ActionPenalty(Objective):
     """Minus `weight` times the squared size of the actions, Σ_t |a_t|².
 
     Raises:
@@ -242,7 +297,7 @@ class ActionPenalty:
         return -self.weight * actions.square().sum(dim=(-2, -1))
 
 
-class Smoothness:
+class Smoothness(Objective):
     """Minus `weight` times the squared changes of the action, Σ_{t>0} |a_t - a_{t-1}|².
 
     Bound to an observation, it also counts the change from the last executed action to the first planned
@@ -257,7 +312,7 @@ class Smoothness:
         self._last: Tensor | None = None  # (E, A)
         self._acted: Tensor | None = None  # (E, 1)
 
-    def bind(self, tensordict: TensorDictBase) -> "Smoothness":
+    def bind(self, tensordict: TensorDictBase) -> Smoothness:
         """The objective of the present decision.
 
         Args:

@@ -4,7 +4,7 @@ from tensordict import TensorDict
 
 from franka_wm.models import make
 from franka_wm.models.lewm import LeWorldModel
-from franka_wm.models.memory import Memory
+from franka_wm.models.history import Memory
 from franka_wm.models.transformer import CausalTransformer, block_causal_mask, hide_invalid
 
 

@@ -142,6 +142,23 @@ def mlp(
     return network
 
 
+def unit_gain(network: nn.Sequential) -> nn.Sequential:
+    """Give the output layer weights of unit gain: where no normalisation follows, std 0.02 starts with no signal."""
+    last = network[-1]
+    assert isinstance(last, nn.Linear)
+    nn.init.xavier_uniform_(last.weight)
+    return network
+
+
+def zero_head(in_features: int, hidden: Sequence[int], outputs: int) -> nn.Sequential:
+    """An `mlp` whose output layer has zero weights: it first predicts exactly 0."""
+    head = mlp(in_features, hidden, outputs)
+    last = head[-1]
+    assert isinstance(last, nn.Linear)
+    nn.init.zeros_(last.weight)
+    return head
+
+
 class TwoHotSymlog(nn.Module):
     """Scalars as a categorical distribution over `bins` equidistant points of symlog space.
 

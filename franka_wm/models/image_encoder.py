@@ -8,11 +8,11 @@ import torch
 from torch import Tensor, nn
 
 from franka_wm.models.backbone import Backbone
-from franka_wm.models.parts import NormedLinear, SimNorm, initialize
+from franka_wm.models.layers import NormedLinear, SimNorm, initialize
 from franka_wm.models.vision import ConvEncoder
 
 
-class PixelEncoder(nn.Module):
+class ImageEncoder(nn.Module):
     """Pictures, and vectors if there are any -> z (..., latent_dim), simplices of `simnorm_dim`.
 
     Each picture goes through convolutions of its own (or all through one pretrained vision transformer),
@@ -77,7 +77,7 @@ class PixelEncoder(nn.Module):
             )
             initialize(self.join)
 
-    def train(self, mode: bool = True) -> "PixelEncoder":
+    def train(self, mode: bool = True) -> "ImageEncoder":
         """As usual, but a frozen backbone stays in evaluation mode."""
         super().train(mode)
         if self.frozen and self.backbone is not None:

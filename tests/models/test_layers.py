@@ -3,7 +3,7 @@ import torch
 from torch.nn import functional as F
 
 from franka_wm.models import available, make, parts
-from franka_wm.models.parts import (
+from franka_wm.models.layers import (
     Ensemble,
     GaussianPolicy,
     NormedLinear,

@@ -1,0 +1,193 @@
+"""Base class of all world models: what a trainer, a planner or an evaluation may ask, with its default."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from types import MappingProxyType
+from typing import Any, ClassVar
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+from torch import Tensor, nn
+
+from franka_wm.models.groups import ParameterGroup, decay_groups
+from franka_wm.models.options import Range, check_options
+
+ABILITIES: Mapping[str, tuple[str, ...]] = MappingProxyType(
+    {
+        "has_next": ("next",),
+        "has_reward": ("reward",),
+        "has_value": ("value",),
+        "has_policy": ("policy",),
+        "has_goal": ("encode_goal",),
+        "has_memory": ("observe",),
+        "has_search": ("prediction", "recurrent"),
+    }
+)
+"""Flag -> methods that a family defines to have this ability. The flags are set when the class is defined."""
+
+
+class WorldModel(nn.Module):
+    """A latent model of an environment: `encode` and `loss`, and the optional abilities that a family defines.
+
+    To define one of the optional methods is to have the ability: its flag is then True (see `ABILITIES`). A family
+    whose ability depends on an option sets the flag in its constructor. Latents z are (..., Z); leading dimensions
+    are free everywhere.
+    """
+
+    # What a family is. Known before it is built.
+    discrete: bool = False
+    """Whether actions are numbers of discrete actions (...) int64, chosen by tree search."""
+    cross_episode: bool = False
+    """Whether `loss` takes windows that go on past the end of an episode."""
+    replay_keys: tuple[str, ...] = ()
+    """Entries that the acting policy writes and `loss` reads."""
+    renamed: ClassVar[Mapping[str, str]] = MappingProxyType({})
+    """Former names of options -> their present names."""
+    ranges: ClassVar[Mapping[str, Range]] = MappingProxyType({})
+    """Option -> values that it may have. `validate` checks them."""
+
+    # Abilities, see `ABILITIES`.
+    has_next: bool = False
+    has_reward: bool = False
+    has_value: bool = False
+    has_policy: bool = False
+    has_goal: bool = False
+    has_memory: bool = False
+    has_search: bool = False
+
+    # What a model is. Set by its constructor.
+    observation_sizes: Mapping[str, int] = MappingProxyType({})
+    """Vector key -> size of its last dimension."""
+    image_sizes: Mapping[str, tuple[int, int, int]] = MappingProxyType({})
+    """Image key -> (height, width, channels), uint8."""
+    num_actions: int = 0
+    """Number of discrete actions, of a family with `discrete`."""
+    discount: float = math.nan
+    """Discount per step, of a family with reward or value."""
+    terminates: bool = False
+    """Whether `terminated` predicts ends of episodes."""
+
+    def __init_subclass__(cls, **kwargs: Any) -> None:
+        super().__init_subclass__(**kwargs)
+        for flag, methods in ABILITIES.items():
+            if flag not in cls.__dict__ and any(method in cls.__dict__ for method in methods):
+                setattr(cls, flag, all(getattr(cls, m) is not getattr(WorldModel, m) for m in methods))
+
+    # ------------------------------------------------------------------ every family
+
+    @property
+    def observation_keys(self) -> list[str]:
+        """Keys of an observation that `encode` reads: vectors, then images."""
+        return [*self.observation_sizes, *self.image_sizes]
+
+    def encode(self, observation: TensorDictBase) -> Tensor:
+        """Latents z (..., Z) of observations of batch size (...)."""
+        raise self._lacks("encode")
+
+    def loss(self, batch: TensorDictBase) -> TensorDict:
+        """Entry `loss` () to differentiate, and metrics () to log.
+
+        Args:
+            batch: windows [B, H] of contiguous transitions, with what follows each in `next`.
+        """
+        raise self._lacks("loss")
+
+    def forward(self, batch: TensorDictBase) -> TensorDict:
+        """Same as `loss`, for wrappers that call the module."""
+        return self.loss(batch)
+
+    # ------------------------------------------------------------------ optional abilities
+
+    def next(self, z: Tensor, action: Tensor) -> Tensor:
+        """Next latents (..., Z) after actions (..., A) in z (..., Z)."""
+        raise self._lacks("next")
+
+    def reward(self, z: Tensor, action: Tensor) -> Tensor:
+        """Expected reward (..., 1) of actions (..., A) in z (..., Z)."""
+        raise self._lacks("reward")
+
+    def value(self, z: Tensor) -> Tensor:
+        """Expected discounted return (..., 1) from z (..., Z)."""
+        raise self._lacks("value")
+
+    def terminated(self, z: Tensor) -> Tensor:
+        """Whether an episode ends in z (..., Z): (..., 1) bool; of models with `terminates`."""
+        raise self._lacks("terminated")
+
+    def policy(self, z: Tensor, deterministic: bool = False) -> Tensor:
+        """Actions (..., A) for z (..., Z): a sample, or the mode."""
+        raise self._lacks("policy")
+
+    def encode_goal(self, observation: TensorDictBase) -> Tensor:
+        """Embedding (..., D) of a goal from its images, in the space of `embed`."""
+        raise self._lacks("encode_goal")
+
+    def embed(self, z: Tensor) -> Tensor:
+        """What distances are measured on (..., D): z itself by default."""
+        return z
+
+    def observe(
+        self, observation: TensorDictBase, previous_z: Tensor, action: Tensor, is_init: Tensor
+    ) -> Tensor:
+        """Latent z (E, Z) after `action` led to `observation`, of a model with memory.
+
+        Args:
+            observation: batch size [E].
+            previous_z: (E, Z), before the action.
+            action: (E, A).
+            is_init: (E, 1) bool; where True the observation is an episode's first, and z that of `encode`.
+        """
+        raise self._lacks("observe")
+
+    def prediction(self, z: Tensor) -> tuple[Tensor, Tensor]:
+        """Logits (..., M) and value (..., 1) of z (..., Z), for tree search."""
+        raise self._lacks("prediction")
+
+    def recurrent(self, z: Tensor, action: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+        """One step of a search: next z, reward, discount, and the next z's logits and value."""
+        raise self._lacks("recurrent")
+
+    # ------------------------------------------------------------------ training
+
+    def set_observation_statistics(self, mean: Tensor, std: Tensor) -> None:
+        """Standardise vector observations from now on; does nothing by default.
+
+        Args:
+            mean, std: (sum of `observation_sizes`), in the units of the observations.
+        """
+
+    def parameter_groups(self, lr: float) -> list[ParameterGroup]:
+        """Groups of parameters for AdamW: all that are trained, without weight decay by default."""
+        return decay_groups(self.parameters(), lr, weight_decay=0.0)
+
+    def after_update(self) -> None:
+        """Move slow copies of weights, after each optimiser step; there are none by default."""
+
+    def compiled_loss(self) -> Callable[[TensorDictBase], TensorDict]:
+        """`loss`, compiled by `torch.compile`."""
+        return torch.compile(self.loss)
+
+    def rebuild_overrides(self) -> dict[str, Any]:
+        """Constructor arguments that replace those which read other files or depend on the environment.
+
+        A checkpoint stores them, so that its own weights rebuild the model. They can be written as JSON.
+        """
+        return {}
+
+    @classmethod
+    def validate(cls, options: Mapping[str, Any], *, window: int | None = None) -> None:
+        """Check options before anything is built: their types by the constructor, and `ranges`.
+
+        Args:
+            options: those of `conf/model`; entries that the constructor does not take are not looked at.
+            window: transitions of a training window; None: not known yet.
+
+        Raises:
+            UserError: one line with the option, its value and what is allowed.
+        """
+        check_options(cls, options, cls.ranges, cls.renamed)
+
+    def _lacks(self, name: str) -> NotImplementedError:
+        return NotImplementedError(f"{type(self).__name__} has no {name}; see docs/models.md")

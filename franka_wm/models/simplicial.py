@@ -1,0 +1,133 @@
+"""What TD-MPC2 and MuZero share: an encoder of vectors and images to simplices, and its inputs."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from tensordict import TensorDictBase
+from torch import Tensor, nn
+
+from franka_wm.errors import UserError
+from franka_wm.models.base import WorldModel
+from franka_wm.models.image_encoder import ImageEncoder
+from franka_wm.models.images import ImageSize, RandomShift, check_image_sizes, check_images
+from franka_wm.models.layers import SimNorm, TwoHotSymlog, mlp
+from franka_wm.models.normalizer import (
+    check_sizes,
+    concatenate,
+    copy_statistics,
+    register_statistics,
+    standardize,
+)
+from franka_wm.models.options import with_defaults
+
+
+class SimplicialWorldModel(WorldModel):
+    """World model of latents (..., `latent_dim`) that are simplices of `simnorm_dim` features.
+
+    Args:
+        observation_sizes: observation key -> size of its last dimension; encoded in this order. May be empty
+            where there are images.
+        image_sizes: image key -> (height, width, channels), uint8.
+        latent_dim: size of z.
+        simnorm_dim: features per simplex; divides `latent_dim`.
+        encoder_dim: width of the encoder's hidden layers.
+        encoder_layers: layers of the encoder, its output layer included.
+        channels: of each convolution over images.
+        random_shift: pixels by which images are shifted at most while training, in each direction.
+        encoder_from, encoder_architecture, encoder_grid, freeze_encoder: of a pretrained vision transformer, see
+            `ImageEncoder`.
+
+    Raises:
+        ValueError: nothing to read.
+    """
+
+    observation_mean: Tensor
+    observation_std: Tensor
+    two_hot: TwoHotSymlog
+
+    def __init__(
+        self,
+        *,
+        observation_sizes: Mapping[str, int] | None,
+        image_sizes: Mapping[str, ImageSize] | None,
+        latent_dim: int,
+        simnorm_dim: int,
+        encoder_dim: int,
+        encoder_layers: int,
+        channels: int,
+        random_shift: int,
+        encoder_from: str | Path | None = None,
+        encoder_architecture: Sequence[int] | None = None,
+        encoder_grid: int | None = None,
+        freeze_encoder: bool = False,
+    ) -> None:
+        super().__init__()
+        self.observation_sizes = check_sizes(observation_sizes)
+        self.image_sizes = check_image_sizes(image_sizes)
+        if not self.observation_keys:
+            raise ValueError("give observation_sizes or image_sizes: there is nothing to read")
+        self.latent_dim = latent_dim
+        observation_dim = sum(self.observation_sizes.values())
+        self.encoder: nn.Module
+        if self.image_sizes:
+            self.encoder = ImageEncoder(
+                image_sizes=self.image_sizes,
+                observation_dim=observation_dim,
+                hidden=(encoder_dim,) * max(1, encoder_layers - 1),
+                latent_dim=latent_dim,
+                simnorm_dim=simnorm_dim,
+                channels=channels,
+                encoder_from=encoder_from,
+                architecture=encoder_architecture,
+                grid=encoder_grid,
+                freeze=freeze_encoder,
+            )
+        else:
+            hidden = (encoder_dim,) * (encoder_layers - 1)
+            self.encoder = mlp(observation_dim, hidden, latent_dim, output=SimNorm(simnorm_dim))
+        self.random_shift = RandomShift(random_shift)
+        register_statistics(self, observation_dim)
+
+    @classmethod
+    def validate(cls, options: Mapping[str, Any], *, window: int | None = None) -> None:
+        super().validate(options, window=window)
+        given = with_defaults(cls, options)
+        latent, simplex = given.get("latent_dim"), given.get("simnorm_dim")
+        if latent and simplex and latent % simplex:
+            raise UserError(f"model.simnorm_dim={simplex}: must divide model.latent_dim={latent}")
+
+    def set_observation_statistics(self, mean: Tensor, std: Tensor) -> None:
+        """Standardise vectors at the encoder's input from now on: (s - mean) / std.
+
+        An addition to the papers: joint angles [rad], velocities [rad/s] and positions [m] differ in size by
+        orders of magnitude. The statistics are saved with the weights and never trained. A feature of
+        zero standard deviation is centred only.
+
+        Args:
+            mean, std: (sum of `observation_sizes`), in the order of `observation_sizes`, in the units of the
+                observations.
+
+        Raises:
+            ValueError: a wrong shape, a value that is not finite, or a negative standard deviation.
+        """
+        copy_statistics(self.observation_mean, self.observation_std, mean, std)
+
+    def encode(self, observation: TensorDictBase) -> Tensor:
+        """Latents (..., latent_dim) of vectors, each (..., size), and images, each (..., height, width, C) uint8."""
+        images = {key: check_images(observation.get(key)) for key in self.image_sizes}
+        vectors = concatenate(observation, self.observation_sizes) if self.observation_sizes else None
+        return self.encode_parts(images, vectors)
+
+    def encode_parts(self, images: Mapping[str, Tensor], vectors: Tensor | None) -> Tensor:
+        """Latents (..., latent_dim) of images by key and of all vectors side by side (..., observation_dim)."""
+        if vectors is not None:
+            vectors = standardize(vectors, self.observation_mean, self.observation_std)
+        return self.encoder(images, vectors) if self.image_sizes else self.encoder(vectors)
+
+    def rebuild_overrides(self) -> dict[str, Any]:
+        """Constructor arguments that replace a pretrained encoder's file, and the range of rewards and values."""
+        encoder = self.encoder.rebuild() if isinstance(self.encoder, ImageEncoder) else {}
+        return encoder | self.two_hot.rebuild()

@@ -1,0 +1,24 @@
+"""Windows [B, H] of contiguous transitions, as `loss` takes them."""
+
+from collections.abc import Iterable
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+
+
+def check_windows(batch: TensorDictBase) -> tuple[int, int]:
+    """B and H.
+
+    Raises:
+        ValueError: the batch size is not [B, H].
+    """
+    if len(batch.batch_size) != 2:
+        raise ValueError(f"a batch of windows has batch size [B, H], got {list(batch.batch_size)}")
+    return batch.batch_size[0], batch.batch_size[1]
+
+
+def window_of(batch: TensorDictBase, keys: Iterable[str]) -> TensorDict:
+    """Observations of windows [B, H], batch size [B, H+1]: those of the root, and the last of `next`."""
+    after, (count, horizon) = batch.get("next"), batch.batch_size
+    window = {key: torch.cat((batch.get(key), after.get(key)[:, -1:]), dim=1) for key in keys}
+    return TensorDict(window, batch_size=[count, horizon + 1])
