@@ -31,7 +31,7 @@ class WindowSampler(Sampler):
         boundary: Key of the flag that marks the first step of an episode.
         oversample: Candidates per window kept. With episodes of L steps a candidate is kept with probability
             (L − H + 1) / L; 4 is enough for L ≥ 2 H and batches of 32.
-        past_end: Windows may go on past the end of an episode, into the next one: for losses that look at
+        cross_episode: Windows may go on past the end of an episode, into the next one: for losses that look at
             ``boundary`` themselves. Then every step starts windows, also the last ones of an episode, and
             episodes shorter than a window are seen.
         before: So many steps before each window must be kept as well: for stacked pictures.
@@ -44,7 +44,7 @@ class WindowSampler(Sampler):
         length: int,
         boundary: str = BOUNDARY,
         oversample: int = 4,
-        past_end: bool = False,
+        cross_episode: bool = False,
         before: int = 0,
     ):
         if length < 1 or oversample < 1:
@@ -53,7 +53,7 @@ class WindowSampler(Sampler):
         self.length = length
         self.boundary = boundary
         self.oversample = oversample
-        self.past_end = past_end
+        self.cross_episode = cross_episode
         self.before = before
         self._missing: torch.Tensor | None = None
 
@@ -86,7 +86,7 @@ class WindowSampler(Sampler):
     @property
     def _checks(self) -> bool:
         """Whether windows across an episode's start are rejected."""
-        return self.length > 1 and not self.past_end
+        return self.length > 1 and not self.cross_episode
 
     def candidates(self, batch_size: int) -> int:
         """How many windows are drawn for a batch of so many."""
@@ -182,7 +182,7 @@ def make_replay(
     window: int,
     batch_size: int,
     device: torch.device | str,
-    past_end: bool = False,
+    cross_episode: bool = False,
     frame_stack: int = 1,
     stacked: Sequence[str] = (),
     hindsight: Hindsight | None = None,
@@ -195,7 +195,7 @@ def make_replay(
         window: Transitions per sampled window, H.
         batch_size: Windows per sample.
         device: Where everything lives.
-        past_end: Windows may go on past the end of an episode, see :class:`WindowSampler`.
+        cross_episode: Windows may go on past the end of an episode, see :class:`WindowSampler`.
         frame_stack: Pictures in each observation under ``stacked``, as ``env.frame_stack``: each is kept once, and
             samples have stacks again.
         stacked: Keys of such observations.
@@ -219,7 +219,7 @@ def make_replay(
     return WindowReplay(
         hindsight=hindsight,
         storage=storage,
-        sampler=WindowSampler(writer, length=window, past_end=past_end, before=before),
+        sampler=WindowSampler(writer, length=window, cross_episode=cross_episode, before=before),
         writer=writer,
         batch_size=batch_size,
         dim_extend=1,

@@ -40,6 +40,7 @@ from franka_wm.evaluation.rollouts import (
     mixture,
 )
 from franka_wm.evaluation.spectrum import spectrum
+from franka_wm.policies import PlannerPolicy
 from franka_wm.seeding import derive_seed, seeded
 
 EPISODES = 48
@@ -74,7 +75,7 @@ class Held:
 def hold_out(agent: Any, *, pictures: bool = True, seed: int = ROLLOUT_SEED) -> Held:
     """Plays the episodes that the diagnostics look at: smooth random and the model's own behaviour, in turns."""
     env, model = agent.env, agent.model
-    keys = list(getattr(model, "observation_keys", model.observation_sizes))
+    keys = model.observation_keys
     shown = min(PICTURED, env.num_envs) if pictures and arm_of(env) is not None else 0
     episodes, seen = gather_episodes(
         env,
@@ -92,7 +93,7 @@ def hold_out(agent: Any, *, pictures: bool = True, seed: int = ROLLOUT_SEED) -> 
 
 def picture_size(model: Any) -> int:
     """Side of the decoder's pictures [px]: what the model itself reads if that is small, else 64."""
-    sizes = [shape[0] for shape in getattr(model, "image_sizes", {}).values()]
+    sizes = [shape[0] for shape in model.image_sizes.values()]
     return min(SIZES, key=lambda size: abs(size - (sizes[0] if sizes else 64)))
 
 
@@ -100,7 +101,7 @@ def open_loop(agent: Any, held: Held, *, horizon: int = HORIZON) -> dict[str, An
     """Latent error by horizon and rank correlations; empty for a model without ``next``."""
     model = agent.model
     out: dict[str, Any] = {}
-    if hasattr(model, "next"):
+    if model.has_next:
         actions = held.episodes.get("action")
         out |= horizon_error(model, held.latents, actions, horizon=horizon, valid=held.valid)
     if "physical" in held.episodes.keys():  # noqa: SIM118
@@ -162,14 +163,14 @@ def calibration(agent: Any, *, episodes: int = 32) -> dict[str, Any]:
     from franka_wm.training import build
 
     model = agent.model
-    if not all(hasattr(model, name) for name in ("value", "discount")) or "policy" not in agent.policies:
+    if not model.has_value or "policy" not in agent.policies:
         return {}
     length = agent.env.config.episode_length
     tail = steps_until_forgotten(model.discount)
     env = build.make_evaluation_env(
         agent.cfg, num_envs=min(episodes, agent.env.num_envs), episode_length=length + tail
     )
-    keys = list(getattr(model, "observation_keys", model.observation_sizes))
+    keys = model.observation_keys
     played, _ = gather_episodes(env, agent.policies["policy"], keys=keys)
     returns = discounted_returns(
         played.get(("next", "reward")), played.get(("next", "terminated")), model.discount
@@ -192,7 +193,7 @@ def health(agent: Any, evaluation: Evaluation | None) -> dict[str, Any]:
     """How the planner searches on held-out first states, and what it gains over its prior in truth."""
     out: dict[str, Any] = {}
     planner = agent.policies.get("planner")
-    if hasattr(planner, "planner") and hasattr(planner, "objective"):
+    if isinstance(planner, PlannerPolicy):
         with seeded(ROLLOUT_SEED, planner):
             searched = planner_health(planner, begin(agent.env, ROLLOUT_SEED))
         out |= {f"planner {name.replace('_', ' ')}": value for name, value in searched.items()}
@@ -215,7 +216,7 @@ def imagine(
         ``None`` without pictures or without ``next``; else strip and film, the decoder, and its errors on the
         episodes left out (:func:`~franka_wm.evaluation.decoder.decoder_error`).
     """
-    if held.pictures is None or not hasattr(agent.model, "next") or held.pictures.shape[0] < 4:
+    if held.pictures is None or not agent.model.has_next or held.pictures.shape[0] < 4:
         return None
     pictures = held.pictures
     count, length = pictures.shape[:2]
@@ -243,7 +244,7 @@ def imagine(
 
 def _starts(agent: Any, *, decoder_size: int, rounds: int = 6, steps: int = 8) -> tuple[Tensor, Tensor]:
     """Latents (n, D) and pictures of the first steps of many more episodes: more poses than a few long ones show."""
-    keys = list(getattr(agent.model, "observation_keys", agent.model.observation_sizes))
+    keys = agent.model.observation_keys
     latents, pictures = [], []
     for k in range(rounds):
         episodes, seen = gather_episodes(

@@ -40,7 +40,7 @@ def training_diagnostics(model: Any, batch: TensorDictBase) -> dict[str, float]:
         encoding is not finite.
     """
     device = batch.device if batch.device is not None else batch.get("action").device
-    keys = list(getattr(model, "observation_keys", model.observation_sizes))
+    keys = model.observation_keys
     batch = cast(TensorDictBase, batch[:SAMPLES])
     devices = [device] if device.type == "cuda" else []
     with evaluating(model), torch.random.fork_rng(devices=devices):
@@ -50,7 +50,7 @@ def training_diagnostics(model: Any, batch: TensorDictBase) -> dict[str, float]:
             return {}
         out = {f"latent/{name}": value for name, value in latent_statistics(embedded).items()}
         reward = batch.get(("next", "reward"), None)
-        if reward is not None and hasattr(model, "value") and hasattr(model, "discount"):
+        if reward is not None and model.has_value:
             last = model.encode(batch.get("next").select(*keys)[:, -1])
             out |= _value_consistency(model, first, last, reward, batch.get(("next", "terminated")))
     return out
@@ -84,8 +84,7 @@ def planner_health(policy: Any, observation: TensorDictBase) -> dict[str, Any]:
         of states where it does. Started from means the policy's plan, or doing nothing for families without
         one. ``prior``, ``plan``: the mean scores of both. Means with 95 % bootstrap intervals over the states.
     """
-    bind = getattr(policy.objective, "bind", None)
-    objective = policy.objective if bind is None else bind(observation)
+    objective = policy.objective.bind(observation)
     z = policy.encode(observation)
     found = policy.planner.plan(z, policy.next, objective, prior=policy.prior, explore=False)
     plan = found.get("best", found.get("plan"))  # iCEM acts by the best one, and its `plan` holds elites, too

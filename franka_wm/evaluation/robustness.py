@@ -104,7 +104,7 @@ def robustness(
     for name in names:
         if name not in agent.policies:
             raise UserError(f"robustness: no policy {name!r}; here are {', '.join(agent.policies)}")
-    seen = bool(getattr(agent.model, "image_sizes", {}))
+    seen = bool(agent.model.image_sizes)
     cases = {UNSHIFTED: Shift({})} | {name: s for name, s in shifts.items() if seen or not s.looks}
     own = build.plain(agent.cfg.env.randomization)
     seed = held_out_seeds(1)[0]

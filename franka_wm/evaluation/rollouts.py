@@ -120,10 +120,10 @@ def encode_episodes(model: Any, episodes: TensorDictBase, *, chunk: int = 1024) 
     Returns:
         (E, T + 1, Z).
     """
-    keys = list(getattr(model, "observation_keys", model.observation_sizes))
+    keys = model.observation_keys
     last = episodes.get("next").select(*keys)[:, -1:]
     observations = cast(TensorDict, torch.cat([episodes.select(*keys), last], 1))  # pyright: ignore  # (E, T + 1)
-    if not hasattr(model, "observe"):
+    if not model.has_memory:
         flat = cast(TensorDict, observations.flatten(0, 1))
         latents = torch.cat([model.encode(part) for part in flat.split(chunk)])
         return latents.unflatten(0, observations.batch_size)
@@ -143,7 +143,7 @@ def encoded_validly(episodes: TensorDictBase) -> Tensor:
 
 def embedding(model: Any) -> Callable[[Tensor], Tensor]:
     """What distances between latents are measured on: ``model.embed``, or the latent itself."""
-    return getattr(model, "embed", lambda z: z)
+    return model.embed
 
 
 def discounted_returns(reward: Tensor, terminated: Tensor, discount: float) -> Tensor:

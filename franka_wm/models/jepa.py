@@ -203,6 +203,7 @@ class JEPA(WorldModel):
         if self.collapse == "ema":
             self.target_encoder = frozen_copy(self.encoder)
             if recipe == "lejepa":
+                assert self.projector is not None
                 self.target_projector = frozen_copy(self.projector)
         self.register_buffer("updates", torch.zeros(()))
         if recipe != "lejepa":

@@ -53,13 +53,13 @@ def _missing(size: int, like: Tensor) -> int:
 class Linear(nn.Linear):
     """`nn.Linear`, whose product is padded with zeros on CUDA where its sizes do not suit tensor cores."""
 
-    def forward(self, x: Tensor) -> Tensor:
-        more, beyond = _missing(self.in_features, x), _missing(self.out_features, x)
+    def forward(self, input: Tensor) -> Tensor:
+        more, beyond = _missing(self.in_features, input), _missing(self.out_features, input)
         if not (more or beyond):
-            return super().forward(x)
+            return super().forward(input)
         weight = F.pad(self.weight, (0, more, 0, beyond))
         bias = None if self.bias is None else F.pad(self.bias, (0, beyond))
-        return F.linear(F.pad(x, (0, more)), weight, bias)[..., : self.out_features]
+        return F.linear(F.pad(input, (0, more)), weight, bias)[..., : self.out_features]
 
 
 class SimNorm(nn.Module):

@@ -20,7 +20,7 @@ class Range(NamedTuple):
     without_low: bool = False
     without_high: bool = False
 
-    def holds(self, value: float) -> bool:
+    def holds(self, value: Any) -> bool:
         """Whether `value` lies inside; nan never does."""
         above = value > self.low if self.without_low else value >= self.low
         return above and (value < self.high if self.without_high else value <= self.high)
@@ -84,7 +84,7 @@ def _check(name: str, value: Any, annotation: Any, allowed: Range | None) -> Non
             raise UserError(f"{name}={value!r}: must be true or false{ending}")
     elif kind in (int, float):
         number = isinstance(value, Integral if kind is int else Real) and not isinstance(value, bool)
-        if not number or (allowed is not None and not allowed.holds(float(value))):
+        if not number or not (allowed is None or allowed.holds(value)):
             what = "a whole number" if kind is int else "a number"
             raise UserError(
                 f"{name}={value!r}: must be {what}{' of' if ' at' in bounds else ''}{bounds}{ending}"

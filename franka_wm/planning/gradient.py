@@ -6,7 +6,7 @@ import torch
 from tensordict import TensorDict
 from torch import Tensor
 
-from franka_wm.planning.objectives import Objective
+from franka_wm.planning.objectives import Score
 from franka_wm.planning.sampling import (
     Next,
     Prior,
@@ -95,7 +95,7 @@ class GradientPlanner:
         self,
         z: Tensor,
         next: Next,
-        objective: Objective,
+        objective: Score,
         *,
         prior: Prior | None = None,
         previous: Tensor | None = None,
@@ -200,9 +200,7 @@ class GradientPlanner:
         )
         return torch.cat((*parts, scattered), dim=1)
 
-    def _ascent(
-        self, z: Tensor, next: Next, objective: Objective, free: Tensor
-    ) -> tuple[Tensor, Tensor, Tensor]:
+    def _ascent(self, z: Tensor, next: Next, objective: Score, free: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """The free variable's actions, their scores (E, S), and the scores' gradient, where finite."""
         with torch.enable_grad():
             free = free.detach().requires_grad_()

@@ -4,7 +4,7 @@ import torch
 from tensordict import TensorDict
 from torch import Tensor
 
-from franka_wm.planning.objectives import Objective
+from franka_wm.planning.objectives import Score
 from franka_wm.planning.sampling import (
     Next,
     Prior,
@@ -157,7 +157,7 @@ class ICEM:
         self,
         z: Tensor,
         next: Next,
-        objective: Objective,
+        objective: Score,
         *,
         prior: Prior | None = None,
         previous: Tensor | None = None,

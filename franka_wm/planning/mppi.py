@@ -6,7 +6,7 @@ import torch
 from tensordict import TensorDict
 from torch import Tensor
 
-from franka_wm.planning.objectives import Objective
+from franka_wm.planning.objectives import Score
 from franka_wm.planning.sampling import (
     best,
     explored,
@@ -20,7 +20,7 @@ from franka_wm.planning.sampling import (
     warm_start,
 )
 
-__all__ = ["MPPI", "Objective"]
+__all__ = ["MPPI", "Score"]
 
 
 class MPPI:
@@ -102,7 +102,7 @@ class MPPI:
         self,
         z: Tensor,
         next: Callable[[Tensor, Tensor], Tensor],
-        objective: Objective,
+        objective: Score,
         *,
         prior: Callable[[Tensor], Tensor] | None = None,
         previous: Tensor | None = None,

@@ -10,7 +10,7 @@ import torch
 from tensordict import TensorDict
 from torch import Tensor
 
-from franka_wm.planning.objectives import Objective
+from franka_wm.planning.objectives import Score
 
 Next = Callable[[Tensor, Tensor], Tensor]
 """(z (..., D), action (..., A)) -> next latents (..., D)."""
@@ -26,7 +26,7 @@ class Planner(Protocol):
         self,
         z: Tensor,
         next: Next,
-        objective: Objective,
+        objective: Score,
         *,
         prior: Prior | None = None,
         previous: Tensor | None = None,

@@ -3,8 +3,9 @@
 Both explore when TorchRL's exploration type is RANDOM, as it is inside a collector, unless told otherwise.
 """
 
+from __future__ import annotations
+
 from collections.abc import Callable, Sequence
-from typing import Any
 
 import torch
 from tensordict import TensorDict, TensorDictBase
@@ -12,8 +13,9 @@ from tensordict.nn import InteractionType, TensorDictModuleBase
 from tensordict.nn.probabilistic import interaction_type
 from torch import Tensor, nn
 
-from franka_wm.planning.mppi import MPPI, Objective
-from franka_wm.planning.objectives import RewardPlusValue
+from franka_wm.models.base import WorldModel
+from franka_wm.planning.objectives import Objective, RewardPlusValue, Score, as_objective
+from franka_wm.planning.sampling import Planner
 from franka_wm.policies.capture import GraphCache
 from franka_wm.policies.settings import settings
 
@@ -34,11 +36,6 @@ def captures(wanted: bool | None, observation: Tensor) -> bool:
 
 def _explores(explore: bool | None) -> bool:
     return interaction_type() is InteractionType.RANDOM if explore is None else explore
-
-
-def _keys(model: Any) -> list[str]:
-    keys = getattr(model, "observation_keys", None)
-    return list(getattr(model, "observation_sizes", ()) if keys is None else keys)
 
 
 class PlannerPolicy(TensorDictModuleBase):
@@ -84,11 +81,11 @@ class PlannerPolicy(TensorDictModuleBase):
 
     def __init__(
         self,
-        planner: MPPI,
+        planner: Planner,
         *,
         encode: Callable[[TensorDictBase], Tensor],
         next: Callable[[Tensor, Tensor], Tensor],
-        objective: Objective,
+        objective: Objective | Score,
         observation_keys: Sequence[str],
         observe: Callable[[TensorDictBase, Tensor, Tensor, Tensor], Tensor] | None = None,
         prior: Callable[[Tensor], Tensor] | None = None,
@@ -104,29 +101,30 @@ class PlannerPolicy(TensorDictModuleBase):
         if compile:
             next = torch.compile(next, dynamic=False)
             prior = prior if prior is None else torch.compile(prior, dynamic=False)
-            objective = getattr(objective, "compiled", lambda: objective)()
+            objective = as_objective(objective).compiled()
         self.precision = precision
-        self.in_keys = [*observation_keys, *getattr(objective, "in_keys", ()), "is_init"]
+        self.objective = as_objective(objective)
+        self.in_keys = [*observation_keys, *self.objective.in_keys, "is_init"]
         context = [] if observe is None else ["context", "context_action"]
         self.out_keys = ["action", "plan", *context]
         self.planner, self.explore, self.model = planner, explore, model
-        self.encode, self.next, self.objective, self.prior = encode, next, objective, prior
+        self.encode, self.next, self.prior = encode, next, prior
         self.observe, self.capture = observe, capture
         self._graphs = GraphCache()
 
     @classmethod
     def for_model(
         cls,
-        model: Any,
-        planner: MPPI,
+        model: WorldModel,
+        planner: Planner,
         *,
         observation_keys: Sequence[str] | None = None,
-        objective: Objective | None = None,
+        objective: Objective | Score | None = None,
         explore: bool | None = None,
         capture: bool | None = None,
         precision: str = "float32",
         compile: bool = False,
-    ) -> "PlannerPolicy":
+    ) -> PlannerPolicy:
         """Plan with any model that has `encode` and `next`.
 
         Args:
@@ -140,24 +138,24 @@ class PlannerPolicy(TensorDictModuleBase):
             ValueError: the model lacks what a default needs.
         """
         if observation_keys is None:
-            observation_keys = _keys(model)
+            observation_keys = model.observation_keys
             if not observation_keys:
                 raise ValueError(f"{type(model).__name__} has no observation_sizes: give observation_keys")
         if objective is None:
-            lacking = [name for name in ("reward", "value", "discount") if not hasattr(model, name)]
-            if lacking:
-                raise ValueError(f"{type(model).__name__} has no {', '.join(lacking)}: give an objective")
-            objective = RewardPlusValue.of(model)
+            try:
+                objective = RewardPlusValue.of(model)
+            except ValueError as error:
+                raise ValueError(f"{error}: give an objective") from error
         return cls(
             planner,
             encode=model.encode,
             next=model.next,
             objective=objective,
             observation_keys=observation_keys,
-            observe=getattr(model, "observe", None),
-            prior=getattr(model, "policy", None),
+            observe=model.observe if model.has_memory else None,
+            prior=model.policy if model.has_policy else None,
             explore=explore,
-            model=model if isinstance(model, nn.Module) else None,
+            model=model,
             capture=capture,
             precision=precision,
             compile=compile,
@@ -202,7 +200,6 @@ class PlannerPolicy(TensorDictModuleBase):
     def _decide(self, tensordict: TensorDictBase, explore: bool) -> TensorDict:
         """What the policy writes."""
         is_init = tensordict.get("is_init", None)
-        bind = getattr(self.objective, "bind", None)
         low = self.precision == "bfloat16"
         # No cache of cast weights: it would hold tensors of one captured decision into the next.
         with torch.autocast(tensordict.get(self.in_keys[0]).device.type, torch.bfloat16, low, False):
@@ -211,7 +208,7 @@ class PlannerPolicy(TensorDictModuleBase):
             result = self.planner.plan(
                 z,
                 self._next_in_float32 if low else self.next,
-                self.objective if bind is None else bind(tensordict),
+                self.objective.bind(tensordict),
                 prior=self.prior,
                 previous=tensordict.get("plan", None),
                 is_init=is_init,
@@ -263,14 +260,14 @@ class ModelPolicy(TensorDictModuleBase):
         self.encode, self.policy, self.explore, self.model = encode, policy, explore, model
 
     @classmethod
-    def for_model(cls, model: Any, *, explore: bool | None = None) -> "ModelPolicy":
-        """The policy of a model with `encode`, `policy` and `observation_sizes`."""
+    def for_model(cls, model: WorldModel, *, explore: bool | None = None) -> ModelPolicy:
+        """The policy of a model that has one."""
         return cls(
             encode=model.encode,
             policy=model.policy,
-            observation_keys=_keys(model),
+            observation_keys=model.observation_keys,
             explore=explore,
-            model=model if isinstance(model, nn.Module) else None,
+            model=model,
         )
 
     @torch.no_grad()

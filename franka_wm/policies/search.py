@@ -1,7 +1,8 @@
 """A policy that a TorchRL collector can run: tree search over a world model with a discrete set of moves."""
 
+from __future__ import annotations
+
 from collections.abc import Callable, Sequence
-from typing import Any
 
 import torch
 from tensordict import TensorDict, TensorDictBase
@@ -9,6 +10,7 @@ from tensordict.nn import InteractionType, TensorDictModuleBase
 from tensordict.nn.probabilistic import interaction_type
 from torch import Tensor, nn
 
+from franka_wm.models.base import WorldModel
 from franka_wm.planning.mcts import MCTS
 from franka_wm.planning.tree import Recurrent
 from franka_wm.policies.capture import GraphCache
@@ -62,39 +64,35 @@ class SearchPolicy(TensorDictModuleBase):
     @classmethod
     def for_model(
         cls,
-        model: Any,
+        model: WorldModel,
         search: MCTS,
         *,
         explore: bool | None = None,
         generator: torch.Generator | None = None,
         capture: bool | None = None,
-    ) -> "SearchPolicy":
-        """Search with a model that has `encode`, `prediction`, `recurrent` and `num_actions`.
+    ) -> SearchPolicy:
+        """Search with a model that has `prediction` and `recurrent`.
 
         Raises:
             ValueError: the model lacks one of them, or has another number of actions than the search.
         """
-        lacking = [
-            name for name in ("encode", "prediction", "recurrent", "num_actions") if not hasattr(model, name)
-        ]
-        if lacking:
+        if not model.has_search:
             raise ValueError(
-                f"{type(model).__name__} has no {', '.join(lacking)}: tree search needs a model of discrete "
+                f"{type(model).__name__} has no prediction and recurrent: tree search needs a model of discrete "
                 "actions such as muzero"
             )
         if model.num_actions != search.num_actions:
             raise ValueError(
                 f"the search has num_actions={search.num_actions}, the model {model.num_actions}: make them equal"
             )
-        keys = getattr(model, "observation_keys", None) or list(getattr(model, "observation_sizes", ()))
         return cls(
             search,
             encode=model.encode,
             prediction=model.prediction,
             recurrent=model.recurrent,
-            observation_keys=keys,
+            observation_keys=model.observation_keys,
             explore=explore,
-            model=model if isinstance(model, nn.Module) else None,
+            model=model,
             generator=generator,
             capture=capture,
         )

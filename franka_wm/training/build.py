@@ -49,8 +49,8 @@ def actor(cfg: DictConfig) -> str:
     if acts != "auto" and acts not in ACTORS:
         raise UserError(f"collector.acts={acts!r}: must be one of auto, {', '.join(ACTORS)}")
     family = models.family(cfg.model.name)
-    there = {"planner": hasattr(family, "next"), "policy": hasattr(family, "policy")}
-    searched = bool(getattr(family, "replay_keys", ()))  # the loss needs what the search found
+    there = {"planner": family.has_next, "policy": family.has_policy}
+    searched = bool(family.replay_keys)  # the loss needs what the search found
     if acts == "auto":
         if searched:
             return "planner"
@@ -124,15 +124,9 @@ def window(cfg: DictConfig) -> int:
     return cfg.model.window if cfg.replay.window is None else cfg.replay.window
 
 
-def refusal(cfg: DictConfig, window: int) -> str | None:
-    """Why the family cannot learn with these settings from windows of so many transitions; ``None``: it can."""
-    asked = getattr(models.family(cfg.model.name), "refusal", None)
-    return None if asked is None else asked(plain(cfg.model), window)
-
-
-def looks_past_ends(cfg: DictConfig) -> bool:
+def crosses_episodes(cfg: DictConfig) -> bool:
     """Whether the model's loss takes windows that go on past the end of an episode."""
-    return bool(getattr(models.family(cfg.model.name), "past_end", False))
+    return models.family(cfg.model.name).cross_episode
 
 
 def learning_rate(cfg: DictConfig) -> float:
@@ -158,7 +152,7 @@ def model_keys(cfg: DictConfig) -> list[str] | None:
 def is_discrete(cfg: DictConfig) -> bool:
     """Whether the model chooses among moves."""
     try:
-        return bool(getattr(models.family(cfg.model.name), "discrete", False))
+        return models.family(cfg.model.name).discrete
     except ValueError as error:
         raise UserError(f"model.name: {error}") from error
 
@@ -176,10 +170,7 @@ def make_model(cfg: DictConfig, surroundings: Any, device: torch.device | str | 
     values = {key: value for key, value in plain(cfg.model).items() if key not in NOT_FOR_MODELS}
     name = cfg.model.name
     spaces = surroundings.only(model_keys(cfg), f"model={name}")
-    for key, value in values.items():
-        counted = key.endswith(("_dim", "_layers", "num_q", "bins"))
-        if counted and (isinstance(value, bool) or not isinstance(value, int) or value < 1):
-            raise UserError(f"model.{key}={value!r}: must be a whole number of at least 1")
+    models.family(name).validate(values)
     discrete = is_discrete(cfg)
     if discrete and not spaces.num_actions:
         raise UserError(f"model={name} chooses among moves; this environment's actions are continuous")
@@ -262,9 +253,9 @@ def objective_name(cfg: DictConfig) -> str | None:
     if name != "auto":
         return name
     family = models.family(cfg.model.name)
-    if getattr(family, "discrete", False) or not hasattr(family, "next"):
+    if family.discrete or not family.has_next:
         return None
-    return "reward_value" if hasattr(family, "value") else "goal_image"
+    return "reward_value" if family.has_value else "goal_image"
 
 
 def make_objective(cfg: DictConfig, model: Any) -> Any:
@@ -274,20 +265,18 @@ def make_objective(cfg: DictConfig, model: Any) -> Any:
     if name is None:
         return None
     if name == "reward_value":
-        lacking = [part for part in ("reward", "value", "discount") if not hasattr(model, part)]
-        if lacking:
-            raise UserError(
-                f"objective=reward_value: model={cfg.model.name} has no {', '.join(lacking)}; use objective=goal_image"
-            )
-        chosen: Any = planning.RewardPlusValue.of(model)
+        try:
+            chosen: Any = planning.RewardPlusValue.of(model)
+        except ValueError as error:
+            raise UserError(f"objective=reward_value: {error}; use objective=goal_image") from error
     elif name == "goal_image":
-        if not hasattr(model, "encode_goal"):
+        if not model.has_goal:
             raise UserError(
                 f"objective=goal_image: model={cfg.model.name} has no encode_goal; use objective=reward_value"
             )
         chosen = planning.GoalImage(
             model.encode_goal,
-            embed=getattr(model, "embed", None),
+            embed=model.embed,
             goals=goal_pictures(model.image_sizes),
             metric=o.metric,
             summed=o.summed,
@@ -325,11 +314,11 @@ def make_policies(
     discrete = not env.action_spec.dtype.is_floating_point
     if discrete:
         policies["planner"] = SearchPolicy.for_model(model, planner, capture=capture)
-    elif hasattr(model, "next"):
+    elif model.has_next:
         policies["planner"] = PlannerPolicy.for_model(
             model, planner, objective=objective, capture=capture, precision=precision, compile=compile
         )
-    if hasattr(model, "policy"):
+    if model.has_policy:
         policies["policy"] = ModelPolicy.for_model(model)
     return policies | make_scripted_policies(env, seed=seed, smoothness=smoothness)
 
@@ -369,7 +358,7 @@ def make_agent_policies(
     """
     if env is None:
         return {}
-    planner = make_planner(cfg, spaces.num_actions or spaces.action_dim) if hasattr(model, "next") else None
+    planner = make_planner(cfg, spaces.num_actions or spaces.action_dim) if model.has_next else None
     return make_policies(
         model,
         planner,
@@ -509,7 +498,7 @@ def make_replay_buffer(
         window=window(cfg),
         batch_size=cfg.replay.batch_size,
         device=device,
-        past_end=looks_past_ends(cfg),
+        cross_episode=crosses_episodes(cfg),
         frame_stack=frame_stack(cfg),
         stacked=pictures if frame_stack(cfg) > 1 else (),
         hindsight=hindsight,

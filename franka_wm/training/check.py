@@ -7,6 +7,7 @@ from typing import Any
 
 from omegaconf import DictConfig, ListConfig
 
+from franka_wm import models
 from franka_wm.device import resolve_device
 from franka_wm.envs import FrankaConfig
 from franka_wm.envs.franka import check_robot
@@ -53,13 +54,11 @@ def check(cfg: DictConfig) -> None:
         raise UserError(
             f"collector.calmest={cfg.collector.calmest!r}: this option is gone; start the run anew without it"
         )
-    refuses = build.refusal(cfg, window)
-    if refuses is not None:
-        raise UserError(refuses)
+    models.family(cfg.model.name).validate(build.plain(cfg.model), window=window)
     if not build.is_offline(cfg):
         build.actor(cfg)
     short = cfg.env.kind != "none" and cfg.env.episode_length < window
-    if short and not build.looks_past_ends(cfg):
+    if short and not build.crosses_episodes(cfg):
         raise UserError(
             f"env.episode_length={cfg.env.episode_length} is shorter than replay.window={window}; "
             "no window would fit into an episode"
@@ -134,7 +133,7 @@ def check(cfg: DictConfig) -> None:
     if spaces is not None:
         model = build.make_model(cfg, spaces, "cpu")
         if build.objective_name(cfg) == "goal_image":
-            goals = build.goal_pictures(getattr(model, "image_sizes", {})).values()
+            goals = build.goal_pictures(model.image_sizes).values()
             if not goals or any(goal not in spaces.image_sizes for goal in goals):
                 raise UserError(
                     "planning to a goal image needs goal_pixels among env.observations="
@@ -142,7 +141,7 @@ def check(cfg: DictConfig) -> None:
                     "use env=reach_goal_image or reach_fixed_goal_image"
                 )
         build.make_objective(cfg, model)
-        if hasattr(model, "next"):
+        if model.has_next:
             build.make_planner(cfg, spaces.num_actions or spaces.action_dim)
 
 

@@ -3,9 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
-from functools import partial
-from inspect import signature
 from typing import Any
 
 import torch
@@ -86,7 +83,7 @@ class Learner:
         self.optimizer = torch.optim.AdamW(groups, lr=lr, weight_decay=0.0, fused=True, capturable=on_cuda)
         self.rates = [float(group["lr"]) for group in self.optimizer.param_groups]
         self.precision = precision
-        self._loss = _compiled(model) if compile else model.loss
+        self._loss = model.compiled_loss() if compile else model.loss
         self.updates = 0
         self._names: list[str] = []
         self._sums: torch.Tensor | None = None
@@ -197,11 +194,3 @@ class Learner:
         with torch.cuda.graph(graph):
             self._eager(self._batch)
         self._graph = graph
-
-
-def _compiled(model: Any) -> Callable[[TensorDictBase], TensorDictBase]:
-    """`model.loss` compiled: as a whole, or part by part where the model names them."""
-    names = getattr(model, "parts_of_loss", ())
-    if not names or "parts" not in signature(model.loss).parameters:  # a subclass may have a loss of its own
-        return torch.compile(model.loss)
-    return partial(model.loss, parts={name: torch.compile(getattr(model, name)) for name in names})

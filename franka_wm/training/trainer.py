@@ -115,12 +115,12 @@ class Trainer:
             self._static = sampling.is_static
         self.spaces = Spaces.of_env(env) if spaces is None else spaces
         self._vectors = list(self.model.observation_sizes)
-        self._keys = list(getattr(self.model, "observation_keys", self._vectors))
+        self._keys = self.model.observation_keys
         if cfg.export.kind != "none":  # a dataset is for other models, too
             self._keys = [*self.spaces.observation_sizes, *self.spaces.image_sizes]
         if getattr(replay, "hindsight", None) is not None:  # it reads where the tool was
             self._keys = list(dict.fromkeys([*self._keys, "state"]))
-        self._extra = list(getattr(self.model, "replay_keys", ()))
+        self._extra = list(self.model.replay_keys)
         # What the acting policy writes for the loss, a random one does not: then the actor fills the replay, too.
         self._acting = None
         if policies:
@@ -347,7 +347,7 @@ class Trainer:
 
     def _config(self) -> DictConfig:
         """The configuration, so that the checkpoint alone rebuilds the model, without what it was started from."""
-        own = getattr(self.model, "rebuild_overrides", dict)()
+        own = self.model.rebuild_overrides()
         if not own:
             return self.cfg
         cfg = cast(DictConfig, OmegaConf.create(OmegaConf.to_container(self.cfg, resolve=True)))

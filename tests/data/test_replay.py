@@ -37,14 +37,14 @@ def experience(steps: int, *, start: int = 0, lengths: tuple[int, ...] = (5, 3, 
     return TensorDict(data, batch_size=time.shape)
 
 
-def buffer(steps: int, window: int, batch_size: int = 64, *, past_end: bool = False) -> ReplayBuffer:
+def buffer(steps: int, window: int, batch_size: int = 64, *, cross_episode: bool = False) -> ReplayBuffer:
     return make_replay(
         capacity=steps * WORLDS,
         num_envs=WORLDS,
         window=window,
         batch_size=batch_size,
         device="cpu",
-        past_end=past_end,
+        cross_episode=cross_episode,
     )
 
 
@@ -103,7 +103,7 @@ def test_every_last_transition_can_be_sampled() -> None:
 def test_windows_past_the_end_of_an_episode() -> None:
     """Every step starts one, equally often, in episodes shorter than a window too; none crosses the writer."""
     torch.manual_seed(0)
-    replay = buffer(40, 6, 400, past_end=True)
+    replay = buffer(40, 6, 400, cross_episode=True)
     for start in range(0, 63, 9):
         replay.extend(experience(9, start=start))
     counts: Counter[tuple[int, int]] = Counter()
@@ -196,7 +196,7 @@ def test_windows_end_with_their_episode_unless_asked() -> None:
     assert (sample["episode"] == sample["episode"][:, :1]).all()
     assert WindowSampler(replay.writer, length=1).candidates(8) == 8  # one step crosses nothing
     usual = WindowSampler(replay.writer, length=1, oversample=1)
-    assert (usual.length, usual.before, usual.past_end) == (1, 0, False)
+    assert (usual.length, usual.before, usual.cross_episode) == (1, 0, False)
 
 
 def test_on_a_gpu_missing_windows_are_kept_in_mind_until_asked_for() -> None:

@@ -56,12 +56,12 @@ def filled(played: TensorDictBase, chunks: list[int], steps: int = 12, **options
     return replay
 
 
-@pytest.mark.parametrize("past_end", [False, True])
+@pytest.mark.parametrize("cross_episode", [False, True])
 @pytest.mark.parametrize("chunks", [[9], [5, 4], [1] * 11, [7, 6, 6, 7]])
-def test_windows_have_the_stacks_that_were_given(played, chunks: list[int], past_end: bool) -> None:
+def test_windows_have_the_stacks_that_were_given(played, chunks: list[int], cross_episode: bool) -> None:
     """Half full, filled step by step, wrapped around twice; across the ends of episodes, and within them."""
     torch.manual_seed(0)
-    replay = filled(played, chunks, stacked=KEYS, past_end=past_end)
+    replay = filled(played, chunks, stacked=KEYS, cross_episode=cross_episode)
     given = {
         state.numpy().tobytes(): divmod(i, played.shape[1])
         for i, state in enumerate(played["state"].flatten(0, 1))
@@ -83,7 +83,7 @@ def test_windows_have_the_stacks_that_were_given(played, chunks: list[int], past
         (world, time)
         for world in range(N)
         for time in range(first, sum(chunks) - WINDOW + 1)
-        if past_end or not begins[world, time + 1 : time + WINDOW].any()
+        if cross_episode or not begins[world, time + 1 : time + WINDOW].any()
     }
 
 

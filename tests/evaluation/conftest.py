@@ -7,8 +7,8 @@ import sys
 from pathlib import Path
 
 import pytest
-import torch
 
+from franka_wm.models import WorldModel
 from franka_wm.training.load import Agent, load_agent
 
 SMOKE = [
@@ -39,7 +39,7 @@ def agent(run_folder: Path) -> Agent:
     return load_agent(run_folder, num_envs=6, device="cpu", seed=0)
 
 
-class PointModel(torch.nn.Module):
+class PointModel(WorldModel):
     """A model that is exact for points that move as their actions say: z' = z + a."""
 
     observation_sizes = {"position": 2}

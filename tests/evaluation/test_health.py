@@ -145,6 +145,7 @@ def test_effective_samples(point_model, states: TensorDict, temperature: float, 
 
 
 def test_a_perfect_prior_leaves_nothing_to_gain(point_model, states: TensorDict) -> None:
+    point_model.has_policy = True
     point_model.policy = lambda z, deterministic=False: (
         (-z).clamp(-1, 1) if deterministic else torch.ones_like(z)
     )

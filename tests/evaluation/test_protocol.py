@@ -20,6 +20,7 @@ from franka_wm.evaluation.rollouts import (
     gather_episodes,
     mixture,
 )
+from franka_wm.models import WorldModel
 from franka_wm.policies.scripted import NoopPolicy, SmoothRandomPolicy
 from franka_wm.report.diagnostics import evaluation_markdown
 from franka_wm.seeding import seeded
@@ -152,11 +153,17 @@ def test_latents_of_whole_episodes(agent) -> None:
 
 def test_a_model_with_memory_sees_its_episode_from_the_beginning(agent) -> None:
     """Its latent counts the steps: 0 where it encodes afresh, one more at every observation."""
-    model = SimpleNamespace(
-        observation_sizes={"state": 20},
-        encode=lambda o: torch.zeros(*o.batch_size, 1),
-        observe=lambda o, z, action, is_init: z + 1,
-    )
+
+    class Counting(WorldModel):
+        observation_sizes = {"state": 20}
+
+        def encode(self, observation):
+            return torch.zeros(*observation.batch_size, 1)
+
+        def observe(self, observation, previous_z, action, is_init):
+            return previous_z + 1
+
+    model = Counting()
     episodes, _ = gather_episodes(agent.env, agent.policies["noop"], keys=["state"])
     latents = encode_episodes(model, episodes)
     assert torch.equal(latents[..., 0], torch.arange(13.0).expand(6, 13))

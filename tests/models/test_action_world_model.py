@@ -123,9 +123,9 @@ def test_observe_pushes_and_starts_anew(dots):
     seen = model.observe(batch["next"][:, 0], z, batch["action"][:, 0], first)
     fresh = model.encode(batch["next"][:, 0])
     torch.testing.assert_close(seen[::2], fresh[::2])
-    frames, actions, valid = model.memory.split(seen[1::2])
+    frames, actions, valid = model.history.split(seen[1::2])
     assert valid.tolist() == [[0.0, 1.0, 1.0]] * 2
-    torch.testing.assert_close(frames[:, 1], model.memory.last(z)[1::2])
+    torch.testing.assert_close(frames[:, 1], model.history.last(z)[1::2])
     assert torch.equal(actions[:, 1], batch["action"][1::2, 0])
     torch.testing.assert_close(model.embed(seen), model.embed(fresh))
 

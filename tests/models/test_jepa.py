@@ -5,7 +5,8 @@ import torch
 from tensordict import TensorDict
 
 from franka_wm.models import make
-from franka_wm.models.jepa import JEPA, random_crops
+from franka_wm.models.images import random_crops
+from franka_wm.models.jepa import JEPA
 from franka_wm.models.regularizers import feature_std
 from franka_wm.models.vision import ViT
 
@@ -50,7 +51,7 @@ def test_every_recipe_trains_with_every_guard_from_pixels_alone(recipe, collapse
             assert parameter.grad is not None and parameter.grad.isfinite().all(), name
     z = model.encode(batch)
     assert z.shape == (6, 2, model.latent_dim) and not z.requires_grad
-    assert not hasattr(model, "next")
+    assert not model.has_next
 
 
 def test_the_context_is_blind_to_what_is_masked(dots):
@@ -191,7 +192,7 @@ def test_settings_that_cannot_work_are_refused(dots):
         (dict(collapse="hope"), "vicreg"),
         (dict(masks="stripes"), "multiblock"),
         (dict(image_sizes={}), "pixels"),
-        (dict(observation_sizes={"state": 3}), "pictures only"),
+        (dict(observation_sizes={"state": 3}), "images only"),
         (dict(tubelet=2), "clips"),
         (dict(patch_size=5), "patch_size"),
         (dict(patch_size=8), "no context"),

@@ -2,7 +2,7 @@ import pytest
 import torch
 from torch.nn import functional as F
 
-from franka_wm.models import available, make, parts
+from franka_wm.models import available, layers, make
 from franka_wm.models.layers import (
     Ensemble,
     GaussianPolicy,
@@ -233,7 +233,7 @@ def test_padding_changes_neither_results_nor_gradients(monkeypatch, kind):
         return [y, *torch.autograd.grad(y.square().sum(), [x, *network.parameters()])]
 
     plain, padded_products = results(), []
-    monkeypatch.setattr(parts, "_missing", lambda size, like: -size % 8)
+    monkeypatch.setattr(layers, "_missing", lambda size, like: -size % 8)
     product = torch.baddbmm if kind != "mlp" else F.linear
 
     def noted(*inputs):

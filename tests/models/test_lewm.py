@@ -3,8 +3,8 @@ import torch
 from tensordict import TensorDict
 
 from franka_wm.models import make
+from franka_wm.models.history import FrameHistory
 from franka_wm.models.lewm import LeWorldModel
-from franka_wm.models.history import Memory
 from franka_wm.models.transformer import CausalTransformer, block_causal_mask, hide_invalid
 
 
@@ -96,7 +96,7 @@ def test_a_short_history_predicts_alike_wherever_it_stands():
 
 
 def test_memory_is_a_queue():
-    memory = Memory(history=3, frame_dim=2, action_dim=1)
+    memory = FrameHistory(length=3, frame_dim=2, action_dim=1)
     frames, actions = torch.randn(4, 5, 2), torch.randn(4, 4, 1)
     z = memory.start(frames[:, 0])
     assert z.shape == (4, memory.size) == (4, 3 * 2 + 2 * 1 + 3)
@@ -109,7 +109,7 @@ def test_memory_is_a_queue():
     assert torch.equal(memory.gather(frames, actions)[:, -1], z)
     cut = memory.windows(frames)
     assert cut.shape == (4 * 3, 3, 2) and torch.equal(cut.view(4, 3, 3, 2)[:, 1], frames[:, 1:4])
-    single = Memory(history=1, frame_dim=2, action_dim=1)
+    single = FrameHistory(length=1, frame_dim=2, action_dim=1)
     assert torch.equal(
         single.last(single.push(single.start(frames[:, 0]), actions[:, 0], frames[:, 1])), frames[:, 1]
     )
@@ -131,7 +131,7 @@ def test_every_part_takes_any_leading_dimensions(reads, leading, dots):
     assert model.embed(z).shape == model.encode_goal(observation).shape == (*leading, 32)
     torch.testing.assert_close(model.embed(z), model.encode_goal(observation))
     assert model.observation_keys == [*vectors, *images]
-    assert not hasattr(model, "reward")
+    assert not model.has_reward
     losses = model.loss(dots.windows(4, 3))
     losses["loss"].backward()
     assert losses.isfinite().all()
@@ -152,7 +152,7 @@ def test_observe_pushes_and_starts_anew(dots):
     for t in range(3):
         before, z = z, model.observe(batch["next"][:, t], z, batch["action"][:, t], never)
         torch.testing.assert_close(model.embed(z), model.embed(model.encode(batch["next"][:, t])))
-    frames, actions, valid = model.memory.split(z)
+    frames, actions, valid = model.history.split(z)
     assert valid.all() and torch.equal(actions, batch["action"][:, 1:])
     torch.testing.assert_close(frames[:, 0], model.embed(model.encode(batch["next"][:, 0])))
     mixed = model.observe(batch["next"][:, 2], before, batch["action"][:, 2], first)

@@ -6,6 +6,7 @@ from tensordict import TensorDict
 from torch._subclasses.fake_tensor import FakeTensorMode
 from torch.nn import functional as F
 
+from franka_wm.errors import UserError
 from franka_wm.models import make
 from franka_wm.models.muzero import MuZero
 from franka_wm.planning import MCTS
@@ -202,8 +203,10 @@ def test_a_window_holds_the_whole_target_of_the_last_step():
     reward, value = batch["next", "reward"], batch["search_value"]
     last = model.value_targets(reward, batch["next", "terminated"], value)[:, model.unroll]
     torch.testing.assert_close(last, reward[:, 3] + 0.9 * reward[:, 4] + 0.81 * value[:, 5])
-    assert model.window == 6 and MuZero.refusal(SMALL, 6) is None
-    assert "replay.window=6" in str(MuZero.refusal(SMALL, 5))
+    assert model.window == 6
+    MuZero.validate(SMALL, window=6)
+    with pytest.raises(UserError, match=r"replay\.window=6"):
+        MuZero.validate(SMALL, window=5)
 
 
 @pytest.mark.parametrize("ends", [False, True])
@@ -249,9 +252,9 @@ def test_the_losses_are_those_of_a_plain_unroll(ends, held):
 
 
 @pytest.mark.parametrize(("ends", "terminated"), [(8, False), (5, False), (5, True), (1, False), (2, True)])
-def test_fresh_values_are_the_models_and_not_the_searchs(ends, terminated):
+def test_reanalyzed_values_are_the_models_and_not_the_searchs(ends, terminated):
     """unroll 3, n_step 2: the targets of steps 0 … 3 end at steps 2 … 5, or with the episode."""
-    model, batch = small(fresh_values=True, discount=0.5), windows(length=8, ends=ends, terminated=terminated)
+    model, batch = small(reanalyze=True, discount=0.5), windows(length=8, ends=ends, terminated=terminated)
     torch.nn.init.normal_(model.value_head.weight)
     scrambled = batch.clone()
     scrambled["search_value"].normal_(100.0, 10.0)
@@ -264,17 +267,17 @@ def test_fresh_values_are_the_models_and_not_the_searchs(ends, terminated):
 
     stop = min(2, ends - 1)
     if terminated and ends <= 2:
-        lent = torch.zeros(6, 1)  # over: nothing is lent
+        bootstrap = torch.zeros(6, 1)  # over: no bootstrap
         summed = ends
     else:
-        lent = model.prediction(model.encode(batch[:, stop]))[1].detach()
+        bootstrap = model.prediction(model.encode(batch[:, stop]))[1].detach()
         summed = stop
     rewards = batch["next", "reward"][:, :summed, 0] * 0.5 ** torch.arange(summed)
-    expected = rewards.sum(-1, keepdim=True) + 0.5**summed * lent
+    expected = rewards.sum(-1, keepdim=True) + 0.5**summed * bootstrap
     torch.testing.assert_close(found["value_target_mean"], expected.mean())
     assert not found["value_target_mean"].requires_grad
     # No gradient reaches the model through its own targets.
-    assert not model._fresh(batch, torch.full((6, 1), ends)).requires_grad
+    assert not model._present_values(batch, torch.full((6, 1), ends)).requires_grad
 
 
 @pytest.mark.parametrize("terminated", [False, True])
@@ -429,10 +432,10 @@ def test_mistakes_are_named():
         model.loss(batch.exclude("search_policy"))
 
 
-@pytest.mark.parametrize("fresh_values", [False, True])
-def test_the_loss_reads_nothing_on_the_host(fresh_values):
+@pytest.mark.parametrize("reanalyze", [False, True])
+def test_the_loss_reads_nothing_on_the_host(reanalyze):
     with FakeTensorMode():
-        model = small(fresh_values=fresh_values, image_sizes={"pixels": (64, 64, 3)}, channels=4)
+        model = small(reanalyze=reanalyze, image_sizes={"pixels": (64, 64, 3)}, channels=4)
         batch = windows(pixels=(64, 64, 3))
         losses = model.loss(batch)
         losses["loss"].backward()

@@ -541,6 +541,6 @@ def test_side_by_side_is_as_one_after_the_other(monkeypatch):
         return found
 
     beside = results()
-    monkeypatch.setattr(tdmpc2, "beside", Plainly)
+    monkeypatch.setattr(tdmpc2, "side_stream", Plainly)
     for found, expected in zip(beside, results(), strict=True):
         torch.testing.assert_close(found, expected, rtol=1e-4, atol=1e-6)

@@ -1,7 +1,8 @@
 import pytest
 import torch
 
-from franka_wm.models.vision import Block, ConvEncoder, RandomShift, ViT, vit_size
+from franka_wm.models.images import RandomShift
+from franka_wm.models.vision import Block, ConvEncoder, ViT, vit_size
 
 
 @pytest.fixture(autouse=True)

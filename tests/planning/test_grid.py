@@ -38,7 +38,7 @@ class Case:
 # ---------------------------------------------------------------------- toy models
 
 
-class Linear(nn.Module):
+class Linear(models.WorldModel):
     """Reward and value: a damped point that is paid for being at the origin."""
 
     discount = 0.95
@@ -64,7 +64,7 @@ class Linear(nn.Module):
         return (-2.0 * z).clamp(-1.0, 1.0)
 
 
-class Goal(nn.Module):
+class Goal(models.WorldModel):
     """No reward: a nonlinear latent in which a goal can be told from the rest."""
 
     def __init__(self) -> None:
@@ -80,7 +80,7 @@ class Goal(nn.Module):
         return torch.cat((state, (state @ self.lift).tanh()), -1)
 
 
-class Context(nn.Module):
+class Context(models.WorldModel):
     """Memory: z holds the last two positions and whether the older one is real; speed is only in both."""
 
     def __init__(self) -> None:
@@ -181,7 +181,7 @@ def imagined(case, objective, z, plan):
 def test_the_plan_is_finite_within_bounds_and_better_than_doing_nothing(case, planner):
     observation = case.observation()
     objective = bind(case.objective, observation)
-    prior = getattr(case.model, "policy", None)
+    prior = case.model.policy if case.model.has_policy else None
     with torch.no_grad():
         z = case.model.encode(observation)
         result = planner.plan(z, case.model.next, objective, prior=prior)

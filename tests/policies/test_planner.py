@@ -10,7 +10,7 @@ from torchrl.data import Bounded, Composite, Unbounded
 from torchrl.envs import EnvBase, InitTracker, TransformedEnv
 from torchrl.envs.utils import ExplorationType, check_env_specs, set_exploration_type
 
-from franka_wm.models import make
+from franka_wm.models import WorldModel, make
 from franka_wm.planning import CEM, ICEM, MPPI, GoalDistance, GradientPlanner
 from franka_wm.policies import ModelPolicy, PlannerPolicy
 
@@ -68,7 +68,7 @@ class Points(EnvBase):
         torch.manual_seed(0 if seed is None else seed)
 
 
-class Exact(nn.Module):
+class Exact(WorldModel):
     """The points' own law as a world model."""
 
     def __init__(self) -> None:

@@ -10,6 +10,7 @@ from torchrl.data import Categorical, Composite, Unbounded
 from torchrl.envs import EnvBase
 from torchrl.envs.utils import ExplorationType, check_env_specs, set_exploration_type
 
+from franka_wm.models import WorldModel
 from franka_wm.planning import MCTS
 from franka_wm.policies import SearchPolicy
 
@@ -55,7 +56,7 @@ def move(state, action):
     return state + torch.tensor([-1.0, 1.0, 0.0])[action].unsqueeze(-1)
 
 
-class Known(nn.Module):
+class Known(WorldModel):
     """The line's own law as a model, without an opinion of its own."""
 
     num_actions = 3
@@ -140,7 +141,7 @@ def test_its_own_generator_makes_actions_repeat():
 def test_mistakes_are_named():
     with pytest.raises(ValueError, match=r"batch size \[E\]"):
         acting()(TensorDict({"state": torch.zeros(2, 3, 1)}, [2, 3]))
-    with pytest.raises(ValueError, match="no encode, prediction, recurrent, num_actions"):
-        SearchPolicy.for_model(nn.Linear(1, 1), MCTS(num_actions=3))
+    with pytest.raises(ValueError, match="no prediction and recurrent"):
+        SearchPolicy.for_model(WorldModel(), MCTS(num_actions=3))
     with pytest.raises(ValueError, match="num_actions=4"):
         SearchPolicy.for_model(Known(), MCTS(num_actions=4))

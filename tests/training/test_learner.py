@@ -15,7 +15,7 @@ from franka_wm.training import build
 from franka_wm.training.learner import Learner
 
 
-class Line(nn.Module):
+class Line(models.WorldModel):
     """y = w x + b with two clip groups; the loss is known by hand."""
 
     def __init__(self) -> None:
