@@ -102,8 +102,8 @@ def main() -> None:
     for size in arguments.sizes:
         model = make_model(size).to(device)
         for name in arguments.planners:
-            # Rewards plus value, or the distance to the goal's picture.
-            objective = None if hasattr(model, "value") else GoalImage(model.encode_goal, embed=model.embed)
+            # Rewards plus value, or the distance to the goal's image.
+            objective = None if model.has_value else GoalImage(model.encode_goal, embed=model.embed)
             for launched in arguments.launched or (["eager", "captured"] if cuda else ["eager"]):
                 policy = PlannerPolicy.for_model(
                     model,

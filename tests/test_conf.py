@@ -11,7 +11,8 @@ import yaml
 from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from franka_wm.conf import FOLDER, SCALES, compose
+from franka_wm.conf import FOLDER, SCALES, compose, use_present_names
+from franka_wm.errors import UserError
 
 ROOT = Path(__file__).resolve().parents[1]
 ROWS = {
@@ -104,3 +105,18 @@ def test_an_unknown_size_says_which_there_are() -> None:
 def test_a_pretrained_encoder_has_the_scales_size() -> None:
     cfg = compose("pretrain=vjepa", "model=action_world_model", "scale=smoke")
     assert (cfg.pretrain.updates, cfg.pretrain.model.encoder_width, cfg.pretrain.model.window) == (10, 24, 8)
+
+
+def test_an_option_by_its_former_name_names_the_present_one() -> None:
+    with pytest.raises(
+        UserError, match=r"model\.fresh_values=true: this option is now called model\.reanalyze"
+    ):
+        compose("model=muzero", "model.fresh_values=true")
+
+
+def test_checkpoints_with_former_names_are_read_with_the_present_ones() -> None:
+    old = {"model": {"name": "muzero", "fresh_values": True, "unroll": 3}}
+    config = OmegaConf.create({**old, "whole_run": old})
+    use_present_names(config)
+    present = {"name": "muzero", "reanalyze": True, "unroll": 3}
+    assert config.model == present and config.whole_run.model == present

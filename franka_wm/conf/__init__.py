@@ -20,15 +20,35 @@ SCALES = ("smoke", "laptop", "gpu")
 """The columns of ``${at_scale:…}`` and ``${at_size:…}``."""
 
 
+RENAMED = {"model.fresh_values": "model.reanalyze"}
+"""Former names of options -> their present names."""
+
+
+def use_present_names(config: DictConfig) -> None:
+    """Rename the options of a checkpoint that had other names when it was written, in place."""
+    for one in (config, config.get("whole_run")):
+        for old, new in RENAMED.items() if one is not None else ():
+            value = OmegaConf.select(one, old)
+            if value is not None:
+                group, name = old.rsplit(".", 1)
+                OmegaConf.update(one, new, value, force_add=True)
+                del OmegaConf.select(one, group)[name]
+
+
 def compose(*overrides: str) -> DictConfig:
     """The configuration that ``python train.py OVERRIDE …`` runs with.
 
     Raises:
+        UserError: An option by a former name.
         HydraException, OmegaConfBaseException: An override that cannot be.
     """
     import hydra
     from hydra.core.global_hydra import GlobalHydra
 
+    for override in overrides:
+        name = override.split("=", 1)[0].lstrip("+~")
+        if name in RENAMED:
+            raise UserError(f"{override}: this option is now called {RENAMED[name]}")
     GlobalHydra.instance().clear()
     try:
         with hydra.initialize_config_dir(str(FOLDER), version_base="1.3"):

@@ -43,8 +43,6 @@ class WorldModel(nn.Module):
     """Whether `loss` takes windows that go on past the end of an episode."""
     replay_keys: tuple[str, ...] = ()
     """Entries that the acting policy writes and `loss` reads."""
-    renamed: ClassVar[Mapping[str, str]] = MappingProxyType({})
-    """Former names of options -> their present names."""
     ranges: ClassVar[Mapping[str, Range]] = MappingProxyType({})
     """Option -> values that it may have. `validate` checks them."""
 
@@ -187,7 +185,7 @@ class WorldModel(nn.Module):
         Raises:
             UserError: one line with the option, its value and what is allowed.
         """
-        check_options(cls, options, cls.ranges, cls.renamed)
+        check_options(cls, options, cls.ranges)
 
     def _lacks(self, name: str) -> NotImplementedError:
         return NotImplementedError(f"{type(self).__name__} has no {name}; see docs/models.md")

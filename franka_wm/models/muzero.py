@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from types import MappingProxyType
 from typing import Any, ClassVar
 
 import torch
@@ -79,7 +78,6 @@ class MuZero(SimplicialWorldModel):
         True  # the loss looks for the end itself; windows within one episode seldom show what precedes it
     )
     replay_keys = ("search_policy", "search_value")
-    renamed: ClassVar[Mapping[str, str]] = MappingProxyType({"fresh_values": "reanalyze"})
     ranges: ClassVar[Mapping[str, Range]] = {
         **dict.fromkeys(
             ("num_actions", "latent_dim", "simnorm_dim", "encoder_dim", "encoder_layers"), POSITIVE

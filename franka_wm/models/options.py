@@ -38,17 +38,12 @@ FRACTION = Range(0.0, 1.0)
 COEFFICIENT = Range(0.0)
 
 
-def check_options(
-    cls: type, options: Mapping[str, Any], ranges: Mapping[str, Range], renamed: Mapping[str, str]
-) -> None:
+def check_options(cls: type, options: Mapping[str, Any], ranges: Mapping[str, Range]) -> None:
     """Check the options that the constructors of `cls` and of its bases take.
 
     Raises:
-        UserError: a former name, a wrong type, or a value out of its range.
+        UserError: a wrong type, or a value out of its range.
     """
-    for old, new in renamed.items():
-        if old in options:
-            raise UserError(f"model.{old}: this option is now called model.{new}")
     for name, annotation in _annotations(cls).items():
         if name in options:
             _check(f"model.{name}", options[name], annotation, ranges.get(name))

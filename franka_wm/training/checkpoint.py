@@ -37,6 +37,7 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor, nn
 from torch.optim import Optimizer
 
+from franka_wm.conf import use_present_names
 from franka_wm.errors import UserError
 from franka_wm.training.tree import read_tree, save_tensors, tree_files, write_json, write_tree
 from franka_wm.version import __version__
@@ -330,6 +331,7 @@ def load_checkpoint(folder: str | Path) -> Checkpoint:
             f"checkpoint {path}: its config.yaml holds an interpolation (${{…}}), which no run writes; "
             "use another checkpoint."
         )
+    use_present_names(config)
     counters = json.loads((path / "counters.json").read_bytes())
     return Checkpoint(path, model_name, config, counters, files)
 

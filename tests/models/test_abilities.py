@@ -121,7 +121,6 @@ def test_what_is_no_world_model_is_refused():
         ("tdmpc2", {"freeze_encoder": 1}, "model.freeze_encoder=1: must be true or false"),
         ("tdmpc2", {"value_members": 9}, "model.value_members=9: must be at most model.num_q=5"),
         ("tdmpc2", {"simnorm_dim": 7}, "model.simnorm_dim=7: must divide model.latent_dim=512"),
-        ("muzero", {"fresh_values": True}, "model.fresh_values: this option is now called model.reanalyze"),
         ("jepa", {"recipe": "mae"}, "model.recipe='mae': must be one of ijepa, vjepa, lejepa"),
         ("lewm", {"history": 0}, "model.history=0: must be a whole number of at least 1"),
         ("action_world_model", {"encoder_size": 3}, "model.encoder_size=3: must be a word"),
