@@ -47,7 +47,7 @@ class Source:
 
 def embedded(config: FrankaConfig) -> Path:
     """The project's own FR3, drawn with primitives."""
-    return Path(str(files("franka_wm.envs.robots") / "fr3.urdf"))
+    return Path(str(files(__package__) / "fr3.urdf"))
 
 
 def newton_asset(config: FrankaConfig) -> Path:

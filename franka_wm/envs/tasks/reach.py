@@ -11,7 +11,7 @@ from tensordict import TensorDict, TensorDictBase
 
 from franka_wm.envs.config import HOME, FrankaConfig
 from franka_wm.envs.kernels import JOINTS, chain_forward, episode_rng
-from franka_wm.envs.tasks import Task
+from franka_wm.envs.tasks._base import Task
 
 if TYPE_CHECKING:
     from franka_wm.envs.simulation import Simulation

@@ -1,0 +1,81 @@
+"""The rooms of docs/architecture.md: imports point down only, and no files import one another in a circle."""
+
+from __future__ import annotations
+
+import ast
+import re
+from graphlib import CycleError, TopologicalSorter
+from pathlib import Path
+
+ROOT = Path(__file__).parents[1]
+PAGE = ROOT / "docs" / "architecture.md"
+FILES = {
+    ".".join(file.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__"): file
+    for file in [ROOT / "train.py", *(ROOT / "franka_wm").rglob("*.py")]
+}
+
+
+def rooms() -> dict[str, set[str]]:
+    """Room → the rooms that it may import besides itself and the ground, from the page's table."""
+    table = PAGE.read_text(encoding="utf-8").split("## Rooms\n")[1].split("\n## ")[0]
+    rows = [line.split("|") for line in table.splitlines() if line.startswith("| `")]
+    rights = {row[1].strip(" `"): row[3] for row in rows}
+    return {
+        room: set(rights) - {"train"} if "everything" in right else set(re.findall(r"`(\w+)`", right))
+        for room, right in rights.items()
+    }
+
+
+def room_of(module: str) -> str:
+    """The folder below ``franka_wm``; ``ground`` for a file beside the folders; ``train`` for what users start from."""
+    if module in ("train", "franka_wm", "franka_wm.__main__"):
+        return "train"
+    return module.split(".")[1] if (ROOT / "franka_wm" / module.split(".")[1]).is_dir() else "ground"
+
+
+def imports(module: str, *, types: bool) -> set[str]:
+    """Our modules that a file names: imports wherever they stand, and modules as text, as registries have them.
+
+    Args:
+        types: Also imports below ``if TYPE_CHECKING``, which never run.
+    """
+    found: set[str] = set()
+    todo: list[ast.AST] = [ast.parse(FILES[module].read_text(encoding="utf-8"))]
+    while todo:
+        node = todo.pop()
+        if not types and isinstance(node, ast.If) and ast.unparse(node.test) == "TYPE_CHECKING":
+            todo += node.orelse
+            continue
+        todo += ast.iter_child_nodes(node)
+        if isinstance(node, ast.Import):
+            found |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom):
+            assert node.level == 0, f"{module}: a relative import; write the whole name"
+            whole = {f"{node.module}.{alias.name}" for alias in node.names}
+            found |= {name if name in FILES else str(node.module) for name in whole}
+        elif isinstance(node, ast.Constant) and str(node.value).startswith("franka_wm."):
+            found.add(str(node.value).split(":")[0])
+    return {name for name in found if name in FILES and name not in (module, "franka_wm")}
+
+
+def test_every_folder_is_a_room_of_the_page() -> None:
+    folders = {file.parent.name for file in (ROOT / "franka_wm").glob("*/__init__.py")}
+    assert folders | {"ground", "train"} == set(rooms())
+
+
+def test_imports_follow_the_page() -> None:
+    allowed = rooms()
+    wrong = [
+        f"{module} ({room_of(module)}) imports {name} ({room_of(name)})"
+        for module in FILES
+        for name in sorted(imports(module, types=True))
+        if room_of(name) not in {room_of(module), "ground", *allowed[room_of(module)]}
+    ]
+    assert not wrong, "\n".join(wrong)
+
+
+def test_no_circle_of_files() -> None:
+    try:
+        TopologicalSorter({module: imports(module, types=False) for module in FILES}).prepare()
+    except CycleError as error:
+        raise AssertionError(" → ".join(reversed(error.args[1]))) from None
