@@ -352,10 +352,10 @@ class GaussianPolicy(nn.Module):
         mean, log_std = self.distribution(z)
         return torch.tanh(mean if deterministic else mean + log_std.exp() * torch.randn_like(mean))
 
-    def sample(self, z: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """A reparameterised action (..., action_dim) and its log-densities (..., 1), before and after squashing.
+    def sample(self, z: Tensor) -> tuple[Tensor, Tensor]:
+        """A reparameterised action (..., action_dim) and its log-density (..., 1).
 
-        Averaged and negated they estimate the Gaussian's entropy [nat] and that of the policy, its actions'.
+        Averaged and negated, the second estimates the entropy [nat] of the actions.
         """
         mean, log_std = self.distribution(z)
         noise = torch.randn_like(mean)
@@ -363,8 +363,7 @@ class GaussianPolicy(nn.Module):
         log_prob = -0.5 * (noise.square() + math.log(2.0 * math.pi)) - log_std
         # log(1 - tanh(u)^2), in the form that stays exact where tanh saturates
         log_slope = 2.0 * (math.log(2.0) - raw - F.softplus(-2.0 * raw))
-        before = log_prob.sum(-1, keepdim=True)
-        return torch.tanh(raw), before, before - log_slope.sum(-1, keepdim=True)
+        return torch.tanh(raw), (log_prob - log_slope).sum(-1, keepdim=True)
 
 
 class RunningScale(nn.Module):

@@ -49,6 +49,9 @@ class TDMPC2(SimplicialWorldModel):
         `set_observation_statistics`; the default is the identity.
       * One backward pass serves model and policy, so the policy learns from the critic before this update
         instead of after it. Their gradients stay apart.
+      * The entropy is that of the actions, as in SAC (Haarnoja et al., arXiv:1801.01290). The authors' code
+        counts the Gaussian's before squashing, which grows without bound at no cost where tanh saturates: where
+        one action changes returns by little, as on an arm at 30 Hz, their policy ends at ±1 everywhere.
       * All frames of a window are shifted alike, so that motion between them is kept; the paper shifts each.
 
     Args:
@@ -75,8 +78,7 @@ class TDMPC2(SimplicialWorldModel):
         log_std_min, log_std_max: bounds of the policy's log standard deviation before squashing.
         rho: weight of unroll step t is rho^t.
         consistency_coef, reward_coef, value_coef, termination_coef: weights of the losses.
-        entropy_coef: weight, against scaled values, of `action_dim` times the entropy [nat] of the Gaussian
-            before squashing, as in the authors' code.
+        entropy_coef: weight, against scaled values, of `action_dim` times the policy's entropy [nat].
         tau: how far target Q-functions, and the policy loss's scale, move at each update.
         encoder_lr_scale: learning rate of the encoder relative to the rest.
         channels: of each convolution over pictures.
@@ -255,8 +257,8 @@ class TDMPC2(SimplicialWorldModel):
         """Actions (..., action_dim) in [-1, 1] for z (..., latent_dim): a sample, or the mode."""
         return self.policy_head(z, deterministic=deterministic)
 
-    def policy_sample(self, z: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """A reparameterised action (..., action_dim) and its log-densities (..., 1), see `GaussianPolicy.sample`."""
+    def policy_sample(self, z: Tensor) -> tuple[Tensor, Tensor]:
+        """A reparameterised action (..., action_dim) and its log-density (..., 1), see `GaussianPolicy.sample`."""
         return self.policy_head.sample(z)
 
     # ------------------------------------------------------------------ training
@@ -421,12 +423,10 @@ class TDMPC2(SimplicialWorldModel):
 
     def _policy_loss(self, z: Tensor, weight: Tensor) -> tuple[Tensor, Tensor]:
         """Loss and mean entropy [nat] of the policy at detached latents z (H+1, B, D)."""
-        action, gaussian_log_prob, log_prob = self.policy_sample(z)
+        action, log_prob = self.policy_sample(z)
         q = self.q(z, action, weights="detached", reduce="pair_mean", dropout=self.training)
         if self.training:
             self.scale.update(q[0])
-        scaled_entropy = (
-            -self.action_dim * gaussian_log_prob
-        )  # not squashed: the bonus never pulls actions inwards
-        loss = -(weight * (self.scale(q) + self.entropy_coef * scaled_entropy)).mean()
+        bonus = self.entropy_coef * self.action_dim * -log_prob
+        loss = -(weight * (self.scale(q) + bonus)).mean()
         return loss, -log_prob.mean()

@@ -95,9 +95,9 @@ def test_every_part_takes_any_leading_dimensions(leading):
     z, action = model.encode(observation), torch.rand(*leading, 2)
     assert z.shape == model.next(z, action).shape == (*leading, 32)
     assert model.reward(z, action).shape == model.q(z, action).shape == model.value(z).shape == (*leading, 1)
-    sample, *log_probs = model.policy_sample(z)
+    sample, log_prob = model.policy_sample(z)
     assert model.policy(z).shape == sample.shape == (*leading, 2)
-    assert [log_prob.shape for log_prob in log_probs] == [(*leading, 1)] * 2
+    assert log_prob.shape == (*leading, 1)
 
 
 def test_latents_of_encoder_and_dynamics_are_simplices_alike():
@@ -178,8 +178,8 @@ def test_the_model_losses_are_those_of_a_plain_unroll():
     torch.testing.assert_close(losses["loss"], total)
 
 
-def test_the_policy_loss_is_the_published_one():
-    """-Σ ρ^t (Q / scale + coefficient · A · entropy of the Gaussian before squashing), over four latents."""
+def test_the_policy_loss_is_as_documented():
+    """-Σ ρ^t (Q / scale + coefficient · A · entropy of the actions), over four latents."""
     model = small(entropy_coef=0.25, rho=0.3).eval()
     randomise(model)
     model.scale.value.fill_(4.0)
@@ -200,10 +200,23 @@ def test_the_policy_loss_is_the_published_one():
     x = torch.cat((handed[0], raw.tanh()), -1)
     q = model.two_hot.decode(model.q_ensemble(x, members=members)).mean(0)
     log_prob = torch.distributions.Normal(mean, log_std.exp()).log_prob(raw).sum(-1, keepdim=True)
-    wanted = -(0.3 ** torch.arange(4.0) * (q / 4.0 + 0.25 * 2 * -log_prob).mean((1, 2))).mean()
-    torch.testing.assert_close(losses["loss_policy"], wanted.detach())
     squashed = log_prob - (1 - raw.tanh().square()).log().sum(-1, keepdim=True)
+    wanted = -(0.3 ** torch.arange(4.0) * (q / 4.0 + 0.25 * 2 * -squashed).mean((1, 2))).mean()
+    torch.testing.assert_close(losses["loss_policy"], wanted.detach(), rtol=1e-4, atol=1e-4)
     torch.testing.assert_close(losses["policy_entropy"], -squashed.mean().detach(), rtol=1e-3, atol=1e-3)
+
+
+def test_where_actions_hardly_matter_the_policy_does_not_saturate():
+    """An entropy counted before squashing drives it to ±1 and its deviation to the bound, as it did on the arm."""
+    torch.manual_seed(0)
+    model = small()
+    optimiser = optimiser_of(model, lr=3e-3)
+    batch = windows()
+    batch["next", "reward"] = 1e-3 * batch["action"].mean(-1, keepdim=True)
+    for _ in range(200):
+        update(model, optimiser, batch)
+    mean, log_std = model.policy_head.distribution(model.encode(batch[:, 0]))
+    assert mean.abs().mean() < 2.0 and log_std.mean() < 1.0
 
 
 def test_ends_are_learned_where_episodes_terminate_and_only_there():
