@@ -13,10 +13,10 @@ from omegaconf import DictConfig
 from franka_wm.commands.entry import one_line_errors, run_command
 
 
-@hydra.main(version_base="1.3", config_path="franka_wm/conf", config_name="config")
+@hydra.main(version_base="1.3", config_path="pkg://franka_wm.conf", config_name="config")
 @one_line_errors
 def main(cfg: DictConfig) -> None:
-    """One run: build, train, evaluate, report."""
+    """One run: build, pretrain if asked to, fit, evaluate, report, export."""
     from franka_wm.console import say
     from franka_wm.evaluation.health import diagnose_training
     from franka_wm.evaluation.protocol import during_training, evaluate_run
@@ -72,5 +72,10 @@ def main(cfg: DictConfig) -> None:
     say(f"results: {run.folder}")
 
 
+def command(arguments: list[str] | None = None) -> None:
+    """This file as a program, and ``franka-wm train``: the package has a link to this file."""
+    run_command(main, arguments)
+
+
 if __name__ == "__main__":
-    run_command(main)
+    command()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import difflib
 import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -78,7 +79,7 @@ def compose(overrides: Sequence[str], options: Sequence[str] = ()) -> Any:
     try:
         return conf.compose(*overrides)
     except (HydraException, OmegaConfBaseException) as error:
-        raise UserError(explain(str(error), allowed=_allowed(str(error), options))) from error
+        raise UserError(explain(str(error), allowed=_allowed(str(error), overrides, options))) from error
 
 
 _MISSING = re.compile(r"Could not find '([^']+)/([^'/]+)'")
@@ -96,21 +97,33 @@ def explain(message: str, *, allowed: Sequence[str] = ()) -> str:
     missing, unknown = _MISSING.search(message), _UNKNOWN.search(message)
     if missing is not None:
         choices = [line for line in message.splitlines() if line.startswith("\t") and "provider=" not in line]
-        return f"{missing[1]}={missing[2]}: must be one of {', '.join(line.strip() for line in choices)}"
+        names = [line.strip() for line in choices]
+        return (
+            f"{missing[1]}={missing[2]}: must be one of {', '.join(names)}{did_you_mean(missing[2], names)}"
+        )
     if unknown is not None:
-        return f"{unknown[1]}: no such option; there are {', '.join(allowed)}"
+        near = did_you_mean(unknown[1], allowed)
+        return f"{unknown[1]}: no such option{near or '; there are ' + ', '.join(allowed)}"
     noise = ("full_key:", "object_type", "Config search path", "provider=", "See https://", "Set the env")
     return "; ".join(line for line in lines if not line.startswith(noise))
 
 
-def _allowed(message: str, options: Sequence[str]) -> list[str]:
+def did_you_mean(word: str, known: Sequence[str]) -> str:
+    """``; did you mean NAME?`` for the nearest of the known words; empty if none is near."""
+    near = difflib.get_close_matches(word, known, n=1, cutoff=0.75)
+    return f"; did you mean {near[0]}?" if near else ""
+
+
+def _allowed(message: str, overrides: Sequence[str], options: Sequence[str]) -> list[str]:
     """The keys beside the one that an override names in vain; at the top, the verb's own, too."""
     from omegaconf import DictConfig, OmegaConf
 
     unknown = _UNKNOWN.search(message)
     if unknown is None:
         return []
-    node: Any = conf.compose()
+    # With the same choices of groups: other environments have other options.
+    chosen = [o for o in overrides if "." not in o.partition("=")[0] and o.partition("=")[0] != unknown[1]]
+    node: Any = conf.compose(*chosen)
     place = unknown[1].rpartition(".")[0] if "/" not in unknown[1] and "@" not in unknown[1] else ""
     found = OmegaConf.select(node, place) if place else node
     if isinstance(found, DictConfig):

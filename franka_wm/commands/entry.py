@@ -8,22 +8,30 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import warp as wp
 from omegaconf import DictConfig
 
-from franka_wm import conf
+from franka_wm.commands.arguments import compose
 from franka_wm.console import say
 from franka_wm.errors import FrankaError
-from franka_wm.training.check import check
-from franka_wm.training.run import INTERRUPTED, import_plugins, occupied, resumed, unwritable
+
+INTERRUPTED = 130
+"""Exit status after Ctrl-C, as shells expect."""
 
 
-def run_command(main: Callable[[], Any]) -> None:
-    """Runs a Hydra main: chooses the scale by device, and turns bad input into one line and exit status 1."""
-    wp.config.log_level = wp.LOG_WARNING  # its list of compiled modules drowns what a run has to say
-    arguments = sys.argv[1:]
+def run_command(main: Callable[[], Any], arguments: list[str] | None = None) -> None:
+    """Runs a Hydra main: chooses the scale by device, and turns bad input into one line and exit status 1.
+
+    Args:
+        main: Reads ``sys.argv``, as Hydra's are.
+        arguments: After the program's name; the command line's if not given.
+    """
+    arguments = sys.argv[1:] if arguments is None else arguments
+    sys.argv[1:] = arguments
+    sweeps = any(a in ("-m", "--multirun") for a in arguments)
     asks_hydra = any(a.startswith("-") and a not in ("-m", "--multirun") for a in arguments)
     if not asks_hydra:
+        if not sweeps:
+            check_overrides(arguments)
         sys.argv[1:] = arguments = with_scale(arguments)
         problem = check_command(arguments)
         if problem is not None:
@@ -50,6 +58,14 @@ def one_line_errors(main: Callable[[DictConfig], Any]) -> Callable[[DictConfig],
     return wrapped
 
 
+def check_overrides(arguments: list[str]) -> None:
+    """Composes the configuration alone, so that a typo is answered before torch or the simulator are imported."""
+    try:
+        compose([a for a in arguments if a != "scale=auto"])
+    except FrankaError as error:
+        fail(str(error))
+
+
 def fail(message: str) -> None:
     """Says what is wrong and exits with status 1."""
     print(f"error: {message}", file=sys.stderr, flush=True)
@@ -73,27 +89,18 @@ def with_scale(arguments: list[str]) -> list[str]:
 
 def check_command(arguments: list[str]) -> str | None:
     """What is wrong with the overrides or the folder they write to, in one line; ``None`` if nothing is."""
-    from hydra.errors import HydraException
-    from omegaconf.errors import OmegaConfBaseException
+    from franka_wm.training.check import check
+    from franka_wm.training.run import import_plugins, occupied, resumed, unwritable
 
     if any(a in ("-m", "--multirun") for a in arguments):
         return None  # sweeps are resolved by Hydra itself
     try:
-        cfg = conf.compose(*arguments)
+        cfg = compose(arguments)
         import_plugins(cfg)
-        if cfg.resume is None:
-            check(cfg)
-        else:
+        if cfg.resume is not None:
             _, cfg = resumed(cfg, arguments)
-            check(cfg)
+        check(cfg)
     except FrankaError as error:
         return str(error)
-    except (HydraException, OmegaConfBaseException) as error:
-        lines = [
-            line.strip() for line in str(error).splitlines() if line.strip() and "object_type" not in line
-        ]
-        noise = ("full_key:", "Config search path", "Set the env", "provider=")
-        lines = [line for line in lines if not line.startswith(noise)]
-        return "; ".join(lines) + "; python train.py --help lists every option"
     chosen = next((a.split("=", 1)[1] for a in arguments if a.startswith("hydra.run.dir=")), "outputs")
     return unwritable(Path(chosen)) or occupied(Path(chosen), cfg.resume)

@@ -1,7 +1,7 @@
 """``franka-wm VERB``: what is there, and what can be done with it.
 
 A verb is one line in :data:`VERBS`. Its function is imported when it is called and gets the arguments after
-the verb; it returns an exit status, or nothing for 0. Training is ``python train.py``, which Hydra configures.
+the verb; it returns an exit status, or nothing for 0.
 
 Nothing here imports the simulator or torch: ``list`` reads files.
 """
@@ -15,7 +15,7 @@ import sys
 from importlib import import_module
 from pathlib import Path
 
-from franka_wm.commands.arguments import CHECKOUT
+from franka_wm.commands.arguments import CHECKOUT, did_you_mean
 from franka_wm.errors import FrankaError, UserError
 from franka_wm.version import __version__
 
@@ -25,6 +25,11 @@ VERBS: dict[str, tuple[str, str, str]] = {
         "franka_wm.commands.main:show_list",
         "",
         "environments, robots, tasks, models, planners and experiments",
+    ),
+    "train": (
+        "franka_wm.commands.train:command",
+        "[key=value …]",
+        "train an agent; the same as python train.py",
     ),
     "evaluate": (
         "franka_wm.commands.evaluate:main",
@@ -113,7 +118,9 @@ def run(verb: str = "--help", *arguments: str) -> int:
         print(f"franka-wm {__version__}")
         return 0
     if verb not in VERBS:
-        complain(f"no verb {verb!r}; choose from {', '.join(VERBS)}, or --help")
+        complain(
+            f"no verb {verb!r}; choose from {', '.join(VERBS)}, or --help{did_you_mean(verb, list(VERBS))}"
+        )
         return USAGE
     module, function = VERBS[verb][0].split(":")
     return getattr(import_module(module), function)(list(arguments)) or 0
@@ -123,7 +130,7 @@ def usage() -> str:
     rows = [(f"{verb} {arguments}".strip(), line) for verb, (_, arguments, line) in VERBS.items()]
     rows += [("--version", "print the version"), ("--help", "print this")]
     lines = "\n".join(f"  franka-wm {left:22s} {line}" for left, line in rows)
-    return f"usage: franka-wm VERB …\n\n{lines}\n\nTo train: python train.py --help"
+    return f"usage: franka-wm VERB …\n\n{lines}"
 
 
 def complain(message: str) -> None:

@@ -56,6 +56,7 @@ def test_unknown_verb_is_one_line_and_status_2(capsys: pytest.CaptureFixture[str
     captured = capsys.readouterr()
     assert captured.out == ""
     assert captured.err.startswith("error: no verb 'fly'")
+    assert cli.main(["evalute"]) == 2 and "did you mean evaluate?" in capsys.readouterr().err
     assert captured.err.count("\n") == 1
 
 

@@ -23,7 +23,7 @@ from franka_wm.report.run import read_run
 from franka_wm.training.checkpoint import latest_checkpoint, load_checkpoint
 from franka_wm.training.run import occupied
 
-TRAIN = Path(__file__).resolve().parents[1] / "train.py"
+TRAIN = Path(__file__).resolve().parents[2] / "train.py"
 LENGTH = 20
 SMOKE = ["scale=smoke", "device=cpu", f"env.episode_length={LENGTH}", "env.substeps=2"]
 
@@ -374,3 +374,24 @@ def test_a_resumed_run_s_folder_has_the_name_of_the_first(resume: str | None, na
         {"resume": resume, "dir": "x-${run_name:${resume},reach,7}"}
     )  # as conf/config.yaml asks
     assert cfg.dir == f"x-{name}"
+
+
+@pytest.mark.parametrize(
+    ("argument", "said"),
+    [
+        ("env.image_sise=3", "env.image_sise: no such option; did you mean env.image_size?"),
+        ("model=tdmcp2", "did you mean tdmpc2?"),
+    ],
+)
+@pytest.mark.parametrize("program", [[str(TRAIN)], ["-m", "franka_wm", "train"]])
+def test_a_typo_is_answered_before_torch_and_the_simulator_load(
+    program: list[str], argument: str, said: str, tmp_path: Path
+) -> None:
+    command = [sys.executable, "-X", "importtime", *program, argument]
+    done = subprocess.run(command, capture_output=True, text=True, check=False, cwd=tmp_path)
+    lines = [line for line in done.stderr.splitlines() if not line.startswith("import time:")]
+    assert done.returncode == 1 and lines == [line for line in lines if line.startswith("error: ")]
+    assert len(lines) == 1 and lines[0].endswith(said) and "+" not in lines[0]
+    loaded = {line.rsplit("|", 1)[-1].strip() for line in done.stderr.splitlines()}
+    assert "hydra" in loaded and not loaded & {"torch", "newton", "warp", "torchrl", "pandas"}
+    assert list(tmp_path.iterdir()) == []
