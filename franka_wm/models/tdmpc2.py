@@ -79,6 +79,8 @@ class TDMPC2(SimplicialWorldModel):
         rho: weight of unroll step t is rho^t.
         consistency_coef, reward_coef, value_coef, termination_coef: weights of the losses.
         entropy_coef: weight, against scaled values, of `action_dim` times the policy's entropy [nat].
+        mode_targets: bootstrap from Q at the policy's mode, so that values are those of the policy that is
+            evaluated; False, as in the paper: at a sample, which counts the policy's noise as well.
         tau: how far target Q-functions, and the policy loss's scale, move at each update.
         encoder_lr_scale: learning rate of the encoder relative to the rest.
         channels: of each convolution over pictures.
@@ -132,6 +134,7 @@ class TDMPC2(SimplicialWorldModel):
         value_coef: float = 0.1,
         termination_coef: float = 1.0,
         entropy_coef: float = 1e-4,
+        mode_targets: bool = False,
         tau: float = 0.01,
         encoder_lr_scale: float = 0.3,
         channels: int = 32,
@@ -163,7 +166,7 @@ class TDMPC2(SimplicialWorldModel):
         self.action_dim, self.num_q, self.value_members = action_dim, num_q, value_members
         self.rho, self.tau, self.encoder_lr_scale = rho, tau, encoder_lr_scale
         self.consistency_coef, self.reward_coef = consistency_coef, reward_coef
-        self.value_coef, self.entropy_coef = value_coef, entropy_coef
+        self.value_coef, self.entropy_coef, self.mode_targets = value_coef, entropy_coef, mode_targets
         self.terminates, self.termination_coef = terminates, termination_coef
 
         hidden = (hidden_dim, hidden_dim)
@@ -417,7 +420,8 @@ class TDMPC2(SimplicialWorldModel):
 
     def _td_target(self, after: Tensor, reward: Tensor, terminated: Tensor) -> Tensor:
         """One-step targets (H, B, 1) from encoded next latents (H, B, D): r + γ min of two target Qs."""
-        bootstrap = self.q(after, self.policy(after), weights="target", reduce="pair_min")
+        action = self.policy(after, deterministic=self.mode_targets)
+        bootstrap = self.q(after, action, weights="target", reduce="pair_min")
         # A selection rather than a product: 0 · nan would poison the target of a terminal step.
         return reward + self.discount * torch.where(terminated, torch.zeros_like(bootstrap), bootstrap)
 

@@ -297,6 +297,28 @@ class ActionPenalty(Objective):
         return -self.weight * actions.square().sum(dim=(-2, -1))
 
 
+class PolicyPenalty(Objective):
+    """Minus `weight` times the squared distance of the first action from the policy's own, |a_0 - π(z_0)|².
+
+    Planning maximises errors of the model along with returns. Near the policy's actions the model was trained, so
+    there it errs less. This keeps the action that is done there, unless the model promises more than the penalty:
+    the other side of TD-M(PC)² (arXiv:2502.03550), which keeps the policy near the plans.
+
+    Args:
+        policy: z (..., D) -> actions (..., A), without noise.
+
+    Raises:
+        ValueError: a negative weight.
+    """
+
+    def __init__(self, policy: Callable[[Tensor], Tensor], weight: float) -> None:
+        self.policy, self.weight = policy, _penalty("PolicyPenalty", weight)
+
+    def __call__(self, trajectory: Tensor, actions: Tensor) -> Tensor:
+        own = self.policy(trajectory[:, :1, 0])  # all candidates start at the same latent
+        return -self.weight * (actions[:, :, 0] - own).square().sum(-1)
+
+
 class Smoothness(Objective):
     """Minus `weight` times the squared changes of the action, Σ_{t>0} |a_t - a_{t-1}|².
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
+from functools import partial
 from inspect import signature
 from typing import Any
 
@@ -286,6 +287,14 @@ def make_objective(cfg: DictConfig, model: Any) -> Any:
     parts: list[tuple[float, Any]] = [(1.0, chosen)]
     if o.action_penalty:
         parts.append((1.0, planning.ActionPenalty(o.action_penalty)))
+    if o.get("policy_penalty"):
+        if not model.has_policy:
+            raise UserError(
+                f"objective.policy_penalty: model={cfg.model.name} has no policy; use objective.policy_penalty=0"
+            )
+        parts.append(
+            (1.0, planning.PolicyPenalty(partial(model.policy, deterministic=True), o.policy_penalty))
+        )
     if o.smoothness_penalty:
         parts.append((1.0, planning.Smoothness(o.smoothness_penalty)))
     return chosen if len(parts) == 1 else planning.Sum(parts)

@@ -178,6 +178,21 @@ def test_the_model_losses_are_those_of_a_plain_unroll():
     torch.testing.assert_close(losses["loss"], total)
 
 
+@pytest.mark.parametrize("mode", [False, True])
+def test_targets_bootstrap_at_a_sample_or_at_the_mode_of_the_policy(mode):
+    model, after = small(mode_targets=mode).eval(), torch.rand(3, 6, 32)
+    randomise(model)
+    seen, own = [], model.policy
+
+    def policy(z, deterministic=False):
+        seen.append(deterministic)
+        return own(z, deterministic)
+
+    model.policy = policy
+    model._td_target(after, torch.zeros(3, 6, 1), torch.zeros(3, 6, 1, dtype=torch.bool))
+    assert seen == [mode]
+
+
 def test_the_policy_loss_is_as_documented():
     """-Σ ρ^t (Q / scale + coefficient · A · entropy of the actions), over four latents."""
     model = small(entropy_coef=0.25, rho=0.3).eval()

@@ -7,7 +7,16 @@ from tensordict import TensorDict
 from torchrl.data import Bounded, Composite, Unbounded
 from torchrl.envs import EnvBase, InitTracker, TransformedEnv
 
-from franka_wm.planning import CEM, ActionPenalty, GoalDistance, GoalImage, RewardPlusValue, Smoothness, Sum
+from franka_wm.planning import (
+    CEM,
+    ActionPenalty,
+    GoalDistance,
+    GoalImage,
+    PolicyPenalty,
+    RewardPlusValue,
+    Smoothness,
+    Sum,
+)
 from franka_wm.planning.objectives import bind
 from franka_wm.policies import PlannerPolicy
 
@@ -79,9 +88,28 @@ def test_actions_and_their_changes_are_penalised():
     actions = torch.tensor([[[[1.0, 2.0], [0.0, 2.0], [0.0, -1.0]], [[0.0, 0.0]] * 3]])
     assert ActionPenalty(0.5)(trajectory, actions).tolist() == [[-5.0, 0.0]]
     assert Smoothness(2.0)(trajectory, actions).tolist() == [[-2.0 * (1 + 9), 0.0]]
-    for kind in (ActionPenalty, Smoothness):
-        with pytest.raises(ValueError, match=kind.__name__):
+    for kind in (ActionPenalty, Smoothness, lambda weight: PolicyPenalty(torch.tanh, weight)):
+        with pytest.raises(ValueError, match="weight"):
             kind(-1.0)
+
+
+def test_the_policy_penalty_counts_the_first_action_from_the_policys_own(trajectory, actions):
+    trajectory = trajectory[:, :1].expand(E, S, H + 1, D)  # all candidates start at the same latent
+    score = PolicyPenalty(torch.tanh, 0.5)(trajectory, actions)
+    for e in range(E):
+        for k in range(S):
+            own = trajectory[e, k, 0].tanh()
+            assert score[e, k].item() == pytest.approx(-0.5 * (actions[e, k, 0] - own).square().sum().item())
+
+
+def test_the_policy_penalty_keeps_a_plan_at_the_policy_unless_more_is_promised():
+    policy = PolicyPenalty(lambda z: torch.full((*z.shape[:-1], 2), 0.5), 1.0)
+    planner = CEM(action_dim=2, horizon=1, num_samples=200, num_elites=20, iterations=6)
+    z = torch.zeros(1, D)
+    for promise, expected in ((0.0, 0.5), (100.0, -1.0)):
+        total = Sum([(1.0, lambda _, a, promise=promise: -promise * a.sum((-2, -1))), (1.0, policy)])
+        action = planner.plan(z, lambda z, a: z, total)["action"]
+        torch.testing.assert_close(action, torch.full((1, 2), expected), atol=0.1, rtol=0)
 
 
 def test_smoothness_counts_the_step_from_the_last_executed_action_unless_an_episode_begins():

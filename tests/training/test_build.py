@@ -12,6 +12,7 @@ from tensordict import TensorDict
 
 from franka_wm.envs import FrankaConfig
 from franka_wm.errors import UserError
+from franka_wm.planning import Sum
 from franka_wm.training import build
 from franka_wm.training.check import check
 from franka_wm.training.run import Run
@@ -391,3 +392,12 @@ def test_the_models_policy_explores_and_others_act_as_they_are(composed) -> None
 def test_exploration_that_cannot_be_is_refused_before_anything_is_built(wrong: str, composed) -> None:
     with pytest.raises(UserError, match=wrong.split("=")[0]):
         check(composed("scale=smoke", "device=cpu", wrong))
+
+
+def test_plans_stay_near_the_policy_on_the_arm_and_are_the_published_ones_elsewhere(composed):
+    spaces = Spaces(observation_sizes={"state": 20}, action_dim=7)
+    for words, penalised in ((("env=reach",), True), (("env=dm_control",), False)):
+        cfg = composed("scale=smoke", *words)
+        objective = build.make_objective(cfg, build.make_model(cfg, spaces))
+        assert isinstance(objective, Sum) == penalised
+        assert penalised == (cfg.model.entropy_coef > 1e-4) == cfg.model.mode_targets
