@@ -18,11 +18,11 @@ STAMP := $(VENV)/.installed
 DEV := $(VENV)/.installed-dev
 BIN := $(VENV)/bin
 
-.PHONY: help setup train test test-slow results mutation lint format lock docs wheel audit clean
+.PHONY: help setup train demo demo-agent test test-slow results mutation lint format lock docs wheel audit clean
 
 help: ## show the targets
 	@grep -hE '^[a-z-]+:.*## ' $(firstword $(MAKEFILE_LIST)) | sed -E 's/:[^#]*## /\t/' | \
-	  while IFS=$$'\t' read -r name text; do printf '  make %-9s %s\n' "$$name" "$$text"; done
+	  while IFS=$$'\t' read -r name text; do printf '  make %-10s %s\n' "$$name" "$$text"; done
 
 # The stamp is written last, by a script that stops at the first failure: if it is there and newer than
 # what the installation depends on, the installation is whole.
@@ -38,6 +38,13 @@ setup: $(STAMP) ## make .venv and install what running needs
 
 train: $(STAMP) ## train, plan and evaluate; Hydra overrides in ARGS="..."
 	@$(BIN)/python train.py $(ARGS)
+
+demo: $(STAMP) ## the live page with a small trained agent; no training, no network
+	@$(BIN)/franka-wm demo $(ARGS)
+
+# When the model's code has changed so that the weights in franka_wm/demo_agent no longer load.
+demo-agent: $(STAMP) ## train that agent anew (ten minutes on two CPU cores)
+	@$(BIN)/python scripts/make_demo_agent.py $(ARGS)
 
 # Two processes with a thread each: tests are small, and torch's threads would wait for each other.
 PYTEST = OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 2 --dist loadfile

@@ -28,6 +28,7 @@ def test_use_the_environment(root: Path) -> None:
     assert "(64, 32, 32, 3)" in out
 
 
+@pytest.mark.slow
 def test_train_from_a_dataset(root: Path, tmp_path: Path) -> None:
     from franka_wm.commands.main import main
 
@@ -42,6 +43,7 @@ CONF = "hydra.searchpath=[file://examples/conf]"
 RUN = ("scale=smoke", "logger=none", "evaluation.video_episodes=0", "device=cpu")
 
 
+@pytest.mark.slow  # four runs of train.py
 @pytest.mark.parametrize(
     "arguments",
     [

@@ -52,6 +52,7 @@ VERBS: dict[str, tuple[str, str, str]] = {
         "[checkpoint=RUN]",
         "an arm in the browser: drag its goal; view --help",
     ),
+    "demo": ("franka_wm.commands.demo:demo", "", "the same page with a small trained agent, at once"),
     "collect": (
         "franka_wm.commands.collect:collect",
         "out=FOLDER …",

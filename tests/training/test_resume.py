@@ -173,6 +173,7 @@ def weights(checkpoint: Checkpoint) -> dict[str, torch.Tensor]:
     return load_file(checkpoint.folder / "model.safetensors")
 
 
+@pytest.mark.slow  # three processes
 def test_after_a_kill(root: Path, train, made: Counter[str], tiny: list[str], tmp_path: Path) -> None:
     """``kill -9`` between two checkpoints: from the last one, in another process, to the same weights."""
     (tmp_path / "killer.py").write_text(
