@@ -29,9 +29,12 @@ def run_command(main: Callable[[], Any], arguments: list[str] | None = None) -> 
     sys.argv[1:] = arguments
     sweeps = any(a in ("-m", "--multirun") for a in arguments)
     asks_hydra = any(a.startswith("-") and a not in ("-m", "--multirun") for a in arguments)
+    if not asks_hydra and not sweeps:
+        check_overrides(arguments)
+    import warp as wp  # from here on: what takes seconds to import
+
+    wp.config.log_level = wp.LOG_WARNING  # its list of compiled modules drowns what a run has to say
     if not asks_hydra:
-        if not sweeps:
-            check_overrides(arguments)
         sys.argv[1:] = arguments = with_scale(arguments)
         problem = check_command(arguments)
         if problem is not None:
