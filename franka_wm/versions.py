@@ -70,6 +70,16 @@ def write_finished(folder: str | Path) -> Path:
     return _write(Path(folder) / "finished.json", {"seconds": round(taken), "source": source.source()})
 
 
+def hardware(device: Any) -> str:
+    """What computes on a torch device: the GPU's name, or the processor's and the threads that torch uses."""
+    import torch
+
+    if torch.device(device).type == "cuda":
+        return torch.cuda.get_device_name(device)
+    threads = torch.get_num_threads()
+    return f"{processor()}, {threads} thread{'s' * (threads > 1)}"
+
+
 def processor() -> str:
     """The processor's name, as its maker writes it."""
     try:

@@ -32,7 +32,7 @@ def test_use_the_environment(root: Path) -> None:
 def test_train_from_a_dataset(root: Path, tmp_path: Path) -> None:
     from franka_wm.commands.main import main
 
-    made = ["collect", f"out={tmp_path}/set", "episodes=12", "policy=smooth", "env=reach", "num_envs=4"]
+    made = ["collect", f"out={tmp_path}/set", "episodes=12", "policy=random", "env=reach", "num_envs=4"]
     assert main([*made, "env.episode_length=10", "env.substeps=1"]) == 0
     out = run(root, "examples/train_from_a_dataset.py", f"{tmp_path}/set", "20")
     losses = [float(line.split("loss ")[1].split()[0]) for line in out.splitlines() if "loss" in line]

@@ -17,8 +17,9 @@ import yaml
 
 from benchmarks.results.rows import Row
 from franka_wm.errors import UserError
-from franka_wm.evaluation.results import read_result
+from franka_wm.evaluation.results import read_result, to_json
 from franka_wm.files import atomic_write
+from franka_wm.policies.names import RENAMED
 from franka_wm.report.run import SAME_BUT, read_config
 from franka_wm.source import ROOT
 from franka_wm.versions import PACKAGES
@@ -146,7 +147,7 @@ def write(record: Mapping[str, Any], place: Path = PLACE) -> Path:
     with atomic_write(place / CODE / f"{key}.json") as temporary:
         temporary.write_text(code)
     with atomic_write(path) as temporary:
-        temporary.write_text(json.dumps({**record, "code": key}, indent=1) + "\n")
+        temporary.write_text(to_json({**record, "code": key}))
     return path
 
 
@@ -160,6 +161,8 @@ def read(row: Row, place: Path = PLACE) -> list[dict[str, Any]]:
     for path in (place / row.name).glob("*.json"):
         record = read_json(path)
         assert record is not None  # it was listed
+        if "policies" in record:
+            record["policies"] = {RENAMED.get(name, name): one for name, one in record["policies"].items()}
         code = read_json(place / CODE / f"{record['code']}.json")
         if code is None:
             raise UserError(f"{path}: its code, {CODE}/{record['code']}.json, is missing; measure it again")

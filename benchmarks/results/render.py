@@ -30,7 +30,7 @@ POLICIES = {
     "policy": "policy alone",
     "noop": "doing nothing",
     "random": "random smooth",
-    "oracle": "inverse kinematics",
+    "ik": "inverse kinematics",
 }
 DISCRETE_ORACLE = "search with the same actions"
 COUNTS = {1: "One CPU core", 2: "Two CPU cores"}
@@ -209,11 +209,11 @@ def _over_seeds(records: Sequence[Record]) -> str:
 
 
 def label(policy: str, record: Record) -> str:
-    """The policy's name; with discrete moves, those of tree search, the oracle is another one."""
+    """The policy's name; with discrete moves, those of tree search, `ik` is another one."""
     from franka_wm.planning import registry
 
     planner = (record["code"]["config"].get("planner") or {}).get("name")
-    if policy == "oracle" and planner in registry.available() and registry.is_search(planner):
+    if policy == "ik" and planner in registry.available() and registry.is_search(planner):
         return DISCRETE_ORACLE
     return POLICIES.get(policy, policy)
 
@@ -319,7 +319,7 @@ def table(titles: Sequence[str], cells: Sequence[Sequence[str]]) -> str:
 
 def _cells(rows: Sequence[Mapping[str, Any]], names: Sequence[str] | None = None) -> list[list[str]]:
     def cell(value: Any) -> str:
-        if isinstance(value, float) and value != value:
+        if value is None or value != value:  # files of earlier versions hold NaN
             return "–"
         if isinstance(value, float):
             return f"{value:,.0f}" if abs(value) >= 100 else f"{value:.3g}"

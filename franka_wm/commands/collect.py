@@ -11,12 +11,13 @@ from franka_wm.console import say
 from franka_wm.data.lerobot.collect import Source, gather
 from franka_wm.data.lerobot.schema import FORMATS, schema_for
 from franka_wm.errors import UserError
+from franka_wm.policies.names import refuse_old_name
 from franka_wm.seeding import derive_seed
 
 OPTIONS: dict[str, Any] = {
     "out": "",
     "episodes": 100,
-    "policy": "smooth",
+    "policy": "random",
     "checkpoint": "",
     "format": "exact",
     "num_envs": 0,
@@ -29,8 +30,8 @@ USAGE = f"""usage: franka-wm collect out=FOLDER [key=value …]
 
   out=FOLDER          where the dataset goes; it appears whole, at the end
   episodes=100        how many, with those of a resumed one
-  policy=smooth       smooth (random), noop, ik (inverse kinematics), or a trained agent: a run's folder, a checkpoint,
-                      hf:user/name
+  policy=random       random (smooth motion), noop, ik (inverse kinematics), or a trained agent: a run's
+                      folder, a checkpoint, hf:user/name
   policy=planner      which part of an agent acts: planner or policy; then checkpoint=… is the agent
   format=exact        {"; ".join(f"{name}: {line}" for name, line in FORMATS.items())}
   num_envs=…          worlds at once; collector.num_envs if not given
@@ -40,7 +41,7 @@ USAGE = f"""usage: franka-wm collect out=FOLDER [key=value …]
 
 Ctrl-C stops and leaves a dataset of the whole episodes so far."""
 
-_SIMPLE = {"smooth": "random", "noop": "noop", "ik": "oracle"}
+_SIMPLE = ("random", "noop", "ik")
 _PARTS = ("planner", "policy")
 
 
@@ -85,6 +86,8 @@ def open_source(options: dict[str, Any], overrides: list[str]) -> Source:
         UserError: One line, for what cannot be built.
     """
     name, checkpoint = options["policy"], options["checkpoint"]
+    if not Path(name).exists():
+        refuse_old_name("collect: policy", name)
     if name in _PARTS and not checkpoint:
         raise UserError(
             f"collect: policy={name} is a part of a trained agent; give checkpoint=RUN, or policy=RUN"
@@ -136,7 +139,7 @@ def _simple(name: str, options: dict[str, Any], overrides: list[str]) -> Source:
     makers: dict[str, Callable[[], Any]] = {
         "noop": lambda: NoopPolicy(env.action_dim),
         "ik": lambda: OraclePolicy(env.kinematics, config),
-        "smooth": lambda: SmoothRandomPolicy(
+        "random": lambda: SmoothRandomPolicy(
             env.action_dim,
             smoothness=smoothness,
             generator=torch.Generator(device=env.device).manual_seed(

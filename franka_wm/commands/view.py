@@ -19,7 +19,7 @@ An arm in the browser, on this machine only: drag its goal, switch policies, mov
 
   checkpoint=FOLDER   a run's folder, a checkpoint in it, or hf:user/name; without one the arm is moved by
                       a planner that knows its geometry, inverse kinematics, random actions, or not at all
-  policy=NAME         who acts first: planner, policy, oracle, random, noop
+  policy=NAME         who acts first: planner, policy, ik, random, noop
   port=8080           of http://127.0.0.1; 0 takes a free one
   out=FOLDER          where recordings go: videos and LeRobot datasets (the present folder)
   seconds=S           ends after so long; without it, Ctrl-C ends it

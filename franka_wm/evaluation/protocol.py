@@ -25,7 +25,7 @@ from franka_wm.evaluation.results import END, FILE, point, to_json
 from franka_wm.files import atomic_write
 from franka_wm.seeding import derive_seed, seeded
 from franka_wm.version import __version__
-from franka_wm.versions import processor
+from franka_wm.versions import hardware
 
 EPISODES = 100
 """Episodes per policy, if not said otherwise."""
@@ -163,14 +163,6 @@ def protocol(
         "franka_wm": __version__,
         "torch": torch.__version__,
     }
-
-
-def hardware(device: torch.device) -> str:
-    """What computes: the GPU's name, or the processor's and the threads that torch uses."""
-    if device.type == "cuda":
-        return torch.cuda.get_device_name(device)
-    threads = torch.get_num_threads()
-    return f"{processor()}, {threads} thread{'s' * (threads > 1)}"
 
 
 def thresholds(env: Any) -> list[float]:

@@ -30,6 +30,7 @@ from pathlib import Path
 from typing import Any
 
 from franka_wm.errors import UserError
+from franka_wm.policies.names import RENAMED
 from franka_wm.untrusted import UntrustedFolder
 
 FILE = "evaluation.json"
@@ -100,7 +101,8 @@ def _result(folder: UntrustedFolder, name: str) -> Result:
     if not all(isinstance(one, Mapping) for one in policies.values()):
         raise UserError(f"{path}: `policies` must hold an object for each policy; measure the run again")
     extras = {name: found[name] for name in EXTRAS if found.get(name)}
-    return Result(path, dict(protocol), dict(policies), extras)
+    policies = {RENAMED.get(str(name), str(name)): one for name, one in policies.items()}
+    return Result(path, dict(protocol), policies, extras)
 
 
 def point(

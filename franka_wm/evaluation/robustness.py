@@ -82,7 +82,7 @@ def robustness(
         agent: Of :func:`franka_wm.training.load.load_agent`; of the arm.
         episodes: Worlds, at least 2.
         shifts: By name; those that change pictures alone are left out for models that read none.
-        policies: Names; the planner (or the policy where there is none) and the oracle, which shows what the shift
+        policies: Names; the planner (or the policy where there is none) and ``ik``, which shows what the shift
             leaves possible, if not given.
         report: Called with each shift's name and results as they come.
 
@@ -191,7 +191,7 @@ def verdict_of_success(
 
 def _chosen(policies: Mapping[str, Any]) -> list[str]:
     own = [name for name in ("planner", "policy") if name in policies][:1]
-    return own + [name for name in ("oracle",) if name in policies]
+    return own + [name for name in ("ik",) if name in policies]
 
 
 def _compared(played: TensorDictBase, before: TensorDictBase, success_distance: float) -> dict[str, Any]:

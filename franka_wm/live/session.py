@@ -23,6 +23,7 @@ from franka_wm.errors import UserError
 from franka_wm.live.commanded import commanded_path
 from franka_wm.live.recorder import DatasetRecorder, VideoRecorder
 from franka_wm.live.settings import Setting, planner_settings, rebuilt, work
+from franka_wm.policies.names import refuse_old_name
 
 SPEEDS = (0.1, 1.0)
 """Slowest and fastest, as shares of the environment's own rate."""
@@ -31,7 +32,7 @@ FARTHEST = 5.0
 BUDGET = 1.0
 """Longest decision that a planner's settings may lead to [s]: while it plans, nothing else is heard."""
 
-PREFERRED = ("planner", "oracle", "noop")
+PREFERRED = ("planner", "ik", "noop")
 """Which policy starts, the first one that there is."""
 
 
@@ -80,7 +81,7 @@ class Session:
     Args:
         env: One world: :class:`~franka_wm.envs.FrankaEnv`, or transforms around one.
         policies: By name; TensorDict modules that write ``action``.
-        policy: Who acts first; ``planner``, ``oracle`` or ``noop``, whichever there is, if not given.
+        policy: Who acts first; ``planner``, ``ik`` or ``noop``, whichever there is, if not given.
         seed: Of poses and goals.
         keep_goal: Whether a goal set by hand outlives the episode.
 
@@ -399,6 +400,7 @@ class Session:
         return point.to(self.arm.device)
 
     def _check_policy(self, name: str) -> None:
+        refuse_old_name("policy", name)
         if name not in self.policies:
             learned = name in ("planner", "policy")
             hint = "; that one needs a checkpoint of a family that has it" if learned else ""

@@ -117,7 +117,7 @@ def untrained(options: Options, changes: Mapping[str, Any]) -> Stage:
     env = FrankaEnv(config, num_envs=1, device=options.device, seed=options.seed)
     policies: dict[str, Any] = {}
     if "joint_target" in config.observations:
-        policies = {"planner": kinematic_planner(env), "oracle": OraclePolicy(env.kinematics, config)}
+        policies = {"planner": kinematic_planner(env), "ik": OraclePolicy(env.kinematics, config)}
     policies |= {"random": SmoothRandomPolicy(env.action_dim), "noop": NoopPolicy(env.action_dim)}
     return Stage(env, policies, "planning with exact geometry", EPISODE)
 

@@ -3,6 +3,7 @@
 import json
 import shlex
 from collections.abc import Mapping, Sequence
+from html import escape
 from pathlib import Path
 from typing import Any
 
@@ -163,6 +164,10 @@ def _measured(runs: Mapping[str, RunFiles]) -> str:
 def _curves(groups: Mapping[str, Mapping[str, RunFiles]]) -> str:
     rows = {name: [run.rows for run in group.values()] for name, group in groups.items()}
     logged = [row for runs in rows.values() for one in runs for row in one]
+    without = [name for group in groups.values() for name, run in group.items() if not run.rows]
+    note = (
+        f"<p>Without curves, since nothing was logged: {escape(', '.join(without))}.</p>" if without else ""
+    )
     axes = [key for key in ("env_steps", "updates") if all(key in row for row in logged)]
     x = next((key for key in axes if any(row[key] for row in logged)), None)  # recorded data makes no steps
     if x is None:
@@ -173,15 +178,15 @@ def _curves(groups: Mapping[str, Mapping[str, RunFiles]]) -> str:
         if key in found:
             who = "" if key.count("/") < 2 else f"Of {style.policy_name(key.split('/')[1])}. "
             many = any(len(group) > 1 for group in groups.values())
-            note = who + (
+            caption = who + (
                 "Mean over runs that differ in their seed alone; bands from lowest to highest."
                 if many
                 else ""
             )
             drawn.append(
-                chart(seeds_figure(rows, key, x=x), f"{key} of all runs while training", note.strip())
+                chart(seeds_figure(rows, key, x=x), f"{key} of all runs while training", caption.strip())
             )
-    return cards(*drawn)
+    return note + cards(*drawn)
 
 
 def _best(keys: set[str], quantity: str) -> str:

@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 from franka_wm.evaluation.protocol import INTERVALS, Evaluation
-from franka_wm.report.style import centimetres, policy_name
+from franka_wm.report.style import centimetres, policy_legend, policy_name
 from franka_wm.report.table import Table, evaluation_tables, markdown
 
 if TYPE_CHECKING:
@@ -31,6 +31,7 @@ def terminal(table: Table, title: str | None = None) -> RichTable:
 def evaluation_markdown(found: Evaluation) -> str:
     """The tables of the policies, and under them how they were measured."""
     parts = [markdown(table) for table in evaluation_tables(found.policies) if table.rows]
+    parts += [f"{legend}\n"] if (legend := policy_legend(found.policies)) else []
     count = next(iter(found.policies.values()))["episodes"]
     seeds = ", ".join(map(str, found.seeds))
     worlds = f" of {found.worlds} worlds" if found.worlds else ""

@@ -255,7 +255,13 @@ section>p{margin:0 0 12px;max-width:70ch}
 .tiles dt{font-size:13px;opacity:.75}
 .tiles dd{margin:0;font-size:24px;font-weight:600;font-variant-numeric:tabular-nums;line-height:1.3}
 .tiles small{display:block;font-size:12px;font-weight:400;opacity:.7}
-.scroll{overflow-x:auto;background:var(--paper);border:1px solid var(--faint);border-radius:10px;margin:12px 0}
+/* a shadow at the side where there is more to scroll to; it moves off at the end */
+.scroll{overflow-x:auto;scrollbar-width:thin;background:
+linear-gradient(to right,var(--paper) 40%,transparent) left/48px 100% no-repeat local,
+linear-gradient(to left,var(--paper) 40%,transparent) right/48px 100% no-repeat local,
+linear-gradient(to right,var(--grey),transparent) left/16px 100% no-repeat,
+linear-gradient(to left,var(--grey),transparent) right/16px 100% no-repeat,var(--paper);
+border:1px solid var(--faint);border-radius:10px;margin:12px 0}
 table{border-collapse:collapse;width:100%;font-size:14px;font-variant-numeric:tabular-nums}
 th,td{padding:8px 12px;text-align:right;border-bottom:1px solid var(--faint);vertical-align:top}
 tbody tr:last-child>*{border-bottom:0}

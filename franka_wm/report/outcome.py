@@ -53,7 +53,8 @@ def result(run: RunFiles) -> str:
 
 def _tables(found: Result, below: str = "") -> str:
     outcome, motion = evaluation_tables(found.policies)
-    text = scrolling(html(outcome)) + below
+    legend = style.policy_legend(found.policies)
+    text = scrolling(html(outcome)) + (f'<p class="note">{legend}</p>' if legend else "") + below
     return text + ("<h3>On the way</h3>" + scrolling(html(motion)) if motion.rows else "")
 
 

@@ -3,6 +3,7 @@
 import math
 import shlex
 from collections.abc import Callable, Mapping
+from html import escape
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +13,7 @@ from franka_wm.evaluation.results import COMMAND, END
 from franka_wm.report import style
 from franka_wm.report.bars import bars_figure
 from franka_wm.report.calibration import calibration_figure
-from franka_wm.report.curves import axis, panel_figure, panels
+from franka_wm.report.curves import QUANTITIES, axis, panel_figure, panels
 from franka_wm.report.document import (
     Section,
     card,
@@ -231,11 +232,14 @@ def health(run: RunFiles) -> str:
     found = {k: v for k, v in (run.extras.get("health") or {}).items() if k != "warnings"}
     table = ""
     if logged:
-        rows = "".join(
-            f'<tr><th scope="row">{key}</th><td>{sparkline(values, key + " while training")}</td>'
-            f"<td>{number(values[-1])}</td><td>{_range(values)}</td></tr>"
-            for key, values in sorted(logged.items())
-        )
+        rows = ""
+        for key, values in sorted(logged.items()):
+            name, scale = logged_name(key)
+            scaled = [scale * value for value in values]
+            rows += (
+                f'<tr><th scope="row">{escape(name)}</th><td>{sparkline(scaled, name + " while training")}</td>'
+                f"<td>{number(scaled[-1])}</td><td>{_range(scaled)}</td></tr>"
+            )
         head = (
             '<th scope="col">logged</th><th scope="col">over time</th><th scope="col">last</th>'
             '<th scope="col">lowest – highest</th>'
@@ -244,6 +248,14 @@ def health(run: RunFiles) -> str:
         if found:
             table = folded("Everything that was logged", table)
     return cards(_numbers(found)) + table
+
+
+def logged_name(key: str) -> tuple[str, float]:
+    """What a logged quantity is called, with its unit, and the factor to that unit: as in the tables and curves."""
+    *above, leaf = key.split("/")
+    name, scale = QUANTITIES.get(leaf, (leaf.replace("_", " "), 1.0))
+    who = [style.policy_name(one) for one in above if one != "eval"]
+    return ", ".join([name, *who]), scale
 
 
 def what(run: RunFiles) -> str:

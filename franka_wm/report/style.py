@@ -7,10 +7,11 @@ same colour everywhere.
 Code names a colour by its light value (`BLUE`, `INK`, …); a theme translates it.
 """
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 
 from franka_wm.errors import UserError
+from franka_wm.policies.names import RENAMED
 
 BLACK = "#000000"
 ORANGE = "#E69F00"
@@ -106,27 +107,34 @@ POLICY_COLOURS = {
     "train": GREY,
     "random": ORANGE,
     "noop": BLACK,
-    "oracle": GREEN,
+    "ik": GREEN,
 }
 
-POLICY_NAMES = {
-    "planner": "planner",
-    "policy": "policy alone",
-    "train": "while collecting",
-    "random": "random smooth",
-    "noop": "doing nothing",
-    "oracle": "inverse kinematics",
+POLICY_LEGEND = {
+    "planner": "plans with the model",
+    "policy": "the learned policy alone",
+    "random": "smooth random motion",
+    "noop": "does nothing",
+    "ik": "inverse kinematics with the true geometry",
 }
+"""What the names of policies mean, for readers of tables."""
 
 
 def policy_colour(policy: str) -> str:
     """The policy's colour; unknown ones get one from the palette that depends on the name alone."""
+    policy = RENAMED.get(policy, policy)
     return POLICY_COLOURS.get(policy, PALETTE[sum(policy.encode()) % len(PALETTE)])
 
 
 def policy_name(policy: str) -> str:
-    """What a reader sees for a policy's key."""
-    return POLICY_NAMES.get(policy, policy)
+    """What a reader sees for a policy's key; the present name where an old file has an earlier one."""
+    return "while collecting" if policy == "train" else RENAMED.get(policy, policy)
+
+
+def policy_legend(policies: Iterable[str]) -> str:
+    """One line that explains the names of those policies that have a usual one; empty where none has."""
+    known = [f"{name}: {POLICY_LEGEND[name]}" for name in map(policy_name, policies) if name in POLICY_LEGEND]
+    return f"{'; '.join(known)}." if known else ""
 
 
 def series_style(index: int) -> tuple[str, str]:

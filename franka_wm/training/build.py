@@ -22,6 +22,7 @@ from franka_wm.envs.discretize import DiscreteActions
 from franka_wm.errors import UserError
 from franka_wm.planning import registry
 from franka_wm.policies import ExploringPolicy, ModelPolicy, PlannerPolicy, SearchPolicy
+from franka_wm.policies.names import POLICIES, refuse_old_name
 from franka_wm.policies.planner import PRECISIONS
 from franka_wm.policies.scripted import (
     DiscreteOraclePolicy,
@@ -34,11 +35,6 @@ from franka_wm.policies.scripted import (
 from franka_wm.seeding import derive_seed, evaluation_seed
 from franka_wm.training.spaces import Spaces
 
-ACTORS = {"policy": "policy", "planner": "planner", "smooth": "random", "noop": "noop", "ik": "oracle"}
-"""What ``collector.acts`` may be beside ``auto``, and the policy that it names."""
-
-POLICIES = ("planner", "policy", "noop", "random", "oracle")
-
 
 def actor(cfg: DictConfig) -> str:
     """The name of the policy that gathers experience, by ``collector.acts``.
@@ -47,8 +43,9 @@ def actor(cfg: DictConfig) -> str:
         UserError: No such policy, or one that the model's family does not have.
     """
     acts = cfg.collector.acts
-    if acts != "auto" and acts not in ACTORS:
-        raise UserError(f"collector.acts={acts!r}: must be one of auto, {', '.join(ACTORS)}")
+    refuse_old_name("collector.acts", acts)
+    if acts != "auto" and acts not in POLICIES:
+        raise UserError(f"collector.acts={acts!r}: must be one of auto, {', '.join(POLICIES)}")
     family = models.family(cfg.model.name)
     there = {"planner": family.has_next, "policy": family.has_policy}
     searched = bool(family.replay_keys)  # the loss needs what the search found
@@ -61,9 +58,9 @@ def actor(cfg: DictConfig) -> str:
         # is given goals by their pictures can learn from any motion.
         return "planner" if objective_name(cfg) == "reward_value" else "random"
     if not there.get(acts, True) or (searched and acts != "planner"):
-        fitting = "planner" if there["planner"] else "smooth"
+        fitting = "planner" if there["planner"] else "random"
         raise UserError(f"collector.acts={acts}: model={cfg.model.name} cannot; use collector.acts={fitting}")
-    return ACTORS[acts]
+    return acts
 
 
 def plain(node: Any) -> dict[str, Any]:
@@ -102,7 +99,7 @@ def make_env(cfg: DictConfig, *, num_envs: int | None = None, seed: int | None =
 
 
 def make_evaluation_env(cfg: DictConfig, *, num_envs: int | None = None, **changes: Any) -> Any:
-    """The same task for evaluation: with what the oracle reads, and the pictures that the model reads."""
+    """The same task for evaluation: with what ``ik`` reads, and the pictures that the model reads."""
     num_envs = cfg.evaluation.episodes if num_envs is None else num_envs
     if is_arm(cfg):
         read = model_keys(cfg) or []
@@ -315,7 +312,7 @@ def make_policies(
     """Every policy that can act or be compared, by name.
 
     ``planner`` and ``policy`` where the model has what they need; ``noop`` and ``random`` (smooth random:
-    first-order autoregressive); for the arm ``oracle``, inverse kinematics with true geometry, or a search over pairs
+    first-order autoregressive); for the arm ``ik``, inverse kinematics with true geometry, or a search over pairs
     of moves. ``capture``,
     ``precision`` and ``compile``: of the planner's, see :class:`~franka_wm.policies.PlannerPolicy`.
     """
@@ -333,7 +330,7 @@ def make_policies(
 
 
 def make_scripted_policies(env: Any, *, seed: int = 0, smoothness: float = 0.7) -> dict[str, Any]:
-    """Policies that need no model: ``noop``, ``random`` and, for the arm, ``oracle``."""
+    """Policies that need no model: ``noop``, ``random`` and, for the arm, ``ik``."""
     generator = torch.Generator(device=env.device).manual_seed(seed)
     discrete = not env.action_spec.dtype.is_floating_point
     arm = isinstance(env, (FrankaEnv, TransformedFrankaEnv))
@@ -347,9 +344,9 @@ def make_scripted_policies(env: Any, *, seed: int = 0, smoothness: float = 0.7) 
     if discrete:
         moves: Any = env.transform
         scripted = {name: DiscretePolicy(policy, moves.table) for name, policy in scripted.items()}
-        scripted["oracle"] = DiscreteOraclePolicy(env.kinematics, env.config, moves.table)
+        scripted["ik"] = DiscreteOraclePolicy(env.kinematics, env.config, moves.table)
     elif arm:
-        scripted["oracle"] = OraclePolicy(env.kinematics, env.config)
+        scripted["ik"] = OraclePolicy(env.kinematics, env.config)
     return scripted
 
 

@@ -12,6 +12,7 @@ from franka_wm.device import resolve_device
 from franka_wm.envs import FrankaConfig
 from franka_wm.envs.franka import check_robot
 from franka_wm.errors import UserError
+from franka_wm.policies.names import POLICIES, refuse_old_name
 from franka_wm.training import build
 from franka_wm.training.learner import PRECISIONS, SCHEDULES
 from franka_wm.training.loggers import check_loggers
@@ -109,7 +110,9 @@ def check(cfg: DictConfig) -> None:
         )
     if cfg.replay.capacity < cfg.collector.num_envs * cfg.collector.steps_per_batch:
         raise UserError(f"replay.capacity={cfg.replay.capacity}: smaller than one batch of the collector")
-    _check_names("evaluation.during", cfg.evaluation.during, build.POLICIES)
+    for name in cfg.evaluation.during:
+        refuse_old_name("evaluation.during", name)
+    _check_names("evaluation.during", cfg.evaluation.during, POLICIES)
     chosen = {
         "precision": (cfg.trainer.precision, PRECISIONS),
         "schedule": (build.schedule(cfg)[0], SCHEDULES),

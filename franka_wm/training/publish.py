@@ -17,6 +17,7 @@ from franka_wm.data.lerobot.paths import shortened, without_paths
 from franka_wm.data.lerobot.publish import README, check_name, files_of, hub_client, send, show_files
 from franka_wm.errors import UserError
 from franka_wm.training.checkpoint import latest_checkpoint, load_checkpoint
+from franka_wm.untrusted import UntrustedFolder
 
 
 def publish_model(
@@ -64,7 +65,11 @@ def stage_model(checkpoint: Path, place: Path, *, repo_id: str, license: str) ->
     Returns:
         ``place``, which is a checkpoint now.
     """
-    opened = load_checkpoint(latest_checkpoint(checkpoint))
+    folder = latest_checkpoint(checkpoint)
+    run = folder.parent.parent if folder.parent.name == "checkpoints" else folder
+    files = UntrustedFolder(run)
+    files.below(folder.relative_to(run)).check_links()
+    opened = load_checkpoint(folder)
     manifest = json.loads((opened.folder / "manifest.json").read_text(encoding="utf-8"))
     kept = ("model.safetensors", "counters.json", "extra.json", "extra.safetensors")
     for name in kept:
@@ -84,13 +89,11 @@ def stage_model(checkpoint: Path, place: Path, *, repo_id: str, license: str) ->
         for path in sorted(place.iterdir())
     }
     (place / "manifest.json").write_text(json.dumps(manifest, indent=1), encoding="utf-8")
-    run = opened.folder.parent.parent if opened.folder.parent.name == "checkpoints" else opened.folder
-    written = run / "evaluation"  # where the verb evaluate puts them; a published model has them at its top
-    written = written if (written / "evaluation.md").is_file() else run
-    if (written / "evaluation.json").is_file():
-        _copy_json(written / "evaluation.json", place / "evaluation.json")
-    if (written / "evaluation.md").is_file():
-        text = (written / "evaluation.md").read_text(encoding="utf-8")
+    # Where the verb evaluate puts them; a published model has them at its top.
+    written = "evaluation/" if files.path("evaluation/evaluation.md") else ""
+    if source := files.path(f"{written}evaluation.json"):
+        _copy_json(source, place / "evaluation.json")
+    if (text := files.text(f"{written}evaluation.md")) is not None:
         (place / "evaluation.md").write_text(shortened(text), encoding="utf-8")
     card = model_card(place, repo_id=repo_id, license=license)
     (place / README).write_text(card, encoding="utf-8")

@@ -16,7 +16,7 @@ from franka_wm.errors import UserError
 from franka_wm.evaluation import diagnose
 from franka_wm.report import diagnostics
 
-POLICIES = {"planner", "policy", "noop", "random", "oracle"}
+POLICIES = {"planner", "policy", "noop", "random", "ik"}
 
 
 @pytest.mark.slow
@@ -39,7 +39,7 @@ def test_everything_twice(run_folder: Path, tmp_path: Path, capsys, monkeypatch)
     for policy in results["policies"].values():
         assert policy["episodes"] == 8
         assert {"final_distance", "success", "success_once", "return", "path_length", "jerk"} <= set(policy)
-    assert results["policies"]["oracle"]["final_distance"]["mean"] < 0.1
+    assert results["policies"]["ik"]["final_distance"]["mean"] < 0.1
     assert len(results["open_loop"]["curves"]["model"]["mean"]) == 10
     assert set(results["probes"]) == {"joints", "velocities", "tool", "goal", "tool to goal"}
     assert results["spectrum"]["effective_rank"] > 1 and results["calibration"]["samples"] == 8 * 12
@@ -50,9 +50,9 @@ def test_everything_twice(run_folder: Path, tmp_path: Path, capsys, monkeypatch)
     assert set(timing) == POLICIES and timing["planner"]["seconds_per_decision"] > 0
 
     text = (one / "evaluation.md").read_text()
-    for title in ("Open loop", "Probes", "What else was found", "inverse kinematics"):
+    for title in ("Open loop", "Probes", "What else was found", "| ik |"):
         assert title in text
-    assert "inverse kinematics" in said and "Robustness" not in text
+    assert " ik " in said and "ik: inverse kinematics" in text and "Robustness" not in text
 
 
 @pytest.mark.slow

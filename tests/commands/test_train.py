@@ -63,7 +63,7 @@ def test_evaluation_json(run) -> None:
     assert (told["planner"], told["seed"], told["episodes"], told["device"]) == ("mppi", 0, 4, "cpu")
     assert (told["updates"], told["env_steps"]) == (30, 8 * (10 + 15)) and told["training_seconds"] > 0
     assert told["hardware"].endswith(("thread", "threads")) and told["franka_wm"] and told["seeds"]
-    assert set(results) == {"planner", "policy", "noop", "random", "oracle"}
+    assert set(results) == {"planner", "policy", "noop", "random", "ik"}
     for name, result in results.items():
         assert {"final_distance", "success", "return", "episodes", "success_once", "jerk"} <= set(result), (
             name
@@ -74,7 +74,7 @@ def test_evaluation_json(run) -> None:
             assert set(interval) == {"mean", "low", "high"}
             assert interval["low"] <= interval["mean"] <= interval["high"]
         assert -LENGTH * 1.01 <= result["return"]["mean"] <= 0
-    assert results["oracle"]["final_distance"]["mean"] < 0.05 < results["noop"]["final_distance"]["mean"]
+    assert results["ik"]["final_distance"]["mean"] < 0.05 < results["noop"]["final_distance"]["mean"]
 
 
 def test_the_curves_end_with_the_table(run) -> None:

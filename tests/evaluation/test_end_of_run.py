@@ -49,9 +49,9 @@ def test_the_table_is_the_curves_last_point(
     distance, success = table["final_distance"]["mean"], table["success"]["0.4"]["mean"]
     assert 0 < success < 1
     if during:
-        assert drawn[0, "policy alone"] == ([50, 120], pytest.approx([90.0, 100 * distance]))
-        assert drawn[1, "policy alone"] == ([50, 120], pytest.approx([10.0, 100 * success]))
+        assert drawn[0, "policy"] == ([50, 120], pytest.approx([90.0, 100 * distance]))
+        assert drawn[1, "policy"] == ([50, 120], pytest.approx([10.0, 100 * success]))
         numbers = {"final_distance": distance, "success": success, "return": table["return"]["mean"]}
         assert logged == [{f"eval/policy/{name}": value for name, value in numbers.items()}]
     else:  # no curve was asked for
-        assert drawn[0, "policy alone"][0] == [50] and logged == []
+        assert drawn[0, "policy"][0] == [50] and logged == []

@@ -38,7 +38,7 @@ def env() -> FrankaEnv:
 def found(env: FrankaEnv) -> Evaluation:
     oracle = OraclePolicy(env.kinematics, env.config)
     random = SmoothRandomPolicy(generator=torch.Generator().manual_seed(0))
-    return evaluate_policies(env, {"planner": random, "oracle": oracle, "noop": NoopPolicy()})
+    return evaluate_policies(env, {"planner": random, "ik": oracle, "noop": NoopPolicy()})
 
 
 def test_success_and_measures_at_the_true_end(env: FrankaEnv) -> None:

@@ -32,7 +32,7 @@ def test_twice_gives_the_same_numbers(agent) -> None:
     first = evaluate_agent(agent, episodes=6)
     torch.rand(17)
     second = evaluate_agent(agent, episodes=6, timing=False)
-    assert set(first.policies) == {"planner", "policy", "noop", "random", "oracle"}
+    assert set(first.policies) == {"planner", "policy", "noop", "random", "ik"}
     assert first.policies == second.policies
     assert evaluation_markdown(first) == evaluation_markdown(second)
     for name, episodes in first.episodes.items():
@@ -106,7 +106,7 @@ def test_what_cannot_be_evaluated(agent) -> None:
 def test_the_table_names_its_intervals(agent) -> None:
     noop = {"noop": agent.policies["noop"]}
     text = evaluation_markdown(evaluate_agent(agent, episodes=6, policies=noop, timing=False))
-    for word in ("doing nothing", "6 episodes", "bootstrap", "Wilson", str(held_out_seeds(1)[0])):
+    for word in ("noop: does nothing", "6 episodes", "bootstrap", "Wilson", str(held_out_seeds(1)[0])):
         assert word in text, word
 
 
@@ -190,10 +190,10 @@ def test_what_a_shift_does(agent) -> None:
     }
     told = []
     results = robustness(
-        agent, episodes=8, shifts=shifts, policies=["oracle"], report=lambda case, r: told.append(case)
+        agent, episodes=8, shifts=shifts, policies=["ik"], report=lambda case, r: told.append(case)
     )
     assert told == list(results) == [UNSHIFTED, "late", "unseen"]  # the model reads no pictures
-    plain, late, unseen = (results[case]["oracle"] for case in results)
+    plain, late, unseen = (results[case]["ik"] for case in results)
     assert plain["change"] is None and plain["verdict"] == ""
     assert late["change"]["low"] > 0.01 and late["verdict"] in ("worse", "breaks")
     assert unseen["final_distance"] == plain["final_distance"] and unseen["verdict"] == "holds"

@@ -25,7 +25,7 @@ def make_session(small_env) -> Callable[..., Session]:
         env = small_env(1, **(LIVE | changes))
         policies = {
             "planner": kinematic_planner(env),
-            "oracle": OraclePolicy(env.kinematics, env.config),
+            "ik": OraclePolicy(env.kinematics, env.config),
             "random": SmoothRandomPolicy(env.action_dim),
             "noop": NoopPolicy(env.action_dim),
         }

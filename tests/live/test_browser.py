@@ -41,7 +41,7 @@ START = (0.45, 0.05, 0.45)
 
 @pytest.fixture(scope="module")
 def page(make_session) -> Iterator[Page]:
-    session = make_session(policy="oracle", keep_goal=True)
+    session = make_session(policy="ik", keep_goal=True)
     session.set_goal(START)
     for _ in range(40):
         session.step()

@@ -23,7 +23,7 @@ def play(session: Session, steps: int) -> Frame:
 
 
 def test_the_tool_follows_a_goal_that_is_dragged(make_session) -> None:
-    session = make_session(policy="oracle")
+    session = make_session(policy="ik")
     for goal in (LEFT, RIGHT, LEFT):
         moved = session.set_goal(goal)
         np.testing.assert_allclose(moved.goal, goal, atol=1e-6)
@@ -69,7 +69,7 @@ def test_another_policy_acts_at_once_and_plans_are_dropped(make_session) -> None
     assert torch.equal(session.arm.joint_targets(), targets), "doing nothing commands nothing"
     session.set_policy("planner")
     assert session.step().path is not None
-    with pytest.raises(UserError, match="policy='fly': choose from planner, oracle, random, noop"):
+    with pytest.raises(UserError, match="policy='fly': choose from planner, ik, random, noop"):
         session.set_policy("fly")
     assert session.policy == "planner"
 
@@ -103,7 +103,7 @@ def test_a_setting_that_cannot_be_leaves_the_planner_as_it_is(make_session) -> N
 
 
 def test_a_new_episode_has_another_pose_and_goal(make_session) -> None:
-    session = make_session(policy="oracle")
+    session = make_session(policy="ik")
     first = play(session, 5)
     frame = session.reset()
     assert frame.episode == first.episode + 1
@@ -112,7 +112,7 @@ def test_a_new_episode_has_another_pose_and_goal(make_session) -> None:
 
 
 def test_a_goal_set_by_hand_outlives_the_episode_only_if_asked(make_session) -> None:
-    session = make_session(policy="oracle")
+    session = make_session(policy="ik")
     session.set_goal(LEFT)
     assert not np.allclose(session.reset().goal, LEFT)
     session.keep_goal = True
@@ -122,7 +122,7 @@ def test_a_goal_set_by_hand_outlives_the_episode_only_if_asked(make_session) -> 
 
 
 def test_episodes_that_end_by_themselves_go_on_with_the_kept_goal(make_session) -> None:
-    session = make_session(policy="oracle", keep_goal=True, episode_length=3)
+    session = make_session(policy="ik", keep_goal=True, episode_length=3)
     session.set_goal(LEFT)
     frames = [session.step() for _ in range(7)]
     assert [f.episode for f in frames] == [0, 0, 1, 1, 1, 2, 2]
@@ -141,7 +141,7 @@ def test_reward_and_distance_are_the_environments(make_session) -> None:
 
 
 def test_the_thread_steps_while_playing_and_rests_while_paused(make_session) -> None:
-    session = make_session(policy="oracle")
+    session = make_session(policy="ik")
     session.step()  # compiles
     seen: list[Frame] = []
     enough = threading.Event()
@@ -210,7 +210,7 @@ def test_what_breaks_in_the_thread_is_kept_and_stops_it(make_session) -> None:
 
 
 def test_a_recording_is_a_video_with_a_picture_for_every_step(make_session, tmp_path: Path) -> None:
-    session = make_session(policy="oracle")
+    session = make_session(policy="ik")
     session.set_goal(RIGHT)
     assert session.step().recording is None
     session.start_recording(size=64)
@@ -246,7 +246,7 @@ def test_one_world_only(small_env) -> None:
 def test_a_recording_can_be_a_dataset_of_what_happened(make_session, tmp_path: Path) -> None:
     from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
-    session = make_session(policy="oracle", observations=("pixels", "state", "joint_target"), image_size=16)
+    session = make_session(policy="ik", observations=("pixels", "state", "joint_target"), image_size=16)
     session.step()
     session.start_recording("dataset")
     seen = [session.step() for _ in range(3)]

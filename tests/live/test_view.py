@@ -99,7 +99,7 @@ def test_bad_worlds_policies_and_checkpoints_are_one_line(
 ) -> None:
     for arguments, said in (
         (["env.arms=2"], "unknown environment option 'arms'"),
-        (["policy=policy"], "policy='policy': choose from planner, oracle, random, noop; that one needs"),
+        (["policy=policy"], "policy='policy': choose from planner, ik, random, noop; that one needs"),
         ([f"checkpoint={tmp_path}"], str(tmp_path)),
     ):
         assert cli.main(["view", *CHEAP, "seconds=1", *arguments]) == 1
@@ -171,7 +171,7 @@ def test_it_serves_this_machine_only_and_ends_in_time(
 
     steps: list[int] = []
     monkeypatch.setattr(page, "Page", Watched)
-    assert cli.main(["view", *CHEAP, "port=0", "policy=oracle", "seconds=2"]) == 0
+    assert cli.main(["view", *CHEAP, "port=0", "policy=ik", "seconds=2"]) == 0
     [(host, port, here, elsewhere)] = served
     assert host == "127.0.0.1"
     assert here
@@ -222,7 +222,7 @@ def test_a_checkpoint_brings_its_own_planner_and_policy(root: Path, tmp_path: Pa
     assert session.step().path.shape == (3, 3)
     session.set_policy("policy")
     assert session.step().path is None
-    session.set_policy("oracle")
+    session.set_policy("ik")
     goal = (0.4, 0.2, 0.5)
     session.set_goal(goal)
     for _ in range(50):
@@ -275,7 +275,7 @@ def test_ctrl_c_ends_it_within_two_seconds_whatever_it_is_doing() -> None:
 def test_rerun_writes_an_episode(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     pytest.importorskip("rerun", reason="needs the extra rerun")
     path = tmp_path / "arm.rrd"
-    assert cli.main(["view", *CHEAP, f"rerun={path}", "policy=oracle", "env.episode_length=4"]) == 0
+    assert cli.main(["view", *CHEAP, f"rerun={path}", "policy=ik", "env.episode_length=4"]) == 0
     assert path.stat().st_size > 1000
     out = capsys.readouterr().out
     assert "recording 4 steps" in out

@@ -92,7 +92,7 @@ def final_distance(env: Any, policy: Any, steps: int) -> torch.Tensor:
 
 def test_the_oracle_with_numbered_moves_is_better_than_the_nearest_row_of_the_table(moving) -> None:
     env = moving()
-    reached = final_distance(env, build.make_scripted_policies(env)["oracle"], 40)
+    reached = final_distance(env, build.make_scripted_policies(env)["ik"], 40)
     rounded = DiscretePolicy(OraclePolicy(env.kinematics, env.config), env.transform.table)
     assert reached.mean() < 0.01 and reached.max() < 0.025
     assert reached.mean() < 0.6 * final_distance(env, rounded, 40).mean()
@@ -100,7 +100,7 @@ def test_the_oracle_with_numbered_moves_is_better_than_the_nearest_row_of_the_ta
 
 def test_the_oracle_with_moves_of_the_tool_ends_where_no_move_helps(moving) -> None:
     env = moving(action_mode="ee_delta")
-    reached = final_distance(env, build.make_scripted_policies(env)["oracle"], 30)
+    reached = final_distance(env, build.make_scripted_policies(env)["ik"], 30)
     assert reached.max() < 0.06  # of a grid of 5 cm, 4.3 cm to the farthest point
 
 
@@ -108,7 +108,7 @@ def test_the_oracle_with_moves_to_poses_takes_the_best(moving) -> None:
     """There, a move is a pose, whatever was before."""
     env = moving(action_mode="joint_position")
     observation, k = env.reset(seed=0), env.kinematics
-    move = build.make_scripted_policies(env)["oracle"](observation)["action"]
+    move = build.make_scripted_policies(env)["ik"](observation)["action"]
     poses = k.lower + (env.transform.table + 1) / 2 * (k.upper - k.lower)
     distances = (k.forward(poses) - observation["goal"].unsqueeze(1)).norm(dim=-1)
     assert torch.equal(move, distances.argmin(1))

@@ -97,7 +97,13 @@ def test_a_full_page_has_every_section_and_needs_nothing_else(make_run) -> None:
     kinds = [v.split(";")[0] for _, name, v in reader.links if name == "src"]
     assert kinds.count("data:video/mp4") == 2 and "data:image/png" in kinds
     assert "the latents have collapsed <to a point>" in reader.text  # escaped, and read back
-    for words in ("reach, fixed goal · tdmpc2 · seed 0", "2.00", "(1.80 – 2.20)", "doing nothing", "breaks"):
+    for words in (
+        "reach, fixed goal · tdmpc2 · seed 0",
+        "2.00",
+        "(1.80 – 2.20)",
+        "noop: does nothing",
+        "breaks",
+    ):
         assert words in reader.text
 
 
@@ -304,6 +310,26 @@ def test_results_of_an_older_form_are_refused_in_one_line(make_run, capsys) -> N
         read_run(run)
 
 
+def test_policies_of_earlier_versions_have_their_present_names(make_run, tmp_path: Path) -> None:
+    run = make_run()
+    found = json.loads((run / "evaluation.json").read_text())
+    found["policies"]["oracle"] = policy(0.01)
+    found["robustness"] = {"camera": {"oracle": {"final_distance": policy(0.01)["final_distance"]}}}
+    (run / "evaluation.json").write_text(json.dumps(found))
+    assert "ik" in read_run(run).policies and "oracle" not in read_run(run).policies
+    text = read(run).text
+    assert "oracle" not in text and "ik: inverse kinematics" in text
+
+
+def test_logged_numbers_have_the_units_of_the_tables(make_run) -> None:
+    run = make_run(distance=0.02)
+    name = "<b>x</b>".replace("/", "")
+    (run / "csv" / "scalars" / f"{name}.csv").write_text("100,1\n")
+    text = page(read_run(run))
+    assert "final distance to the goal [cm], planner" in text and "2 – 30" in Reader(text).text
+    assert "<b>" not in text and "<b>x<b>" in Reader(text).text
+
+
 def test_versions_are_written_and_shown(make_run) -> None:
     import torch
 
@@ -359,6 +385,9 @@ def test_the_comparison_shows_results_curves_and_what_differs(make_run, tmp_path
     for words in ("3.10", "4.20", "5.30", "3 runs in 2 groups", "s0 (2 runs)", "trainer.lr", "0.001"):
         assert words in reader.text
     assert "env.task" not in reader.text  # the same in all
+    (curveless := make_run("unlogged", rows=False, distance=0.06)).joinpath("evaluation.json").unlink()
+    both = Reader(compare_page([read_run(runs[0]), read_run(curveless)])).text
+    assert "Without curves, since nothing was logged: unlogged." in both
     plain = Reader(compare_page([read_run(make_run("p", rows=False)), read_run(make_run("q", rows=False))]))
     assert plain.sections == ["result", "config", "reproduce"]
     assert "the configurations are the same" in plain.text

@@ -228,7 +228,7 @@ def test_markdown_table_has_units_order_and_intervals() -> None:
         "| planner | 2.12 (1.06 – 3.18) | 60 (30 – 90) | 40 (20 – 60) | 10 (5 – 15) "
         "| -3.00 (-1.50 – -4.50) | 64 |"
     )
-    assert [line.split(" | ")[0] for line in lines[2:]] == ["| planner", "| doing nothing", "| mine"]
+    assert [line.split(" | ")[0] for line in lines[2:]] == ["| planner", "| noop", "| mine"]
 
 
 def test_terminal_table_shows_the_same_numbers() -> None:
@@ -236,7 +236,7 @@ def test_terminal_table_shows_the_same_numbers() -> None:
     console.print(terminal_table(evaluation(), title="reach"))
     text = console.export_text()
     assert "reach" in text
-    for cell in ("planner", "doing nothing", "mine", "2.12 (1.06 – 3.18)", "final distance [cm]", "64"):
+    for cell in ("planner", "noop", "mine", "2.12 (1.06 – 3.18)", "final distance [cm]", "64"):
         assert cell in text
 
 
@@ -249,4 +249,4 @@ def test_an_incomplete_evaluation_is_named() -> None:
 
 def test_policies_that_are_compared_have_different_colours() -> None:
     assert len(set(style.POLICY_COLOURS.values())) == len(style.POLICY_COLOURS)
-    assert style.POLICY_COLOURS.keys() == style.POLICY_NAMES.keys()
+    assert style.POLICY_COLOURS.keys() == {*style.POLICY_LEGEND, "train"}

@@ -123,7 +123,9 @@ def test_environments_of_a_run(composed) -> None:
         ("env.episode_length=2", "episode_length"),
         ("collector.num_envs=0", "num_envs"),
         ("collector.num_envs=2.5", "num_envs"),
-        ("collector.acts=oracle", "acts"),
+        ("collector.acts=fly", "acts"),
+        ("collector.acts=smooth", "acts=smooth: this policy is called random now"),
+        ("evaluation.during=[oracle]", "during=oracle: this policy is called ik now"),
         ("collector.steps_per_batch=0", "steps_per_batch"),
         ("collector.seed_steps=0", "seed_steps"),
         ("+collector.calmest=0.5", "calmest"),
@@ -319,7 +321,7 @@ def test_runs_of_before_an_option_was_there_go_on(composed) -> None:
     env = build.make_env(cfg, num_envs=2)
     spaces = Spaces.of_env(env)
     policies = build.make_agent_policies(cfg, build.make_model(cfg, env), env, spaces)
-    assert set(policies) == {"planner", "policy", "noop", "random", "oracle"}
+    assert set(policies) == {"planner", "policy", "noop", "random", "ik"}
 
 
 @pytest.fixture

@@ -30,7 +30,7 @@ HALF = 15  # amid the updates of a batch, which has 10
 KINDS = {
     "policy": (),
     "planner": ("collector.acts=planner",),
-    "random": ("collector.acts=smooth",),
+    "random": ("collector.acts=random",),
     "exploring": ("collector.noise=0.4", "collector.planner_worlds=1", "env.goal_sampling=reachable"),
     "moves": ("model=muzero", "planner=gumbel"),
     "pictures": (

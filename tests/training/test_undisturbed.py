@@ -27,7 +27,7 @@ def assert_same_weights(one: Checkpoint, other: Checkpoint) -> None:
 
 
 OTHERWISE = {
-    "more, oftener": ("evaluation.during=[policy,planner,random,oracle]", "evaluation.every=1"),
+    "more, oftener": ("evaluation.during=[policy,planner,random,ik]", "evaluation.every=1"),
     "other numbers of episodes": ("evaluation.during=[policy,random]", "evaluation.episodes=3"),
     "at steps": ("evaluation.during=[planner]", "evaluation.at_steps=[31]"),
     "every line": ("evaluation.during=[]", "trainer.log_every=1e-6"),
@@ -42,7 +42,7 @@ def kept() -> dict[str, dict[str, torch.Tensor]]:
 
 @pytest.mark.parametrize(
     ("acts", "name"),
-    [("policy", name) for name in OTHERWISE] + [(acts, "more, oftener") for acts in ("smooth", "planner")],
+    [("policy", name) for name in OTHERWISE] + [(acts, "more, oftener") for acts in ("random", "planner")],
 )
 def test_what_is_looked_at_does_not_change_the_weights(acts: str, name: str, kept, train, tmp_path) -> None:
     acts = f"collector.acts={acts}"

@@ -109,7 +109,7 @@ def test_provenance_says_how(collected) -> None:
     provenance = read_provenance(collected)
     assert provenance is not None
     assert [(s["policy"], s["episodes"], s["seed"]) for s in provenance["sessions"]] == [
-        ("smooth", 12, 5),
+        ("random", 12, 5),
         ("ik", 8, 5),
     ]
     assert provenance["sessions"][0]["config"]["env"]["image_size"] == 16
@@ -144,7 +144,8 @@ def test_ctrl_c_leaves_a_dataset(tmp_path, load) -> None:
         (["out=x", "episodes=0"], "at least 1"),
         (["out=x", "format=gif"], "must be one of exact, video"),
         (["out=x", "policy=planner"], "give checkpoint="),
-        (["out=x", "policy=nonsense"], "smooth, noop, ik, or the folder of a run"),
+        (["out=x", "policy=smooth"], "collect: policy=smooth: this policy is called random now"),
+        (["out=x", "policy=nonsense"], "random, noop, ik, or the folder of a run"),
         (["out=x", "env=nonsense"], "env=nonsense: must be one of dm_control, franka, gym, none, reach"),
         (["out=x", "fmt=exact"], "fmt: no such option; there are out, episodes, policy, checkpoint, format"),
         (

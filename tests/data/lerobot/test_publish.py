@@ -405,3 +405,18 @@ def test_a_missing_repository_is_one_line() -> None:
 
     with pytest.raises(UserError, match="cannot be reached"), explained("user/name"):
         raise httpx.ConnectError("no route")
+
+
+@pytest.mark.parametrize(
+    "name", ["evaluation.md", "evaluation/evaluation.md", "checkpoints/latest/counters.json"]
+)
+def test_links_out_of_a_run_are_not_followed(name: str, run_folder, tmp_path) -> None:
+    run, place, secret = run_folder[0], tmp_path / "place", tmp_path / "secret"
+    place.mkdir()
+    (run / name).parent.mkdir(exist_ok=True)
+    secret.write_bytes((run / name).read_bytes() if (run / name).exists() else b"of this machine")
+    (run / name).unlink(missing_ok=True)
+    (run / name).symlink_to(secret)
+    with pytest.raises(UserError, match="is a link to"):
+        stage_model(run, place, repo_id="user/model", license="mit")
+    assert not (place / "evaluation.md").exists()
