@@ -52,15 +52,15 @@ class ActionWorldModel(HistoryWorldModel):
     a coarser grid, since z holds them for every candidate of a planner.
 
     Args:
-        image_sizes: picture key -> (height, width, channels); several of one size share the encoder. Empty
+        image_sizes: image key -> (height, width, channels); several of one size share the encoder. Empty
             for `encoder=state`.
-        observation_sizes: vector key -> size. The state token next to pictures; what is encoded for
-            `encoder=state`. May be empty next to pictures.
+        observation_sizes: vector key -> size. The state token next to images; what is encoded for
+            `encoder=state`. May be empty next to images.
         action_dim: size of an action.
         episode_length: unused, accepted for the common signature.
         encoder: `vit`, `conv` or `state`.
-        encoder_size, encoder_width, encoder_depth, encoder_heads, patch_size: of `vit`.
-        channels: of `conv`.
+        encoder_size, encoder_width, encoder_depth, encoder_heads, patch_size: sizes of `vit`.
+        channels: channels of `conv`.
         state_embed_dim, state_hidden_dim: of `state`: its token and the two hidden layers before it.
         encoder_from: take the encoder of this checkpoint (a JEPA's, say), see `read_encoder`.
         encoder_architecture: see `Backbone`; only to rebuild from a checkpoint.
@@ -69,14 +69,14 @@ class ActionWorldModel(HistoryWorldModel):
         grid: average the tokens to this many rows and columns; None: as they are.
         history: frames that the dynamics sees.
         predictor: `transformer` or `mlp`.
-        predictor_width, predictor_depth, predictor_heads, dropout: of `transformer`.
-        predictor_hidden_dim: of the three hidden layers of `mlp`.
+        predictor_width, predictor_depth, predictor_heads, dropout: options of `transformer`.
+        predictor_hidden_dim: width of the three hidden layers of `mlp`.
         rollout: steps of the rollout; 1: teacher forcing alone.
         collapse: `ema`, `sigreg`, `vicreg` or `none`, for an encoder that is trained along.
         guard_coef, guard_directions: see `CollapseGuard`.
-        ema: part that the teacher keeps of itself at each update.
+        ema: share that the teacher keeps of itself at each update.
         encoder_lr_scale: learning rate of the encoder relative to the rest.
-        weight_decay: of matrices.
+        weight_decay: weight decay of matrices.
 
     Raises:
         ValueError: a setting that cannot work.
@@ -204,7 +204,7 @@ class ActionWorldModel(HistoryWorldModel):
         self.target_encoder = frozen_copy(self.encoder) if self.guard.kind == "ema" else None
 
     def train(self, mode: bool = True) -> ActionWorldModel:
-        """As usual, but a frozen encoder stays in evaluation mode."""
+        """Set the mode; a frozen encoder stays in evaluation mode."""
         super().train(mode)
         if self.frozen:
             self.encoder.eval()
@@ -232,11 +232,11 @@ class ActionWorldModel(HistoryWorldModel):
         return self.history.push(z, action, frame.view(*z.shape[:-1], -1))
 
     def embed(self, z: Tensor) -> Tensor:
-        """What goals are compared on: the newest frame's tokens, flattened (..., feature_dim)."""
+        """Tokens that goals are compared on: the newest frame's tokens, flattened (..., feature_dim)."""
         return self.history.last(z)[..., : self.feature_dim]
 
     def encode_goal(self, observation: TensorDictBase) -> Tensor:
-        """The tokens (..., feature_dim) of a goal: of its pictures, or of its state vectors for
+        """The tokens (..., feature_dim) of a goal: of its images, or of its state vectors for
         `encoder=state`."""
         return self._features(observation)
 

@@ -1,4 +1,4 @@
-"""Attention over heads, by the way that is quickest for its sizes and its device."""
+"""Attention over heads, by the quickest kernel for its sizes and device."""
 
 import torch
 from torch import Tensor

@@ -1,4 +1,4 @@
-"""Vision encoders as a grid of tokens, whatever they are inside: ours, pretrained ones, Hugging Face's."""
+"""Vision encoders as a grid of tokens: our own, pretrained ones, and those of Hugging Face."""
 
 import json
 from collections.abc import Mapping, Sequence
@@ -51,13 +51,13 @@ def read_encoder(path: str | Path) -> dict[str, Tensor]:
 
 
 class Backbone(nn.Module):
-    """Pictures (N, height, width, C) uint8 -> tokens (N, `tokens`, `width`), one for each cell of a grid.
+    """Images (N, height, width, C) uint8 -> tokens (N, `tokens`, `width`), one for each cell of a grid.
 
     Args:
         image_size: (height, width, channels).
         kind: `vit` or `conv`; ignored with `huggingface` or `encoder_from`.
         size, width, depth, heads, patch_size: of a `vit`, see `vit_size`.
-        channels: of a `conv`.
+        channels: channels of a `conv`.
         grid: tokens are averaged down to this many rows and columns; None: as they are.
         encoder_from: start from this checkpoint, see `read_encoder`; it gives the architecture, too.
         architecture: numbers of an `Architecture`, instead of `size` and so on.
@@ -94,7 +94,7 @@ class Backbone(nn.Module):
         if (encoder_from is not None) + (huggingface is not None or huggingface_config is not None) > 1:
             raise ValueError("give encoder_from or huggingface, not both")
         if kind not in ("vit", "conv"):
-            raise ValueError(f"unknown encoder {kind!r} of pictures; available: vit, conv")
+            raise ValueError(f"unknown encoder {kind!r} of images; available: vit, conv")
         if grid is not None and grid < 1:
             raise ValueError(f"grid must be at least 1, got {grid}")
         self.image_size = image_size
@@ -122,7 +122,7 @@ class Backbone(nn.Module):
             if image_size[0] % patch or image_size[1] % patch or image_size[2] != channels_in:
                 raise ValueError(
                     f"the pretrained encoder takes {channels_in} channels and sides that are multiples of "
-                    f"{patch} pixels, got pictures of {image_size}"
+                    f"{patch} pixels, got images of {image_size}"
                 )
             own, self.width = (image_size[0] // patch, image_size[1] // patch), self.network.width
         else:
@@ -132,12 +132,12 @@ class Backbone(nn.Module):
         self.grid = own if grid is None else (min(grid, own[0]), min(grid, own[1]))
         self.tokens = self.grid[0] * self.grid[1]
 
-    def forward(self, pictures: Tensor) -> Tensor:
+    def forward(self, images: Tensor) -> Tensor:
         if isinstance(self.network, ViT):
-            x = self.network(pictures)[:, int(self.network.cls) :]
+            x = self.network(images)[:, int(self.network.cls) :]
             x = x.mT.unflatten(-1, self.own_grid)
         else:
-            x = self.network.maps(pictures)
+            x = self.network.maps(images)
         if self.grid != self.own_grid:
             x = F.adaptive_avg_pool2d(x, self.grid)
         return x.flatten(2).mT
@@ -154,7 +154,7 @@ class Backbone(nn.Module):
 class HuggingFaceEncoder(nn.Module):
     """A vision model of the Hugging Face Hub as feature maps; see `Backbone`.
 
-    Pictures are resized to what the model was trained on and normalised as its `preprocessor_config.json`
+    Images are resized to what the model was trained on and normalised as its `preprocessor_config.json`
     says, or as ImageNet where it has none.
     """
 
@@ -177,7 +177,7 @@ class HuggingFaceEncoder(nn.Module):
                 "a Hugging Face backbone needs transformers: pip install 'franka-wm[huggingface]'"
             ) from error
         if image_size[2] != 3:
-            raise ValueError(f"a Hugging Face backbone needs pictures of 3 channels, got {image_size}")
+            raise ValueError(f"a Hugging Face backbone needs images of 3 channels, got {image_size}")
         mean, std = IMAGENET_MEAN, IMAGENET_STD
         if config is not None:
             settings = dict(config)
@@ -210,9 +210,9 @@ class HuggingFaceEncoder(nn.Module):
             probe = self.maps(torch.zeros(1, *image_size, dtype=torch.uint8))
         self.width, self.grid = probe.shape[1], (probe.shape[2], probe.shape[3])
 
-    def maps(self, pictures: Tensor) -> Tensor:
+    def maps(self, images: Tensor) -> Tensor:
         """(N, height, width, 3) uint8 -> feature maps (N, width, rows, columns)."""
-        x = check_images(pictures).permute(0, 3, 1, 2).to(self.mean.dtype).div(255.0)
+        x = check_images(images).permute(0, 3, 1, 2).to(self.mean.dtype).div(255.0)
         if x.shape[-2:] != self.size:
             x = F.interpolate(x, size=self.size, mode="bilinear", antialias=True)
         hidden = self.model(pixel_values=(x - self.mean) / self.std).last_hidden_state
@@ -229,7 +229,7 @@ class HuggingFaceEncoder(nn.Module):
 
 
 def _normalisation(name: str, local_files_only: bool) -> tuple[Sequence[float], Sequence[float]]:
-    """Mean and standard deviation of the pictures that the model was trained on."""
+    """Mean and standard deviation of the images that the model was trained on."""
     from transformers.utils.hub import cached_file
 
     file = cached_file(

@@ -59,7 +59,7 @@ class HistoryWorldModel(WorldModel):
         return torch.where(is_init, self.history.start(frame), pushed)
 
     def unpack(self, z: Tensor, action: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """What a predictor reads of z (..., latent_dim) and the next action (..., A), N = number of latents.
+        """Inputs of a predictor from z (..., latent_dim) and the next action (..., A), N = number of latents.
 
         Returns:
             Frames (N, K, F), the action taken at each (N, K, A), and which frames are real (N, K).

@@ -1,4 +1,4 @@
-"""TD-MPC2's encoder of pictures, and of pictures with vectors."""
+"""TD-MPC2's encoder of images, and of images with vectors."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -13,14 +13,14 @@ from franka_wm.models.vision import ConvEncoder
 
 
 class ImageEncoder(nn.Module):
-    """Pictures, and vectors if there are any -> z (..., latent_dim), simplices of `simnorm_dim`.
+    """Images, and vectors if there are any -> z (..., latent_dim), simplices of `simnorm_dim`.
 
-    Each picture goes through convolutions of its own (or all through one pretrained vision transformer),
+    Each image goes through convolutions of its own (or all through one pretrained vision transformer),
     vectors through `NormedLinear` layers; the features side by side go through one more, with SimNorm. One
-    picture whose features are as many as the latent's go to SimNorm directly, as published.
+    image whose features are as many as the latent's go to SimNorm directly, as published.
 
     Args:
-        image_sizes: picture key -> (height, width, channels).
+        image_sizes: image key -> (height, width, channels).
         observation_dim: size of the vectors together; 0: none.
         hidden: widths of the layers over vectors.
         channels: of the convolutions.
@@ -49,7 +49,7 @@ class ImageEncoder(nn.Module):
             sizes = set(image_sizes.values())
             if len(sizes) > 1:
                 raise ValueError(
-                    f"all pictures must have one size to share an encoder, got {dict(image_sizes)}"
+                    f"all images must have one size to share an encoder, got {dict(image_sizes)}"
                 )
             self.backbone = Backbone(
                 sizes.pop(), grid=grid, encoder_from=encoder_from, architecture=architecture
@@ -78,19 +78,19 @@ class ImageEncoder(nn.Module):
             initialize(self.join)
 
     def train(self, mode: bool = True) -> "ImageEncoder":
-        """As usual, but a frozen backbone stays in evaluation mode."""
+        """Set the mode; a frozen backbone stays in evaluation mode."""
         super().train(mode)
         if self.frozen and self.backbone is not None:
             self.backbone.eval()
         return self
 
-    def forward(self, pictures: Mapping[str, Tensor], vectors: Tensor | None = None) -> Tensor:
-        """Pictures (..., height, width, C) uint8 by key, vectors (..., observation_dim) -> (..., latent_dim)."""
+    def forward(self, images: Mapping[str, Tensor], vectors: Tensor | None = None) -> Tensor:
+        """Images (..., height, width, C) uint8 by key, vectors (..., observation_dim) -> (..., latent_dim)."""
         if self.backbone is None:
             assert self.convolutions is not None
-            parts = [conv(pictures[key]) for key, conv in zip(self.keys, self.convolutions, strict=True)]
+            parts = [conv(images[key]) for key, conv in zip(self.keys, self.convolutions, strict=True)]
         else:
-            stacked = torch.stack([pictures[key] for key in self.keys], dim=-4)
+            stacked = torch.stack([images[key] for key in self.keys], dim=-4)
             with torch.set_grad_enabled(torch.is_grad_enabled() and not self.frozen):
                 tokens = self.backbone(stacked.flatten(0, -4))
             parts = [tokens.reshape(*stacked.shape[:-4], -1)]

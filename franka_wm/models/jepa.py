@@ -1,4 +1,4 @@
-"""Joint-embedding predictive pretraining of vision encoders from pictures alone: I-JEPA, V-JEPA, LeJEPA."""
+"""Joint-embedding predictive pretraining of vision encoders from images alone: I-JEPA, V-JEPA, LeJEPA."""
 
 from __future__ import annotations
 
@@ -48,10 +48,10 @@ RECIPES: dict[str, tuple[CollapseName, str | None, bool, int]] = {
 
 
 class JEPA(WorldModel):
-    """An encoder of pictures or clips, trained to predict embeddings instead of pixels. No actions.
+    """An encoder of images or clips, trained to predict embeddings instead of pixels. No actions.
 
     Three recipes:
-      * `ijepa` (Assran et al., CVPR 2023, arXiv:2301.08243): from the visible patches of a picture, predict
+      * `ijepa` (Assran et al., CVPR 2023, arXiv:2301.08243): from the visible patches of an image, predict
         the embeddings of hidden blocks; smooth L1.
       * `vjepa` (Bardes et al., TMLR 2024, arXiv:2404.08471): likewise on clips with tubes; L1.
       * `lejepa` (Balestriero & LeCun 2025, arXiv:2511.08544): embeddings of large and small crops agree with
@@ -72,14 +72,14 @@ class JEPA(WorldModel):
     MLP between student and teacher as BYOL does (arXiv:2006.07733).
 
     Args:
-        image_sizes: picture key -> (height, width, channels); several cameras of one size share the encoder.
+        image_sizes: image key -> (height, width, channels); several cameras of one size share the encoder.
         observation_sizes: must be empty; it reads no vectors.
         action_dim, episode_length: unused, accepted for the common signature.
         recipe: `ijepa`, `vjepa` or `lejepa`.
         collapse: the guard; None: the recipe's (`ema`, `ema`, `sigreg`).
         masks: `multiblock`, `tube`, `temporal` or `random`; None: the recipe's.
         mask_ratio: part of the tokens to predict, for all but `multiblock`; None: the sampler's.
-        clips: a window is one clip (True) or H pictures (False); None: True for `vjepa`.
+        clips: a window is one clip (True) or H images (False); None: True for `vjepa`.
         tubelet: frames of a token; None: 2 for `vjepa`, else 1.
         encoder_size: `tiny` or `small`; width, depth and heads override it.
         patch_size: pixels.
@@ -93,7 +93,7 @@ class JEPA(WorldModel):
             being centred, and so the guard from spreading them.
         global_views, local_views, global_scale, local_scale: crops of `lejepa` and the range of their area;
             local ones have half the pixels a side.
-        weight_decay: of matrices.
+        weight_decay: weight decay of matrices.
 
     Raises:
         ValueError: a setting that cannot work.
@@ -218,7 +218,7 @@ class JEPA(WorldModel):
 
     @torch.no_grad()
     def encode(self, observation: TensorDictBase) -> Tensor:
-        """Pictures (..., height, width, C) uint8 of each key -> features (..., latent_dim), float.
+        """Images (..., height, width, C) uint8 of each key -> features (..., latent_dim), float.
 
         Of the teacher where there is one, as published, else of the encoder. No gradient.
         """
@@ -239,9 +239,9 @@ class JEPA(WorldModel):
         """Loss of a batch of windows; call `backward` once on the entry `loss`.
 
         Args:
-            batch: batch size [B, H], with the picture keys (B, H, height, width, C). Only the root is read:
+            batch: batch size [B, H], with the image keys (B, H, height, width, C). Only the root is read:
                 neither `next` nor actions are needed. With `clips`, the first frames of a window, as many as
-                fill whole tubelets, are one clip; otherwise every frame is a picture of its own.
+                fill whole tubelets, are one clip; otherwise every frame is an image of its own.
 
         Returns:
             batch size []: `loss`, and detached `loss_prediction`, `loss_guard` (weighted), `feature_std` and
@@ -265,7 +265,7 @@ class JEPA(WorldModel):
         return TensorDict({"loss": prediction + guard, **metrics}, batch_size=[])
 
     def ema(self) -> Tensor:
-        """The part that the teacher keeps of itself at the next update, on the device: ()."""
+        """Share () that the teacher keeps of itself at the next update, on the device."""
         part = (self.updates / self.ema_steps).clamp(max=1.0)
         return self.ema_start + (self.ema_end - self.ema_start) * part
 
@@ -285,7 +285,7 @@ class JEPA(WorldModel):
     # ------------------------------------------------------------------ pieces
 
     def _as_clips(self, batch: TensorDictBase) -> Tensor:
-        """(N, T, height, width, C) from windows [B, H]: each camera's clip, or picture, by itself."""
+        """(N, T, height, width, C) from windows [B, H]: each camera's clip, or image, by itself."""
         images = stack_cameras(batch, self.image_sizes)  # (B, H, V, height, width, C)
         if not self.clips:
             return images.flatten(0, 2).unsqueeze(1)
@@ -358,9 +358,9 @@ class MaskedPredictor(nn.Module):
     for. Groups of targets are predicted independently of each other.
 
     Args:
-        encoder: whose tokens it reads; only its sizes are used.
+        encoder: encoder whose tokens it reads; only its sizes are used.
         outputs: size P of the embeddings that it predicts.
-        width, depth, heads: of the predictor.
+        width, depth, heads: sizes of the predictor.
     """
 
     space: Tensor

@@ -43,39 +43,39 @@ class LeWorldModel(HistoryWorldModel):
     `embed(z)`, the newest embedding. BatchNorm uses the batch's statistics in `loss` alone, and there in
     training mode alone: planning never depends on what else is in the batch.
 
-    With `observation_sizes` a frame's embedding is joined by that of the state vector; without pictures it is
-    that of the state alone. With pictures, goals are compared by the picture's part.
+    With `observation_sizes` a frame's embedding is joined by that of the state vector; without images it is
+    that of the state alone. With images, goals are compared by the image's part.
 
     Deliberate differences: rotary positions in the predictor instead of learned ones, so that a history which
     is still short predicts as in training; `rollout`, InfoNCE, inverse dynamics and the reward probe, off
     by default.
 
     Args:
-        image_sizes: picture key -> (height, width, channels); several of one size share the encoder.
-        observation_sizes: vector key -> size; may be empty if there are pictures.
+        image_sizes: image key -> (height, width, channels); several of one size share the encoder.
+        observation_sizes: vector key -> size; may be empty if there are images.
         action_dim: size of an action.
         episode_length: unused but for the discount's default.
-        embed_dim: of a frame's picture.
-        state_embed_dim: of a frame's state vector, next to pictures; without, it is `embed_dim`.
+        embed_dim: size of the embedding of a frame's image.
+        state_embed_dim: size of the embedding of a frame's state vector, next to images; without, it is `embed_dim`.
         state_hidden_dim: width of the state encoder's two hidden layers.
         history: frames that the predictor sees.
         encoder_size, encoder_width, encoder_depth, encoder_heads, patch_size: the vision transformer.
-        projector_hidden: of the MLPs after encoder and predictor.
+        projector_hidden: width of the MLPs after encoder and predictor.
         predictor_width: of the predictor's tokens; None: a frame's embedding is a token, as published. A small
             embedding needs wider ones.
         predictor_depth, predictor_heads, predictor_head_dim, predictor_mlp, dropout: the predictor.
-        sigreg_coef, sigreg_directions: of the regulariser.
+        sigreg_coef, sigreg_directions: weight and random directions of the regulariser.
         rollout: 1, as published: predict from true embeddings. More: feed predictions back for so many steps
             at the end of each window as well.
         infonce_coef: weight of an InfoNCE loss between predicted and true next embeddings.
         inverse_coef: weight of inverse dynamics, after PLDM (Sobal et al. 2025, arXiv:2502.14819): the actions
-            of a window are read from the embeddings of its frames (of the pictures' part where there are any),
-            so that these tell of all that the actions move, the hand's turning as well as the large links.
+            of a window are read from the embeddings of its frames (of the images' part where there are any),
+            so that these describe all that the actions move, the hand's turning as well as the large links.
             Windows must then be at least `history` transitions long.
         reward_head: learn the reward as a probe of z whose gradient stops there, for planners that need it;
             the batch must then hold rewards.
-        discount: of the rewards, for objectives that ask.
-        weight_decay: of matrices.
+        discount: discount of the rewards per step, for planning for return.
+        weight_decay: weight decay of matrices.
 
     Raises:
         ValueError: a setting that cannot work.
@@ -206,11 +206,11 @@ class LeWorldModel(HistoryWorldModel):
         return self.history.push(z, action, predicted.view(*z.shape[:-1], -1))
 
     def embed(self, z: Tensor) -> Tensor:
-        """What goals are compared on: the newest frame's embedding (..., embed_dim)."""
+        """Embedding that goals are compared on: the newest frame's embedding (..., embed_dim)."""
         return self._comparable(self.history.last(z))
 
     def encode_goal(self, observation: TensorDictBase) -> Tensor:
-        """The embedding (..., embed_dim) of a goal: of its pictures where the model reads any (state vectors
+        """The embedding (..., embed_dim) of a goal: of its images where the model reads any (state vectors
         are not needed then), else of its state vectors."""
         if self.image_sizes:
             return self._picture(observation, batch_statistics=False)
@@ -311,7 +311,7 @@ class LeWorldModel(HistoryWorldModel):
         return self.head(x, batch_statistics=training)
 
     def _sigreg(self, frames: Tensor) -> Tensor:
-        """Of pictures and states apart: they tell of the same thing, so they cannot be independent."""
+        """SIGReg of images and states apart: both describe the same scene, so they cannot be independent."""
         parts = [part for part in (self.image_part, self.state_part) if part]
         values = [self.sigreg(x) for x in frames.split(parts, dim=-1)]
         return torch.stack(values).mean()

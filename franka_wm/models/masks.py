@@ -1,4 +1,4 @@
-"""Which tokens a JEPA sees and which it predicts: fixed numbers of them, drawn on the device.
+"""Masks of a JEPA: tokens that it sees and tokens that it predicts, fixed numbers of them, drawn on the device.
 
 A sampler is made for a grid of tokens, (time slots, rows, columns), numbered in that order. Called with a
 batch size it draws `Masks` for each entry. The numbers of tokens never vary, so that shapes are static: where

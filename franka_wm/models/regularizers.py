@@ -1,4 +1,4 @@
-"""What keeps embeddings apart when no decoder does, and how to see that they collapse.
+"""Regularisers that keep embeddings from collapsing without a decoder, and measures of collapse.
 
 All of it is computed in float32, on the device, with static shapes.
 """
@@ -141,7 +141,7 @@ class CollapseGuard(nn.Module):
         kind: one of `COLLAPSE`.
         coef: weight of the guard; None: 0.05 for sigreg (LeJEPA's); for vicreg 1, which with a prediction
             loss of weight 1 gives the published ratio 25 : 25 : 1.
-        directions: of SIGReg.
+        directions: random directions of SIGReg.
 
     Raises:
         ValueError: an unknown `kind`, or a negative `coef`.
@@ -231,7 +231,7 @@ class BatchNorm(nn.Module):
         return y.reshape(x.shape)
 
 
-# -- seeing a collapse -----------------------------------------------------------------------------------
+# -- measuring collapse -----------------------------------------------------------------------------------
 
 
 def feature_std(x: Tensor) -> Tensor:

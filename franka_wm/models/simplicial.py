@@ -1,4 +1,4 @@
-"""What TD-MPC2 and MuZero share: an encoder of vectors and images to simplices, and its inputs."""
+"""Base class of TD-MPC2 and MuZero: an encoder of vectors and images to simplices, and its inputs."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ class SimplicialWorldModel(WorldModel):
         simnorm_dim: features per simplex; divides `latent_dim`.
         encoder_dim: width of the encoder's hidden layers.
         encoder_layers: layers of the encoder, its output layer included.
-        channels: of each convolution over images.
+        channels: channels of each convolution over images.
         random_shift: pixels by which images are shifted at most while training, in each direction.
         encoder_from, encoder_architecture, encoder_grid, freeze_encoder: of a pretrained vision transformer, see
             `ImageEncoder`.

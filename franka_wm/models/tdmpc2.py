@@ -37,7 +37,7 @@ class TDMPC2(SimplicialWorldModel):
 
     z = h(s);  z' = d(z, a);  r = R(z, a);  q = Q(z, a);  a = π(z). Where episodes may terminate, a head on z' says
     whether they do, for planners (as in the authors' later code). The defaults are the published
-    5 M-parameter model for state observations, for pictures with `image_sizes` (shifted at random in `loss`
+    5 M-parameter model for state observations, for images with `image_sizes` (shifted at random in `loss`
     in training mode, never while planning), or for both. Latents (..., `latent_dim`) are simplices of `simnorm_dim`
     features, both from the encoder and from the dynamics. Rewards and values are in the units of the
     environment's reward.
@@ -56,8 +56,8 @@ class TDMPC2(SimplicialWorldModel):
 
     Args:
         observation_sizes: observation key -> size of its last dimension; encoded in this order. May be empty
-            where there are pictures.
-        image_sizes: picture key -> (height, width, channels), uint8.
+            where there are images.
+        image_sizes: image key -> (height, width, channels), uint8.
         action_dim: size of an action; each component lies in [-1, 1].
         episode_length: steps of an episode, from which the discount follows if it is not given:
             clamp((T/5 - 1) / (T/5), 0.95, 0.995).
@@ -83,8 +83,8 @@ class TDMPC2(SimplicialWorldModel):
             evaluated; False, as in the paper: at a sample, which counts the policy's noise as well.
         tau: how far target Q-functions, and the policy loss's scale, move at each update.
         encoder_lr_scale: learning rate of the encoder relative to the rest.
-        channels: of each convolution over pictures.
-        random_shift: pixels by which pictures are shifted at most, in each direction; the paper pads by 3 to 4.
+        channels: of each convolution over images.
+        random_shift: pixels by which images are shifted at most, in each direction; the paper pads by 3 to 4.
         encoder_from: start from the vision transformer of this checkpoint instead of convolutions, see
             `franka_wm.models.backbone.read_encoder`.
         encoder_architecture: the transformer's numbers; only to rebuild from a checkpoint.

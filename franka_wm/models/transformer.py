@@ -18,7 +18,7 @@ def block_causal_mask(frames: int, tokens: int = 1, device: torch.device | None 
 
     Args:
         frames: number of frames.
-        tokens: of each frame.
+        tokens: number of tokens of each frame.
 
     Returns:
         (frames · tokens, frames · tokens) bool, True where the row may attend to the column.
@@ -33,7 +33,7 @@ def hide_invalid(mask: Tensor, valid: Tensor, tokens: int = 1) -> Tensor:
     Args:
         mask: (L, L) bool, L = frames · tokens.
         valid: (N, frames), 1 (or True) where the frame is real.
-        tokens: of each frame.
+        tokens: number of tokens of each frame.
 
     Returns:
         (N, 1, L, L) bool. Every token keeps itself, so that no row is empty (its softmax would be nan).
@@ -60,8 +60,8 @@ class CausalBlock(nn.Module):
     at zero, so that the block starts as the identity.
 
     Args:
-        width: of the tokens.
-        heads, head_dim: of the attention; `head_dim` even.
+        width: size of a token.
+        heads, head_dim: heads of the attention and their size; `head_dim` even.
         hidden: width of the MLP.
         condition: size of the condition; without, a plain pre-norm block.
         dropout: after attention and inside the MLP, where `forward` is asked for it.
@@ -219,7 +219,7 @@ class TokenDynamics(nn.Module):
     Every token attends to all tokens of its own and earlier frames. Predicts the change, and starts with none.
 
     Args:
-        tokens, token_dim: of the pictures of one frame.
+        tokens, token_dim: of the images of one frame.
         state_dim: size of the state vector; 0: no state token.
         action_dim: size of an action.
         width, depth, heads, dropout: of the transformer.

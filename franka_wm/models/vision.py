@@ -1,6 +1,6 @@
-"""Encoders of pictures and clips: a small convolutional one, and a vision transformer.
+"""Encoders of images and clips: a small convolutional one, and a vision transformer.
 
-Pictures are uint8, channels last, (..., height, width, channels), as the environment emits them; they are
+Images are uint8, channels last, (..., height, width, channels), as the environment emits them; they are
 normalised here. Everything is device-side tensor code with static shapes.
 """
 
@@ -21,19 +21,19 @@ SIZES = {"tiny": (192, 12, 3), "small": (384, 12, 6)}
 
 
 class ConvEncoder(nn.Module):
-    """TD-MPC2's convolutional encoder for small pictures (arXiv:2310.16828, appendix H).
+    """TD-MPC2's convolutional encoder for small images (arXiv:2310.16828, appendix H).
 
-    Kernels 7, 5, 3, 3 with strides 2, 2, 2, 1, `channels` channels each, ReLU between them. Pictures are
+    Kernels 7, 5, 3, 3 with strides 2, 2, 2, 1, `channels` channels each, ReLU between them. Images are
     scaled to [-0.5, 0.5]. 64 × 64 pixels give `channels` × 4 × 4 = 512 features.
 
     (..., height, width, C) uint8 -> (..., features).
 
     Args:
         image_size: (height, width, channels).
-        channels: of every convolution.
+        channels: channels of every convolution.
 
     Raises:
-        ValueError: pictures too small for the four convolutions (less than 38 pixels a side).
+        ValueError: images too small for the four convolutions (less than 38 pixels a side).
     """
 
     KERNELS = ((7, 2), (5, 2), (3, 2), (3, 1))
@@ -47,7 +47,7 @@ class ConvEncoder(nn.Module):
             height, width = (height - kernel) // stride + 1, (width - kernel) // stride + 1
         if min(height, width) < 1:
             raise ValueError(
-                f"pictures of {image_size[0]} × {image_size[1]} pixels are too small for the convolutional "
+                f"images of {image_size[0]} × {image_size[1]} pixels are too small for the convolutional "
                 "encoder: it needs at least 38 × 38"
             )
         self.image_size, self.channels = image_size, channels
@@ -59,15 +59,15 @@ class ConvEncoder(nn.Module):
             inputs = channels
         self.network = nn.Sequential(*layers[:-1])  # what follows normalises; a last ReLU would lose half
 
-    def maps(self, pictures: Tensor) -> Tensor:
+    def maps(self, images: Tensor) -> Tensor:
         """(N, height, width, C) uint8 -> feature maps (N, channels, rows, columns)."""
         weight = self.network[0].weight
-        x = check_images(pictures).permute(0, 3, 1, 2).to(weight.dtype).div(255.0).sub(0.5)  # type: ignore[arg-type]
+        x = check_images(images).permute(0, 3, 1, 2).to(weight.dtype).div(255.0).sub(0.5)  # type: ignore[arg-type]
         return self.network(x)
 
-    def forward(self, pictures: Tensor) -> Tensor:
-        leading = pictures.shape[:-3]
-        return self.maps(pictures.reshape(-1, *pictures.shape[-3:])).reshape(*leading, self.features)
+    def forward(self, images: Tensor) -> Tensor:
+        leading = images.shape[:-3]
+        return self.maps(images.reshape(-1, *images.shape[-3:])).reshape(*leading, self.features)
 
 
 # -- the vision transformer ------------------------------------------------------------------------------
@@ -89,7 +89,7 @@ def sincos_grid(rows: Tensor, columns: Tensor, width: int) -> Tensor:
 
 
 def token_codes(slots: int, places: Tensor) -> Tensor:
-    """Add time to the codes of a grid (P, width): (slots · P, width). The first slot's are a picture's."""
+    """Add time to the codes of a grid (P, width): (slots · P, width). The first slot's are an image's."""
     if slots == 1:
         return places
     time = sincos(torch.arange(slots, device=places.device), places.shape[-1])
@@ -117,7 +117,7 @@ class Block(nn.Module):
 
 
 class Architecture(NamedTuple):
-    """What a `ViT` is built from; stored with its weights, so that these alone rebuild it."""
+    """Numbers that a `ViT` is built from. They are stored with its weights, which alone rebuild it."""
 
     height: int
     width_pixels: int
@@ -132,7 +132,7 @@ class Architecture(NamedTuple):
 
 
 class ViT(nn.Module):
-    """Vision transformer of pictures and clips (arXiv:2010.11929), of the visible patches only if asked.
+    """Vision transformer of images and clips (arXiv:2010.11929), of the visible patches only if asked.
 
     A token is a patch of `patch_size` × `patch_size` pixels, over `tubelet` frames in clips. Positions are
     fixed sine-cosine codes, space and time added. With `keep`, the pixels of the other patches are not even
@@ -179,7 +179,7 @@ class ViT(nn.Module):
                 raise ValueError(f"{name} must be at least 1, got {value}")
         if rows % patch_size or columns % patch_size:
             raise ValueError(
-                f"patch_size must divide the picture's sides, got {patch_size} and {rows} × {columns}"
+                f"patch_size must divide the image's sides, got {patch_size} and {rows} × {columns}"
             )
         if width % heads or width % 4:
             raise ValueError(f"width must be a multiple of 4 and of heads, got {width} and {heads}")
@@ -230,8 +230,8 @@ class ViT(nn.Module):
         """Encode.
 
         Args:
-            clips: pictures (N, height, width, C) or clips (N, T, height, width, C), uint8; T a multiple of
-                `tubelet`. A single picture is repeated to fill a tubelet. Pictures of another size than
+            clips: images (N, height, width, C) or clips (N, T, height, width, C), uint8; T a multiple of
+                `tubelet`. A single image is repeated to fill a tubelet. Images of another size than
                 `image_size` are fine if `patch_size` divides their sides: positions are scaled.
             keep: indices (N, n) of the tokens to compute, in any order; time leads, then rows, then columns.
                 All when None.
@@ -240,7 +240,7 @@ class ViT(nn.Module):
             (N, n, width), or (N, 1 + n, width) with the class token first.
 
         Raises:
-            ValueError: pictures that are not uint8, or sizes that do not divide.
+            ValueError: images that are not uint8, or sizes that do not divide.
         """
         if clips.dim() == 4:
             clips = clips.unsqueeze(1).expand(-1, self.tubelet, -1, -1, -1)
@@ -260,9 +260,9 @@ class ViT(nn.Module):
         """Codes of all tokens of a clip, (tokens, width).
 
         Args:
-            frames: of the clip.
+            frames: number of frames of the clip.
             grid: patches along rows and columns; the codes of another grid than the own are those of its
-                places on the same picture.
+                places on the same image.
         """
         device = self.code.device
         if grid is None or grid == self.grid:
@@ -291,7 +291,7 @@ class ViT(nn.Module):
 
 
 class Size(NamedTuple):
-    """Of a vision transformer."""
+    """Size of a vision transformer."""
 
     width: int
     depth: int

@@ -143,7 +143,7 @@ class CEM:
             )
             actions = torch.cat((mean.unsqueeze(1), *given, drawn), dim=1)
             elites = best(objective(rollout(z, actions, next), actions), self.num_elites)
-            mean, std = refit(take(actions, elites.index), elites.valid, mean, std, momentum=self.momentum)
+            mean, std = refit(take(actions, elites.which), elites.valid, mean, std, momentum=self.momentum)
             # Rounding can carry a mean of actions at a bound just past it.
             mean, std = mean.clamp(self.low, self.high), std.clamp(min=self.min_std)
             value = elites.mean_score()

@@ -217,7 +217,7 @@ class ICEM:
                 pool.append(mean.unsqueeze(1))
             actions = torch.cat(pool, dim=1)
             elites = best(objective(rollout(z, actions, next), actions), self.num_elites)
-            chosen = take(actions, elites.index)
+            chosen = take(actions, elites.which)
             kept = chosen[:, : self.num_kept]
             mean, std = refit(chosen, elites.valid, mean, std, momentum=self.momentum)
             # Rounding can carry a mean of actions at a bound just past it.

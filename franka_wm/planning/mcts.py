@@ -14,20 +14,20 @@ from franka_wm.planning.tree import Recurrent, Tree
 class MCTS:
     """Tree search over a model of E environments, as MuZero or as Gumbel MuZero acts.
 
-    Every simulation walks from the root to a move not tried yet, asks the model for what it leads to, and adds
-    the return found to every move on the way. The two variants differ in how they walk, act and teach:
+    Every simulation walks from the root to a action not tried yet, asks the model for what it leads to, and adds
+    the return found to every action on the way. The two variants differ in how they walk, act and teach:
 
-    `puct` (MuZero, Schrittwieser et al., arXiv:1911.08265). At each node the move of the largest
+    `puct` (MuZero, Schrittwieser et al., arXiv:1911.08265). At each node the action of the largest
     Q̂ + P · √N / (1 + n) · (`pb_c_init` + log((N + `pb_c_base` + 1) / `pb_c_base`)), with n the visits of the
-    move, N those of the node, and Q̂ the mean return of the move, scaled to [0, 1] by the smallest and largest
+    action, N those of the node, and Q̂ the mean return of the action, scaled to [0, 1] by the smallest and largest
     in the tree; 0 where n = 0. With `explore`, the priors of the root are mixed with Dirichlet noise, and the
     action is drawn from visits^(1/`temperature`); else the most visited one is taken. The policy target is the
     share of visits.
 
     `gumbel` (Danihelka et al., "Policy improvement by planning with Gumbel", ICLR 2022). The root takes the
     `max_num_considered_actions` best by Gumbel noise + logits and halves them in rounds by noise + logits +
-    σ(Q). σ(Q) = (`c_visit` + max n) · `c_scale` · Q, with Q completed (a move without visits counts as the
-    mixed value of its node) and scaled to [0, 1] within its node. Other nodes take, without noise, the move
+    σ(Q). σ(Q) = (`c_visit` + max n) · `c_scale` · Q, with Q completed (a action without visits counts as the
+    mixed value of its node) and scaled to [0, 1] within its node. Other nodes take, without noise, the action
     whose share of visits lags furthest behind softmax(logits + σ(Q)). The action is the best of the most
     visited; the policy target is softmax(logits + σ(Q)) at the root. The noise is there with `explore` alone.
     It improves the policy with any number of simulations, 2 as well, where PUCT may worsen it.
@@ -45,7 +45,7 @@ class MCTS:
         num_actions: M.
         num_simulations: model calls per search, one new node each.
         variant: `puct` or `gumbel`.
-        max_depth: the longest path in moves; None: as deep as the simulations reach.
+        max_depth: the longest path in actions; None: as deep as the simulations reach.
         pb_c_init, pb_c_base: weight of the prior, see above (PUCT).
         dirichlet_alpha, dirichlet_fraction: noise of the root (PUCT).
         temperature: of the drawn action (PUCT); 0 takes the most visited.
@@ -117,7 +117,7 @@ class MCTS:
         """Search for E environments.
 
         Args:
-            root_logits: (E, M) prior of the moves; need not be normalised.
+            root_logits: (E, M) prior of the actions; need not be normalised.
             root_value: (E, 1) the model's value of the root.
             root_embedding: (E, Z) latent of the root.
             recurrent: the model: (z (E, Z), action (E,) int64) -> next z (E, Z), reward (E, 1), discount
@@ -133,9 +133,9 @@ class MCTS:
         Raises:
             ValueError: a tensor of another shape.
         """
-        envs, moves = root_logits.shape[0], self.num_actions
-        if root_logits.shape != (envs, moves):
-            raise ValueError(f"root_logits must be (E, {moves}), got {tuple(root_logits.shape)}")
+        envs, actions = root_logits.shape[0], self.num_actions
+        if root_logits.shape != (envs, actions):
+            raise ValueError(f"root_logits must be (E, {actions}), got {tuple(root_logits.shape)}")
         if root_value.shape != (envs, 1):
             raise ValueError(f"root_value must be ({envs}, 1), got {tuple(root_value.shape)}")
         if root_embedding.dim() != 2 or root_embedding.shape[0] != envs:
@@ -143,13 +143,13 @@ class MCTS:
         tree = Tree(self.num_simulations + 1, root_value, root_embedding, self.max_depth)
         rule = (_Puct if self.variant == "puct" else _Gumbel)(self, tree, root_logits, explore, generator)
         for node in range(1, self.num_simulations + 1):
-            astray, moves_of = rule.choose(node)
-            last = tree.last(astray)
-            move = moves_of(last)
-            logits, used = tree.grow(node, last, move, recurrent)
+            off_path, actions_of = rule.choose(node)
+            last = tree.last(off_path)
+            action = actions_of(last)
+            logits, used = tree.grow(node, last, action, recurrent)
             if logits.shape != root_logits.shape:
                 raise ValueError(
-                    f"recurrent must return logits of shape ({envs}, {moves}), got {tuple(logits.shape)}"
+                    f"recurrent must return logits of shape ({envs}, {actions}), got {tuple(logits.shape)}"
                 )
             rule.add(node, logits, last, used)
         action, policy, visits = rule.result()
@@ -160,24 +160,24 @@ class MCTS:
 
 
 class _Puct:
-    """How MuZero walks and acts.
+    """MuZero's rule for choosing actions.
 
-    Among the moves of a node that were not tried yet, the one of the largest prior scores highest. So moves
+    Among the actions of a node that were not tried yet, the one of the largest prior scores highest. So actions
     are tried in the order of their priors, which is sorted once, and a node has one candidate besides the
-    moves that have slots: everything is (E, n) for n slots, whatever the number of moves.
+    actions that have slots: everything is (E, n) for n slots, whatever the number of actions.
     """
 
     def __init__(
         self, settings: MCTS, tree: Tree, logits: Tensor, explore: bool, generator: torch.Generator | None
     ) -> None:
         self.settings, self.tree, self.explore, self.generator = settings, tree, explore, generator
-        (envs, moves), slots = logits.shape, tree.slot.shape[0]
-        self.moves = moves
-        # One more column than moves: nothing is left to try.
-        self.priors = logits.new_full((envs, slots, moves + 1), -math.inf)
-        self.order = torch.zeros(envs, slots, moves + 1, device=logits.device, dtype=torch.int64)
+        (envs, actions), slots = logits.shape, tree.slot.shape[0]
+        self.actions = actions
+        # One more column than actions: nothing is left to try.
+        self.priors = logits.new_full((envs, slots, actions + 1), -math.inf)
+        self.order = torch.zeros(envs, slots, actions + 1, device=logits.device, dtype=torch.int64)
         self.tried = torch.zeros_like(tree.parent)
-        self.prior = torch.zeros_like(tree.value)  # of the move into each slot
+        self.prior = torch.zeros_like(tree.value)  # of the action into each slot
         count = torch.arange(slots + 2, device=logits.device, dtype=logits.dtype)
         self.weight = count.sqrt() * (
             ((count + settings.pb_c_base + 1.0) / settings.pb_c_base).log() + settings.pb_c_init
@@ -196,7 +196,7 @@ class _Puct:
         return draw / draw.sum(-1, keepdim=True)
 
     def _sort(self, node: int, prior: Tensor) -> None:
-        self.priors[:, node, : self.moves], self.order[:, node, : self.moves] = prior.sort(
+        self.priors[:, node, : self.actions], self.order[:, node, : self.actions] = prior.sort(
             dim=-1, descending=True, stable=True
         )
 
@@ -206,7 +206,7 @@ class _Puct:
         weight = self.weight[visits.long()]
         untried = self.priors[:, :nodes].gather(2, self.tried[:, :nodes, None]).squeeze(-1)
         best = weight * untried
-        astray = torch.zeros_like(best, dtype=torch.bool)
+        off_path = torch.zeros_like(best, dtype=torch.bool)
         if nodes > 1:
             q, parent = tree.q(nodes), tree.parent[:, 1:nodes]
             low, high = self._range(q)
@@ -215,8 +215,8 @@ class _Puct:
                 score, weight.gather(1, parent), self.prior[:, 1:nodes] / (visits[:, 1:] + 1.0)
             )
             best.scatter_reduce_(1, parent, score, "amax")
-            astray[:, 1:] = score < best.gather(1, parent)
-        return astray, lambda last: self.order[tree.env, last, self.tried[tree.env, last]]
+            off_path[:, 1:] = score < best.gather(1, parent)
+        return off_path, lambda last: self.order[tree.env, last, self.tried[tree.env, last]]
 
     def _range(self, q: Tensor) -> tuple[Tensor, Tensor]:
         """The smallest and largest Q of the tree (E, 1)."""
@@ -237,43 +237,43 @@ class _Puct:
         self._sort(node, logits.softmax(-1))
 
     def result(self) -> tuple[Tensor, Tensor, Tensor]:
-        visits = self.tree.root_visits(self.moves)
+        visits = self.tree.root_visits(self.actions)
         score = visits
         if self.explore and self.settings.temperature > 0.0:
-            # The largest of log p + Gumbel noise is a draw from p; a move without visits has p = 0.
+            # The largest of log p + Gumbel noise is a draw from p; a action without visits has p = 0.
             score = visits.log() / self.settings.temperature + _gumbel_noise(visits, self.generator)
         return score.argmax(-1), visits / visits.sum(-1, keepdim=True), visits
 
 
 class _Gumbel:
-    """How Gumbel MuZero walks and acts; scores of all moves of all nodes, (E, n, M)."""
+    """Gumbel MuZero's rule for choosing actions; scores of all actions of all nodes, (E, n, M)."""
 
     def __init__(
         self, settings: MCTS, tree: Tree, logits: Tensor, explore: bool, generator: torch.Generator | None
     ) -> None:
         self.settings, self.tree = settings, tree
-        self.moves, slots = logits.shape[1], tree.slot.shape[0]
-        self.logits = logits.new_zeros(logits.shape[0], slots, self.moves)
+        self.actions, slots = logits.shape[1], tree.slot.shape[0]
+        self.logits = logits.new_zeros(logits.shape[0], slots, self.actions)
         self.logits[:, 0] = logits.log_softmax(-1)
         self.noise = _gumbel_noise(logits, generator) if explore else torch.zeros_like(logits)
         self.schedule = sequential_halving(
-            min(settings.max_num_considered_actions, self.moves), settings.num_simulations
+            min(settings.max_num_considered_actions, self.actions), settings.num_simulations
         )
 
     def _sigma(self, nodes: int, slots: int) -> tuple[Tensor, Tensor]:
-        """Visits, and σ of the completed Q, of the moves of the first `nodes` (E, nodes, M).
+        """Visits, and σ of the completed Q, of the actions of the first `nodes` (E, nodes, M).
 
         Args:
             slots: how many are filled.
         """
-        tree, shape = self.tree, (self.logits.shape[0], nodes, self.moves)
-        visits = self.logits.new_zeros(shape[0], slots * self.moves)
+        tree, shape = self.tree, (self.logits.shape[0], nodes, self.actions)
+        visits = self.logits.new_zeros(shape[0], slots * self.actions)
         q = torch.zeros_like(visits)
         if slots > 1:
-            index = torch.add(tree.move[:, 1:slots], tree.parent[:, 1:slots], alpha=self.moves)
+            index = torch.add(tree.action[:, 1:slots], tree.parent[:, 1:slots], alpha=self.actions)
             visits.scatter_(1, index, tree.visits[:, 1:slots])
             q.scatter_(1, index, tree.q(slots))
-        visits, q = (x[:, : nodes * self.moves].view(shape) for x in (visits, q))
+        visits, q = (x[:, : nodes * self.actions].view(shape) for x in (visits, q))
         visited = visits > 0
         # The mixed value: the model's own, and the mean Q of what was visited, by prior.
         tiny = torch.finfo(q.dtype).tiny
@@ -287,9 +287,9 @@ class _Gumbel:
         return visits, scale * ((q - low) / (high - low).clamp_min(_tiny(q)))
 
     def _root_score(self, visits: Tensor, sigma: Tensor, considered: Tensor | int) -> Tensor:
-        """noise + logits + σ(Q) of the root's moves (E, M); -inf unless they have `considered` visits."""
+        """noise + logits + σ(Q) of the root's actions (E, M); -inf unless they have `considered` visits."""
         score = self.noise + self.logits[:, 0] + sigma[:, 0]
-        # A floor, or a move with a prior of nearly 0 would be no better than one out of turn.
+        # A floor, or a action with a prior of nearly 0 would be no better than one out of turn.
         return score.clamp_min(-1e9).masked_fill(visits[:, 0] != considered, -math.inf)
 
     def choose(self, nodes: int) -> tuple[Tensor, Callable[[Tensor], Tensor]]:
@@ -298,9 +298,9 @@ class _Gumbel:
         improved = (self.logits[:, :nodes] + sigma).softmax(-1)
         choice = (improved - visits / tree.visits[:, :nodes, None]).argmax(-1)
         choice[:, 0] = self._root_score(visits, sigma, self.schedule[nodes - 1]).argmax(-1)
-        astray = choice.gather(1, tree.parent[:, :nodes]) != tree.move[:, :nodes]
-        astray[:, 0] = False
-        return astray, lambda last: choice[tree.env, last]
+        off_path = choice.gather(1, tree.parent[:, :nodes]) != tree.action[:, :nodes]
+        off_path[:, 0] = False
+        return off_path, lambda last: choice[tree.env, last]
 
     def add(self, node: int, logits: Tensor, last: Tensor, used: Tensor | None) -> None:
         self.logits[:, node] = logits.log_softmax(-1)
@@ -313,13 +313,13 @@ class _Gumbel:
 
 
 def sequential_halving(considered: int, simulations: int) -> list[int]:
-    """How many visits a root move must have to be eligible, for each simulation in turn.
+    """How many visits a root action must have to be eligible, for each simulation in turn.
 
-    The moves with that many visits are the ones still considered; each round gives them equally many visits
+    The actions with that many visits are the ones still considered; each round gives them equally many visits
     and keeps the better half, never fewer than two (Danihelka et al., ICLR 2022, figure 1).
 
     Args:
-        considered: moves in the first round.
+        considered: actions in the first round.
         simulations: length of the result.
     """
     if considered <= 1:

@@ -193,20 +193,20 @@ class GoalDistance(Objective):
 
 
 class GoalImage(Objective):
-    """Minus the distance to what the goal's picture, or its pictures from several cameras, look like to the model.
+    """Minus the distance to the embedding of the goal's image, or of its images from several cameras.
 
     They are encoded once per decision, by `bind`; planning then is `GoalDistance`.
 
     Args:
-        encode_goal: observation of a goal, a TensorDict of batch size [E] with the goal's pictures -> (E, D). It
+        encode_goal: observation of a goal, a TensorDict of batch size [E] with the goal's images -> (E, D). It
             holds nothing else: other entries of the present observation (joint angles) are not those of the goal.
         embed: latents (..., Z) -> (..., D), the space of `encode_goal`; None: the latents themselves.
-        goals: key that the model's encoder reads -> key of the goal's picture in the observation,
+        goals: key that the model's encoder reads -> key of the goal's image in the observation,
             (E, H, W, C) uint8. None: `pixels` -> `goal_pixels`.
         metric, summed: see `GoalDistance`.
 
     Raises:
-        ValueError: there is no such metric, or no picture.
+        ValueError: there is no such metric, or no image.
     """
 
     def __init__(
@@ -220,7 +220,7 @@ class GoalImage(Objective):
         _require_metric(metric)
         self.goals = {"pixels": "goal_pixels"} if goals is None else dict(goals)
         if not self.goals:
-            raise ValueError("goals is empty: name at least one picture")
+            raise ValueError("goals is empty: name at least one image")
         self.encode_goal, self.embed = encode_goal, embed
         self.metric: Metric = metric
         self.summed = summed
@@ -230,16 +230,16 @@ class GoalImage(Objective):
         """The objective of the present decision.
 
         Raises:
-            ValueError: the observation has no picture of the goal.
+            ValueError: the observation has no image of the goal.
         """
-        pictures = {key: tensordict.get(goal, None) for key, goal in self.goals.items()}
-        for key, picture in pictures.items():
-            if picture is None:
+        images = {key: tensordict.get(goal, None) for key, goal in self.goals.items()}
+        for key, image in images.items():
+            if image is None:
                 raise ValueError(
-                    f"the observation has no {self.goals[key]!r}, the picture of the goal to plan towards: "
+                    f"the observation has no {self.goals[key]!r}, the image of the goal to plan towards: "
                     "add goal_pixels to env.observations"
                 )
-        observation = TensorDict(pictures, batch_size=tensordict.batch_size)
+        observation = TensorDict(images, batch_size=tensordict.batch_size)
         return GoalDistance(self.encode_goal(observation), self.summed, metric=self.metric, embed=self.embed)
 
     def __call__(self, trajectory: Tensor, actions: Tensor) -> Tensor:

@@ -7,7 +7,7 @@ file in `conf/planner` with `name:` and the constructor's arguments.
 from importlib import import_module
 from typing import Any
 
-# name -> (module, class, whether it chooses among moves, what it is in one line)
+# name -> (module, class, whether it chooses among discrete actions, what it is in one line)
 _PLANNERS: dict[str, tuple[str, str, bool, str]] = {
     "mppi": (
         "franka_wm.planning.mppi",
@@ -35,7 +35,7 @@ def available() -> dict[str, str]:
 
 
 def is_search(name: str) -> bool:
-    """Whether the planner chooses among numbered moves (tree search), instead of continuous actions.
+    """Whether the planner chooses among discrete actions (tree search), instead of continuous actions.
 
     Raises:
         ValueError: no planner has this name.
@@ -50,7 +50,7 @@ def register(name: str, cls: type, *, search: bool = False, line: str = "") -> N
     Args:
         name: what `planner.name` will say.
         cls: built with `action_dim=…` (with `num_actions=…` if `search`) and the rest of the configuration.
-        search: whether it chooses among numbered moves.
+        search: whether it chooses among discrete actions.
         line: what it is.
     """
     _REGISTERED[name] = (cls, search, line)

@@ -1,4 +1,4 @@
-"""What the planners share: the start of a search, rollouts of candidates, and which candidates are the best.
+"""Shared parts of the planners: the start of a search, rollouts of candidates, and the best candidates.
 
 E environments, S candidates, H steps, A action components, D the size of a latent.
 """
@@ -20,7 +20,7 @@ Prior = Callable[[Tensor], Tensor]
 
 
 class Planner(Protocol):
-    """What a policy asks of a planner; see `franka_wm.planning.MPPI.plan` for the shapes."""
+    """Interface of a planner; see `franka_wm.planning.MPPI.plan` for the shapes."""
 
     def plan(
         self,
@@ -184,7 +184,7 @@ def explored(
 class Elites(NamedTuple):
     """The best candidates of each environment, best first."""
 
-    index: Tensor
+    which: Tensor
     """(E, K): which candidates they are."""
     scores: Tensor
     """(E, K), always finite: the worst valid score (0 if none is valid) stands in for one that is not."""

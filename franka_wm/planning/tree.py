@@ -14,15 +14,15 @@ _BITS = 62  # of an int64, so that no sum of bits overflows
 class Tree:
     """N slots for each of E environments: slot 0 is the root, slot n what simulation n reached.
 
-    A slot stands for a node and for the move into it. Walking down and adding up need no loop over depth,
+    A slot stands for a node and for the action into it. Walking down and adding up need no loop over depth,
     because each slot keeps which slots are above it, as bits (`above`), and the discounted reward on the way
     from each of them (`paths`): to find the nodes on a chosen path is one comparison, and to update them one
     addition.
 
     Attributes:
         embedding: (E, N, Z) latents.
-        value, reward, discount: (E, N), the model's value of the node, and what the move into it brought.
-        parent, move, depth: (E, N) int64: the slot above, the move that led here, moves from the root.
+        value, reward, discount: (E, N), the model's value of the node, and what the action into it brought.
+        parent, action, depth: (E, N) int64: the slot above, the action that led here, actions from the root.
         visits: (E, N), simulations that ended here or passed through; 1 at first, for the root too.
         returns: (E, N), the sum over these visits of the return from here on.
         above: (E, N, W) int64, the slots above and the slot itself as bits, `_BITS` to a word.
@@ -34,7 +34,7 @@ class Tree:
         slots: N.
         value: (E, 1) of the root.
         embedding: (E, Z) of the root.
-        max_depth: the longest path in moves; None: no limit.
+        max_depth: the longest path in actions; None: no limit.
     """
 
     def __init__(self, slots: int, value: Tensor, embedding: Tensor, max_depth: int | None = None) -> None:
@@ -45,7 +45,7 @@ class Tree:
 
         self.embedding = embedding.new_empty(envs, slots, embedding.shape[1])
         self.value, self.reward, self.discount = numbers(), numbers(), numbers()
-        self.parent, self.move = numbers(of=torch.int64), numbers(of=torch.int64)
+        self.parent, self.action = numbers(of=torch.int64), numbers(of=torch.int64)
         self.visits, self.returns = torch.ones_like(self.value), numbers()
         self.paths = numbers(3, slots)
         self.paths[:, :, :_REWARD].diagonal(dim1=1, dim2=3).fill_(1.0)  # a slot from itself
@@ -62,20 +62,20 @@ class Tree:
         self.value[:, 0] = self.returns[:, 0] = value.squeeze(-1)
 
     def q(self, slots: int) -> Tensor:
-        """Mean return (E, slots - 1) of the moves into slots 1 … slots - 1, from the slots above them."""
+        """Mean return (E, slots - 1) of the actions into slots 1 … slots - 1, from the slots above them."""
         held = slice(1, slots)
         mean = self.returns[:, held] / self.visits[:, held]
         return torch.addcmul(self.reward[:, held], self.discount[:, held], mean)
 
-    def last(self, astray: Tensor) -> Tensor:
+    def last(self, off_path: Tensor) -> Tensor:
         """The slot (E,) where the chosen path ends.
 
         Args:
-            astray: (E, n) bool for the first n slots: the slot above would choose another move. Where equal
-                moves are all chosen, the path to the newest slot counts.
+            off_path: (E, n) bool for the first n slots: the slot above would choose another action. Where equal
+                actions are all chosen, the path to the newest slot counts.
         """
-        nodes = astray.shape[1]
-        off = (astray.unsqueeze(-1) * self.bits[:nodes]).sum(1, keepdim=True)  # (E, 1, W)
+        nodes = off_path.shape[1]
+        off = (off_path.unsqueeze(-1) * self.bits[:nodes]).sum(1, keepdim=True)  # (E, 1, W)
         on_path = ((self.above[:, :nodes] & off) == 0).all(-1)
         if self.attached is not None:
             on_path = on_path & self.attached[:, :nodes]
@@ -83,9 +83,9 @@ class Tree:
         return (on_path * self.slot[:nodes]).amax(-1)
 
     def grow(
-        self, node: int, last: Tensor, move: Tensor, recurrent: Recurrent
+        self, node: int, last: Tensor, action: Tensor, recurrent: Recurrent
     ) -> tuple[Tensor, Tensor | None]:
-        """Ask the model what `move` (E,) leads to from the slots `last` (E,), put it into slot `node`, and add
+        """Ask the model what `action` (E,) leads to from the slots `last` (E,), put it into slot `node`, and add
         its return to every slot above.
 
         Where `last` is at `max_depth` it is itself what is evaluated, once more, and slot `node` stays unused.
@@ -97,16 +97,16 @@ class Tree:
         if self.attached is not None and self.max_depth is not None:
             used = self.depth[self.env, last] < self.max_depth
             parent = torch.where(used, last, self.parent[self.env, last])
-            move = torch.where(used, move, self.move[self.env, last])
+            action = torch.where(used, action, self.action[self.env, last])
             # A slot that stands for nothing hangs on itself.
             self.parent[:, node] = torch.where(used, parent, node)
             self.depth[:, node] = self.depth[self.env, parent] + 1
             self.attached[:, node] = used
         else:
             self.parent[:, node] = parent
-        self.move[:, node] = move
+        self.action[:, node] = action
 
-        embedding, reward, discount, logits, value = recurrent(self.embedding[self.env, parent], move)
+        embedding, reward, discount, logits, value = recurrent(self.embedding[self.env, parent], action)
         if node == 1:
             _check(self.visits.shape[0], reward=reward, discount=discount, value=value)
         self.embedding[:, node] = embedding
@@ -126,11 +126,11 @@ class Tree:
         self.returns[:, :node] += torch.addcmul(gained, scale, value)  # 0 where not above
         return logits, used
 
-    def root_visits(self, moves: int) -> Tensor:
-        """Visits (E, M) of the root's moves."""
+    def root_visits(self, actions: int) -> Tensor:
+        """Visits (E, M) of the root's actions."""
         under_root = (self.parent[:, 1:] == 0) * self.visits[:, 1:]
-        return self.visits.new_zeros(self.visits.shape[0], moves).scatter_add_(
-            1, self.move[:, 1:], under_root
+        return self.visits.new_zeros(self.visits.shape[0], actions).scatter_add_(
+            1, self.action[:, 1:], under_root
         )
 
 

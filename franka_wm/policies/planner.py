@@ -48,7 +48,7 @@ class PlannerPolicy(TensorDictModuleBase):
     A model with memory (`observe`) predicts from a history that its latents hold. Then the last latent and
     the action taken in it travel along, too, as `context` (E, Z) and `context_action` (E, A).
 
-    An objective that depends on the observation (a goal picture) has `bind(tensordict)`, which is called at
+    An objective that depends on the observation (a goal image) has `bind(tensordict)`, which is called at
     every decision. It sees what the policy reads: other entries that it needs are named by its `in_keys`.
 
     On CUDA the third decision of a kind (so many environments, exploring or not, these settings) is captured as

@@ -1,5 +1,8 @@
 """Policies that need no learning, as TensorDict modules that a TorchRL collector can run."""
 
+# TorchRL declares in_keys and out_keys as properties, and lets classes set them as plain lists.
+# pyright: reportIncompatibleMethodOverride=false
+
 from __future__ import annotations
 
 import math

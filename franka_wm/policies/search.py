@@ -1,4 +1,4 @@
-"""A policy that a TorchRL collector can run: tree search over a world model with a discrete set of moves."""
+"""A policy that a TorchRL collector can run: tree search over a world model with discrete actions."""
 
 from __future__ import annotations
 

@@ -144,7 +144,12 @@ def test_prediction_is_the_trained_one_at_every_length_of_history(dots):
         z = model.observe(batch["next"][:, t], z, batch["action"][:, t], never)
 
 
-@pytest.mark.parametrize("collapse", ["sigreg", "vicreg", "ema"])
+SLOW = pytest.mark.slow
+
+
+@pytest.mark.parametrize(
+    "collapse", ["sigreg", pytest.param("vicreg", marks=SLOW), pytest.param("ema", marks=SLOW)]
+)
 def test_trained_along_the_encoder_does_not_collapse_and_actions_matter(collapse, dots):
     model = small(collapse=collapse)
     with torch.no_grad():

@@ -81,8 +81,8 @@ def test_the_best_are_those_with_the_highest_finite_scores():
     nan, inf = torch.nan, torch.inf
     scores = torch.tensor([[1.0, nan, 3.0, inf, 2.0], [nan, nan, -5.0, -inf, nan], [nan] * 5])
     elites = best(scores, 2)
-    assert elites.index[0].tolist() == [2, 4] and elites.valid[0].all()
-    assert elites.index[1, 0] == 2 and elites.valid[1].tolist() == [True, False]
+    assert elites.which[0].tolist() == [2, 4] and elites.valid[0].all()
+    assert elites.which[1, 0] == 2 and elites.valid[1].tolist() == [True, False]
     assert elites.scores[1].tolist() == [-5.0, -5.0] and not elites.valid[2].any()
     assert elites.mean_score().flatten().tolist() == [2.5, -5.0, 0.0]
 
