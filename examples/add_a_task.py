@@ -22,7 +22,7 @@ def place_goal(mask: wp.array[wp.bool], height: float, goal: wp.array2d[float]):
 
 
 @wp.kernel
-def judge_height(
+def height_reward(
     state: wp.array2d[float], height: float, reward: wp.array2d[float], success: wp.array2d[wp.bool]
 ):
     world = wp.tid()
@@ -43,10 +43,10 @@ class RaiseTool(Task):
     def reset(self, sim, mask):
         wp.launch(place_goal, sim.num_envs, [mask, HEIGHT, sim.warp.task_goal], device=sim.device)
 
-    def judge(self, sim):
+    def reward_and_success(self, sim):
         w = sim.warp
         inputs = [w.next_true_state, HEIGHT, w.reward, w.success]
-        wp.launch(judge_height, sim.num_envs, inputs, device=sim.device)
+        wp.launch(height_reward, sim.num_envs, inputs, device=sim.device)
 
     def measures(self, sim):
         return {"height [m]": sim.tensors.next_true_state[:, 16]}

@@ -25,7 +25,7 @@ from franka_wm.envs.frames import FrameStack
 from franka_wm.envs.kinematics import Kinematics
 from franka_wm.envs.robots import load_robot
 from franka_wm.envs.simulation import STATISTICS, Simulation
-from franka_wm.envs.tasks import Task, goal_distance, reach_reward
+from franka_wm.envs.tasks import Task, goal_distance
 from franka_wm.errors import UserError
 from franka_wm.seeding import derive_seed
 
@@ -391,16 +391,12 @@ class FrankaEnv(EnvBase):
         return goal_distance(self.simulation.tensors.state)
 
     def reward(self, action: torch.Tensor) -> torch.Tensor:
-        """Reward of having applied ``action`` (N, 7) and being in the present state, (N, 1)."""
-        c, sim = self.config, self.simulation
-        return reach_reward(
-            sim.tensors.true_state,
-            action,
-            kind=c.reward,
-            action_penalty=c.action_penalty,
-            success_distance=c.success_distance,
-            initial_distance=sim.tensors.initial_distance.unsqueeze(-1),
-        )
+        """Reward of having applied ``action`` (N, 7) and being in the present state, (N, 1).
+
+        Raises:
+            UserError: A task of one's own has its reward in a kernel: read it from a step.
+        """
+        return self.simulation.task.present_reward(self.simulation, action)
 
     def is_finite(self) -> torch.Tensor:
         """(N,) bool: health of each world's present state."""

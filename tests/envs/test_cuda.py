@@ -15,6 +15,8 @@ from torch.profiler import ProfilerActivity, profile
 
 from franka_wm.envs import FrankaConfig, FrankaEnv, Randomization, TransformedFrankaEnv
 from franka_wm.envs.discretize import DiscreteActions
+from franka_wm.envs.tasks import TorchTask
+from franka_wm.errors import UserError
 from franka_wm.training.learner import Learner
 
 pytestmark = [
@@ -105,6 +107,64 @@ def test_no_step_waits_or_copies(case: str) -> None:
     assert copies == []
     # One is ours, after the steps; the profiler's own stop may add a few, but never one for each step.
     assert len(waits) < STEPS // 2
+
+
+class Hover(TorchTask):
+    """A task in torch, with everything that one may do: draws, a goal, reward and success."""
+
+    def goal(self, draws: torch.Tensor) -> torch.Tensor:
+        x, y, z = draws[:, :3].unbind(-1)
+        return torch.stack([0.3 + 0.2 * x, 0.5 * y - 0.25, 0.3 + 0.4 * z], -1)
+
+    def reward(self, state: torch.Tensor, action: torch.Tensor) -> torch.Tensor:
+        return -torch.tanh(state[..., 17:20].norm(dim=-1)) - 0.01 * action.square().mean(-1)
+
+    def success(self, state: torch.Tensor) -> torch.Tensor:
+        return state[..., 17:20].norm(dim=-1) < 0.2
+
+
+def hover(device: str, **changes: Any) -> FrankaEnv:
+    config = FrankaConfig(**BASE | {"terminate_on_success": True} | changes)
+    return FrankaEnv(config, num_envs=N, device=device, task=Hover(config))
+
+
+@pytest.mark.parametrize("observations", [("state", "joint_target"), ("state", "goal_pixels")])
+def test_a_task_in_torch_is_part_of_the_graph(observations: tuple[str, ...], random_actions) -> None:
+    """Nothing waits, its functions are not called again, other work of torch's does not disturb it, the CPU agrees."""
+    actions = 0.3 * random_actions(N, STEPS)
+    expected = play(hover("cpu", observations=observations), actions)
+    env = hover("cuda", observations=observations)
+    got = play(env, actions.cuda())
+    check_agreement(expected, {key: value.cpu() for key, value in got.items()})
+
+    def never(*_: Any) -> torch.Tensor:
+        raise AssertionError
+
+    for name in ("goal", "reward", "success"):
+        setattr(env.simulation.task, name, never)
+    tensordict = env.reset(seed=3)
+    torch.cuda.empty_cache()
+    with no_waiting():
+        others, again = [], []
+        for action in actions.cuda()[..., : env.action_dim].unbind(1):
+            others += [torch.full((k * k,), float("nan"), device="cuda") for k in (8, 64, 512)]
+            step, tensordict = env.step_and_maybe_reset(tensordict.set("action", action))
+            again.append(step["next"].clone())
+    for key, value in got.items():
+        assert torch.equal(torch.stack(again)[key], value), key
+    assert all(other.isnan().all() for other in others)
+
+
+def test_a_task_in_torch_that_waits_is_told_so() -> None:
+    class Waiting(Hover):
+        def success(self, state: torch.Tensor) -> torch.Tensor:
+            return state[..., 16] > state[0, 16].item()
+
+    config = FrankaConfig(**BASE)
+    env = FrankaEnv(config, num_envs=N, device="cuda", task=Waiting(config))
+    tensordict = env.reset()
+    with pytest.raises(UserError, match="must not wait"):
+        env.step(tensordict.set("action", env.rand_action(tensordict)["action"]))
 
 
 def test_no_step_waits_under_transforms() -> None:

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import importlib.util
 import math
-import re
 
 import pytest
 import torch
@@ -67,9 +65,9 @@ def test_rewards_equal_those_in_torch(small_env, random_actions, kind: str) -> N
         )
 
 
-def test_a_subclass_that_judges_otherwise_has_no_bounds_but_its_own() -> None:
+def test_a_subclass_with_another_reward_has_no_bounds_but_its_own() -> None:
     class Doubled(Reach):
-        def judge(self, sim) -> None: ...
+        def reward_and_success(self, sim) -> None: ...
 
     class Bounded(Doubled):
         reward_bounds = (-2.0, 0.0)
@@ -138,16 +136,9 @@ def test_track_around_a_drawn_center(small_env) -> None:
 
 
 @pytest.fixture(scope="module")
-def height(root, tmp_path_factory):
-    """The class that docs/tasks.md prints."""
-    blocks = re.findall(r"```python\n(.*?)```", (root / "docs" / "tasks.md").read_text(), re.DOTALL)
-    path = tmp_path_factory.mktemp("task") / "height.py"
-    path.write_text(next(block for block in blocks if "class Height(Task)" in block))
-    spec = importlib.util.spec_from_file_location("height", path)
-    assert spec is not None and spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)  # Warp reads a kernel's source from its file
-    return module.Height
+def height(printed_class):
+    """The class in Warp that docs/tasks.md prints."""
+    return printed_class("Height(Task)", lines=60)
 
 
 @pytest.mark.parametrize("auto_reset", ["native", "standard"])
@@ -180,11 +171,18 @@ def test_the_documented_task(height, random_actions, auto_reset: str) -> None:
     )
 
 
-@pytest.mark.parametrize(("method", "word"), [("reset", "goal"), ("judge", "reward")])
+@pytest.mark.parametrize(("method", "word"), [("reset", "goal"), ("reward_and_success", "reward")])
 def test_a_task_without_goal_or_reward_says_so(method: str, word: str) -> None:
     arguments = (None, None)[: 2 if method == "reset" else 1]
     with pytest.raises(NotImplementedError, match=word):
         getattr(Task(FrankaConfig()), method)(*arguments)
+
+
+def test_the_old_name_of_a_method_names_the_new_one() -> None:
+    with pytest.raises(UserError, match=r"Old\.judge: .*reward_and_success"):
+
+        class Old(Task):
+            def judge(self, sim) -> None: ...
 
 
 def test_an_unknown_task_or_reward() -> None:
@@ -203,7 +201,7 @@ def test_relabel_speaks_only_for_the_task_that_defines_it() -> None:
     class Faster(Reach):
         """Another reward: what Reach says of other goals is not true of it."""
 
-        def judge(self, sim) -> None:
+        def reward_and_success(self, sim) -> None:
             raise AssertionError
 
     class Told(Faster):

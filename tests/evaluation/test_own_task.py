@@ -71,7 +71,7 @@ def test_reach_is_judged_by_distances_as_ever(small_env) -> None:
 
 def test_a_subclass_of_reach_that_judges_otherwise_is_judged_by_itself() -> None:
     class Otherwise(Reach):
-        def judge(self, sim) -> None: ...
+        def reward_and_success(self, sim) -> None: ...
 
     class Near(Otherwise):
         goal_distance = True

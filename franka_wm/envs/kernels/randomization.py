@@ -101,3 +101,15 @@ def draw_dynamics(
         f = 1.0 + wp.randf(rng, -mass_width, mass_width)
         mass[world, b] = plain_mass[world, b] * f
         inertia[world, b] = plain_inertia[world, b] * f
+
+
+@wp.kernel(enable_backward=False)
+def draw_uniform(
+    mask: wp.array[wp.bool], seed: wp.array[int], episode: wp.array[int], draws: wp.array2d[float]
+):
+    """Numbers in [0, 1) for the tasks of the masked worlds' new episodes."""
+    world = wp.tid()
+    if mask[world]:
+        rng = episode_rng(seed[0], world, episode[world], 7)
+        for k in range(draws.shape[1]):
+            draws[world, k] = wp.randf(rng)

@@ -38,6 +38,7 @@ class Arrays[T]:
         task_goal: (N, 3) the goal of the episode [m], which ``goal`` and ``state`` observe.
         goal_q: (N, 7) joints that reach it [rad].
         goal_center, phase: (N, 3) [m] and (N,) [rad], of the circle that a moving goal follows.
+        draws: (N, D) uniform in [0, 1), new in each episode: random numbers for the task.
         initial_distance: (N,) tool to goal at the start of the episode [m], or what else a task notes there.
         target: (N, 7) what the servo was told last [rad].
         history: (N, latency + 1, A), actions not yet applied; a ring.
@@ -77,6 +78,7 @@ class Arrays[T]:
     goal_q: T
     goal_center: T
     phase: T
+    draws: T
     initial_distance: T
     target: T
     history: T
@@ -100,7 +102,13 @@ class Arrays[T]:
 
 
 def allocate(
-    config: FrankaConfig, model: newton.Model, state: newton.State, control: newton.Control, seed: int
+    config: FrankaConfig,
+    model: newton.Model,
+    state: newton.State,
+    control: newton.Control,
+    *,
+    seed: int,
+    draws: int,
 ) -> tuple[Arrays[torch.Tensor], Arrays[wp.array]]:
     """The arrays of all worlds in torch and in Warp; those of Newton's state and control are views of these."""
     n, device = model.world_count, str(wp.device_to_torch(model.device))
@@ -144,6 +152,7 @@ def allocate(
         goal_q=zeros(n, NUM_JOINTS),
         goal_center=zeros(n, 3),
         phase=zeros(n),
+        draws=zeros(n, draws),
         initial_distance=torch.ones(n, device=device),
         target=zeros(n, NUM_JOINTS),
         history=zeros(n, slots, actions),

@@ -2,11 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
-from contextlib import AbstractContextManager
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 
 import torch
 import warp as wp
+
+from franka_wm.errors import UserError
+
+Function = Callable[[], None]
+Recording = list[wp.Graph | Function]
+"""One graph; on the CPU, where torch cannot be recorded, graphs with functions in torch between them."""
 
 
 class Recorder:
@@ -19,52 +25,90 @@ class Recorder:
     def __init__(self, device: str):
         self.device = wp.get_device(device)
         self._torch = torch.device(device)
+        self._pieces: Recording | None = None  # of the recording under way
+        # Replays write where torch's operations wrote while they were recorded: nothing else may live there.
+        self._pool = torch.cuda.MemPool() if self.device.is_cuda else None
 
     def record(
-        self,
-        launches: Callable[[], None],
-        keep: Iterable[wp.array],
-        warm_up: Callable[[], None],
-        restored: Callable[[], None],
-    ) -> wp.Graph:
+        self, launches: Function, keep: Iterable[wp.array], warm_up: Function, restored: Function
+    ) -> Recording:
         """Records ``launches``; whatever it does to the arrays in ``keep`` is undone.
 
         The kernels are compiled, and the solver's buffers allocated, by one run outside the capture, on the
         real arrays; hence the backup.
 
         Args:
-            launches: What to record; it only launches.
+            launches: What to record; it only launches, and calls :meth:`run`.
             keep: Every array that a launch may change and that outlives it.
             warm_up: Called first, so that even what only some steps run is compiled before the capture.
             restored: Called at the end, when the arrays are as they were.
         """
         arrays = [array for array in keep if array is not None and array.size]
         backup = [wp.clone(array) for array in arrays]
-        with wp.ScopedDevice(self.device):
-            if self.device.is_cuda:
-                torch.cuda.synchronize(self._torch)
+        with self._one_stream():
             warm_up()
             launches()
-            with wp.ScopedCapture(device=self.device) as capture:
-                launches()
+            recording = self._capture(launches)
             for array, copy in zip(arrays, backup, strict=True):
                 wp.copy(array, copy)
             restored()
-            if self.device.is_cuda:
-                wp.synchronize_device(self.device)
-        assert capture.graph is not None
-        return capture.graph
+        return recording
 
-    def replay(self, graph: wp.Graph) -> None:
-        """Runs the graph once; no host sync."""
-        if self.device.is_cuda:
-            # Warp's own stream does not wait for torch's: launch on the one torch is using.
-            wp.capture_launch(graph, stream=wp.stream_from_torch(torch.cuda.current_stream(self._torch)))
+    def run(self, function: Function) -> None:
+        """Calls a function in torch among launches: on CUDA it is recorded, on the CPU called in every replay.
+
+        Raises:
+            UserError: It cannot be recorded.
+        """
+        if self._pieces is None:  # nothing is recorded yet
+            function()
+        elif self.device.is_cuda:
+            try:
+                function()
+            except RuntimeError as error:
+                raise UserError(
+                    f"{error}: on a GPU a task in torch must not wait for the device (.item(), if) or copy from the "
+                    "host (torch.tensor)"
+                ) from error
         else:
-            wp.capture_launch(graph)
+            self._pieces += [wp.capture_end(self.device), function]
+            wp.capture_begin(self.device)
+
+    def replay(self, recording: Recording) -> None:
+        """Runs what was recorded once; no host sync."""
+        # Warp's own stream does not wait for torch's: launch on the one torch is using.
+        stream = wp.stream_from_torch(torch.cuda.current_stream(self._torch)) if self.device.is_cuda else None
+        for piece in recording:
+            if isinstance(piece, wp.Graph):
+                wp.capture_launch(piece, stream=stream)
+            else:
+                piece()
 
     def on_stream_of_torch(self) -> AbstractContextManager:
         """Warp launches inside in the order of torch's own work."""
         if not self.device.is_cuda:
             return wp.ScopedDevice(self.device)
         return wp.ScopedStream(wp.stream_from_torch(torch.cuda.current_stream(self._torch)))
+
+    @contextmanager
+    def _one_stream(self) -> Iterator[None]:
+        """Torch and Warp on one stream that can be captured, after and before everything else on the device."""
+        if not self.device.is_cuda:
+            with wp.ScopedDevice(self.device):
+                yield
+            return
+        torch.cuda.synchronize(self._torch)
+        with torch.cuda.stream(torch.cuda.Stream(self._torch)), self.on_stream_of_torch():
+            yield
+        wp.synchronize_device(self.device)
+
+    def _capture(self, launches: Function) -> Recording:
+        self._pieces = []
+        with torch.cuda.use_mem_pool(self._pool, self._torch) if self._pool else nullcontext():
+            wp.capture_begin(self.device)
+            try:
+                launches()
+            finally:
+                last = wp.capture_end(self.device)
+                pieces, self._pieces = self._pieces, None
+        return [*pieces, last]

@@ -19,13 +19,13 @@ import torch
 import warp as wp
 
 from franka_wm.envs.config import NUM_JOINTS, FrankaConfig
-from franka_wm.envs.kernels import episodes, observation, servo
+from franka_wm.envs.kernels import episodes, observation, randomization, servo
 from franka_wm.envs.kinematics import Kinematics
 from franka_wm.envs.randomize import Randomizer
 from franka_wm.envs.simulation import state as worlds
 from franka_wm.envs.simulation.arrays import allocate, as_int32
 from franka_wm.envs.simulation.build import Chain, build_model, make_solver
-from franka_wm.envs.simulation.graph import Recorder
+from franka_wm.envs.simulation.graph import Recorder, Recording
 from franka_wm.envs.simulation.images import Renderer
 from franka_wm.envs.tasks import Task, make_task
 
@@ -71,14 +71,17 @@ class Simulation:
         self.kinematics = Kinematics(self.robot, device)
         self.chain = Chain.of(self.robot, config, device)
         self.task = make_task(config) if task is None else task
-        self.tensors, self.warp = allocate(config, self.model, self.newton_state, self.control, seed)
+        draws = self.task.num_draws
+        self.tensors, self.warp = allocate(
+            config, self.model, self.newton_state, self.control, seed=seed, draws=draws
+        )
         self.randomizer = Randomizer(self)
         self.recorder = Recorder(device)
         self.renderer = Renderer(self)
         self._dt = 1.0 / (config.fps * config.substeps)
         newton.eval_fk(self.model, self.model.joint_q, self.model.joint_qd, self.newton_state)
-        self._step_graphs: dict[bool, wp.Graph] = {}
-        self._reset_graph: wp.Graph | None = None
+        self._step_graphs: dict[bool, Recording] = {}
+        self._reset_graph: Recording | None = None
 
     # -- what a user of this class calls ------------------------------------------------------------------
 
@@ -135,8 +138,8 @@ class Simulation:
         self._observe_anew()
         self.renderer.show_goal()
 
-    def record(self, launches: Callable[[], None]) -> wp.Graph:
-        """A graph of what ``launches`` launches, for :meth:`Recorder.replay`; the worlds stay as they are."""
+    def record(self, launches: Callable[[], None]) -> Recording:
+        """What ``launches`` launches, recorded for :meth:`Recorder.replay`; the worlds stay as they are."""
 
         def reset_everywhere() -> None:
             self.tensors.mask.fill_(True)
@@ -180,7 +183,7 @@ class Simulation:
             w.true_state, w.joint_target, w.next_true_state, w.next_joint_target, w.target, w.joint_q, w.joint_qd,
             w.broken,
         )  # fmt: skip
-        self.task.judge(self)
+        self.task.reward_and_success(self)
         self._launch(
             episodes.end_step,
             w.reward, w.success, w.broken, cfg.episode_length, cfg.terminate_on_success,
@@ -234,6 +237,8 @@ class Simulation:
             cfg.action_mode == "joint_position",
         )  # fmt: skip
         self.randomizer.launch(w.mask)
+        if self.task.num_draws:
+            self._launch(randomization.draw_uniform, w.mask, w.seed, w.episode, w.draws)
         self.task.reset(self, w.mask)
         self.launch_forward_kinematics(w.mask)
         self._launch_observe(w.true_state, w.joint_target, w.goal)

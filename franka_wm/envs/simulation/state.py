@@ -35,6 +35,8 @@ def memory(sim: Simulation) -> dict[str, torch.Tensor]:
     out = {name: getattr(sim.tensors, name) for name in MEMORY}
     out["body_qd"] = wp.to_torch(sim.newton_state.body_qd).view(sim.num_envs, -1, 6)
     out |= {f"solver_{name}": wp.to_torch(array) for name, array in solver_memory(sim).items() if array.size}
+    if sim.task.num_draws:
+        out["draws"] = sim.tensors.draws
     out |= {f"random_{k}": wp.to_torch(array) for k, array in enumerate(sim.randomizer.arrays())}
     return out
 

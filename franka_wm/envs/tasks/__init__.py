@@ -1,26 +1,23 @@
 """What is asked of the arm: goal, reward, success. One file for each task.
 
-A task launches Warp kernels, so that it is part of the captured step; :class:`Task` says when. The pure tensor
-functions of a task say the same in torch, for users and for the tests. To add one: a subclass, made
-known by :func:`register`; ``docs/tasks.md`` walks through an example.
+A task is a subclass of :class:`Task`, which launches Warp kernels, or of :class:`TorchTask`, which has functions of
+batched tensors; ``docs/tasks.md`` walks through both. :func:`register` gives it a name.
 """
 
-from __future__ import annotations
-
 from franka_wm.envs.config import TASKS, FrankaConfig
-from franka_wm.envs.tasks._base import Task
+from franka_wm.envs.tasks.base import Task
 from franka_wm.envs.tasks.reach import Reach, goal_distance, reach_reward
+from franka_wm.envs.tasks.torch_task import TorchTask
 from franka_wm.envs.tasks.track import Track
 
-__all__ = ["Reach", "Task", "Track", "goal_distance", "make_task", "reach_reward", "register"]
+__all__ = ["Reach", "Task", "TorchTask", "Track", "goal_distance", "make_task", "reach_reward", "register"]
+
+_REGISTERED: dict[str, type[Task]] = {}
 
 
 def make_task(config: FrankaConfig) -> Task:
     """The task that ``config.task`` names."""
     return ({"reach": Reach, "track": Track} | _REGISTERED)[config.task](config)
-
-
-_REGISTERED: dict[str, type[Task]] = {}
 
 
 def register(name: str, task: type[Task]) -> None:

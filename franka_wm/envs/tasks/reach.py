@@ -7,11 +7,11 @@ from typing import TYPE_CHECKING
 
 import torch
 import warp as wp
-from tensordict import TensorDict, TensorDictBase
+from tensordict import TensorDictBase
 
 from franka_wm.envs.config import HOME, FrankaConfig
 from franka_wm.envs.kernels import JOINTS, chain_forward, episode_rng
-from franka_wm.envs.tasks._base import Task
+from franka_wm.envs.tasks.base import Task, with_goal
 
 if TYPE_CHECKING:
     from franka_wm.envs.simulation import Simulation
@@ -117,7 +117,7 @@ def note_initial_distance(
 
 
 @wp.kernel(enable_backward=False)
-def judge_reach(
+def reach_reward_and_success(
     state: wp.array2d[float],
     action: wp.array2d[float],
     kind: int,
@@ -159,8 +159,8 @@ class Reach(Task):
 
     @property
     def reward_bounds(self) -> tuple[float, float] | None:
-        """Of :func:`reach_reward`; ``None`` where a subclass judges otherwise."""
-        if type(self).judge is not Reach.judge:
+        """Of :func:`reach_reward`; ``None`` where a subclass pays otherwise."""
+        if type(self).reward_and_success is not Reach.reward_and_success:
             return None
         least, largest = {"dense": (-1.0, 0.0), "sparse": (0.0, 1.0), "normalized": (-1.0, 1.0)}[
             self.config.reward
@@ -169,8 +169,8 @@ class Reach(Task):
 
     @property
     def goal_distance(self) -> bool:
-        """Not where a subclass judges otherwise."""
-        return type(self).judge is Reach.judge
+        """Not where a subclass has another success."""
+        return type(self).reward_and_success is Reach.reward_and_success
 
     def reset(self, sim: "Simulation", mask: wp.array) -> None:
         self.choose(sim, mask, sim.warp.task_goal)
@@ -210,13 +210,7 @@ class Reach(Task):
         Returns:
             (B, H): ``state``, ``goal`` where there is one, and in ``next`` the same, ``reward`` and ``terminated``.
         """
-        goal, c = goal.unsqueeze(1).expand(*transitions.batch_size, 3), self.config
-        out = TensorDict({}, batch_size=transitions.batch_size)
-        for root in ((), ("next",)):
-            state = transitions.get((*root, "state"))
-            out.set((*root, "state"), torch.cat([state[..., :17], state[..., 14:17] - goal], -1))
-            if transitions.get((*root, "goal"), None) is not None:
-                out.set((*root, "goal"), goal)
+        c, out = self.config, with_goal(transitions, goal)
         after = out.get(("next", "state"))
         reward = reach_reward(
             after,
@@ -230,15 +224,27 @@ class Reach(Task):
         out.set(("next", "terminated"), reached & c.terminate_on_success)
         return out
 
+    def present_reward(self, sim: "Simulation", action: torch.Tensor) -> torch.Tensor:
+        if type(self).reward_and_success is not Reach.reward_and_success:
+            return super().present_reward(sim, action)
+        return reach_reward(
+            sim.tensors.true_state,
+            action,
+            kind=self.config.reward,
+            action_penalty=self.config.action_penalty,
+            success_distance=self.config.success_distance,
+            initial_distance=sim.tensors.initial_distance.unsqueeze(-1),
+        )
+
     def begin(self, sim: "Simulation", mask: wp.array) -> None:
         if self.config.reward == "normalized":
             inputs = [mask, sim.warp.true_state, sim.warp.initial_distance]
             wp.launch(note_initial_distance, sim.num_envs, inputs, device=sim.device)
 
-    def judge(self, sim: "Simulation") -> None:
+    def reward_and_success(self, sim: "Simulation") -> None:
         w, c = sim.warp, self.config
         wp.launch(
-            judge_reach,
+            reach_reward_and_success,
             sim.num_envs,
             [
                 w.next_true_state, w.action, REWARDS[c.reward], c.action_penalty, c.success_distance,

@@ -1,0 +1,124 @@
+"""The base class of tasks."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import TYPE_CHECKING
+
+import torch
+import warp as wp
+from tensordict import TensorDict, TensorDictBase
+
+from franka_wm.envs.config import FrankaConfig
+from franka_wm.errors import UserError
+
+if TYPE_CHECKING:
+    from franka_wm.envs.simulation import Simulation
+
+
+class Task:
+    """Goal, reward and success of all worlds, in Warp kernels. Override what differs; each method only launches.
+
+    A task in torch instead is a :class:`~franka_wm.envs.tasks.TorchTask`.
+
+    Args:
+        config: The environment's.
+
+    Attributes:
+        num_draws: How many random numbers, uniform in [0, 1), each episode of each world gets in ``sim.warp.draws``
+            before ``reset``. They depend on seed, world and episode alone.
+    """
+
+    num_draws = 0
+
+    def __init__(self, config: FrankaConfig):
+        self.config = config
+
+    def __init_subclass__(cls, **kwargs) -> None:
+        super().__init_subclass__(**kwargs)
+        if "judge" in vars(cls):
+            raise UserError(f"{cls.__name__}.judge: the method is called reward_and_success now; rename it")
+
+    @property
+    def reward_bounds(self) -> tuple[float, float] | None:
+        """Least and largest reward of a step, from which models derive the range of their values.
+
+        ``None``: unknown. A class attribute is enough: ``reward_bounds = (-1.0, 0.0)``.
+        """
+        return None
+
+    @property
+    def goal_distance(self) -> bool:
+        """Whether success is to have the tool near ``task_goal``.
+
+        Then evaluation reports the distance, and success within several distances, and else the task's own success.
+        A class attribute is enough: ``goal_distance = True``.
+        """
+        return False
+
+    def reset(self, sim: Simulation, mask: wp.array) -> None:
+        """Writes ``sim.warp.task_goal`` (N, 3), and ``sim.warp.goal_q`` (N, 7) if known, where ``mask`` (N,)."""
+        raise NotImplementedError(f"{type(self).__name__} gives no goal")
+
+    def begin(self, sim: Simulation, mask: wp.array) -> None:
+        """Called after a reset, when ``sim.warp.true_state`` (N, 20) is the first one of the masked worlds."""
+
+    def advance(self, sim: Simulation) -> None:
+        """Called in every step after the physics and before the observation: moves a goal that moves."""
+
+    def reward_and_success(self, sim: Simulation) -> None:
+        """Writes ``sim.warp.reward`` and ``sim.warp.success`` (N, 1) from ``next_true_state`` (N, 20) and ``action``.
+
+        ``next_true_state`` is ``next_state`` without observation noise.
+        """
+        raise NotImplementedError(f"{type(self).__name__} gives no reward")
+
+    def present_reward(self, sim: Simulation, action: torch.Tensor) -> torch.Tensor:
+        """Reward of having applied ``action`` (N, A) and being in the present state, (N, 1).
+
+        Raises:
+            UserError: The task has no reward in torch.
+        """
+        raise UserError(f"{type(self).__name__} has its reward in a kernel; read it from a step")
+
+    def measures(self, sim: Simulation) -> dict[str, torch.Tensor]:
+        """What else evaluation reports, by names with their units: (N,) each, after a step; the episode's last counts.
+
+        Computed with torch, outside the captured step, from ``sim.tensors.next_true_state`` (N, 20): finished worlds
+        have been reset already.
+        """
+        return {}
+
+    relabel: Callable[[TensorDictBase, torch.Tensor], TensorDictBase] | None = None
+    """Recorded transitions as if the goal had been another, where the task can say so in torch: see `Reach.relabel`."""
+
+    @classmethod
+    def relabels(cls) -> bool:
+        """Whether ``relabel`` speaks for this task: a subclass that changes rewards or moves goals says so anew."""
+
+        def owner(name: str) -> int:
+            return next(i for i, one in enumerate(cls.__mro__) if name in vars(one))
+
+        return cls.relabel is not None and owner("relabel") <= min(
+            owner("reward_and_success"), owner("advance")
+        )
+
+
+def with_goal(transitions: TensorDictBase, goal: torch.Tensor) -> TensorDict:
+    """What another goal changes in the observations of recorded transitions; exact where they have no noise.
+
+    Args:
+        transitions: (B, H) with ``state`` (20), also in ``next``.
+        goal: (B, 3) [m].
+
+    Returns:
+        (B, H): ``state``, and ``goal`` where there is one; the same in ``next``.
+    """
+    goal = goal.unsqueeze(1).expand(*transitions.batch_size, 3)
+    out = TensorDict({}, batch_size=transitions.batch_size)
+    for root in ((), ("next",)):
+        state = transitions.get((*root, "state"))
+        out.set((*root, "state"), torch.cat([state[..., :17], state[..., 14:17] - goal], -1))
+        if transitions.get((*root, "goal"), None) is not None:
+            out.set((*root, "goal"), goal)
+    return out

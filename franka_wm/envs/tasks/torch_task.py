@@ -1,0 +1,97 @@
+"""Tasks in torch tensors alone."""
+
+from __future__ import annotations
+
+from functools import partial
+from typing import TYPE_CHECKING
+
+import torch
+import warp as wp
+from tensordict import TensorDict, TensorDictBase
+
+from franka_wm.envs.tasks.base import Task, with_goal
+from franka_wm.errors import UserError
+
+if TYPE_CHECKING:
+    from franka_wm.envs.simulation import Simulation
+
+
+class TorchTask(Task):
+    """Goal, reward and success as functions of batched tensors. Override ``goal``, ``reward`` and ``success``.
+
+    On a GPU they become part of the captured step: only what they did to tensors is replayed. On the CPU they run
+    beside it. So they work on whole batches (``torch.where`` instead of ``if``), never wait for the device (no
+    ``.item()``), copy nothing from the host (no ``torch.tensor``), and draw nothing: random numbers are given.
+
+    The 20 numbers of a state are joints 7 [rad], velocities 7 [rad/s], tool 3 [m], tool − goal 3 [m]; it has no
+    observation noise.
+    """
+
+    num_draws = 8
+
+    def goal(self, draws: torch.Tensor) -> torch.Tensor:
+        """Goal of an episode: (N, num_draws) random numbers, uniform in [0, 1) → (N, 3) [m]."""
+        raise NotImplementedError(f"{type(self).__name__} gives no goal")
+
+    def reward(self, state: torch.Tensor, action: torch.Tensor) -> torch.Tensor:
+        """Reward of being in ``state`` after ``action``, clipped to [−1, 1]: (..., 20), (..., A) → (...,)."""
+        raise NotImplementedError(f"{type(self).__name__} gives no reward")
+
+    def success(self, state: torch.Tensor) -> torch.Tensor:
+        """Whether the task is solved in ``state``: (..., 20) → (...,) bool."""
+        raise NotImplementedError(f"{type(self).__name__} says no success")
+
+    def reset(self, sim: Simulation, mask: wp.array) -> None:
+        sim.recorder.run(partial(self._write_goal, sim))
+
+    def reward_and_success(self, sim: Simulation) -> None:
+        sim.recorder.run(partial(self._write_reward_and_success, sim))
+
+    def present_reward(self, sim: Simulation, action: torch.Tensor) -> torch.Tensor:
+        return self.reward(sim.tensors.true_state, _applied(action)).unsqueeze(-1)
+
+    def relabel(self, transitions: TensorDictBase, goal: torch.Tensor) -> TensorDict:
+        """As :meth:`Reach.relabel`: observations, reward and end of recorded transitions had the goal been another."""
+        out = with_goal(transitions, goal)
+        after = out.get(("next", "state"))
+        out.set(("next", "reward"), self.reward(after, _applied(transitions.get("action"))).unsqueeze(-1))
+        ended = self.success(after).unsqueeze(-1) & self.config.terminate_on_success
+        out.set(("next", "terminated"), ended)
+        return out
+
+    @classmethod
+    def relabels(cls) -> bool:
+        """Where success is a distance to the goal: else a place that the tool reached is no goal of the task."""
+        return cls.goal_distance is True and super().relabels()
+
+    def _write_goal(self, sim: Simulation) -> None:
+        t = sim.tensors
+        goal = self._checked("goal", self.goal(t.draws), (sim.num_envs, 3))
+        mask = t.mask.unsqueeze(-1)
+        t.task_goal.copy_(torch.where(mask, goal, t.task_goal))
+        if "goal_pixels" in sim.config.images:
+            home = wp.to_torch(sim.chain.home).expand(sim.num_envs, -1)
+            t.goal_q.copy_(torch.where(mask, sim.kinematics.solve(goal, home, iterations=24), t.goal_q))
+
+    def _write_reward_and_success(self, sim: Simulation) -> None:
+        t, shape = sim.tensors, (sim.num_envs,)
+        reward = self._checked("reward", self.reward(t.next_true_state, _applied(t.action)), shape)
+        success = self._checked("success", self.success(t.next_true_state), shape, boolean=True)
+        t.reward.copy_(reward.unsqueeze(-1))
+        t.success.copy_(success.unsqueeze(-1))
+
+    def _checked(
+        self, name: str, value: torch.Tensor, shape: tuple[int, ...], *, boolean: bool = False
+    ) -> torch.Tensor:
+        right = value.dtype == torch.bool if boolean else value.dtype.is_floating_point
+        if value.shape != shape or not right:
+            raise UserError(
+                f"{type(self).__name__}.{name} gave {tuple(value.shape)} {value.dtype}; for {shape[0]} worlds it must "
+                f"give {shape} {'bool' if boolean else 'float'}"
+            )
+        return value
+
+
+def _applied(action: torch.Tensor) -> torch.Tensor:
+    """Actions as they count: in [−1, 1]; 0 for one that is not finite, whose world is caught as broken."""
+    return action.nan_to_num(0.0, 0.0, 0.0).clamp(-1.0, 1.0)
