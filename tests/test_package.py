@@ -24,6 +24,27 @@ def test_import_is_light() -> None:
     assert done.stdout.strip() == "[]"
 
 
+def test_the_environment_is_loaded_when_it_is_used() -> None:
+    heavy = ["torch", "tensordict", "torchrl", "warp", "newton"]
+    code = f"import sys, franka_wm.envs; print([m for m in {heavy} if m in sys.modules])"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=ROOT)
+    assert done.stdout.strip() == "[]"
+
+
+def test_names_at_the_top() -> None:
+    from franka_wm import envs
+    from franka_wm.envs.franka import FrankaEnv
+    from franka_wm.training import load
+
+    assert franka_wm.FrankaEnv is envs.FrankaEnv is FrankaEnv
+    assert (franka_wm.load, franka_wm.load_agent) == (load.load_model, load.load_agent)
+    for name in envs.__all__:  # those of the reference environment among them
+        assert callable(getattr(envs, name)), name
+    for module in (franka_wm, envs):
+        with pytest.raises(AttributeError, match="no_such_name"):
+            module.no_such_name  # noqa: B018
+
+
 def test_report_does_not_load_what_it_may_not_need() -> None:
     heavy = ["matplotlib", "av", "PIL", "rich"]
     modules = ", ".join(f"franka_wm.report.{m}" for m in ("curves", "style", "table"))

@@ -22,14 +22,16 @@ from franka_wm.device import resolve_device
 from franka_wm.envs.camera import Camera, as_torch, camera_framing
 from franka_wm.envs.config import STATE_DIM, FrankaConfig
 from franka_wm.envs.frames import FrameStack
-from franka_wm.envs.kinematics import Kinematics
-from franka_wm.envs.robots import load_robot
+from franka_wm.envs.kinematics import check_robot
 from franka_wm.envs.simulation import STATISTICS, Simulation
+from franka_wm.envs.specs import observation_spec
 from franka_wm.envs.tasks import Task, goal_distance
 from franka_wm.errors import UserError
 from franka_wm.seeding import derive_seed
 
 log = logging.getLogger(__name__)
+
+FLAGS = ("done", "terminated", "truncated")
 
 _unseeded = itertools.count()
 
@@ -128,37 +130,15 @@ class FrankaEnv(EnvBase):
         self._stacked = [
             key for key in self.simulation.renderer.images if self._stack and key.startswith("pixels")
         ]
-        self._make_specs()
-        self._renderers: dict[tuple[int, int], Camera] = {}
-
-    def _make_specs(self) -> None:
-        n, device, size = self.num_envs, self.device, self.config.image_size
-        entries: dict = {}
-        for key in self.simulation.renderer.images:
-            if key.startswith("depth"):
-                entries[key] = Unbounded(shape=(n, size, size, 1), device=device)
-            else:
-                channels = 1 if key.startswith("segmentation") else 3 * self.config.frame_stack
-                entries[key] = Bounded(
-                    0, 255, shape=(n, size, size, channels), dtype=torch.uint8, device=device
-                )
-        if "state" in self.config.observations:
-            entries["state"] = Unbounded(shape=(n, STATE_DIM), device=device)
-        if "joint_target" in self.config.observations:
-            entries["joint_target"] = Bounded(
-                self.kinematics.lower.expand(n, -1), self.kinematics.upper.expand(n, -1), device=device
-            )
-        entries["goal"] = Unbounded(shape=(n, 3), device=device)
-        entries["success"] = Binary(shape=(n, 1), dtype=torch.bool, device=device)
-        entries["is_init"] = Binary(shape=(n, 1), dtype=torch.bool, device=device)
-        self._observed = [key for key in entries if key not in ("success", "is_init")]
-        self.observation_spec = Composite(**entries, shape=(n,), device=device)
-        self.action_spec = Bounded(-1.0, 1.0, shape=(n, self.config.action_dim), device=device)
-        self.reward_spec = Unbounded(shape=(n, 1), device=device)
-        flag = Binary(shape=(n, 1), dtype=torch.bool, device=device)
-        self.done_spec = Composite(
-            done=flag, terminated=flag.clone(), truncated=flag.clone(), shape=(n,), device=device
+        self.observation_spec = observation_spec(
+            config, list(self.simulation.renderer.images), self.kinematics, num_envs, device
         )
+        self._observed = [key for key in self.observation_spec if key not in ("success", "is_init")]
+        self.action_spec = Bounded(-1.0, 1.0, shape=(num_envs, config.action_dim), device=device)
+        self.reward_spec = Unbounded(shape=(num_envs, 1), device=device)
+        flags = {key: Binary(shape=(num_envs, 1), dtype=torch.bool, device=device) for key in FLAGS}
+        self.done_spec = Composite(**flags, shape=(num_envs,), device=device)
+        self._renderers: dict[tuple[int, int], Camera] = {}
 
     # -- TorchRL ------------------------------------------------------------------------------------------
 
@@ -175,7 +155,7 @@ class FrankaEnv(EnvBase):
         out = self._present()
         out["is_init"] = sim.tensors.mask.clone().unsqueeze(-1)
         out["success"] = torch.zeros_like(sim.tensors.success)
-        for key in ("done", "terminated", "truncated"):
+        for key in FLAGS:
             out[key] = torch.zeros_like(sim.tensors.done)
         return TensorDict(out, batch_size=self.batch_size, device=self.device)
 
@@ -192,7 +172,7 @@ class FrankaEnv(EnvBase):
         for key in self._stacked:
             self._stack.push(key, sim.renderer.next_images[key])
         out = {
-            key: self._picture(key, sim.renderer.next_images)
+            key: self._image(key, sim.renderer.next_images)
             if key in sim.renderer.images
             else getattr(sim.tensors, f"next_{key}").clone()
             for key in self._observed
@@ -215,19 +195,19 @@ class FrankaEnv(EnvBase):
             return super()._step_and_maybe_reset(tensordict)
         if tensordict.device != self.device:
             tensordict = tensordict.to(self.device)
-        with self._restarting():
+        with self.restarting():
             tensordict = self.step(tensordict)
         following = self._step_mdp(tensordict)
         done = following.get("done")
         following.update(self._present())
         following.set("success", following.get("success") & ~done)
         following.set("is_init", done.clone())
-        for key in ("done", "terminated", "truncated"):
+        for key in FLAGS:
             following.set(key, torch.zeros_like(done))
         return tensordict, following
 
     @contextmanager
-    def _restarting(self) -> Iterator[None]:
+    def restarting(self) -> Iterator[None]:
         """Steps inside begin the next episode of finished worlds."""
         self._restart = True
         try:
@@ -238,14 +218,14 @@ class FrankaEnv(EnvBase):
     def _present(self) -> dict[str, torch.Tensor]:
         sim = self.simulation
         return {
-            key: self._picture(key, sim.renderer.images)
+            key: self._image(key, sim.renderer.images)
             if key in sim.renderer.images
             else getattr(sim.tensors, key).clone()
             for key in self._observed
         }
 
-    def _picture(self, key: str, images: dict[str, torch.Tensor]) -> torch.Tensor:
-        """A copy of a picture as it is observed; pictures of the goal, which stands still, are stacked alike."""
+    def _image(self, key: str, images: dict[str, torch.Tensor]) -> torch.Tensor:
+        """A copy of an image as it is observed; images of the goal, which stands still, are stacked alike."""
         if self._stack is None:
             return images[key].clone()
         if key in self._stacked:
@@ -319,7 +299,7 @@ class FrankaEnv(EnvBase):
         out = self._present()
         out["is_init"] = sim.tensors.step_count == 0
         out["success"] = torch.zeros_like(sim.tensors.success)
-        for key in ("done", "terminated", "truncated"):
+        for key in FLAGS:
             out[key] = torch.zeros_like(sim.tensors.done)
         return TensorDict(out, batch_size=self.batch_size, device=self.device)
 
@@ -403,11 +383,11 @@ class FrankaEnv(EnvBase):
         return torch.isfinite(self.simulation.tensors.state).all(-1)
 
     def observe(self) -> torch.Tensor:
-        """The camera's picture now, (N, 3, H, W) float32 in [0, 1] at ``image_size``."""
+        """The camera's image now, (N, 3, H, W) float32 in [0, 1] at ``image_size``."""
         return self.render(self.config.image_size).permute(0, 3, 1, 2).float().div_(255.0)
 
     def render(self, size: int | None = None, samples: int = 1, num_views: int | None = None) -> torch.Tensor:
-        """The camera's picture now, (views, size, size, 3) uint8, for people and videos.
+        """The camera's image now, (views, size, size, 3) uint8, for people and videos.
 
         Args:
             size: Side [px]; ``image_size`` if not given.
@@ -432,8 +412,8 @@ class FrankaEnv(EnvBase):
         return as_torch("pixels", camera.images["pixels"]).clone(memory_format=torch.contiguous_format)
 
     def high_quality_renderer(self, **options):
-        """A :class:`~franka_wm.envs.render.HighQualityRenderer` on this model, aimed by the same framing."""
-        from franka_wm.envs.render import high_quality_renderer
+        """A :class:`~franka_wm.envs.high_quality.HighQualityRenderer` on this model, aimed by the same framing."""
+        from franka_wm.envs.high_quality import high_quality_renderer
 
         return high_quality_renderer(self, **options)
 
@@ -449,34 +429,9 @@ class FrankaEnv(EnvBase):
             ``done`` (N, T, 1), and ``video`` (N, T + 1, H, W, 3) uint8 if the environment observes pixels.
             Batch size (N,). An episode that ends within T steps goes on in its next one.
         """
-        if actions.dim() != 3 or actions.shape[0] != self.num_envs or actions.shape[2] != self.action_dim:
-            raise UserError(
-                f"actions has shape {tuple(actions.shape)}; it must be ({self.num_envs}, T, {self.action_dim})"
-            )
-        self.reset(seed=seed)
-        sim = self.simulation
-        states, videos, rewards, dones = [sim.tensors.state.clone()], [], [], []
-        if "pixels" in sim.renderer.images:
-            videos.append(sim.renderer.images["pixels"].clone())
-        for t in range(actions.shape[1]):
-            with self._restarting():
-                step = self._step(TensorDict({"action": actions[:, t]}, batch_size=self.batch_size))
-            rewards.append(step["reward"])
-            dones.append(step["done"])
-            states.append(sim.tensors.next_state.clone())
-            if "pixels" in sim.renderer.images:
-                videos.append(sim.renderer.next_images["pixels"].clone())
-        state = torch.stack(states, 1)
-        out = {
-            "state": state,
-            "joint_q": state[..., :7],
-            "tool": state[..., 14:17],
-            "reward": torch.stack(rewards, 1),
-            "done": torch.stack(dones, 1),
-        }
-        if videos:
-            out["video"] = torch.stack(videos, 1)
-        return TensorDict(out, batch_size=self.batch_size)
+        from franka_wm.envs.sequences import play_actions
+
+        return play_actions(self, actions, seed)
 
     def statistics(self, *, clear: bool = True) -> dict[str, float]:
         """Means over the episodes that ended since the last call; one host sync.
@@ -493,12 +448,3 @@ class FrankaEnv(EnvBase):
         if totals["episodes"]:
             out |= {key: totals[key] / totals["episodes"] for key in STATISTICS[1:-1]}
         return out
-
-
-def check_robot(config: FrankaConfig, urdf_path: str | Path | None = None) -> None:
-    """Raises ``UserError`` if the robot cannot be loaded or the fixed goal is out of its reach."""
-    robot = load_robot(config, urdf_path)
-    if config.goal_sampling == "fixed" and not Kinematics(robot).reachable(config.goal):
-        raise UserError(
-            f"goal={config.goal} m: out of the arm's reach; it reaches about 0.85 m from (0, 0, 0.333)"
-        )

@@ -1,12 +1,14 @@
-"""``FrankaEnv`` as a Gymnasium vector environment, for LeRobot's evaluation and other NumPy code.
+"""The arm in Gymnasium: one arm, and N arms as a vector environment, for LeRobot's evaluation and other NumPy code.
 
-    envs = gymnasium.make_vec("franka_wm.envs.gym:FrankaWM/Reach-v0", num_envs=16)
+    import franka_wm.envs.gym  # registers the names
+    env = gymnasium.make("franka_wm/Reach-v0")
+    envs = gymnasium.make_vec("franka_wm/Reach-v0", num_envs=16)
 
 Gymnasium speaks NumPy, so **each step copies its observations to the host and waits for the device**. This is
 the one place in the package that does; train on :class:`~franka_wm.envs.FrankaEnv` itself.
 
-Importing this module registers the names: the part before the colon above is Gymnasium's own way to say what
-to import first. Nothing is simulated before an environment is made.
+``gymnasium.make("franka_wm.envs.gym:franka_wm/Reach-v0")`` imports this module first. Nothing is simulated before an
+environment is made.
 """
 
 from __future__ import annotations
@@ -14,17 +16,21 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-import gymnasium
 import numpy as np
 import torch
-from gymnasium import spaces
-from gymnasium.vector import AutoresetMode
-from gymnasium.vector.utils import batch_space
 from tensordict import TensorDictBase
 
-from franka_wm.envs.config import NUM_JOINTS, FrankaConfig
+from franka_wm.envs.config import NUM_JOINTS, TASKS, FrankaConfig
 from franka_wm.envs.franka import FrankaEnv
 from franka_wm.errors import UserError
+
+try:
+    import gymnasium
+    from gymnasium import spaces
+    from gymnasium.vector import AutoresetMode
+    from gymnasium.vector.utils import batch_space
+except ImportError as error:
+    raise UserError(f"franka_wm.envs.gym needs pip install 'franka-wm[gym]' ({error})") from error
 
 CAMERA = "front"
 
@@ -37,7 +43,7 @@ REACH_V0: dict[str, Any] = {
     "substeps": 4,
     "episode_length": 50,
 }
-"""What ``FrankaWM/Reach-v0`` is. Published numbers refer to it: change it under another version."""
+"""What ``franka_wm/Reach-v0`` is. Published numbers refer to it: change it under another version."""
 
 
 class FrankaVectorEnv(gymnasium.vector.VectorEnv):
@@ -251,19 +257,101 @@ def _row(tree: dict[str, Any], index: int) -> dict[str, Any]:
     }
 
 
-def register() -> None:
-    """Tells Gymnasium about ``FrankaWM/Reach-v0``; once is enough, again does nothing.
+class FrankaGymEnv(gymnasium.Env):
+    """One arm behind Gymnasium's interface: a :class:`FrankaVectorEnv` of one world, without its leading dimension.
 
-    ``gymnasium.make_vec`` then takes every field of :class:`~franka_wm.envs.FrankaConfig`, ``device`` and
-    ``render_mode`` as options. There is no single environment for ``gymnasium.make``: ask for one world.
+    Observations are those of the vector environment: ``pixels``/``front`` (H, W, 3) uint8, ``agent_pos`` (7,)
+    [rad], ``environment_state`` (3,) [m]. Actions are (A,) float32 in [−1, 1]; A is 7, or 3 with
+    ``action_mode="ee_delta"``. ``info["is_success"]`` belongs to the observation returned. A finished episode
+    goes on until :meth:`reset`, still finished.
+
+    Args:
+        device: Where it simulates; the GPU where there is one.
+        seed: Until the first ``reset(seed=…)``.
+        render_mode: ``"rgb_array"`` for :meth:`render`, or ``None``.
+        **config: Fields of :class:`~franka_wm.envs.FrankaConfig`.
+
+    Raises:
+        UserError: If an option cannot be used.
     """
-    if "FrankaWM/Reach-v0" not in gymnasium.registry:
-        gymnasium.register(
-            "FrankaWM/Reach-v0",
-            vector_entry_point=f"{__name__}:FrankaVectorEnv",
-            kwargs=dict(REACH_V0),
-            disable_env_checker=True,
+
+    metadata: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": 30}
+
+    def __init__(
+        self,
+        *,
+        device: torch.device | str | None = None,
+        seed: int = 0,
+        render_mode: str | None = None,
+        **config: Any,
+    ):
+        self._vector = FrankaVectorEnv(1, device=device, seed=seed, render_mode=render_mode, **config)
+        self.env = self._vector.env
+        self.render_mode = render_mode
+        self.metadata = {key: self._vector.metadata[key] for key in ("render_modes", "render_fps")}
+        self.observation_space = self._vector.single_observation_space
+        self.action_space = self._vector.single_action_space
+        self._present: TensorDictBase | None = None
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[dict[str, Any], dict[str, Any]]:
+        """Starts a new episode; the first of ``seed`` if one is given. ``options`` are ignored."""
+        super().reset(seed=seed)
+        self._present = self.env.reset(seed=seed)
+        return self._observed(self._present)
+
+    def step(self, action: np.ndarray) -> tuple[dict[str, Any], float, bool, bool, dict[str, Any]]:
+        """One control step with ``action`` (A,), clipped to [−1, 1]."""
+        if self._present is None:
+            raise UserError("step before reset: call reset() first")
+        action = np.asarray(action, dtype=np.float32)
+        if action.shape != self.action_space.shape:
+            raise UserError(f"action has shape {action.shape}; it must be {self.action_space.shape}")
+        given = torch.from_numpy(action).to(self.env.device).unsqueeze(0)
+        after = self.env.step(self._present.set("action", given)).get("next")
+        self._present = after
+        observation, info = self._observed(after)
+        reward, terminated, truncated = (
+            after.get(key).item() for key in ("reward", "terminated", "truncated")
         )
+        return observation, float(reward), bool(terminated), bool(truncated), info
+
+    def render(self) -> np.ndarray | None:
+        """A frame, (256, 256, 3) uint8; ``None`` without ``render_mode="rgb_array"``."""
+        frames = self._vector.render()
+        return None if frames is None else frames[0]
+
+    def close(self) -> None:
+        self._vector.close()
+
+    def _observed(self, tensordict: TensorDictBase) -> tuple[dict[str, Any], dict[str, Any]]:
+        observation, success = self._vector._to_numpy(tensordict)
+        return _row(observation, 0), {"is_success": bool(success[0])}
+
+
+def register() -> None:
+    """Tells Gymnasium about every task: ``franka_wm/Reach-v0``, ``franka_wm/Track-v0``, and those of your own.
+
+    Importing this module does it; call it again after :func:`franka_wm.envs.tasks.register`. Names that are there
+    stay as they are. Options are every field of :class:`~franka_wm.envs.FrankaConfig`, ``device``, ``seed`` and
+    ``render_mode``. ``FrankaWM/Reach-v0`` is the former name of the vector environment.
+    """
+    names = {f"franka_wm/{_camel(task)}-v0": task for task in TASKS}
+    for name, task in (names | {"FrankaWM/Reach-v0": "reach"}).items():
+        if name not in gymnasium.registry:
+            gymnasium.register(
+                name,
+                entry_point=f"{__name__}:FrankaGymEnv" if name in names else None,
+                vector_entry_point=f"{__name__}:FrankaVectorEnv",
+                kwargs=REACH_V0 | {"task": task},
+                disable_env_checker=True,
+            )
+
+
+def _camel(task: str) -> str:
+    """``raise_tool`` → ``RaiseTool``."""
+    return "".join(word.capitalize() for word in task.split("_"))
 
 
 register()

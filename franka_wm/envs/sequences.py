@@ -68,7 +68,7 @@ def franka_sequences(
     reset it before going on. Its ``statistics()`` are as before.
 
     Args:
-        env: The arm. Pictures come if it observes ``pixels``.
+        env: The arm. Images come if it observes ``pixels``.
         n_sequences: Sequences wanted, n ≥ 1.
         length: Frames of each, T ≥ 2; at most ``episode_length + 1``.
         seed: Of actions, poses and goals.
@@ -145,3 +145,35 @@ def franka_sequences(
     if "video" in out:
         out["video"] = out["video"].movedim(-1, 2)
     return TensorDict(out, batch_size=[n_sequences], device=env.device)
+
+
+def play_actions(env: FrankaEnv, actions: torch.Tensor, seed: int | None) -> TensorDict:
+    """What :meth:`FrankaEnv.rollout_actions` says."""
+    if actions.dim() != 3 or actions.shape[0] != env.num_envs or actions.shape[2] != env.action_dim:
+        raise UserError(
+            f"actions has shape {tuple(actions.shape)}; it must be ({env.num_envs}, T, {env.action_dim})"
+        )
+    env.reset(seed=seed)
+    t, renderer = env.simulation.tensors, env.simulation.renderer
+    states, videos, rewards, dones = [t.state.clone()], [], [], []
+    if "pixels" in renderer.images:
+        videos.append(renderer.images["pixels"].clone())
+    for action in actions.unbind(1):
+        with env.restarting():
+            step = env._step(TensorDict({"action": action}, batch_size=env.batch_size))
+        rewards.append(step["reward"])
+        dones.append(step["done"])
+        states.append(t.next_state.clone())
+        if "pixels" in renderer.images:
+            videos.append(renderer.next_images["pixels"].clone())
+    state = torch.stack(states, 1)
+    out = {
+        "state": state,
+        "joint_q": state[..., :7],
+        "tool": state[..., 14:17],
+        "reward": torch.stack(rewards, 1),
+        "done": torch.stack(dones, 1),
+    }
+    if videos:
+        out["video"] = torch.stack(videos, 1)
+    return TensorDict(out, batch_size=env.batch_size)

@@ -1,13 +1,17 @@
 """The Gymnasium view: its spaces, and what it says where an episode ends."""
 
+import subprocess
+import sys
+
 import gymnasium
 import numpy as np
 import pytest
 import torch
+from gymnasium.utils.env_checker import check_env
 from gymnasium.vector import AutoresetMode
 
-from franka_wm.envs import FrankaConfig, FrankaEnv
-from franka_wm.envs.gym import REACH_V0, FrankaVectorEnv, register
+from franka_wm.envs import FrankaConfig, FrankaEnv, tasks
+from franka_wm.envs.gym import REACH_V0, FrankaGymEnv, FrankaVectorEnv, register
 from franka_wm.errors import UserError
 
 SMALL = {"image_size": 32, "substeps": 4, "gravity_compensation": True, "device": "cpu"}
@@ -20,7 +24,9 @@ def actions() -> np.ndarray:
 
 
 def test_made_by_name_and_inside_its_spaces() -> None:
-    envs = gymnasium.make_vec("franka_wm.envs.gym:FrankaWM/Reach-v0", num_envs=2, image_size=32, device="cpu")
+    envs = gymnasium.make_vec(
+        "franka_wm.envs.gym:franka_wm/Reach-v0", num_envs=2, image_size=32, device="cpu"
+    )
     assert envs.num_envs == 2
     assert envs.metadata["autoreset_mode"] is AutoresetMode.SAME_STEP
     config = envs.unwrapped.env.config
@@ -167,3 +173,62 @@ def test_wrong_use_is_one_line() -> None:
     view.reset()
     with pytest.raises(UserError, match=r"\(2, 7\)"):
         view.step(np.zeros((3, 7), np.float32))
+
+
+@pytest.mark.filterwarnings("ignore:.*")
+@pytest.mark.parametrize("options", [{}, {"action_mode": "ee_delta", "observations": ("state",)}])
+def test_gymnasiums_own_check_of_one_arm(options: dict) -> None:
+    env = gymnasium.make(
+        "franka_wm/Reach-v0", device="cpu", image_size=16, substeps=2, render_mode="rgb_array", **options
+    )
+    assert env.action_space.shape == ((3,) if options else (7,))
+    check_env(env.unwrapped)
+    env.close()
+
+
+def test_one_arm_is_world_0_of_many(actions: np.ndarray) -> None:
+    one, many = (
+        FrankaGymEnv(**SMALL, goal_sampling="reachable"),
+        FrankaVectorEnv(3, **SMALL, goal_sampling="reachable"),
+    )
+    first, expected = one.reset(seed=3)[0], many.reset(seed=3)[0]
+    for action in actions:
+        assert one.observation_space.contains(first)
+        assert np.array_equal(first["pixels"]["front"], expected["pixels"]["front"][0])
+        for key in ("agent_pos", "environment_state"):
+            assert np.array_equal(first[key], expected[key][0])
+        first, reward, terminated, truncated, info = one.step(action[0])
+        expected, rewards, *_ = many.step(action)
+        assert reward == rewards[0] and (terminated, truncated) == (False, False)
+    assert info == {"is_success": False}
+
+
+def test_one_arm_stays_finished_until_it_is_reset() -> None:
+    one = FrankaGymEnv(**STATE, episode_length=2)
+    with pytest.raises(UserError, match="reset"):
+        one.step(np.zeros(7, np.float32))
+    one.reset(seed=0)
+    ended = [one.step(np.zeros(7, np.float32))[3] for _ in range(4)]
+    assert ended == [False, True, True, True]
+    one.reset()
+    assert not one.step(np.zeros(7, np.float32))[3]
+    with pytest.raises(UserError, match=r"\(3,\).*\(7,\)"):
+        one.step(np.zeros(3, np.float32))
+
+
+def test_every_task_has_a_name(monkeypatch) -> None:
+    assert gymnasium.spec("franka_wm/Track-v0").kwargs["task"] == "track"
+    monkeypatch.setattr(tasks, "_REGISTERED", {})
+    tasks.register("raise_tool", tasks.Reach)
+    try:
+        register()
+        assert gymnasium.spec("franka_wm/RaiseTool-v0").kwargs["task"] == "raise_tool"
+    finally:
+        tasks.TASKS.remove("raise_tool")
+        gymnasium.registry.pop("franka_wm/RaiseTool-v0")
+
+
+def test_without_gymnasium_the_extra_is_named() -> None:
+    code = "import sys; sys.modules['gymnasium'] = None; import franka_wm.envs.gym"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert "UserError" in done.stderr and "franka-wm[gym]" in done.stderr

@@ -109,6 +109,35 @@ def test_a_broken_world_is_no_success(small_env) -> None:
     assert env.statistics()["success"] == pytest.approx((N - 1) / N)
 
 
+@pytest.mark.parametrize("harm", [angle, nan_action])
+def test_a_broken_world_stays_ended_until_it_is_reset(small_env, harm: Harm) -> None:
+    """As any other finished world: stepped on by hand it is truncated in every step, and counted once."""
+    env = small_env(N, success_distance=0.01, terminate_on_success=True)
+    env.statistics()
+    step = env.reset(seed=0)
+    for t in range(4):
+        action = torch.zeros(N, 7)
+        if t in (0, 1, 2):
+            harm(env, action)
+        if t == 3:  # what it reaches now is no success of the episode that is over
+            env.set_goal(env.tool_position())
+        step = env.step(step.set("action", action))["next"]
+        expected = torch.zeros(N, 1, dtype=torch.bool)
+        expected[BROKEN] = True
+        assert torch.equal(step["truncated"], expected), t
+        assert all(torch.isfinite(value.float()).all() for value in step.values(True, True)), t
+        assert env.is_finite().all() and env.tool_position().isfinite().all(), t
+        assert step["terminated"][BROKEN].item() is False and step["done"][BROKEN].item(), t
+    statistics = env.statistics()
+    assert statistics["nonfinite"] == 1 and statistics["episodes"] == N
+    assert statistics["success_once"] == pytest.approx((N - 1) / N)
+    # A saved state remembers that it is over; a reset begins the next episode.
+    env.set_state(env.get_state())
+    assert env.step(step.set("action", torch.zeros(N, 7)))["next", "done"][BROKEN]
+    again = env.step(env.reset(seed=0).set("action", torch.zeros(N, 7)))["next"]
+    assert not again["done"].any()
+
+
 @pytest.mark.parametrize("harm", [angle, velocity, None])
 def test_nothing_of_an_episode_reaches_the_next(small_env, harm: Harm | None, random_actions) -> None:
     """Not through the solver's warm start either, which counts where joints are at their limits."""

@@ -12,15 +12,10 @@ import pytest
 import torch
 import warp as wp
 
-from franka_wm.envs import FrankaConfig, FrankaEnv, render
+from franka_wm.envs import FrankaConfig, FrankaEnv, high_quality
 from franka_wm.envs.camera import look_at as camera_pose
-from franka_wm.envs.render import (
-    HighQualityRenderer,
-    high_quality_renderer,
-    look_at_angles,
-    supersample,
-    which_backends,
-)
+from franka_wm.envs.high_quality import HighQualityRenderer, high_quality_renderer, which_backends
+from franka_wm.envs.view import look_at_angles, supersample
 from franka_wm.errors import UserError
 
 CONFIG = FrankaConfig(observations=("state",), substeps=4, gravity_compensation=True)
@@ -102,7 +97,7 @@ def test_backends_are_looked_for_without_importing_them() -> None:
 
 
 def test_backends_follow_what_is_installed(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(render, "find_spec", lambda name: None if name == "ovrtx" else object())
+    monkeypatch.setattr(high_quality, "find_spec", lambda name: None if name == "ovrtx" else object())
     assert which_backends() == {"warp": True, "rtx": False, "usd": True}
 
 
@@ -110,7 +105,7 @@ def test_backends_follow_what_is_installed(monkeypatch: pytest.MonkeyPatch) -> N
 def test_a_missing_backend_names_its_extra(
     backend: Any, env: FrankaEnv, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    monkeypatch.setattr(render, "find_spec", lambda name: None)
+    monkeypatch.setattr(high_quality, "find_spec", lambda name: None)
     with pytest.raises(UserError, match=rf"pip install 'franka-wm\[{backend}\]'") as error:
         HighQualityRenderer(env.model, backend=backend, output_path=tmp_path / "a.usd")
     assert "\n" not in str(error.value)
@@ -342,7 +337,7 @@ class FakeRTX:
 def fake_rtx(monkeypatch: pytest.MonkeyPatch, viewer: type) -> None:
     import newton.viewer
 
-    monkeypatch.setattr(render, "find_spec", lambda name: object())
+    monkeypatch.setattr(high_quality, "find_spec", lambda name: object())
     monkeypatch.setattr(newton.viewer, "ViewerRTX", viewer)
 
 

@@ -20,6 +20,7 @@ def end_step(
     step_count: wp.array2d[int],
     episode_return: wp.array2d[float],
     episode_success: wp.array2d[wp.bool],
+    ended: wp.array[wp.bool],
     statistics: wp.array2d[wp.float64],
     # outputs
     terminated: wp.array2d[wp.bool],
@@ -34,19 +35,20 @@ def end_step(
     time or success, and is not counted again.
     """
     world = wp.tid()
-    over = step_count[world, 0] >= episode_length or (terminate_on_success and episode_success[world, 0])
+    over = ended[world]
     count = step_count[world, 0] + 1
     step_count[world, 0] = count
     total = episode_return[world, 0] + reward[world, 0]
     episode_return[world, 0] = total
-    solved = success[world, 0] and not broken[world]
+    solved = success[world, 0] and not broken[world] and not over
     once = episode_success[world, 0] or solved
     episode_success[world, 0] = once
-    ended = terminate_on_success and once
-    late = (count >= episode_length) or broken[world]
-    terminated[world, 0] = ended
-    truncated[world, 0] = late and not ended
-    finished = ended or late
+    stops = terminate_on_success and once
+    late = (count >= episode_length) or broken[world] or over
+    terminated[world, 0] = stops
+    truncated[world, 0] = late and not stops
+    finished = stops or late
+    ended[world] = finished
     done[world, 0] = finished
     reset_mask[world] = finished
     if finished and not over:
@@ -57,7 +59,7 @@ def end_step(
             statistics[world, 3] += wp.float64(1.0)
         if once:
             statistics[world, 4] += wp.float64(1.0)
-    if broken[world]:
+    if broken[world] and not over:
         statistics[world, 5] += wp.float64(1.0)
 
 
@@ -79,6 +81,7 @@ def reset_pose(
     step_count: wp.array2d[int],
     episode_return: wp.array2d[float],
     episode_success: wp.array2d[wp.bool],
+    ended: wp.array[wp.bool],
     history: wp.array3d[float],
     absolute: bool,
 ):
@@ -98,6 +101,7 @@ def reset_pose(
     step_count[world, 0] = 0
     episode_return[world, 0] = 0.0
     episode_success[world, 0] = False
+    ended[world] = False
     for k in range(history.shape[1]):
         for j in range(history.shape[2]):
             history[world, k, j] = 0.0

@@ -34,6 +34,7 @@ class Arrays[T]:
         terminated, truncated, done: Of the last step, (N, 1) bool.
         step_count: (N, 1) int32, steps done in the episode.
         episode_return, episode_success: Of the episode so far, (N, 1): sum of rewards; any success.
+        ended: (N,) bool: the episode is over, and the next one has not begun.
         statistics: (N, 6) float64, see :data:`STATISTICS`.
         task_goal: (N, 3) the goal of the episode [m], which ``goal`` and ``state`` observe.
         goal_q: (N, 7) joints that reach it [rad].
@@ -73,6 +74,7 @@ class Arrays[T]:
     step_count: T
     episode_return: T
     episode_success: T
+    ended: T
     statistics: T
     task_goal: T
     goal_q: T
@@ -147,6 +149,7 @@ def allocate(
         step_count=zeros(n, 1, dtype=torch.int32),
         episode_return=zeros(n, 1),
         episode_success=flags(n, 1),
+        ended=flags(n),
         statistics=zeros(n, len(STATISTICS), dtype=torch.float64),
         task_goal=zeros(n, 3),
         goal_q=zeros(n, NUM_JOINTS),

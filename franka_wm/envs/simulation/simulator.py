@@ -169,6 +169,7 @@ class Simulation:
     def _launch_step(self) -> None:
         w = self.warp
         self._launch_control_step()
+        self.launch_forward_kinematics(w.broken)  # their links are not finite yet; a reset would mend them
         self._launch_observe(w.true_state, w.joint_target, w.goal)
         self._launch_noise(w.true_state, w.state)
 
@@ -187,7 +188,7 @@ class Simulation:
         self._launch(
             episodes.end_step,
             w.reward, w.success, w.broken, cfg.episode_length, cfg.terminate_on_success,
-            w.step_count, w.episode_return, w.episode_success, w.statistics,
+            w.step_count, w.episode_return, w.episode_success, w.ended, w.statistics,
             w.terminated, w.truncated, w.done, w.reset_mask,
         )  # fmt: skip
         self._launch_noise(w.next_true_state, w.next_state)
@@ -233,7 +234,7 @@ class Simulation:
         self._launch(
             episodes.reset_pose,
             w.mask, w.seed, c.home, cfg.pose_noise, c.lower, c.upper, w.episode, w.joint_q, w.joint_qd,
-            w.target, w.control, w.step_count, w.episode_return, w.episode_success, w.history,
+            w.target, w.control, w.step_count, w.episode_return, w.episode_success, w.ended, w.history,
             cfg.action_mode == "joint_position",
         )  # fmt: skip
         self.randomizer.launch(w.mask)

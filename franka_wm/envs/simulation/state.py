@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from franka_wm.envs.simulation.simulator import Simulation
 
 MEMORY = (
-    "step_count", "episode_return", "episode_success", "episode", "task_goal", "goal_center", "goal_q",
+    "step_count", "episode_return", "episode_success", "ended", "episode", "task_goal", "goal_center", "goal_q",
     "initial_distance", "phase", "target", "history", "delay", "brightness", "joint_q", "joint_qd", "control",
     "body_q", "poses",
 )  # fmt: skip
@@ -55,6 +55,7 @@ def write(sim: Simulation, state: Mapping[str, torch.Tensor]) -> None:
         UserError: An array is missing or has another shape; nothing is changed then.
     """
     there = memory(sim)
+    state = {"ended": torch.zeros_like(there["ended"])} | dict(state)  # states of version 0.1.0 have none
     expected = there | {"seed": sim.tensors.seed.expand(sim.num_envs)}
     for name, tensor in expected.items():
         if name not in state or state[name].shape != tensor.shape or state[name].dtype != tensor.dtype:

@@ -1,4 +1,4 @@
-"""Pictures for people: recordings as USD, path-traced video, and the small tools around them.
+"""Recordings for people: USD stages and path-traced video.
 
 What a model or a policy sees comes from :mod:`franka_wm.envs.camera` and never leaves the device. Here a frame
 is copied to the host, once per :meth:`HighQualityRenderer.add`.
@@ -19,14 +19,13 @@ from typing import TYPE_CHECKING, Any, Literal, Self
 import numpy as np
 import torch
 
+from franka_wm.envs.view import Vector, axes, camera_rotation, look_at_angles, point
 from franka_wm.errors import UserError
 
 if TYPE_CHECKING:
     import newton
 
     from franka_wm.envs.franka import FrankaEnv
-
-Vector = Sequence[float]
 
 NEEDS = {"warp": ("warp",), "rtx": ("ovrtx", "ovstage", "pyglet", "pxr"), "usd": ("pxr",)}
 """Modules that each way of rendering imports."""
@@ -63,86 +62,6 @@ def _missing(backend: str) -> list[str]:
 def _pxr(*names: str) -> tuple[Any, ...]:
     """Modules of the extra ``[usd]``. By name: a type checker may run without it, and they have no types."""
     return tuple(import_module(f"pxr.{name}") for name in names)
-
-
-def supersample(frame: torch.Tensor, factor: int) -> torch.Tensor:
-    """Averages blocks of ``factor``² pixels: the box filter.
-
-    Args:
-        frame: (..., 3, H·factor, W·factor), of any floating type, or uint8.
-        factor: Pixels per pixel along each side, ≥ 1.
-
-    Returns:
-        (..., 3, H, W) of the same type; uint8 is rounded to nearest.
-
-    Raises:
-        UserError: If the sides are no multiples of ``factor``.
-    """
-    if isinstance(factor, bool) or not isinstance(factor, int) or factor < 1:
-        raise UserError(f"factor={factor!r}: must be a whole number of at least 1")
-    if frame.dim() < 3 or frame.shape[-2] % factor or frame.shape[-1] % factor:
-        raise UserError(
-            f"frame has shape {tuple(frame.shape)}; it must be (…, 3, H·{factor}, W·{factor}) for factor={factor}"
-        )
-    *lead, height, width = frame.shape
-    blocks = frame.reshape(*lead, height // factor, factor, width // factor, factor)
-    if frame.is_floating_point():
-        return blocks.mean((-3, -1))
-    return blocks.float().mean((-3, -1)).round_().to(frame.dtype)
-
-
-def look_at_angles(eye: Vector, target: Vector, up_axis: str = "Z") -> tuple[float, float]:
-    """Angles of a camera at ``eye`` that looks at ``target``.
-
-    Args:
-        eye, target: World points [m].
-        up_axis: ``"X"``, ``"Y"`` or ``"Z"``.
-
-    Returns:
-        (pitch, yaw) in degrees. Pitch is the elevation above the horizon, −90 to 90. Yaw turns about the up
-        axis; it is 0 along +x for Z up (then towards +y) and for Y up (towards +z), along +y for X up (towards
-        +z). Straight up or down, where any yaw will do, it is 0.
-
-    Raises:
-        UserError: If the points coincide, or are no points.
-    """
-    direction = _point("target", target) - _point("eye", eye)
-    length = float(np.linalg.norm(direction))
-    if length < 1e-9:
-        raise UserError(f"eye and target coincide at {tuple(float(v) for v in eye)} m; move one of them")
-    up, ahead, aside = _axes(up_axis)
-    flat = math.hypot(direction[ahead], direction[aside])
-    pitch = math.degrees(math.atan2(direction[up], flat))
-    yaw = math.degrees(math.atan2(direction[aside], direction[ahead])) if flat > 1e-9 * length else 0.0
-    return pitch, yaw
-
-
-def _axes(up_axis: str) -> tuple[int, int, int]:
-    """Indices of the up axis, of yaw 0 and of yaw 90°."""
-    axes = {"X": (0, 1, 2), "Y": (1, 0, 2), "Z": (2, 0, 1)}.get(str(up_axis).upper())
-    if axes is None:
-        raise UserError(f"up_axis={up_axis!r}: must be X, Y or Z")
-    return axes
-
-
-def _point(name: str, value: Vector) -> np.ndarray:
-    point = np.asarray(value, dtype=np.float64)
-    if point.shape != (3,) or not np.isfinite(point).all():
-        raise UserError(f"{name}={value}: give three finite numbers (x, y, z) in metres")
-    return point
-
-
-def _camera_rotation(pitch: float, yaw: float, up_axis: str) -> np.ndarray:
-    """Rows are the camera's right, up and backward axes in the world, (3, 3).
-
-    Up is the derivative of forward by pitch: defined straight up and down, too.
-    """
-    p, y = math.radians(pitch), math.radians(yaw)
-    up_index, ahead, aside = _axes(up_axis)
-    forward, up = np.zeros(3), np.zeros(3)
-    forward[[up_index, ahead, aside]] = math.sin(p), math.cos(y) * math.cos(p), math.sin(y) * math.cos(p)
-    up[[up_index, ahead, aside]] = math.cos(p), -math.cos(y) * math.sin(p), -math.sin(y) * math.sin(p)
-    return np.stack([np.cross(forward, up), up, -forward])
 
 
 class HighQualityRenderer:
@@ -205,7 +124,7 @@ class HighQualityRenderer:
             raise UserError(f"fov_degrees={fov_degrees}: must be between 0 and 180")
         if passes < 1:
             raise UserError(f"passes={passes}: must be at least 1")
-        _axes(up_axis)
+        axes(up_axis)
         if worlds is not None:
             wrong = [w for w in worlds if not 0 <= w < model.world_count]
             if wrong or not worlds:
@@ -260,7 +179,7 @@ class HighQualityRenderer:
         """
         if not (math.isfinite(pitch) and math.isfinite(yaw)):
             raise UserError(f"pitch={pitch}, yaw={yaw}: must be finite, in degrees")
-        self._position = _point("position", position)
+        self._position = point("position", position)
         self._pitch, self._yaw = float(pitch), float(yaw)
 
     def look_at(self, eye: Vector, target: Vector) -> None:
@@ -368,7 +287,7 @@ class HighQualityRenderer:
         (Gf,) = _pxr("Gf")
 
         pose = np.eye(4)  # row vectors, as USD has it
-        pose[:3, :3] = _camera_rotation(self._pitch, self._yaw, self.up_axis)
+        pose[:3, :3] = camera_rotation(self._pitch, self._yaw, self.up_axis)
         pose[3, :3] = self._position
         self._camera.Set(Gf.Matrix4d(*pose.flatten().tolist()), frame)
 
@@ -385,7 +304,7 @@ class HighQualityRenderer:
             light.CreateIntensityAttr(intensity)
             light.CreateAngleAttr(1.0)  # [degrees] soft edges of shadows
             pose = np.eye(4)
-            pose[:3, :3] = _camera_rotation(pitch, yaw, self.up_axis)
+            pose[:3, :3] = camera_rotation(pitch, yaw, self.up_axis)
             light.AddTransformOp().Set(Gf.Matrix4d(*pose.flatten().tolist()))
 
     def _publish_usd(self) -> None:

@@ -1,0 +1,44 @@
+# pyright: reportArgumentType=false
+# (TorchRL's annotations do not know shapes as tuples.)
+"""TorchRL's specs of what the arm observes."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from torchrl.data import Binary, Bounded, Composite, Unbounded
+
+from franka_wm.envs.config import STATE_DIM, FrankaConfig
+from franka_wm.envs.kinematics import Kinematics
+
+
+def observation_spec(
+    config: FrankaConfig, images: Sequence[str], kinematics: Kinematics, n: int, device: torch.device
+) -> Composite:
+    """Shapes, types and bounds of the observations of ``n`` worlds, in the order in which they are emitted.
+
+    Args:
+        config: What is observed.
+        images: Keys of the images.
+        kinematics: The joint limits.
+        n, device: Number of worlds; where the tensors live.
+    """
+    size = config.image_size
+    entries: dict = {}
+    for key in images:
+        if key.startswith("depth"):
+            entries[key] = Unbounded(shape=(n, size, size, 1), device=device)
+        else:
+            channels = 1 if key.startswith("segmentation") else 3 * config.frame_stack
+            shape = (n, size, size, channels)
+            entries[key] = Bounded(0, 255, shape=shape, dtype=torch.uint8, device=device)
+    if "state" in config.observations:
+        entries["state"] = Unbounded(shape=(n, STATE_DIM), device=device)
+    if "joint_target" in config.observations:
+        low, high = (limit.expand(n, -1) for limit in (kinematics.lower, kinematics.upper))
+        entries["joint_target"] = Bounded(low, high, device=device)
+    entries["goal"] = Unbounded(shape=(n, 3), device=device)
+    entries["success"] = Binary(shape=(n, 1), dtype=torch.bool, device=device)
+    entries["is_init"] = Binary(shape=(n, 1), dtype=torch.bool, device=device)
+    return Composite(**entries, shape=(n,), device=device)
