@@ -32,19 +32,19 @@ def main(cfg: DictConfig) -> None:
     env, judge = run.build_environments()
     replay, spaces = run.build_experience(env)
     pretrain(run, env, replay, spaces)
-    model = build.make_model(run.cfg, spaces, run.device)
-    acting = build.make_agent_policies(run.cfg, model, env, spaces, purpose="training")
-    judged = build.make_agent_policies(run.cfg, model, judge, spaces)
+    model = build.make_model(run.settings, spaces, run.device)
+    acting = build.make_agent_policies(run.settings, model, env, spaces, purpose="training")
+    judged = build.make_agent_policies(run.settings, model, judge, spaces)
     trainer = Trainer(
         env=env,
-        learner=Learner(model, **run.learner_options()),
+        learner=Learner(model, **run.settings.learner_options),
         replay=replay,
         policies=acting,
-        actor=build.actor(run.cfg),
-        cfg=run.cfg,
+        actor=run.settings.actor,
+        settings=run.settings,
         folder=run.folder,
         loggers=run.loggers,
-        evaluate=during_training(judge, judged, **run.during),
+        evaluate=during_training(run.settings.evaluation, judge, judged),
         spaces=spaces,
         validation=run.validation,
         diagnose=diagnose_training,
@@ -55,9 +55,9 @@ def main(cfg: DictConfig) -> None:
     if trainer.interrupted:
         run.stop()
     if judged:
-        found = evaluate_run(run.cfg, run.folder, judge, judged, counters=trainer.counters)
+        found = evaluate_run(run.settings, run.folder, judge, judged, counters=trainer.counters)
         report_run(
-            run.cfg,
+            run.settings,
             run.folder,
             judge,
             judged,

@@ -13,6 +13,7 @@ from omegaconf import DictConfig
 
 from franka_wm import conf
 from franka_wm.envs import FrankaConfig, FrankaEnv
+from franka_wm.training.settings import RunSettings
 
 ROOT = Path(__file__).resolve().parents[1]
 
@@ -42,6 +43,12 @@ def small_env() -> Callable[..., FrankaEnv]:
 def composed() -> Callable[..., DictConfig]:
     """The configuration that ``python train.py …`` would run with."""
     return conf.compose
+
+
+@pytest.fixture(scope="session")
+def settled() -> Callable[..., RunSettings]:
+    """Settings of the run that ``python train.py …`` would be."""
+    return lambda *overrides: RunSettings.of(conf.compose(*overrides))
 
 
 @pytest.fixture(scope="session")

@@ -111,16 +111,16 @@ def _simple(name: str, options: dict[str, Any], overrides: list[str]) -> Source:
     from franka_wm.commands.entry import with_scale
     from franka_wm.console import announced, say
     from franka_wm.envs import FrankaConfig, FrankaEnv
-    from franka_wm.training import build
+    from franka_wm.training.settings import plain
 
     cfg = compose(with_scale(overrides), tuple(OPTIONS))
     seed, smoothness = number(cfg, "seed"), number(cfg, "collector.smoothness", float)
     worlds = options["num_envs"] or min(number(cfg, "collector.num_envs"), options["episodes"])
-    if not build.is_arm(cfg):
+    if cfg.env.kind != "franka":
         raise UserError(
             f"collect: env.kind={cfg.env.kind!r}: datasets are gathered from the arm (env=reach, …)"
         )
-    values = build.plain(cfg.env)
+    values = plain(cfg.env)
     added = [key for key in ("state", "joint_target") if key not in values["observations"]]
     if added:
         say(f"env.observations: adding {' and '.join(added)}, which a dataset always has")
@@ -196,5 +196,5 @@ def _agent(part: str, checkpoint: str, options: dict[str, Any], overrides: list[
     part = part or ("planner" if "planner" in agent.policies else "policy")
     if part not in agent.policies:
         raise UserError(f"collect: policy={part}: {checkpoint} has only {', '.join(agent.policies)}")
-    resolved: Any = OmegaConf.to_container(agent.cfg, resolve=True)
-    return Source(agent.env, agent.policies[part], resolved, f"{part} of {checkpoint}", int(agent.cfg.seed))
+    settings = agent.settings
+    return Source(agent.env, agent.policies[part], settings.values, f"{part} of {checkpoint}", settings.seed)

@@ -92,17 +92,17 @@ def with_scale(arguments: list[str]) -> list[str]:
 
 def check_command(arguments: list[str]) -> str | None:
     """What is wrong with the overrides or the folder they write to, in one line; ``None`` if nothing is."""
-    from franka_wm.training.check import check
-    from franka_wm.training.run import import_plugins, occupied, resumed, unwritable
+    from franka_wm.training.run import check_once, import_plugins, occupied, resumed, unwritable
+    from franka_wm.training.settings import RunSettings
 
     if any(a in ("-m", "--multirun") for a in arguments):
         return None  # sweeps are resolved by Hydra itself
     try:
         cfg = compose(arguments)
-        import_plugins(cfg)
+        import_plugins(cfg.plugins)
         if cfg.resume is not None:
             _, cfg = resumed(cfg, arguments)
-        check(cfg)
+        check_once(RunSettings.of(cfg, saved=cfg.resume is not None))
     except FrankaError as error:
         return str(error)
     chosen = next((a.split("=", 1)[1] for a in arguments if a.startswith("hydra.run.dir=")), "outputs")

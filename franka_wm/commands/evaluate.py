@@ -137,7 +137,7 @@ def run(options: Options) -> dict[str, Any]:
     evaluation = evaluate_agent(
         agent, episodes=options.episodes, report=lambda name, r: say(describe(name, r))
     )
-    described = protocol(agent.cfg, agent.env, evaluation, by=COMMAND, counters=agent.counters)
+    described = protocol(agent.settings, agent.env, evaluation, by=COMMAND, counters=agent.counters)
     results = {
         "protocol": {"checkpoint": options.checkpoint, **described},
         "policies": evaluation.policies,

@@ -168,7 +168,7 @@ def calibration(agent: Any, *, episodes: int = 32) -> dict[str, Any]:
     length = agent.env.config.episode_length
     tail = steps_until_forgotten(model.discount)
     env = build.make_evaluation_env(
-        agent.cfg, num_envs=min(episodes, agent.env.num_envs), episode_length=length + tail
+        agent.settings, num_envs=min(episodes, agent.env.num_envs), episode_length=length + tail
     )
     keys = model.observation_keys
     played, _ = gather_episodes(env, agent.policies["policy"], keys=keys)

@@ -15,7 +15,6 @@ from franka_wm import console
 from franka_wm.errors import UserError
 from franka_wm.evaluation.closed_loop import (
     THRESHOLDS,
-    arm_of,
     decision_times,
     play_episodes,
     reaches,
@@ -24,6 +23,7 @@ from franka_wm.evaluation.closed_loop import (
 from franka_wm.evaluation.results import END, FILE, point, to_json
 from franka_wm.files import atomic_write
 from franka_wm.seeding import derive_seed, seeded
+from franka_wm.training.settings import EvaluationSettings, RunSettings
 from franka_wm.version import __version__
 from franka_wm.versions import hardware
 
@@ -133,24 +133,23 @@ def evaluate_policies(
 
 
 def protocol(
-    cfg: Any, env: Any, evaluation: Evaluation, *, by: str, counters: Mapping[str, float]
+    settings: RunSettings, env: Any, evaluation: Evaluation, *, by: str, counters: Mapping[str, float]
 ) -> dict[str, Any]:
     """How it was measured, for whoever reads the numbers later: ``protocol`` of ``evaluation.json``.
 
     Args:
-        cfg: The run's configuration.
+        settings: Of the run.
         env: Evaluation worlds.
         evaluation: What was found.
         by: Who measured: :data:`~franka_wm.evaluation.results.END` or :data:`~franka_wm.evaluation.results.COMMAND`.
         counters: Of the training: ``updates``, ``env_steps``, ``seconds``.
     """
-    arm = arm_of(env) is not None
     return {
         "by": by,
-        "task": str(cfg.env.task if arm else cfg.env.name),
-        "model": str(cfg.model.name),
-        **({"planner": str(cfg.planner.name)} if "planner" in evaluation.policies else {}),
-        "seed": int(cfg.seed),
+        "task": settings.env.label,
+        "model": settings.model.name,
+        **({"planner": settings.planner.name} if "planner" in evaluation.policies else {}),
+        "seed": settings.seed,
         **{name: counters[name] for name in ("updates", "env_steps") if name in counters},
         **({"training_seconds": counters["seconds"]} if "seconds" in counters else {}),
         "episodes": next(iter(evaluation.policies.values()))["episodes"],
@@ -192,15 +191,15 @@ def describe(name: str, summary: Mapping[str, Any]) -> str:
 
 
 def during_training(
-    env: Any, policies: Mapping[str, Any], *, names: Sequence[str], episodes: int | None
+    settings: EvaluationSettings, env: Any, policies: Mapping[str, Any]
 ) -> Callable[[], dict[str, float]]:
-    """A function for the trainer: plays the policies in ``names`` and returns numbers to log."""
-    chosen = {name: policies[name] for name in names if name in policies}
-    return lambda: numbers_to_log(env, chosen, episodes=episodes)
+    """A function for the trainer: plays the policies of ``evaluation.during`` and returns numbers to log."""
+    chosen = {name: policies[name] for name in settings.during if name in policies}
+    return lambda: numbers_to_log(env, chosen, episodes=settings.during_episodes)
 
 
 def evaluate_run(
-    cfg: Any,
+    settings: RunSettings,
     folder: Path,
     env: Any,
     policies: Mapping[str, Any],
@@ -211,7 +210,7 @@ def evaluate_run(
     """The end of a run: every policy over the same held-out episodes, and ``evaluation.json`` in the run's folder.
 
     Args:
-        cfg: The run's configuration.
+        settings: Of the run.
         folder: Of the run.
         env: Evaluation worlds; as many episodes.
         policies: By name.
@@ -220,7 +219,7 @@ def evaluate_run(
     """
     say(f"evaluating over {env.num_envs} held-out episodes …")
     found = evaluate_policies(env, policies, report=lambda name, r: say(describe(name, r)))
-    found.protocol = protocol(cfg, env, found, by=END, counters=counters)
+    found.protocol = protocol(settings, env, found, by=END, counters=counters)
     with atomic_write(folder / FILE) as path:
         path.write_text(to_json({"protocol": found.protocol, "policies": found.policies}))
     return found

@@ -106,13 +106,13 @@ def robustness(
             raise UserError(f"robustness: no policy {name!r}; here are {', '.join(agent.policies)}")
     seen = bool(agent.model.image_sizes)
     cases = {UNSHIFTED: Shift({})} | {name: s for name, s in shifts.items() if seen or not s.looks}
-    own = build.plain(agent.cfg.env.randomization)
+    own = dict(agent.settings.values["env"]["randomization"])
     seed = held_out_seeds(1)[0]
     results: dict[str, dict[str, dict[str, Any]]] = {}
     before: dict[str, TensorDictBase] = {}
     for case, shift in cases.items():
         env = build.make_evaluation_env(
-            agent.cfg, num_envs=episodes, randomization=own | dict(shift.randomization), **shift.env
+            agent.settings, num_envs=episodes, randomization=own | dict(shift.randomization), **shift.env
         )
         results[case] = {}
         for name in names:

@@ -94,8 +94,8 @@ def build(options: Options) -> Stage:
         agent = load_agent(
             options.checkpoint, num_envs=1, device=options.device, env_changes=changes, seed=options.seed
         )
-    title = f"{agent.cfg.model.name}, {int(agent.counters.get('updates', 0)):,} updates"
-    return Stage(agent.env, agent.policies, title, int(agent.cfg.env.episode_length))
+    title = f"{agent.settings.model.name}, {int(agent.counters.get('updates', 0)):,} updates"
+    return Stage(agent.env, agent.policies, title, agent.settings.env.episode_length)
 
 
 def check_arm(checkpoint: str) -> None:

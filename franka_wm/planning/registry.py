@@ -4,8 +4,11 @@ To add one: a file with a class that has `plan` (see `Planner`), a line in `_PLA
 file in `conf/planner` with `name:` and the constructor's arguments.
 """
 
+from collections.abc import Mapping
 from importlib import import_module
 from typing import Any
+
+from franka_wm.options import check_arguments
 
 # name -> (module, class, whether it chooses among discrete actions, what it is in one line)
 _PLANNERS: dict[str, tuple[str, str, bool, str]] = {
@@ -56,17 +59,35 @@ def register(name: str, cls: type, *, search: bool = False, line: str = "") -> N
     _REGISTERED[name] = (cls, search, line)
 
 
+def planner(name: str) -> Any:
+    """The class of the planner `name`, or what makes one.
+
+    Raises:
+        ValueError: no planner has this name.
+    """
+    _require(name)
+    if name in _REGISTERED:
+        return _REGISTERED[name][0]
+    module, cls, _, _ = _PLANNERS[name]
+    return getattr(import_module(module), cls)
+
+
+def validate(name: str, options: Mapping[str, Any]) -> None:
+    """Check options against the types that the planner's constructor declares.
+
+    Raises:
+        UserError: an option that it does not have, or a value of another type.
+    """
+    check_arguments(planner(name), options, "planner")
+
+
 def make(name: str, **arguments: Any) -> Any:
     """Build the planner `name`.
 
     Raises:
         ValueError: no planner has this name, or an argument that cannot work.
     """
-    _require(name)
-    if name in _REGISTERED:
-        return _REGISTERED[name][0](**arguments)
-    module, cls, _, _ = _PLANNERS[name]
-    return getattr(import_module(module), cls)(**arguments)
+    return planner(name)(**arguments)
 
 
 def _require(name: str) -> None:

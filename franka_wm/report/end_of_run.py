@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from omegaconf import DictConfig
 
 from franka_wm.envs.camera import project
 from franka_wm.evaluation.closed_loop import arm_of, play_episodes, reaches
@@ -19,11 +18,12 @@ from franka_wm.report.diagnostics import evaluation_markdown, terminal
 from franka_wm.report.table import evaluation_tables
 from franka_wm.seeding import seeded
 from franka_wm.training.build import make_evaluation_env
+from franka_wm.training.settings import RunSettings
 from franka_wm.video import draw_marker, tile_frames, write_png, write_video
 
 
 def report_run(
-    cfg: DictConfig,
+    settings: RunSettings,
     folder: Path,
     env: Any,
     policies: Mapping[str, Any],
@@ -38,7 +38,7 @@ def report_run(
     Writes ``evaluation.md``, ``curves.png`` and, of the arm, ``video.mp4`` and ``last_frame.png`` into ``folder``.
 
     Args:
-        cfg: The run's configuration.
+        settings: Of the run.
         folder: Of the run; :func:`~franka_wm.evaluation.protocol.evaluate_run` has written its results there.
         env: Evaluation worlds.
         policies: By name.
@@ -51,7 +51,7 @@ def report_run(
 
     with atomic_write(folder / "evaluation.md") as path:
         path.write_text(evaluation_markdown(found))
-    last = last_row([Result(folder / FILE, found.protocol, found.policies)], cfg.evaluation.during)
+    last = last_row([Result(folder / FILE, found.protocol, found.policies)], settings.evaluation.during)
     drawn = [*rows, last]
     if log is not None and last:
         log({name: value for name, value in last.items() if name.startswith("eval/")})
@@ -59,9 +59,9 @@ def report_run(
     if x := axis(drawn):
         mark = arm.config.success_distance if arm is not None and reaches(env) else None
         plot_learning_curves(drawn, folder / "curves.png", x=x, success_distance=mark)
-    if cfg.evaluation.video_episodes and arm is not None:
+    if settings.evaluation.video_episodes and arm is not None:
         name = acting(policies)
-        frames = film(cfg, folder, policies[name])
+        frames = film(settings, folder, policies[name])
         if log_video is not None:
             log_video(f"eval/{name}", frames, round(arm.config.fps))
     Console(width=120).print(terminal(evaluation_tables(found.policies)[0]))
@@ -72,12 +72,12 @@ def acting(policies: Mapping[str, Any]) -> str:
     return next((name for name in ("planner", "policy") if name in policies), next(iter(policies)))
 
 
-def film(cfg: DictConfig, folder: Path, policy: Any) -> torch.Tensor:
+def film(settings: RunSettings, folder: Path, policy: Any) -> torch.Tensor:
     """``video.mp4`` and ``last_frame.png``: episodes of one policy, the goal drawn as a ring."""
-    env = make_evaluation_env(cfg, num_envs=cfg.evaluation.video_episodes)
+    env = make_evaluation_env(settings, num_envs=settings.evaluation.video_episodes)
     arm = arm_of(env)
     assert arm is not None
-    size = cfg.evaluation.video_size
+    size = settings.evaluation.video_size
     frames: list[torch.Tensor] = []
 
     def picture() -> None:

@@ -8,12 +8,12 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from omegaconf import DictConfig
 
 from franka_wm.device import resolve_device
 from franka_wm.errors import UserError
 from franka_wm.training import build
 from franka_wm.training.checkpoint import Checkpoint, latest_checkpoint, load_checkpoint
+from franka_wm.training.settings import RunSettings
 from franka_wm.training.spaces import Spaces
 
 HUB = "hf:"
@@ -25,7 +25,7 @@ class Agent:
 
     Attributes:
         folder: Of the checkpoint.
-        cfg: The configuration it was trained with; ``device`` is the one in use now.
+        settings: Those it was trained with; ``device`` is the one in use now.
         env: Evaluation worlds.
         model: In evaluation mode.
         planner: Of the family; ``None`` where the model has no dynamics.
@@ -34,7 +34,7 @@ class Agent:
     """
 
     folder: Path
-    cfg: DictConfig
+    settings: RunSettings
     env: Any
     model: Any
     planner: Any
@@ -63,20 +63,19 @@ def load_agent(
         UserError: One line: no checkpoint, a damaged one, or one whose environment cannot be built here.
     """
     checkpoint = find_checkpoint(folder)
-    cfg = checkpoint.config.copy()
-    cfg.device = str(device)
+    settings = RunSettings.of(checkpoint.config, saved=True).changed(device=str(device))
     if seed is not None:
-        cfg.seed = seed
-    if cfg.env.kind == "none":
+        settings = settings.changed(seed=seed)
+    if settings.env.kind == "none":
         raise UserError(
             f"{folder}: was trained on recorded data without an environment; there is nothing to act in"
         )
-    model = _model(checkpoint, cfg, resolve_device(cfg.device))
-    env = build.make_evaluation_env(cfg, num_envs=num_envs, **dict(env_changes or {}))
+    model = _model(checkpoint, settings, resolve_device(settings.device))
+    env = build.make_evaluation_env(settings, num_envs=num_envs, **dict(env_changes or {}))
     spaces = Spaces.of_env(env)
-    policies = build.make_agent_policies(cfg, model, env, spaces)
+    policies = build.make_agent_policies(settings, model, env, spaces)
     planner = getattr(policies.get("planner"), "planner", None)
-    return Agent(checkpoint.folder, cfg, env, model, planner, policies, dict(checkpoint.counters))
+    return Agent(checkpoint.folder, settings, env, model, planner, policies, dict(checkpoint.counters))
 
 
 def load_model(folder: str | Path, *, device: torch.device | str = "cpu") -> Any:
@@ -85,7 +84,7 @@ def load_model(folder: str | Path, *, device: torch.device | str = "cpu") -> Any
     Args and errors: as for :func:`load_agent`.
     """
     checkpoint = find_checkpoint(folder)
-    return _model(checkpoint, checkpoint.config, resolve_device(device))
+    return _model(checkpoint, RunSettings.of(checkpoint.config, saved=True), resolve_device(device))
 
 
 def find_checkpoint(folder: str | Path) -> Checkpoint:
@@ -97,12 +96,12 @@ def find_checkpoint(folder: str | Path) -> Checkpoint:
     return load_checkpoint(latest_checkpoint(folder))
 
 
-def _model(checkpoint: Checkpoint, cfg: DictConfig, device: torch.device) -> Any:
+def _model(checkpoint: Checkpoint, settings: RunSettings, device: torch.device) -> Any:
     saved = (checkpoint.extra() or {}).get("spaces")
     if saved is None:
         raise UserError(
             f"{checkpoint.folder}: does not say what sizes its model has; it was written by an older version"
         )
-    model = build.make_model(cfg, Spaces.from_dict(saved), device)
+    model = build.make_model(settings, Spaces.from_dict(saved), device)
     checkpoint.load_model(model)
     return model.eval()

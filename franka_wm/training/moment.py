@@ -6,7 +6,6 @@ from collections.abc import Mapping
 from typing import Any
 
 import torch
-from omegaconf import DictConfig
 from tensordict import TensorDict, TensorDictBase
 from torchrl.collectors import Collector
 
@@ -19,10 +18,11 @@ def restorable(env: Any) -> FrankaEnv | None:
     return base if isinstance(base, FrankaEnv) else None
 
 
-def same_worlds(saved: DictConfig, cfg: DictConfig) -> bool:
-    """Whether worlds and plans of a run with the configuration ``saved`` fit into one with ``cfg``."""
+def same_worlds(saved: Mapping[str, Any], now: Mapping[str, Any]) -> bool:
+    """Whether worlds and plans of a run with the configuration ``saved`` fit into one with ``now``, both plain."""
     parts = ("env", "planner", "objective")
-    return saved.collector.num_envs == cfg.collector.num_envs and all(saved[k] == cfg[k] for k in parts)
+    fitting = saved["collector"]["num_envs"] == now["collector"]["num_envs"]
+    return fitting and all(saved[part] == now[part] for part in parts)
 
 
 def worlds_now(env: Any, collector: Collector | None) -> dict[str, Any] | None:

@@ -7,12 +7,12 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from omegaconf import DictConfig
 from tensordict import TensorDictBase
 
 from franka_wm.data.memory import free_memory
 from franka_wm.data.stacks import StackStorage, newest
 from franka_wm.errors import UserError
+from franka_wm.training.settings import RunSettings
 
 BETWEEN = 2e9
 """Up to so much experience [bytes] goes into checkpoints while a run goes on: writing tens of GB takes minutes."""
@@ -24,14 +24,8 @@ SPARE = 5e8
 """What must stay free on the disk [bytes], for the weights and for what else a run writes."""
 
 
-def planned_steps(cfg: DictConfig, updates: int = 0) -> int:
-    """Steps that each world of a run will make until its end, after so many ``updates``."""
-    c, t = cfg.collector, cfg.trainer
-    return max(c.seed_steps, 1) + -(-max(t.updates - updates, 0) // t.updates_per_batch) * c.steps_per_batch
-
-
 def fill(
-    replay: Any, batch: TensorDictBase, cfg: DictConfig, *, updates: int = 0, restored: bool = False
+    replay: Any, batch: TensorDictBase, run: RunSettings, *, updates: int = 0, restored: bool = False
 ) -> None:
     """Extends an empty replay by its first ``batch``, if it has room for that and for what a run will add.
 
@@ -48,14 +42,14 @@ def fill(
     device = torch.device(storage.device)
     kept = newest(batch, storage.stacked, storage.frame_stack) if isinstance(storage, StackStorage) else batch
     per_step = kept.bytes() / kept.numel()
-    steps = cfg.replay.capacity
+    steps = run.replay.capacity
     if device.type != "cuda":
-        ahead = cfg.collector.num_envs * planned_steps(cfg, updates)
+        ahead = run.collector.num_envs * run.planned_steps(updates)
         steps = min(steps, ahead + (batch.numel() if restored else 0))
     free = free_memory(device)
     if free is not None and per_step * steps > free:
         raise UserError(
-            f"replay.capacity={cfg.replay.capacity}: {per_step * steps / 1e9:.1f} GB of experience "
+            f"replay.capacity={run.replay.capacity}: {per_step * steps / 1e9:.1f} GB of experience "
             f"({per_step / 1e3:.1f} kB a step) do not fit into the {free / 1e9:.1f} GB that are free on {device}; "
             f"at most replay.capacity={int(0.9 * free / per_step)} would, less what learning needs"
         )
@@ -65,7 +59,7 @@ def fill(
         if not isinstance(error, torch.OutOfMemoryError) and "can't allocate memory" not in str(error):
             raise
         raise UserError(
-            f"replay.capacity={cfg.replay.capacity}: {per_step * cfg.replay.capacity / 1e9:.1f} GB cannot be allocated "
+            f"replay.capacity={run.replay.capacity}: {per_step * run.replay.capacity / 1e9:.1f} GB cannot be allocated "
             f"on {device}; use a smaller replay.capacity"
         ) from error
 

@@ -7,7 +7,7 @@ import importlib
 import logging
 import sys
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, NoReturn
@@ -25,6 +25,7 @@ from franka_wm.training import build
 from franka_wm.training.check import check
 from franka_wm.training.checkpoint import latest_checkpoint, load_checkpoint
 from franka_wm.training.loggers import close_loggers, log_config, log_video, make_loggers
+from franka_wm.training.settings import RunSettings
 from franka_wm.training.spaces import Spaces
 from franka_wm.versions import write_finished, write_versions
 
@@ -32,13 +33,13 @@ INTERRUPTED = 130
 """Exit status after Ctrl-C, as shells expect."""
 
 
-def import_plugins(cfg: DictConfig) -> None:
-    """Imports the modules that ``cfg.plugins`` names; they register tasks, models and planners of the user's.
+def import_plugins(names: Iterable[str]) -> None:
+    """Imports modules, those of ``plugins``; they register tasks, models and planners of the user's.
 
     Raises:
         UserError: There is no such module.
     """
-    for name in cfg.plugins:
+    for name in names:
         if str(Path.cwd()) not in sys.path:
             sys.path.insert(0, str(Path.cwd()))  # as for python -m: modules beside the one who starts the run
         try:
@@ -85,9 +86,9 @@ def occupied(folder: Path, resume: str | None) -> str | None:
 
 @dataclass
 class Run:
-    """One run's configuration, folder, loggers, and the checkpoint that it goes on from."""
+    """One run's settings, folder, loggers, and the checkpoint that it goes on from."""
 
-    cfg: DictConfig
+    settings: RunSettings
     folder: Path
     checkpoint: Any = None
     loggers: list[Any] = field(default_factory=list)
@@ -99,32 +100,32 @@ class Run:
 
         A run on recorded data trains in no world; without an environment (``env=none``) none judges it either.
         """
-        if self.cfg.env.kind == "none":
+        if self.settings.env.kind == "none":
             return None, None
-        gathers = not build.is_offline(self.cfg)
-        worlds = f"{self.cfg.evaluation.episodes} evaluation worlds"
+        gathers = not self.settings.is_offline
+        worlds = f"{self.settings.evaluation.episodes} evaluation worlds"
         if gathers:
-            worlds = f"{self.cfg.collector.num_envs} training and {worlds}"
+            worlds = f"{self.settings.collector.num_envs} training and {worlds}"
         compiling = "on a machine's first start this compiles kernels for a minute or two"
-        with announced(f"building {worlds}" + (f"; {compiling}" if build.is_arm(self.cfg) else "")):
-            judge = build.make_evaluation_env(self.cfg)
-            env = build.make_env(self.cfg) if gathers else None
+        with announced(f"building {worlds}" + (f"; {compiling}" if self.settings.is_arm else "")):
+            judge = build.make_evaluation_env(self.settings)
+            env = build.make_env(self.settings) if gathers else None
             for one in (env, judge):
                 if one is not None:
                     with seeded(0):  # how many worlds there are must not decide what a run draws later
                         one.step_and_maybe_reset(one.rand_action(one.reset()))
                     one.statistics()
-                    one.set_seed(derive_seed("training" if one is env else "evaluation", self.cfg.seed))
+                    one.set_seed(derive_seed("training" if one is env else "evaluation", self.settings.seed))
         return env, judge
 
     def build_experience(self, env: Any) -> tuple[Any, Any]:
         """Where batches come from, and what a model must know of it: ``sample()`` and its :class:`Spaces`."""
-        if not build.is_offline(self.cfg):
-            hindsight = build.make_hindsight(self.cfg, env)
-            return build.make_replay_buffer(self.cfg, env.device, hindsight), self.as_saved(
+        if not self.settings.is_offline:
+            hindsight = build.make_hindsight(self.settings, env)
+            return build.make_replay_buffer(self.settings, env.device, hindsight), self.as_saved(
                 Spaces.of_env(env)
             )
-        windows, self.validation = build.open_recorded(self.cfg, self.device)
+        windows, self.validation = build.open_recorded(self.settings, self.device)
         spaces = Spaces(
             observation_sizes=dict(windows.observation_sizes),
             image_sizes=dict(windows.image_sizes),
@@ -144,24 +145,11 @@ class Run:
     @property
     def device(self) -> Any:
         """Where the run computes."""
-        return resolve_device(self.cfg.device)
-
-    def learner_options(self, cfg: DictConfig | None = None) -> dict[str, Any]:
-        """Arguments of the learner; ``cfg`` is another than the run's for a first stage."""
-        cfg = self.cfg if cfg is None else cfg
-        trainer = cfg.trainer
-        names = ("grad_clip", "capture", "compile", "precision")
-        kind, warmup = build.schedule(cfg)
-        return {name: trainer[name] for name in names} | {
-            "lr": build.learning_rate(cfg),
-            "total_updates": trainer.updates,
-            "schedule": kind,
-            "warmup": warmup,
-        }
+        return resolve_device(self.settings.device)
 
     def log_video(self, name: str, frames: Any, fps: int) -> None:
         """A film (T, H, W, 3) uint8 to every logger that takes films."""
-        log_video(self.loggers, name, frames, fps=fps, step=self.cfg.trainer.updates)
+        log_video(self.loggers, name, frames, fps=fps, step=self.settings.trainer.updates)
 
     def stop(self) -> NoReturn:
         """The last line of a run that was interrupted and has saved; exits with 130."""
@@ -180,18 +168,9 @@ class Run:
         Args:
             experience: Gives the replay, oldest step first; called only if something is exported.
         """
-        if self.cfg.export.kind == "none":
+        if self.settings.export.kind == "none":
             return
-        export_run(build.plain(self.cfg), experience(), folder=self.folder)
-
-    @property
-    def during(self) -> dict[str, Any]:
-        """What is evaluated while training: names of policies, and episodes."""
-        evaluation = self.cfg.evaluation
-        return {
-            "names": list(evaluation.during),
-            "episodes": evaluation.get("during_episodes"),  # checkpoints of earlier versions have none
-        }
+        export_run(self.settings.values, experience(), folder=self.folder)
 
 
 def start(cfg: DictConfig) -> Run:
@@ -202,23 +181,35 @@ def start(cfg: DictConfig) -> Run:
     """
     folder = Path(HydraConfig.get().runtime.output_dir)
     checkpoint = None
-    import_plugins(cfg)  # those of the command line: what a checkpoint names is never imported
+    import_plugins(cfg.plugins)  # those of the command line: what a checkpoint names is never imported
     if cfg.resume is not None:
         checkpoint, cfg = resumed(cfg, list(HydraConfig.get().overrides.task))
-    check(cfg)
-    device = resolve_device(cfg.device)
+    settings = RunSettings.of(cfg, saved=checkpoint is not None)
+    if settings != _checked:
+        check(settings)
+    device = resolve_device(settings.device)
     logging.getLogger("torchrl").setLevel(logging.WARNING)
-    torch.manual_seed(derive_seed("weights", cfg.seed))
+    torch.manual_seed(derive_seed("weights", settings.seed))
     if device.type == "cuda":
         torch.set_float32_matmul_precision("high")
     claim(folder)
-    problem = occupied(folder, cfg.resume)  # also of a sweep, whose folders only Hydra knows
+    problem = occupied(folder, settings.resume)  # also of a sweep, whose folders only Hydra knows
     if problem is not None:
         raise UserError(problem)
-    OmegaConf.save(cfg, folder / "config.yaml", resolve=True)
+    OmegaConf.save(OmegaConf.create(dict(settings.values)), folder / "config.yaml")
     write_versions(folder, device)
-    say(f"device {device}   seed {cfg.seed}   results in {folder}")
-    return Run(cfg=cfg, folder=folder, checkpoint=checkpoint, loggers=open_loggers(cfg, folder))
+    say(f"device {device}   seed {settings.seed}   results in {folder}")
+    return Run(settings, folder, checkpoint, open_loggers(settings, folder))
+
+
+_checked: RunSettings | None = None
+
+
+def check_once(settings: RunSettings) -> None:
+    """Checks what :func:`start` will be given, so that it need not do so again."""
+    global _checked
+    check(settings)
+    _checked = settings
 
 
 _CLAIMED: list[Any] = []  # open files: their locks last as long as the process
@@ -267,9 +258,8 @@ def resumed(cfg: DictConfig, overrides: list[str]) -> tuple[Any, DictConfig]:
     return checkpoint, merged
 
 
-def open_loggers(cfg: DictConfig, folder: Path) -> list[Any]:
-    """The loggers that ``cfg.logger`` names; each is told the configuration."""
-    options = build.plain(cfg.logger)
-    loggers = make_loggers(options.pop("names"), folder, **options)
-    log_config(loggers, build.plain(cfg))
+def open_loggers(settings: RunSettings, folder: Path) -> list[Any]:
+    """The loggers that ``logger`` names; each is told the configuration."""
+    loggers = make_loggers(settings.logger.names, folder, **settings.logger.options)
+    log_config(loggers, settings.values)
     return loggers

@@ -9,8 +9,6 @@ from __future__ import annotations
 import gc
 from typing import Any
 
-from omegaconf import open_dict
-
 from franka_wm.console import say
 from franka_wm.seeding import derive_seed
 from franka_wm.training import build
@@ -22,44 +20,38 @@ from franka_wm.training.trainer import Trainer
 
 
 def pretrain(run: Run, env: Any, experience: Any, spaces: Spaces) -> None:
-    """The first stage, if ``cfg.pretrain`` asks for one; ``cfg.model.encoder_from`` then names its checkpoint.
+    """The first stage, if the settings ask for one; ``model.encoder_from`` then names its checkpoint.
 
     Experience comes from smooth random motion, or from the recorded data. A run that resumes goes on with the stage in
     which it ended; in the second it has its encoder already.
 
     Args:
-        run: Its configuration is changed: the second stage starts from what was learned here, and from no checkpoint.
+        run: Gets the second stage's settings, which start from what was learned here, and from no checkpoint.
         env: The training worlds; ``None`` on recorded data.
         experience: Recorded windows; not used where there are worlds.
         spaces: Of observations and actions.
-
-    Raises:
-        UserError: The model takes no pretrained encoder.
     """
-    cfg = run.cfg
+    settings = run.settings
     begun = run.checkpoint if run.checkpoint is not None and "whole_run" in run.checkpoint.config else None
-    if cfg.pretrain.kind == "none" or (run.checkpoint is not None and begun is None):
+    if settings.pretrain.kind == "none" or (run.checkpoint is not None and begun is None):
         return
-    first = cfg.copy()
-    with open_dict(first):
-        first.whole_run = cfg  # so that this stage's checkpoint resumes the run, not the stage alone
-    first.model = cfg.pretrain.model
-    first.trainer.updates = cfg.pretrain.updates
-    first.export.kind = "none"
+    first = settings.first_stage()
     model = build.make_model(first, spaces, run.device)
-    say(f"first stage: {cfg.pretrain.model.name}, {cfg.pretrain.updates} updates on pictures alone")
+    say(f"first stage: {first.model.name}, {first.trainer.updates} updates on pictures alone")
     policies = {}
     if env is not None:
         policies = build.make_scripted_policies(
-            env, seed=derive_seed("policies", cfg.seed, FIRST_STAGE), smoothness=cfg.collector.smoothness
+            env,
+            seed=derive_seed("policies", settings.seed, FIRST_STAGE),
+            smoothness=settings.collector.smoothness,
         )
     trainer = Trainer(
         env=env,
-        learner=Learner(model, **run.learner_options(first)),
+        learner=Learner(model, **first.learner_options),
         replay=experience if env is None else build.make_replay_buffer(first, env.device),
         policies=policies,
         actor="random",
-        cfg=first,
+        settings=first,
         folder=run.folder / FIRST_STAGE,
         loggers=[],
         evaluate=dict,
@@ -74,5 +66,6 @@ def pretrain(run: Run, env: Any, experience: Any, spaces: Spaces) -> None:
         run.stop()
     del trainer
     gc.collect()  # these hold one another, and the second stage needs the memory of the first one's replay
-    cfg.model.encoder_from = str(run.folder.absolute() / FIRST_STAGE / "checkpoints" / "latest")
+    encoder = str(run.folder.absolute() / FIRST_STAGE / "checkpoints" / "latest")
+    run.settings = settings.changed(model={"encoder_from": encoder})
     say("second stage: dynamics on the frozen encoder")

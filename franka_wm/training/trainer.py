@@ -6,10 +6,9 @@ import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import AbstractContextManager
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import torch
-from omegaconf import DictConfig, OmegaConf
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torchrl.collectors import Collector
@@ -25,6 +24,7 @@ from franka_wm.training.learner import Learner
 from franka_wm.training.loggers import log_numbers
 from franka_wm.training.moment import draws, go_on_drawing, put_back, restorable, same_worlds, worlds_now
 from franka_wm.training.room import fill, held, left_out
+from franka_wm.training.settings import RunSettings, plain
 from franka_wm.training.spaces import Spaces
 
 OTHER_DEVICE = (
@@ -54,11 +54,6 @@ EVALUATION_SHARE = 0.1
 ``evaluation.every`` asks for them. The weights are the same with and without."""
 
 
-def evaluation_period(cfg: DictConfig) -> int:
-    """Updates between evaluations while training: ``evaluation.every``, or an eighth of the run."""
-    return max(1, -(-cfg.trainer.updates // 8)) if cfg.evaluation.every is None else cfg.evaluation.every
-
-
 class Trainer:
     """Gathers experience and learns from it, in turns.
 
@@ -68,7 +63,7 @@ class Trainer:
         replay: Receives (worlds, time) batches, gives windows; or recorded windows.
         policies: By name, for the training worlds alone; ``random`` gathers the first steps, ``actor`` the rest.
         actor: Which of them acts.
-        cfg: The whole configuration; saved with every checkpoint.
+        settings: Of the run; saved with every checkpoint.
         folder: Of the run.
         loggers: TorchRL loggers.
         evaluate: Called now and then with nothing, returns numbers to log. What it and ``diagnose`` draw at random
@@ -86,7 +81,7 @@ class Trainer:
         replay: Any,
         policies: Mapping[str, TensorDictModuleBase],
         actor: str,
-        cfg: DictConfig,
+        settings: RunSettings,
         folder: Path,
         loggers: list[Any],
         evaluate: Any,
@@ -94,7 +89,13 @@ class Trainer:
         validation: Any = None,
         diagnose: Callable[[Any, TensorDictBase], tuple[dict[str, float], str | None]] | None = None,
     ):
-        self.env, self.learner, self.replay, self.cfg, self.folder = env, learner, replay, cfg, folder
+        self.env, self.learner, self.replay, self.settings, self.folder = (
+            env,
+            learner,
+            replay,
+            settings,
+            folder,
+        )
         self.model = learner.model
         self.actor = actor
         self.loggers = loggers
@@ -116,7 +117,7 @@ class Trainer:
         self.spaces = Spaces.of_env(env) if spaces is None else spaces
         self._vectors = list(self.model.observation_sizes)
         self._keys = self.model.observation_keys
-        if cfg.export.kind != "none":  # a dataset is for other models, too
+        if settings.export.kind != "none":  # a dataset is for other models, too
             self._keys = [*self.spaces.observation_sizes, *self.spaces.image_sizes]
         if getattr(replay, "hindsight", None) is not None:  # it reads where the tool was
             self._keys = list(dict.fromkeys([*self._keys, "state"]))
@@ -124,7 +125,7 @@ class Trainer:
         # What the acting policy writes for the loss, a random one does not: then the actor fills the replay, too.
         self._acting = None
         if policies:
-            exploring = {actor: explore(cfg, policies, actor)}
+            exploring = {actor: explore(settings.collector, policies, actor)}
             self._acting = ActingPolicy({**policies, **exploring}, actor if self._extra else "random")
         self._collector: Collector | None = None
         self._experience: Iterator[TensorDictBase] | None = None
@@ -132,16 +133,16 @@ class Trainer:
     # -- the loop -----------------------------------------------------------------------------------------
 
     def fit(self) -> None:
-        """Trains until ``cfg.trainer.updates``, or until Ctrl-C; writes checkpoints into ``folder``."""
-        trainer = self.cfg.trainer
+        """Trains until ``trainer.updates``, or until Ctrl-C; writes checkpoints into ``folder``."""
+        trainer = self.settings.trainer
         total = trainer.updates
         started = time.perf_counter() - self.seconds
         progress = Progress(
             total, done=self.learner.updates, env_steps=self.env_steps, every=trainer.log_every
         )
         saved = time.perf_counter()
-        every = evaluation_period(self.cfg)
-        ahead = sorted(steps for steps in self.cfg.evaluation.get("at_steps", []) if steps > self.env_steps)
+        every = self.settings.evaluation_period
+        ahead = sorted(steps for steps in self.settings.evaluation.at_steps if steps > self.env_steps)
         with interruptible() as stop:
             if self.env is None:
                 self.standardize(self.replay.statistics())
@@ -191,7 +192,7 @@ class Trainer:
 
     def seed(self) -> None:
         """Fills the replay with smooth random motion and lets the model see its scale."""
-        collector = self.cfg.collector
+        collector = self.settings.collector
         batches = -(-collector.seed_steps // collector.steps_per_batch)
         for _ in range(batches):
             self.gather()
@@ -201,7 +202,7 @@ class Trainer:
 
     def standardize(self, statistics: Mapping[str, tuple[torch.Tensor, torch.Tensor]]) -> None:
         """Lets the model see mean and deviation of its vector observations."""
-        if not self.cfg.trainer.standardize or self.learner.updates or not self._vectors:
+        if not self.settings.trainer.standardize or self.learner.updates or not self._vectors:
             return  # trained weights know their scale
         mean, std = (torch.cat([statistics[key][i] for key in self._vectors]) for i in (0, 1))
         device = self.learner.device
@@ -218,13 +219,13 @@ class Trainer:
         after = [("next", key) for key in (*self._keys, "reward", "terminated")]
         batch = batch.select(*keys, *after)
         if len(self.replay) == 0:
-            fill(self.replay, batch, self.cfg, updates=self.learner.updates)
+            fill(self.replay, batch, self.settings, updates=self.learner.updates)
         else:
             self.replay.extend(batch)
 
     def _collect(self) -> Collector:
         """Starts the collector: it resets all worlds."""
-        collector = self.cfg.collector
+        collector = self.settings.collector
         self._collector = Collector(
             self.env,
             self._acting,
@@ -241,7 +242,7 @@ class Trainer:
 
     def _too_long(self) -> bool:
         """Whether evaluations have taken more of the time than they may; where ``every`` is given, they may."""
-        if self.cfg.evaluation.every is not None or self._evaluated <= EVALUATION_SHARE * self.seconds:
+        if self.settings.evaluation.every is not None or self._evaluated <= EVALUATION_SHARE * self.seconds:
             return False
         if not self._said_too_long:
             say(
@@ -255,7 +256,7 @@ class Trainer:
 
         How often and when that happens depends on the machine and on what is wanted to be known.
         """
-        return seeded(derive_seed(purpose, self.cfg.seed, self.learner.updates))
+        return seeded(derive_seed(purpose, self.settings.seed, self.learner.updates))
 
     def log(self, progress: Progress) -> None:
         """Reads what the device has summed up, tells the terminal and the loggers."""
@@ -321,9 +322,11 @@ class Trainer:
         """
         self.require_finite(weights=True)
         replay = None
-        wanted = self.cfg.trainer.checkpoint_replay
+        wanted = self.settings.trainer.checkpoint_replay
         # A first stage that is done leaves its weights; the second gathers what it needs itself.
-        needed = "whole_run" not in self.cfg or self.learner.updates < self.cfg.trainer.updates
+        needed = (
+            "whole_run" not in self.settings.values or self.learner.updates < self.settings.trainer.updates
+        )
         if self.env is not None and wanted is not False and len(self.replay) and needed:
             why = left_out(held(self.replay), self.folder, last=last, wanted=wanted)
             replay = self.experience() if why is None else None
@@ -345,14 +348,11 @@ class Trainer:
         """How far the run is: ``env_steps``, ``updates``, ``seconds`` of training."""
         return {"env_steps": self.env_steps, "updates": self.learner.updates, "seconds": self.seconds}
 
-    def _config(self) -> DictConfig:
+    def _config(self) -> Mapping[str, Any]:
         """The configuration, so that the checkpoint alone rebuilds the model, without what it was started from."""
         own = self.model.rebuild_overrides()
-        if not own:
-            return self.cfg
-        cfg = cast(DictConfig, OmegaConf.create(OmegaConf.to_container(self.cfg, resolve=True)))
-        cfg.model.update(own)
-        return cfg
+        values = self.settings.values
+        return {**values, "model": {**values["model"], **own}}
 
     def require_finite(self, *, weights: bool = False) -> None:
         """Ends a run that cannot recover; waits for the device.
@@ -406,8 +406,8 @@ class Trainer:
         self.rows = list(extra.get("rows", []))
         experience = None if self.env is None else checkpoint.replay(self.env.device)
         if experience is not None:
-            fill(self.replay, experience, self.cfg, updates=self.learner.updates, restored=True)
-        elif self.env is not None and self.learner.updates < self.cfg.trainer.updates:
+            fill(self.replay, experience, self.settings, updates=self.learner.updates, restored=True)
+        elif self.env is not None and self.learner.updates < self.settings.trainer.updates:
             say("  the checkpoint holds no experience: this run gathers anew and will not be the same")
         self._restore_moment(checkpoint, extra.get("moment", {}))
         checkpoint.restore_rng()  # the last: whatever is built draws
@@ -421,7 +421,7 @@ class Trainer:
             return
         assert self._acting is not None
         worlds = moment.get("worlds")
-        if worlds is not None and same_worlds(checkpoint.config, self.cfg):
+        if worlds is not None and same_worlds(plain(checkpoint.config), self.settings.values):
             put_back(self.env, self._collect(), worlds)
         else:
             if restorable(self.env) is None:
@@ -432,7 +432,7 @@ class Trainer:
                 )
             say(f"  worlds: {why}; they start new episodes, and this run will not be the same")
             # Not those that the first run has seen already.
-            self.env.set_seed(derive_seed("training", self.cfg.seed, "resumed", self.env_steps))
+            self.env.set_seed(derive_seed("training", self.settings.seed, "resumed", self.env_steps))
         if not go_on_drawing(self._acting.policies, moment.get("policies", {}), self.env.device):
             say(f"  {OTHER_DEVICE}")
 

@@ -244,11 +244,11 @@ def test_states_go_in_and_out(random_actions) -> None:
 
 
 @pytest.mark.parametrize("precision", ["float32", "bfloat16"])
-def test_captured_and_eager_updates_agree(precision: str, composed) -> None:
+def test_captured_and_eager_updates_agree(precision: str, settled) -> None:
     from franka_wm.training import build
     from franka_wm.training.spaces import Spaces
 
-    cfg = composed("scale=smoke", "device=cuda", "model.dropout=0.0")
+    cfg = settled("scale=smoke", "device=cuda", "model.dropout=0.0")
 
     def trained(capture: bool) -> dict[str, torch.Tensor]:
         torch.manual_seed(0)

@@ -7,7 +7,6 @@ from pathlib import Path
 
 import pytest
 from matplotlib.axes import Axes
-from omegaconf import OmegaConf
 
 from franka_wm.evaluation.protocol import evaluate_run
 from franka_wm.evaluation.results import END, read_result
@@ -17,17 +16,11 @@ from franka_wm.report.end_of_run import report_run
 
 @pytest.mark.parametrize("during", [["policy"], []])
 def test_the_table_is_the_curves_last_point(
-    during: list[str], small_env, tmp_path: Path, monkeypatch
+    during: list[str], small_env, settled, tmp_path: Path, monkeypatch
 ) -> None:
     env = small_env(3, episode_length=4, goal_sampling="reachable", success_distance=0.4)
-    cfg = OmegaConf.create(
-        {
-            "env": {"task": "reach"},
-            "model": {"name": "none"},
-            "seed": 7,
-            "evaluation": {"during": during, "video_episodes": 0},
-        }
-    )
+    shown = f"evaluation.during=[{','.join(during)}]"
+    cfg = settled("seed=7", shown, "evaluation.video_episodes=0")
     before = {"eval/policy/final_distance": 0.9, "eval/policy/success": 0.1, "env_steps": 50, "updates": 5}
     drawn: dict[tuple[int, str], tuple[list[float], list[float]]] = {}
     plot, logged = Axes.plot, []

@@ -10,7 +10,6 @@ from typing import Any
 
 import pytest
 import torch
-from omegaconf import OmegaConf
 from tensordict import TensorDict
 from torch import nn
 
@@ -19,7 +18,7 @@ from franka_wm.conf import compose
 from franka_wm.planning import CEM, ICEM, MPPI, GoalDistance, GradientPlanner, RewardPlusValue
 from franka_wm.planning.objectives import bind
 from franka_wm.policies import PlannerPolicy
-from franka_wm.training.build import OF_THE_POLICY
+from franka_wm.training.settings import RunSettings
 
 PLANNERS: dict[str, type] = {"mppi": MPPI, "cem": CEM, "icem": ICEM, "gradient": GradientPlanner}
 ENVS = 4
@@ -156,10 +155,8 @@ def case(request):
 def planner_settings(name: str) -> dict:
     """What `planner=NAME` says at the scale of its paper, but for what is the policy's."""
     scale = "laptop" if name == "icem" else "gpu"
-    settings = dict(
-        OmegaConf.to_container(compose(f"planner={name}", f"scale={scale}").planner, resolve=True)
-    )
-    return {key: value for key, value in settings.items() if key not in OF_THE_POLICY}
+    planner = RunSettings.of(compose(f"planner={name}", f"scale={scale}")).planner
+    return {"name": planner.name, **planner.options}
 
 
 @pytest.fixture(params=PLANNERS)

@@ -16,9 +16,9 @@ from franka_wm.training import build
 
 
 @pytest.fixture(scope="module")
-def env(composed) -> FrankaEnv:
+def env(settled) -> FrankaEnv:
     """The reach preset, as train.py builds it."""
-    return build.make_env(composed("env=reach", "device=cpu"), num_envs=16)
+    return build.make_env(settled("env=reach", "device=cpu"), num_envs=16)
 
 
 def first(num_envs: int, is_init: bool = False) -> TensorDict:
@@ -73,11 +73,11 @@ def test_oracle_reaches_every_goal(env: FrankaEnv) -> None:
 
 
 @pytest.fixture(scope="module")
-def moving(composed) -> Callable[..., Any]:
+def moving(settled) -> Callable[..., Any]:
     """The reach preset with numbered moves, as train.py builds it for MuZero."""
 
     def make(**changes: Any) -> Any:
-        cfg = composed("env=reach", "device=cpu", "model=muzero", "planner=gumbel")
+        cfg = settled("env=reach", "device=cpu", "model=muzero", "planner=gumbel")
         return build.make_env(cfg, num_envs=16, **changes)
 
     return make

@@ -377,9 +377,8 @@ def test_a_benchmark(tmp_path) -> None:
 
 
 def test_train_accepts_every_declared_command() -> None:
-    from omegaconf import OmegaConf
-
     from franka_wm.training.check import check
+    from franka_wm.training.settings import RunSettings
 
     for row in load_rows().values():
         if row.script is not None:
@@ -387,7 +386,7 @@ def test_train_accepts_every_declared_command() -> None:
             continue
         config = composed(tuple(row.words))
         assert isinstance(config, dict), f"{row.name}: {config}"
-        check(OmegaConf.create(config | {"seed": 0, "device": "cpu", "resume": None}))
+        check(RunSettings.of(config | {"seed": 0, "device": "cpu", "resume": None}))
 
 
 @pytest.mark.parametrize(

@@ -2,20 +2,20 @@
 
 from __future__ import annotations
 
+import copy
 import math
 from pathlib import Path
 
 import pytest
 import torch
-from omegaconf import OmegaConf
 from tensordict import TensorDict
 
-from franka_wm.envs import FrankaConfig
 from franka_wm.errors import UserError
 from franka_wm.planning import Sum
 from franka_wm.training import build
 from franka_wm.training.check import check
 from franka_wm.training.run import Run
+from franka_wm.training.settings import RunSettings
 from franka_wm.training.spaces import Spaces
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -38,13 +38,10 @@ OTHERS = ("gym", "dm_control", "none")
 
 
 @pytest.mark.parametrize("name", [name for name in options("env") if name not in OTHERS])
-def test_every_environment_preset(name: str, composed) -> None:
-    cfg = composed(f"env={name}")
+def test_every_environment_preset(name: str, settled) -> None:
+    cfg = settled(f"env={name}")
     check(cfg)
-    values = build.plain(cfg.env)
-    assert values.pop("kind") == "franka"
-    values.pop("urdf_path")
-    config = FrankaConfig.from_mapping(values)
+    config = cfg.env.arm
     assert ("pixels" in config.observations) == (name.endswith(("pixels", "goal_image")) or name == "franka")
     if "fixed" in name:
         assert config.goal_sampling == "fixed" and config.episode_length == 20
@@ -53,10 +50,10 @@ def test_every_environment_preset(name: str, composed) -> None:
 
 
 @pytest.mark.parametrize("name", options("scale"))
-def test_every_scale(name: str, composed) -> None:
-    cfg = composed(f"scale={name}")
+def test_every_scale(name: str, settled) -> None:
+    cfg = settled(f"scale={name}")
     check(cfg)
-    assert cfg.scale == name
+    assert cfg.values["scale"] == name
     build.make_planner(cfg, 7)
 
 
@@ -88,21 +85,21 @@ NEEDS = {  # what else an option goes with
         for name in options(group)
     ],
 )
-def test_every_other_option(group: str, name: str, composed) -> None:
+def test_every_other_option(group: str, name: str, settled) -> None:
     if group == "logger" and name in ("mlflow", "trackio"):
         pytest.importorskip(name)
     others = NEEDS.get(group, {}).get(name, ["env=reach_pixels"] if group == "model" else [])
-    check(composed(f"{group}={name}", *others))
+    check(settled(f"{group}={name}", *others))
 
 
-def test_the_default_is_to_reach_sampled_goals(composed) -> None:
-    cfg = composed()
-    assert cfg.env.goal_sampling == "reachable" and cfg.env.gravity_compensation is True
+def test_the_default_is_to_reach_sampled_goals(settled) -> None:
+    cfg = settled()
+    assert cfg.env.arm.goal_sampling == "reachable" and cfg.env.arm.gravity_compensation is True
     assert cfg.evaluation.episodes >= 64 and cfg.trainer.checkpoint_replay is None
 
 
-def test_environments_of_a_run(composed) -> None:
-    cfg = composed(
+def test_environments_of_a_run(settled) -> None:
+    cfg = settled(
         "env=reach_pixels", "device=cpu", "env.image_size=8", "env.substeps=1", "collector.num_envs=2"
     )
     env = build.make_env(cfg)
@@ -142,7 +139,7 @@ def test_environments_of_a_run(composed) -> None:
         ("evaluation.video_size=97", "video_size"),
         ("trainer.checkpoint_replay=8", "checkpoint_replay"),
         ("evaluation.at_steps=1000", "at_steps"),
-        ("evaluation.every=60.0", "whole number of updates"),
+        ("evaluation.every=60.0", "a whole number of updates"),
         ("evaluation.every=-1", "whole number of updates"),
         ("evaluation.at_steps=[1000,-5]", "at_steps"),
         (("evaluation.at_steps=[1000]", "evaluation.during=[]"), "evaluation.during=[planner]"),
@@ -150,26 +147,20 @@ def test_environments_of_a_run(composed) -> None:
         ("device=tpu", "tpu"),
     ],
 )
-def test_refused_before_anything_is_built(override: str | tuple[str, ...], named: str, composed) -> None:
-    cfg = composed(*([override] if isinstance(override, str) else override))
+def test_refused_before_anything_is_built(override: str | tuple[str, ...], named: str, settled) -> None:
     with pytest.raises(UserError) as caught:
-        check(cfg)
+        check(settled(*([override] if isinstance(override, str) else override)))
     assert named in str(caught.value) and "\n" not in str(caught.value)
 
 
 @pytest.mark.parametrize("model", [["model=tdmpc2"], ["model=muzero", "planner=gumbel"]])
 @pytest.mark.parametrize("scale", ["laptop", "gpu"])
-def test_the_range_of_values_holds_the_returns_of_long_episodes(model, scale: str, composed) -> None:
+def test_the_range_of_values_holds_the_returns_of_long_episodes(model, scale: str, settled) -> None:
     """And is no wider than needed for short ones; a number given wins."""
 
     def high(*overrides: str) -> tuple[float, float]:
-        cfg = composed(f"scale={scale}", *model, *overrides)
-        spaces = Spaces.of_config(
-            FrankaConfig.from_mapping(
-                {k: v for k, v in build.plain(cfg.env).items() if k not in ("kind", "urdf_path")}
-            ),
-            discrete=build.is_discrete(cfg),
-        )
+        cfg = settled(f"scale={scale}", *model, *overrides)
+        spaces = Spaces.of_config(cfg.env.arm, discrete=cfg.is_discrete)
         assert Spaces.from_dict(spaces.as_dict()) == spaces
         built = build.make_model(cfg, spaces, "cpu")
         return built.two_hot.high, 1.0 / (1.0 - built.discount)
@@ -182,10 +173,10 @@ def test_the_range_of_values_holds_the_returns_of_long_episodes(model, scale: st
     assert high("model.value_high=7.5")[0] == 7.5
 
 
-def test_a_head_for_ends_is_there_where_episodes_terminate(composed) -> None:
-    small = ("device=cpu", "env.substeps=1", "collector.num_envs=2")
+def test_a_head_for_ends_is_there_where_episodes_terminate(settled) -> None:
+    small = ("device=cpu", "env.substeps=1", "collector.num_envs=2", "objective.policy_penalty=0")
     for overrides, there in (((), False), (("env.terminate_on_success=true",), True)):
-        cfg = composed(*small, *overrides)
+        cfg = settled(*small, *overrides)
         env = build.make_env(cfg)
         assert Spaces.of_env(env) == Spaces.of_config(env.config)
         model = build.make_model(cfg, env)
@@ -201,18 +192,18 @@ def test_spaces_of_an_older_checkpoint_know_no_bounds() -> None:
     assert Spaces.from_dict(values).reward_bounds is None and not Spaces.from_dict(values).terminates
 
 
-def test_muzero_sees_ends_and_episodes_shorter_than_its_windows(composed) -> None:
+def test_muzero_sees_ends_and_episodes_shorter_than_its_windows(settled) -> None:
     """Else its value targets could not reach further than the shortest episode is long."""
     episodes = TensorDict({"is_init": (torch.arange(80) % 8 == 0).expand(4, 80).unsqueeze(-1)}, [4, 80])
-    cfg = composed("env=gym", "model=muzero", "planner=gumbel", "collector.num_envs=4")
+    cfg = settled("env=gym", "model=muzero", "planner=gumbel", "collector.num_envs=4")
     check(cfg)
-    assert build.window(cfg) == cfg.model.unroll + cfg.model.n_step + 1 > 8
-    assert cfg.collector.seed_steps >= build.window(cfg)
-    check(composed("env=gym", "model=muzero", "planner=gumbel", "env.episode_length=8"))
+    assert cfg.window == cfg.model.options["unroll"] + cfg.model.options["n_step"] + 1 > 8
+    assert cfg.collector.seed_steps >= cfg.window
+    check(settled("env=gym", "model=muzero", "planner=gumbel", "env.episode_length=8"))
     replay = build.make_replay_buffer(cfg, torch.device("cpu"))
     replay.extend(episodes)
-    assert replay.sample().batch_size == (cfg.replay.batch_size, build.window(cfg))
-    cfg = composed("collector.num_envs=4", "replay.window=9")
+    assert replay.sample().batch_size == (cfg.replay.batch_size, cfg.window)
+    cfg = settled("collector.num_envs=4", "replay.window=9")
     replay = build.make_replay_buffer(cfg, torch.device("cpu"))
     replay.extend(episodes)
     with pytest.raises(UserError, match="episodes of at least 9"):  # TD-MPC2 takes whole windows alone
@@ -229,9 +220,9 @@ STACKED = (
 )
 
 
-def test_a_run_keeps_each_picture_of_a_stack_once(composed, random_actions) -> None:
+def test_a_run_keeps_each_picture_of_a_stack_once(settled, random_actions) -> None:
     """And its model's batches have stacks; a run without has none to take apart."""
-    cfg = composed(*STACKED, "collector.num_envs=4", "env.image_size=16", "env.episode_length=6")
+    cfg = settled(*STACKED, "collector.num_envs=4", "env.image_size=16", "env.episode_length=6")
     env = build.make_env(cfg)
     root, steps = env.reset(seed=0), []
     for action in random_actions(4, 20).unbind(1):
@@ -244,14 +235,14 @@ def test_a_run_keeps_each_picture_of_a_stack_once(composed, random_actions) -> N
     assert replay.sample()["pixels"].shape[-1] == 9
     time, world = torch.arange(2, 20).expand(4, 18), torch.arange(4).unsqueeze(1).expand(4, 18)
     assert torch.equal(replay.storage.get((time, world))["pixels"], played["pixels"][:, 2:])
-    replay = build.make_replay_buffer(composed("collector.num_envs=4"), torch.device("cpu"))
+    replay = build.make_replay_buffer(settled("collector.num_envs=4"), torch.device("cpu"))
     replay.extend(played.select("state", "is_init"))
     assert len(replay) == 80 and replay.sampler.before == 0
 
 
-def test_stacks_that_do_not_fit_are_refused_before_anything_is_built(composed) -> None:
-    check(composed(*STACKED))
-    check(composed(*STACKED, "export=lerobot", "trainer.updates=1000"))
+def test_stacks_that_do_not_fit_are_refused_before_anything_is_built(settled) -> None:
+    check(settled(*STACKED))
+    check(settled(*STACKED, "export=lerobot", "trainer.updates=1000"))
     for overrides, says in (
         (("env.frame_stack=abc",), "frame_stack='abc': must be a whole number"),
         (("env.frame_stack=null",), "frame_stack=None: must be a whole number"),
@@ -267,39 +258,39 @@ def test_stacks_that_do_not_fit_are_refused_before_anything_is_built(composed) -
         ),
     ):
         with pytest.raises(UserError, match=says):
-            check(composed(*STACKED, *overrides))
+            check(settled(*STACKED, *overrides))
 
 
-def test_planner_and_model_that_do_not_exist(composed, small_env) -> None:
+def test_planner_and_model_that_do_not_exist(settled, small_env) -> None:
     with pytest.raises(UserError, match="planner"):
-        build.make_planner(composed("planner.name=crystal_ball"), 7)
+        build.make_planner(settled("planner.name=crystal_ball"), 7)
     with pytest.raises(UserError, match="model"):
-        build.make_model(composed("model.name=oracle_bone"), small_env(1))
+        build.make_model(settled("model.name=oracle_bone"), small_env(1))
 
 
-def test_the_planner_computes_as_configured(composed) -> None:
+def test_the_planner_computes_as_configured(settled) -> None:
     """`planner.precision` and `planner.compile` reach the policy that plans."""
-    cfg = composed("scale=smoke", "planner.precision=bfloat16", "trainer.capture=false")
+    cfg = settled("scale=smoke", "planner.precision=bfloat16", "trainer.capture=false")
     env = build.make_evaluation_env(cfg, num_envs=2)
     spaces = Spaces.of_env(env)
     model = build.make_model(cfg, spaces, "cpu")
     policy = build.make_agent_policies(cfg, model, env, spaces)["planner"]
     assert policy.precision == "bfloat16" and policy.capture is False and policy.next == model.next
-    cfg.planner.compile, cfg.trainer.capture = True, True
+    cfg = cfg.changed(planner={"compile": True}, trainer={"capture": True})
     policy = build.make_agent_policies(cfg, model, env, spaces)["planner"]
     assert policy.next != model.next  # compiled
     assert policy.capture is None  # a checkpoint of a GPU acts on a CPU, too
 
 
-def test_goal_pictures_of_every_camera_that_the_model_reads(composed) -> None:
+def test_goal_pictures_of_every_camera_that_the_model_reads(settled) -> None:
     two = ("env=reach_fixed_goal_image", "env.cameras=[front,side]", "model=lewm", "planner=icem")
-    cfg = composed(*two, "model.observations=[pixels,pixels_side]", "device=cpu", "env.image_size=16")
+    cfg = settled(*two, "model.observations=[pixels,pixels_side]", "device=cpu", "env.image_size=16")
     check(cfg)
     with pytest.raises(UserError, match="reads pixels, not"):
-        check(composed(*two, "model.observations=[joint_target]"))
+        check(settled(*two, "model.observations=[joint_target]"))
     with pytest.raises(UserError, match="needs goal_pixels"):
-        check(composed(*two, "env.observations=[pixels,state]"))
-    cfg.model.patch_size = 8
+        check(settled(*two, "env.observations=[pixels,state]"))
+    cfg = cfg.changed(model={"patch_size": 8})
     env = build.make_evaluation_env(cfg, num_envs=2)
     model = build.make_model(cfg, env)
     objective = build.make_objective(cfg, model)
@@ -310,14 +301,30 @@ def test_goal_pictures_of_every_camera_that_the_model_reads(composed) -> None:
     assert not torch.equal(objective.bind(swapped).goal_latent, goal)  # the second picture counts
 
 
-def test_runs_of_before_an_option_was_there_go_on(composed) -> None:
-    cfg = composed("env=reach", "device=cpu", "env.observations=[state,joint_target]")
-    for node, key in ((cfg.env, "frame_stack"), (cfg.env, "mesh_detail")):
-        OmegaConf.set_struct(cfg, False)
-        del node[key]
-        OmegaConf.set_struct(cfg, True)
+OPTIONS_SINCE = (
+    ("env", "frame_stack"),
+    ("env", "mesh_detail"),
+    ("collector", "noise"),
+    ("collector", "planner_worlds"),
+    ("replay", "hindsight"),
+    ("evaluation", "at_steps"),
+    ("evaluation", "during_episodes"),
+    ("planner", "precision"),
+    ("planner", "compile"),
+)
+"""Options that checkpoints of earlier versions do not have."""
+
+
+def test_runs_of_before_an_option_was_there_go_on(settled, capsys) -> None:
+    cfg = settled("env=reach", "device=cpu", "env.observations=[state,joint_target]")
+    old = copy.deepcopy(dict(cfg.values))
+    for group, key in OPTIONS_SINCE:
+        del old[group][key]
+    old["collector"]["calmest"] = 1.0  # gone since
+    cfg = RunSettings.of(old, saved=True)
+    assert "collector.calmest" in capsys.readouterr().out
     check(cfg)
-    check(composed("env=reach", "+collector.calmest=1.0"))  # gone since, and it did nothing
+    assert cfg.replay.hindsight == 0.0 and cfg.evaluation.at_steps == () and cfg.collector.noise == 0.0
     env = build.make_env(cfg, num_envs=2)
     spaces = Spaces.of_env(env)
     policies = build.make_agent_policies(cfg, build.make_model(cfg, env), env, spaces)
@@ -325,9 +332,9 @@ def test_runs_of_before_an_option_was_there_go_on(composed) -> None:
 
 
 @pytest.fixture
-def hindsight(composed):
+def hindsight(settled):
     def make(*overrides: str):
-        cfg = composed("scale=smoke", "device=cpu", *overrides)
+        cfg = settled("scale=smoke", "device=cpu", *overrides)
         return build.make_hindsight(cfg, build.make_env(cfg, num_envs=2))
 
     return make
@@ -360,25 +367,25 @@ def test_elsewhere_hindsight_is_none_and_refused_where_it_is_asked_for(
 
 @pytest.mark.parametrize("share", ["1.5", "-0.1", "true", "some"])
 def test_a_share_that_is_none_is_refused(share: str, hindsight) -> None:
-    with pytest.raises(UserError, match="must be a share from 0 to 1, or null"):
+    with pytest.raises(UserError, match=r"must be a finite number of at least 0 and of at most 1, or null"):
         hindsight(f"replay.hindsight={share}")
 
 
-def test_windows_of_a_run_are_relabeled(composed, tmp_path: Path) -> None:
-    run = Run(cfg=composed("scale=smoke", "device=cpu"), folder=tmp_path)
-    replay, _ = run.build_experience(build.make_env(run.cfg, num_envs=2))
+def test_windows_of_a_run_are_relabeled(settled, tmp_path: Path) -> None:
+    run = Run(settings=settled("scale=smoke", "device=cpu"), folder=tmp_path)
+    replay, _ = run.build_experience(build.make_env(run.settings, num_envs=2))
     assert replay.hindsight is not None
 
 
-def test_the_models_policy_explores_and_others_act_as_they_are(composed) -> None:
-    cfg = composed("scale=smoke", "collector.noise=0.4", "collector.planner_worlds=2")
+def test_the_models_policy_explores_and_others_act_as_they_are(settled) -> None:
+    cfg = settled("scale=smoke", "collector.noise=0.4", "collector.planner_worlds=2")
     policies = {name: torch.nn.Identity() for name in ("policy", "planner", "random")}
     for one in policies.values():
         one.in_keys = one.out_keys = ["action"]  # pyright: ignore[reportAttributeAccessIssue]
-    found = build.explore(cfg, policies, "policy")
+    found = build.explore(cfg.collector, policies, "policy")
     assert (found.noise, found.planner_worlds, found.planner) == (0.4, 2, policies["planner"])
-    assert build.explore(cfg, policies, "random") is policies["random"]
-    assert build.explore(composed("env=reach_fixed"), policies, "policy") is policies["policy"]
+    assert build.explore(cfg.collector, policies, "random") is policies["random"]
+    assert build.explore(settled("env=reach_fixed").collector, policies, "policy") is policies["policy"]
 
 
 @pytest.mark.parametrize(
@@ -391,15 +398,15 @@ def test_the_models_policy_explores_and_others_act_as_they_are(composed) -> None
         "replay.hindsight=2",
     ],
 )
-def test_exploration_that_cannot_be_is_refused_before_anything_is_built(wrong: str, composed) -> None:
+def test_exploration_that_cannot_be_is_refused_before_anything_is_built(wrong: str, settled) -> None:
     with pytest.raises(UserError, match=wrong.split("=")[0]):
-        check(composed("scale=smoke", "device=cpu", wrong))
+        check(settled("scale=smoke", "device=cpu", wrong))
 
 
-def test_plans_stay_near_the_policy_on_the_arm_and_are_the_published_ones_elsewhere(composed):
+def test_plans_stay_near_the_policy_on_the_arm_and_are_the_published_ones_elsewhere(settled):
     spaces = Spaces(observation_sizes={"state": 20}, action_dim=7)
     for words, penalised in ((("env=reach",), True), (("env=dm_control",), False)):
-        cfg = composed("scale=smoke", *words)
+        cfg = settled("scale=smoke", *words)
         objective = build.make_objective(cfg, build.make_model(cfg, spaces))
         assert isinstance(objective, Sum) == penalised
-        assert penalised == (cfg.model.entropy_coef > 1e-4) == cfg.model.mode_targets
+        assert penalised == (cfg.model.options["entropy_coef"] > 1e-4) == cfg.model.options["mode_targets"]

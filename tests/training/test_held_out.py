@@ -7,7 +7,6 @@ from typing import Any
 
 import pytest
 import torch
-from omegaconf import DictConfig
 from tensordict import TensorDictBase
 
 from franka_wm.envs.simulation import Simulation
@@ -17,6 +16,7 @@ from franka_wm.policies.scripted import NoopPolicy, SmoothRandomPolicy
 from franka_wm.seeding import derive_seed, evaluation_seed
 from franka_wm.training import build
 from franka_wm.training.run import Run
+from franka_wm.training.settings import RunSettings
 
 EPISODES = 12
 
@@ -35,14 +35,14 @@ class Watching(NoopPolicy):
 
 
 @pytest.fixture(scope="module")
-def cfg(composed, tiny: list[str]) -> DictConfig:
+def cfg(settled, tiny: list[str]) -> RunSettings:
     sizes = [one for one in tiny if not one.startswith("env.episode_length")]
-    return composed(*sizes, "env.episode_length=4", "env.observations=[state,joint_target]", "seed=5")
+    return settled(*sizes, "env.episode_length=4", "env.observations=[state,joint_target]", "seed=5")
 
 
 @pytest.fixture(scope="module")
-def run(cfg: DictConfig, tmp_path_factory) -> Run:
-    return Run(cfg=cfg, folder=tmp_path_factory.mktemp("run"))
+def run(cfg: RunSettings, tmp_path_factory) -> Run:
+    return Run(settings=cfg, folder=tmp_path_factory.mktemp("run"))
 
 
 @pytest.fixture(scope="module")
@@ -71,11 +71,13 @@ def test_no_episode_of_the_evaluation_occurs_in_training(run: Run, worlds, train
     watching = Watching()
     during = during_training(worlds[1], {"policy": watching}, **run.during)
     assert during()
-    evaluate_run(run.cfg, run.folder, worlds[1], {"policy": watching}, counters={}, say=lambda text: None)
+    evaluate_run(
+        run.settings, run.folder, worlds[1], {"policy": watching}, counters={}, say=lambda text: None
+    )
     evaluated = torch.cat(watching.starts)
-    assert len(evaluated) >= 2 * run.cfg.evaluation.episodes
+    assert len(evaluated) >= 2 * run.settings.evaluation.episodes
     assert not meet(evaluated, trained)
-    worlds[0].set_seed(derive_seed("training", run.cfg.seed))
+    worlds[0].set_seed(derive_seed("training", run.settings.seed))
     root = worlds[0].reset()
     assert meet(torch.cat([root["state"][:, :7], root["goal"]], 1), trained)  # such a meeting would be seen
 
@@ -94,13 +96,13 @@ def test_seeds_of_a_whole_run(train, monkeypatch, tmp_path: Path) -> None:
     assert len({5, training, evaluation, *held_out_seeds(3), ROLLOUT_SEED}) == 7
 
 
-def test_seeds_of_the_worlds_of_a_configuration(cfg: DictConfig) -> None:
+def test_seeds_of_the_worlds_of_a_configuration(cfg: RunSettings) -> None:
     """Also of those that are built alone, to look at a checkpoint."""
     assert build.make_env(cfg, num_envs=1).simulation.tensors.seed.item() == derive_seed("training", 5)
     assert build.make_evaluation_env(cfg, num_envs=1).simulation.tensors.seed.item() == evaluation_seed(5)
 
 
-def test_policies_draw_from_the_purpose_they_serve(cfg: DictConfig, worlds) -> None:
+def test_policies_draw_from_the_purpose_they_serve(cfg: RunSettings, worlds) -> None:
     env = worlds[0]
     model = build.make_model(cfg, env)
     made = [

@@ -101,8 +101,8 @@ def test_capture_without_cuda() -> None:
         Learner(Line(), capture=True)
 
 
-def test_every_part_of_the_world_model_moves(composed, small_env) -> None:
-    cfg = composed("scale=smoke", "device=cpu")
+def test_every_part_of_the_world_model_moves(settled, small_env) -> None:
+    cfg = settled("scale=smoke", "device=cpu")
     torch.manual_seed(0)
     model = build.make_model(cfg, small_env(2))
     learner = Learner(model, lr=1e-3)
@@ -150,8 +150,8 @@ def test_schedule() -> None:
     assert learner.optimizer.param_groups[0]["lr"] == pytest.approx(0.1 * 0.5)
 
 
-def test_bfloat16_is_close_to_float32(composed, small_env) -> None:
-    cfg = composed("scale=smoke", "device=cpu")
+def test_bfloat16_is_close_to_float32(settled, small_env) -> None:
+    cfg = settled("scale=smoke", "device=cpu")
 
     def losses(precision: str) -> dict[str, float]:
         torch.manual_seed(0)

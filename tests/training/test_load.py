@@ -13,7 +13,6 @@ from typing import Any
 
 import pytest
 import torch
-from omegaconf import DictConfig
 from torchrl.data import LazyTensorStorage
 
 import franka_wm
@@ -23,6 +22,7 @@ from franka_wm.training.check import check
 from franka_wm.training.learner import Learner
 from franka_wm.training.load import load_agent
 from franka_wm.training.run import _CLAIMED, Run, claim
+from franka_wm.training.settings import RunSettings
 from franka_wm.training.stages import pretrain
 from franka_wm.training.trainer import Trainer
 
@@ -51,25 +51,26 @@ FAMILIES = {
 
 
 @pytest.fixture(scope="module")
-def train(composed, tmp_path_factory) -> Callable[..., tuple[Path, DictConfig, Any]]:
+def train(settled, tmp_path_factory) -> Callable[..., tuple[Path, RunSettings, Any]]:
     """What train.py does, without Hydra's folders: the run's folder, configuration and trainer."""
 
-    def make(*overrides: str) -> tuple[Path, DictConfig, Any]:
-        cfg = composed(*SMALL, *overrides)
+    def make(*overrides: str) -> tuple[Path, RunSettings, Any]:
+        cfg = settled(*SMALL, *overrides)
         check(cfg)
         torch.manual_seed(0)
-        run = Run(cfg=cfg, folder=tmp_path_factory.mktemp("run"))
+        run = Run(settings=cfg, folder=tmp_path_factory.mktemp("run"))
         env = build.make_env(cfg)
         replay, spaces = run.build_experience(env)
         pretrain(run, env, replay, spaces)
+        cfg = run.settings  # the second stage's
         model = build.make_model(cfg, spaces, run.device)
         trainer = Trainer(
             env=env,
-            learner=Learner(model, **run.learner_options()),
+            learner=Learner(model, **run.settings.learner_options),
             replay=replay,
             policies=build.make_agent_policies(cfg, model, env, spaces),
-            actor=build.actor(cfg),
-            cfg=cfg,
+            actor=cfg.actor,
+            settings=cfg,
             folder=run.folder,
             loggers=[],
             evaluate=dict,
@@ -125,16 +126,16 @@ def test_two_stages(train) -> None:
         torch.testing.assert_close(again.encode(batch), trainer.model.encode(batch))
 
 
-def test_the_first_stage_leaves_no_replay_behind(composed, tmp_path: Path) -> None:
+def test_the_first_stage_leaves_no_replay_behind(settled, tmp_path: Path) -> None:
     """Or the second could not have the memory."""
-    cfg = composed(
+    cfg = settled(
         *SMALL,
         "model=action_world_model",
         "pretrain=jepa",
         "pretrain.updates=4",
         *FAMILIES["action_world_model"],
     )
-    run = Run(cfg=cfg, folder=tmp_path)
+    run = Run(settings=cfg, folder=tmp_path)
     env = build.make_env(cfg)
     replay, spaces = run.build_experience(env)
 
@@ -148,14 +149,14 @@ def test_the_first_stage_leaves_no_replay_behind(composed, tmp_path: Path) -> No
     assert filled() == before
 
 
-def test_a_family_without_an_encoder_to_replace(composed) -> None:
+def test_a_family_without_an_encoder_to_replace(settled) -> None:
     with pytest.raises(UserError, match="pretrain"):
-        check(composed(*SMALL, "pretrain=jepa"))
+        check(settled(*SMALL, "pretrain=jepa"))
 
 
-def test_no_world_and_no_data(composed) -> None:
+def test_no_world_and_no_data(settled) -> None:
     with pytest.raises(UserError, match="dataset"):
-        check(composed("env=none"))
+        check(settled("env=none"))
 
 
 def test_one_run_in_a_folder(tmp_path: Path) -> None:
@@ -193,7 +194,7 @@ def test_no_checkpoint(tmp_path: Path) -> None:
         (["trainer.schedule=up"], "schedule"),
     ],
 )
-def test_what_does_not_go_together(overrides: list[str], named: str, composed) -> None:
+def test_what_does_not_go_together(overrides: list[str], named: str, settled) -> None:
     with pytest.raises(UserError) as caught:
-        check(composed(*SMALL, *overrides))
+        check(settled(*SMALL, *overrides))
     assert named in str(caught.value) and "\n" not in str(caught.value)

@@ -52,22 +52,20 @@ def kind(request) -> str:
 
 
 @pytest.fixture(scope="module")
-def make(kind: str, composed, tiny: list[str], tmp_path_factory) -> Callable[..., Trainer]:
+def make(kind: str, settled, tiny: list[str], tmp_path_factory) -> Callable[..., Trainer]:
     """Makes trainers whose weights, policies, worlds and global generators are those of ``seed``."""
     asked = KINDS[kind]
     given = {one.split("=", 1)[0] for one in asked}
     sizes = [one for one in tiny if one.split("=", 1)[0] not in given]
     if kind in ("moves", "memory"):
         sizes = [one for one in sizes if not one.startswith("planner.")]
-    cfg = composed(
+    cfg = settled(
         *sizes, *asked, "trainer.schedule=cosine", "trainer.warmup=5", f"trainer.updates={2 * HALF}"
     )
     env, folder = build.make_env(cfg), tmp_path_factory.mktemp(kind)
 
     def make(name: str, *, seed: int, updates: int = 2 * HALF, **options: Any) -> Trainer:
-        mine = cfg.copy()
-        mine.seed, mine.trainer.updates = seed, updates
-        mine.trainer.update(options)
+        mine = cfg.changed(seed=seed, trainer={"updates": updates, **options})
         torch.manual_seed(seed)
         random.seed(seed)
         np.random.seed(seed)
@@ -79,8 +77,8 @@ def make(kind: str, composed, tiny: list[str], tmp_path_factory) -> Callable[...
             learner=Learner(model, lr=1e-3, schedule="cosine", warmup=5, total_updates=2 * HALF),
             replay=build.make_replay_buffer(mine, env.device, build.make_hindsight(mine, env)),
             policies=build.make_agent_policies(mine, model, env, spaces, purpose="training"),
-            actor=build.actor(mine),
-            cfg=mine,
+            actor=mine.actor,
+            settings=mine,
             folder=folder / name,
             loggers=[],
             evaluate=dict,
@@ -137,7 +135,7 @@ def test_two_halves_are_a_whole(make: Callable[..., Trainer]) -> None:
     halfway = play(first)
     second = make("second", seed=99)  # other weights, worlds, policies and generators
     second.env.rollout(3)
-    second.cfg.seed = 0
+    second.settings = second.settings.changed(seed=0)
     second.restore(load_checkpoint(latest_checkpoint(first.folder)))
     assert differing(everything(second), halfway) == []
     got = play(second)
@@ -161,7 +159,7 @@ def test_a_signal_changes_nothing(make: Callable[..., Trainer]) -> None:
     first.fit()
     assert first.interrupted and first.learner.updates == 20
     second = make("second", seed=98)
-    second.cfg.seed = 0
+    second.settings = second.settings.changed(seed=0)
     second.restore(load_checkpoint(latest_checkpoint(first.folder)))
     assert differing(play(second), expected) == []
 
@@ -353,13 +351,13 @@ def test_other_worlds_start_new_episodes_and_say_so(make: Callable[..., Trainer]
     first = make("first", seed=0, updates=10)
     first.fit()
     other = make("other", seed=0, updates=20)
-    other.cfg.env.success_distance = 0.2
+    other.settings = other.settings.changed(env={"success_distance": 0.2})
     other.restore(load_checkpoint(latest_checkpoint(first.folder)))
     said = capsys.readouterr().out
     assert "of another configuration; they start new episodes" in said
     arm = getattr(other.env, "base_env", other.env)
     assert arm.get_state()["episode"].eq(-1).all()
-    assert arm.simulation.tensors.seed.item() != first.cfg.seed
+    assert arm.simulation.tensors.seed.item() != first.settings.seed
 
 
 def test_other_simulators_start_new_episodes_and_say_so(train, tmp_path: Path, capsys) -> None:

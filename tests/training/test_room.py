@@ -5,7 +5,6 @@ from types import SimpleNamespace
 
 import pytest
 import torch
-from omegaconf import OmegaConf
 from tensordict import TensorDict
 from torchrl.data import LazyTensorStorage, ReplayBuffer
 
@@ -44,19 +43,17 @@ def test_left_out(
         assert said is not None and why in said and "\n" not in said
 
 
-def test_a_replay_that_memory_cannot_hold_is_refused(monkeypatch) -> None:
+def test_a_replay_that_memory_cannot_hold_is_refused(monkeypatch, settled) -> None:
     """Before its first step, in one line that names what would fit; of stacked pictures only one each counts."""
     pictures = {
         "pixels": torch.zeros(4, 5, 8, 8, 9, dtype=torch.uint8),
         "is_init": torch.ones(4, 5, 1, dtype=torch.bool),
     }
     batch = TensorDict({**pictures, "next": TensorDict({"pixels": pictures["pixels"]}, [4, 5])}, [4, 5])
-    cfg = OmegaConf.create(
-        {
-            "replay": {"capacity": 4000},
-            "collector": {"num_envs": 4, "seed_steps": 1000, "steps_per_batch": 2},
-            "trainer": {"updates": 0, "updates_per_batch": 1},
-        }
+    cfg = settled("scale=smoke").changed(
+        replay={"capacity": 4000},
+        collector={"num_envs": 4, "seed_steps": 1000, "steps_per_batch": 2},
+        trainer={"updates": 0, "updates_per_batch": 1},
     )
     for stack, per_step in ((1, 2 * 8 * 8 * 9 + 1), (3, 2 * 8 * 8 * 3 + 1)):
         replay = make_replay(
@@ -75,11 +72,11 @@ def test_a_replay_that_memory_cannot_hold_is_refused(monkeypatch) -> None:
         with pytest.raises(UserError, match=r"at most replay\.capacity=3599 would") as caught:
             room.fill(replay, batch, cfg)
         assert "\n" not in str(caught.value) and len(replay) == 0
-    short = OmegaConf.merge(cfg, {"collector": {"seed_steps": 999}})
+    short = cfg.changed(collector={"seed_steps": 999})
     room.fill(replay, batch, short)  # it never fills what it may
     with pytest.raises(UserError, match="do not fit"):  # beside a checkpoint's
         room.fill(replay, batch, short, restored=True)
-    longer = OmegaConf.merge(cfg, {"trainer": {"updates": 30}, "collector": {"seed_steps": 999}})
+    longer = cfg.changed(trainer={"updates": 30}, collector={"seed_steps": 999})
     with pytest.raises(UserError, match="do not fit"):
         room.fill(replay, batch, longer)
     room.fill(replay, batch, longer, updates=30)  # made before
@@ -87,14 +84,12 @@ def test_a_replay_that_memory_cannot_hold_is_refused(monkeypatch) -> None:
     room.fill(replay, batch, cfg)
 
 
-def test_what_cannot_be_allocated_is_one_line_as_well(monkeypatch) -> None:
+def test_what_cannot_be_allocated_is_one_line_as_well(monkeypatch, settled) -> None:
     """Where free memory is not known, or what is asked for is more than the machine has in all."""
-    cfg = OmegaConf.create(
-        {
-            "replay": {"capacity": 10**14},
-            "collector": {"num_envs": 4, "seed_steps": 1, "steps_per_batch": 1},
-            "trainer": {"updates": 0, "updates_per_batch": 1},
-        }
+    cfg = settled("scale=smoke").changed(
+        replay={"capacity": 10**14},
+        collector={"num_envs": 4, "seed_steps": 1, "steps_per_batch": 1},
+        trainer={"updates": 0, "updates_per_batch": 1},
     )
     replay = make_replay(capacity=10**14, num_envs=4, window=2, batch_size=2, device="cpu")
     with pytest.raises(UserError, match=r"replay\.capacity=100000000000000: .* cannot be allocated on cpu"):

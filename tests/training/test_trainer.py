@@ -11,7 +11,6 @@ from types import SimpleNamespace
 
 import pytest
 import torch
-from omegaconf import DictConfig
 from tensordict import TensorDict
 
 from franka_wm.envs import FrankaEnv
@@ -20,6 +19,7 @@ from franka_wm.training import build, room
 from franka_wm.training.checkpoint import latest_checkpoint, load_checkpoint
 from franka_wm.training.learner import Learner
 from franka_wm.training.run import Run
+from franka_wm.training.settings import RunSettings
 from franka_wm.training.trainer import Trainer
 
 N, CAPACITY = 4, 50
@@ -28,8 +28,8 @@ Make = Callable[..., Trainer]
 
 
 @pytest.fixture(scope="module")
-def cfg(composed) -> DictConfig:
-    return composed(
+def cfg(settled) -> RunSettings:
+    return settled(
         "scale=smoke",
         "device=cpu",
         "env.substeps=1",
@@ -43,27 +43,25 @@ def cfg(composed) -> DictConfig:
 
 
 @pytest.fixture(scope="module")
-def env(cfg: DictConfig) -> FrankaEnv:
+def env(cfg: RunSettings) -> FrankaEnv:
     return build.make_env(cfg)
 
 
 @pytest.fixture
-def make(cfg: DictConfig, env: FrankaEnv, tmp_path: Path) -> Make:
-    def make(folder: str = "run", evaluate=dict, **changes) -> Trainer:
-        mine = cfg.copy()
-        for key, value in changes.items():
-            mine.trainer[key] = value
+def make(cfg: RunSettings, env: FrankaEnv, tmp_path: Path) -> Make:
+    def make(folder: str = "run", evaluate=dict, model=(), **changes) -> Trainer:
+        mine = cfg.changed(trainer=changes, model=dict(model))
         torch.manual_seed(0)
         env.set_seed(0)
-        model = build.make_model(mine, env)
+        built = build.make_model(mine, env)
         planner = build.make_planner(mine, env.action_dim)
         return Trainer(
             env=env,
-            learner=Learner(model),
+            learner=Learner(built),
             replay=build.make_replay_buffer(mine, env.device),
-            policies=build.make_policies(model, planner, env),
+            policies=build.make_policies(built, planner, env),
             actor="policy",
-            cfg=mine,
+            settings=mine,
             folder=tmp_path / folder,
             loggers=[],
             evaluate=evaluate,
@@ -98,9 +96,8 @@ def test_a_run(make: Make) -> None:
 
 
 @pytest.mark.parametrize("low", [None, -0.01])
-def test_targets_outside_of_the_range_are_said(make: Make, cfg: DictConfig, monkeypatch, capsys, low) -> None:
-    monkeypatch.setitem(cfg.model, "value_low", low)
-    make().fit()
+def test_targets_outside_of_the_range_are_said(make: Make, capsys, low) -> None:
+    make(model={"value_low": low}).fit()
     said = [line for line in capsys.readouterr().out.splitlines() if "outside" in line]
     assert bool(said) == (low is not None)
     assert all("model.value_low" in line for line in said)
@@ -111,10 +108,11 @@ def test_weights_fit_when_a_run_goes_on_in_another_environment(make: Make, tmp_p
     trainer = make()
     trainer.fit()
     checkpoint = load_checkpoint(latest_checkpoint(trainer.folder))
-    cfg = checkpoint.config.copy()
-    cfg.env.terminate_on_success, cfg.env.action_penalty = True, 5.0
+    cfg = RunSettings.of(checkpoint.config, saved=True).changed(
+        env={"terminate_on_success": True, "action_penalty": 5.0}
+    )
     env = build.make_env(cfg)
-    _, spaces = Run(cfg=cfg, folder=tmp_path, checkpoint=checkpoint).build_experience(env)
+    _, spaces = Run(settings=cfg, folder=tmp_path, checkpoint=checkpoint).build_experience(env)
     model = build.make_model(cfg, spaces, env.device)
     checkpoint.load_model(model)
     assert torch.equal(model.two_hot.support, trainer.model.two_hot.support)
@@ -190,7 +188,7 @@ def test_going_on_without_the_experience_keeps_the_scale_of_observations(make: M
 def test_a_disk_without_room_costs_the_experience_not_the_weights(make: Make, monkeypatch, capsys) -> None:
     monkeypatch.setattr(room.shutil, "disk_usage", lambda folder: SimpleNamespace(free=10e6))
     trainer = make()
-    trainer.cfg.trainer.checkpoint_every = 1e-9
+    trainer.settings = trainer.settings.changed(trainer={"checkpoint_every": 1e-9})
     trainer.fit()
     said = capsys.readouterr().out
     assert said.count("WITHOUT the experience") == 2  # once on the way, and at the end
@@ -201,7 +199,7 @@ def test_a_disk_without_room_costs_the_experience_not_the_weights(make: Make, mo
 def test_large_experience_is_written_at_the_end_alone(make: Make, monkeypatch, capsys) -> None:
     monkeypatch.setattr(room, "BETWEEN", 10.0)
     trainer = make(updates=40)
-    trainer.cfg.trainer.checkpoint_every = 1e-9
+    trainer.settings = trainer.settings.changed(trainer={"checkpoint_every": 1e-9})
     written = []
     experience = trainer.experience
     trainer.experience = lambda: (written.append(trainer.learner.updates), experience())[1]  # type: ignore[method-assign]
@@ -211,9 +209,9 @@ def test_large_experience_is_written_at_the_end_alone(make: Make, monkeypatch, c
     assert load_checkpoint(latest_checkpoint(trainer.folder)).replay("cpu") is not None
 
 
-def test_evaluation_while_training(make: Make, cfg: DictConfig) -> None:
+def test_evaluation_while_training(make: Make, cfg: RunSettings) -> None:
     trainer = make(evaluate=lambda: {"eval/policy/success": 0.5})
-    trainer.cfg.evaluation.every = 10
+    trainer.settings = trainer.settings.changed(evaluation={"every": 10})
     trainer.fit()
     rows = [row for row in trainer.rows if "eval/policy/success" in row]
     assert len(rows) == 1  # after the first batch; the last one is left to the end of the run
@@ -227,7 +225,7 @@ def test_evaluations_that_take_long_are_left_out_unless_asked_for(make: Make, ca
 
     for every, count in ((None, 1), (10, 3)):
         trainer = make(str(every), updates=40, evaluate=slowly)
-        trainer.cfg.evaluation.every = every
+        trainer.settings = trainer.settings.changed(evaluation={"every": every})
         trainer.fit()
         assert sum("eval/policy/success" in row for row in trainer.rows) == count
         assert capsys.readouterr().out.count("some are left out") == (every is None)
@@ -236,13 +234,13 @@ def test_evaluations_that_take_long_are_left_out_unless_asked_for(make: Make, ca
 def test_evaluation_at_environment_steps(make: Make, capsys) -> None:
     """At the end of the batch in which the steps are reached, once, and not again by a resumed run."""
     trainer = make(updates=40, evaluate=lambda: {"eval/policy/success": 0.5})
-    trainer.cfg.evaluation.at_steps = [17 * N, 21 * N, 22 * N]
+    trainer.settings = trainer.settings.changed(evaluation={"at_steps": [17 * N, 21 * N, 22 * N]})
     trainer.fit()  # 10 steps to begin with, then 5 for every 10 updates
     rows = [row for row in trainer.rows if "eval/policy/success" in row]
     assert [row["env_steps"] for row in rows] == [20 * N, 25 * N]
 
     resumed = make("resumed", updates=60, evaluate=lambda: {"eval/policy/success": 0.5})
-    resumed.cfg.evaluation.at_steps = [17 * N, 33 * N, 999 * N]
+    resumed.settings = resumed.settings.changed(evaluation={"at_steps": [17 * N, 33 * N, 999 * N]})
     resumed.restore(load_checkpoint(latest_checkpoint(trainer.folder)))
     resumed.fit()
     assert f"at_steps=[{999 * N}]: not evaluated" in capsys.readouterr().out
@@ -256,7 +254,7 @@ def test_a_signal_ends_the_run_with_everything_saved(make: Make, number: int) ->
     trainer = make(
         updates=40, evaluate=lambda: (os.kill(os.getpid(), number), {"eval/policy/success": 0.5})[1]
     )
-    trainer.cfg.evaluation.every = 10
+    trainer.settings = trainer.settings.changed(evaluation={"every": 10})
     trainer.fit()
     assert trainer.interrupted and trainer.learner.updates == 10
     checkpoint = load_checkpoint(latest_checkpoint(trainer.folder))

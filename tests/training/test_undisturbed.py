@@ -13,7 +13,6 @@ from safetensors.torch import load_file
 from franka_wm.commands.main import main
 from franka_wm.seeding import seeded
 from franka_wm.training.checkpoint import Checkpoint
-from franka_wm.training.trainer import evaluation_period
 
 
 def weights(checkpoint: Checkpoint) -> dict[str, torch.Tensor]:
@@ -112,7 +111,7 @@ def test_global_generators_are_put_back() -> None:
     assert (random.random(), np.random.rand()) == expected[1:]
 
 
-def test_evaluation_every_eighth_of_a_run(composed) -> None:
-    assert evaluation_period(composed("scale=laptop", "trainer.updates=8000")) == 1000
-    assert evaluation_period(composed("scale=gpu", "trainer.updates=9")) == 2
-    assert evaluation_period(composed("evaluation.every=7")) == 7
+def test_evaluation_every_eighth_of_a_run(settled) -> None:
+    assert settled("scale=laptop", "trainer.updates=8000").evaluation_period == 1000
+    assert settled("scale=gpu", "trainer.updates=9").evaluation_period == 2
+    assert settled("evaluation.every=7").evaluation_period == 7

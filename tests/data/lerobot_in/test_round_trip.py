@@ -53,7 +53,7 @@ def test_bit_for_bit(exact: Any, opened: Callable) -> None:
     assert not theirs  # every window of the replay, the last action of each episode among them
 
 
-def test_a_run_gets_stacks_from_it(exact: Any, composed: Callable, tmp_path: Any) -> None:
+def test_a_run_gets_stacks_from_it(exact: Any, settled: Callable, tmp_path: Any) -> None:
     """`env.frame_stack` with `dataset=lerobot`: what the model is built for is what batches hold."""
     overrides = (
         "scale=smoke",
@@ -66,16 +66,16 @@ def test_a_run_gets_stacks_from_it(exact: Any, composed: Callable, tmp_path: Any
         f"dataset.cache_dir={tmp_path}",
         "dataset.workers=0",
     )
-    cfg = composed(*overrides, "env.frame_stack=3")
+    cfg = settled(*overrides, "env.frame_stack=3")
     check(cfg)
     train, validation = build.open_recorded(cfg, torch.device("cpu"))
     assert train.image_sizes == {"pixels": (64, 64, 9)} == validation.image_sizes
-    _, spaces = Run(cfg=cfg, folder=tmp_path).build_experience(None)
+    _, spaces = Run(settings=cfg, folder=tmp_path).build_experience(None)
     assert spaces.image_sizes == train.image_sizes and not spaces.terminates
     rewards = torch.stack([piece["next", "reward"] for piece in replay_windows(exact.replay).values()])
     least, largest = spaces.reward_bounds
     assert least == rewards.min() and rewards.max() <= largest <= 0.0  # rows after an end may hold 0
-    single = build.open_recorded(composed(*overrides, "env.frame_stack=1"), torch.device("cpu"))
+    single = build.open_recorded(settled(*overrides, "env.frame_stack=1"), torch.device("cpu"))
     for windows, alone in zip((train, validation), single, strict=True):
         h = windows.window
         per_episode = windows.episode_length - h + 1

@@ -1,0 +1,254 @@
+"""All settings of a run, read once, and what follows from several of them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, fields
+from functools import cached_property
+from typing import Any, Literal
+
+from omegaconf import DictConfig, OmegaConf
+
+from franka_wm.console import say
+from franka_wm.errors import UserError
+from franka_wm.options import is_whole, read, unknown
+from franka_wm.policies.names import refuse_old_name
+from franka_wm.training.settings.groups import (
+    CollectorSettings,
+    DatasetSettings,
+    EnvSettings,
+    EvaluationSettings,
+    ExportSettings,
+    LoggerSettings,
+    ModelSettings,
+    ObjectiveSettings,
+    PlannerSettings,
+    PretrainSettings,
+    ReplaySettings,
+    TrainerSettings,
+)
+
+
+def plain(cfg: DictConfig | Mapping[str, Any]) -> dict[str, Any]:
+    """A configuration, or a part of one, as plain values; ``${…}`` are resolved."""
+    values: Any = OmegaConf.to_container(cfg, resolve=True) if isinstance(cfg, DictConfig) else cfg
+    return dict(values)
+
+
+GROUPS = {
+    "collector": CollectorSettings,
+    "replay": ReplaySettings,
+    "trainer": TrainerSettings,
+    "evaluation": EvaluationSettings,
+    "objective": ObjectiveSettings,
+    "export": ExportSettings,
+    "dataset": DatasetSettings,
+    "pretrain": PretrainSettings,
+}
+
+
+@dataclass(frozen=True)
+class RunSettings:
+    """All of a run.
+
+    Attributes:
+        values: What ``config.yaml`` of the run's folder and of its checkpoints holds; plain.
+        seed: All random numbers come from it.
+        device: ``auto``, ``cpu``, ``cuda``, ``cuda:K``.
+        resume: The run or the checkpoint that it goes on from.
+    """
+
+    values: Mapping[str, Any]
+    seed: int
+    device: str
+    resume: str | None
+    env: EnvSettings
+    model: ModelSettings
+    planner: PlannerSettings
+    objective: ObjectiveSettings
+    collector: CollectorSettings
+    replay: ReplaySettings
+    trainer: TrainerSettings
+    evaluation: EvaluationSettings
+    logger: LoggerSettings
+    dataset: DatasetSettings
+    export: ExportSettings
+    pretrain: PretrainSettings
+
+    @classmethod
+    def of(cls, cfg: DictConfig | Mapping[str, Any], *, saved: bool = False) -> RunSettings:
+        """Reads a configuration.
+
+        Args:
+            cfg: Hydra's, or what a checkpoint holds.
+            saved: It is a checkpoint's: options that no longer exist are said and left out, not refused.
+
+        Raises:
+            UserError: One line that names the option and what is allowed.
+        """
+        values = plain(cfg)
+        missing = [name for name in ("seed", "device", "env", "model", "planner") if name not in values]
+        if missing:
+            raise UserError(f"the configuration has no {missing[0]}; it is not one of a run of this package")
+        refuse_old_name("collector.acts", values.get("collector", {}).get("acts"))
+        for name in _listed(values.get("evaluation", {}).get("during")):
+            refuse_old_name("evaluation.during", name)
+        groups = {}
+        for name, group in GROUPS.items():
+            given = values.get(name, {})  # checkpoints of earlier versions lack some
+            if saved:
+                given = values[name] = _without_unknown(given, group, name)
+            groups[name] = read(group, given, name)
+        if not is_whole(values["seed"]) or values["seed"] < 0:
+            raise UserError(f"seed={values['seed']!r}: must be a whole number of at least 0")
+        loggers = dict(values.get("logger", {}))
+        names = loggers.pop("names", ())
+        if not isinstance(names, list | tuple):
+            raise UserError(f"logger.names={names!r}: must be a list such as [csv,tensorboard]")
+        return cls(
+            values=values,
+            seed=values["seed"],
+            device=values["device"],
+            resume=values.get("resume"),
+            env=EnvSettings.of(values["env"]),
+            model=ModelSettings.of(values["model"]),
+            planner=PlannerSettings.of(values["planner"]),
+            logger=LoggerSettings(tuple(names), loggers),
+            **groups,
+        )
+
+    def changed(self, **changes: Any) -> RunSettings:
+        """The same with other values: ``changed(seed=3, model={"encoder_from": …})``; groups are merged."""
+        merged = {
+            name: {**self.values[name], **change} if isinstance(change, Mapping) else change
+            for name, change in changes.items()
+        }
+        return RunSettings.of({**self.values, **merged}, saved=True)
+
+    def first_stage(self) -> RunSettings:
+        """The run that pretrains the encoder; its checkpoints resume the whole run, not the stage alone."""
+        return RunSettings.of(
+            {
+                **self.values,
+                "whole_run": self.values,
+                "model": self.pretrain.model,
+                "trainer": {**self.values["trainer"], "updates": self.pretrain.updates},
+                "export": {**self.values["export"], "kind": "none"},
+            },
+            saved=True,
+        )
+
+    # -- what follows from several options ------------------------------------------------------------------
+
+    @property
+    def is_arm(self) -> bool:
+        """Whether the environment is the arm, not one of another library."""
+        return self.env.kind == "franka"
+
+    @property
+    def is_offline(self) -> bool:
+        """Whether experience comes from recorded data."""
+        return self.dataset.kind != "none"
+
+    @property
+    def is_discrete(self) -> bool:
+        """Whether the model chooses among discrete actions."""
+        return self.model.family.discrete
+
+    @property
+    def crosses_episodes(self) -> bool:
+        """Whether the model's loss takes windows that go on past the end of an episode."""
+        return self.model.family.cross_episode
+
+    @property
+    def window(self) -> int:
+        """Transitions of a training window."""
+        return self.model.window if self.replay.window is None else self.replay.window
+
+    @property
+    def learning_rate(self) -> float:
+        """The trainer's, or the model's own."""
+        return self.model.lr if self.trainer.lr is None else self.trainer.lr
+
+    @property
+    def schedule(self) -> str:
+        """The trainer's, or the model's own."""
+        return self.model.schedule if self.trainer.schedule is None else self.trainer.schedule
+
+    @property
+    def warmup(self) -> int:
+        """Updates over which the learning rate rises."""
+        return (
+            round(self.model.warmup * self.trainer.updates)
+            if self.trainer.warmup is None
+            else self.trainer.warmup
+        )
+
+    @property
+    def evaluation_period(self) -> int:
+        """Updates between evaluations while training: ``evaluation.every``, or an eighth of the run."""
+        every = self.evaluation.every
+        return max(1, -(-self.trainer.updates // 8)) if every is None else every
+
+    @property
+    def learner_options(self) -> dict[str, Any]:
+        """Arguments of the learner."""
+        names = ("grad_clip", "capture", "compile", "precision")
+        return {name: getattr(self.trainer, name) for name in names} | {
+            "lr": self.learning_rate,
+            "total_updates": self.trainer.updates,
+            "schedule": self.schedule,
+            "warmup": self.warmup,
+        }
+
+    @property
+    def objective_name(self) -> Literal["reward_value", "goal_image"] | None:
+        """What the planner maximises; ``None`` for a family that does not plan by an objective."""
+        name: Any = self.objective.name
+        if name != "auto":
+            return name
+        family = self.model.family
+        if family.discrete or not family.has_next:
+            return None
+        return "reward_value" if family.has_value else "goal_image"
+
+    @cached_property
+    def actor(self) -> str:
+        """The name of the policy that gathers experience, by ``collector.acts``.
+
+        Raises:
+            UserError: The model's family does not have it.
+        """
+        acts, family = self.collector.acts, self.model.family
+        there = {"planner": family.has_next, "policy": family.has_policy}
+        searched = bool(family.replay_keys)  # the loss needs what the search found
+        if acts == "auto":
+            if searched:
+                return "planner"
+            if there["policy"]:
+                return "policy"
+            # A planner without a policy's candidates takes far longer to decide than the worlds to step, and a model
+            # that is given goals by their images can learn from any motion.
+            return "planner" if self.objective_name == "reward_value" else "random"
+        if not there.get(acts, True) or (searched and acts != "planner"):
+            fitting = "planner" if there["planner"] else "random"
+            raise UserError(
+                f"collector.acts={acts}: model={self.model.name} cannot; use collector.acts={fitting}"
+            )
+        return acts
+
+    def planned_steps(self, updates: int = 0) -> int:
+        """Steps that each world will make until the end of the run, after so many ``updates``."""
+        c, t = self.collector, self.trainer
+        return c.seed_steps + -(-max(t.updates - updates, 0) // t.updates_per_batch) * c.steps_per_batch
+
+
+def _listed(names: Any) -> Any:
+    return names if isinstance(names, list | tuple) else [names]
+
+
+def _without_unknown(values: Mapping[str, Any], group: type, name: str) -> dict[str, Any]:
+    known = {f.name for f in fields(group)}
+    for gone in sorted(set(values) - known):
+        say(f"{unknown(f'{name}.{gone}', sorted(known)).split(';')[0]} any more: it is left out")
+    return {key: value for key, value in values.items() if key in known}

@@ -1,0 +1,207 @@
+"""Every documented option refuses other types and values out of range, in one line that says what is allowed."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import fields
+from functools import cache
+from typing import Any
+
+import pytest
+from omegaconf import OmegaConf
+
+from franka_wm.conf import FOLDER, compose
+from franka_wm.errors import UserError
+from franka_wm.planning import registry
+from franka_wm.training.settings import RunSettings
+from franka_wm.training.settings.run import GROUPS
+
+OUT_OF_RANGE = {
+    "seed": [-1],
+    "env.frame_stack": [0],
+    "env.episode_length": [0],
+    "collector.acts": ["judge"],
+    "collector.num_envs": [0],
+    "collector.steps_per_batch": [0],
+    "collector.seed_steps": [0],
+    "collector.smoothness": [-0.1, 1.0],
+    "collector.noise": [-0.1, 2.1],
+    "collector.planner_worlds": [-1],
+    "replay.capacity": [0],
+    "replay.batch_size": [0],
+    "replay.window": [0],
+    "replay.hindsight": [-0.1, 1.1],
+    "trainer.updates": [-1],
+    "trainer.updates_per_batch": [0],
+    "trainer.lr": [0.0, -1.0],
+    "trainer.grad_clip": [0.0],
+    "trainer.precision": ["float16"],
+    "trainer.schedule": ["linear"],
+    "trainer.warmup": [-1],
+    "trainer.log_every": [0.0],
+    "trainer.checkpoint_every": [0.0],
+    "evaluation.episodes": [1],
+    "evaluation.during": [["oracel"], "planner"],
+    "evaluation.during_episodes": [1],
+    "evaluation.every": [0],
+    "evaluation.at_steps": [[0], [1.5], 1000],
+    "evaluation.video_episodes": [-1],
+    "evaluation.video_size": [14, 97],
+    "objective.name": ["reward"],
+    "objective.metric": ["l3"],
+    "objective.action_penalty": [-1.0],
+    "objective.smoothness_penalty": [-1.0],
+    "objective.policy_penalty": [-1.0],
+    "export.kind": ["hdf5"],
+    "export.workers": [0],
+    "dataset.kind": ["hdf5"],
+    "dataset.validation_fraction": [-0.1, 1.0],
+    "dataset.workers": [0],
+    "dataset.image_size": [0, [1, 2, 3]],
+    "pretrain.kind": ["model"],
+    "pretrain.updates": [-1],
+    "model.name": ["oracle_bone"],
+    "model.window": [0],
+    "model.lr": [0.0],
+    "model.schedule": ["linear"],
+    "model.warmup": [-0.1, 1.1],
+    "planner.precision": ["float16"],
+}
+"""Option → values of the right type that it cannot have."""
+
+
+@cache
+def values() -> Mapping[str, Any]:
+    """All groups, with the options of a dataset, an export and a first stage."""
+    found = compose("dataset=lerobot", "export=lerobot", "pretrain=jepa", "model=lewm", "scale=laptop")
+    return OmegaConf.to_container(found, resolve=True)  # type: ignore[return-value]
+
+
+def changed(option: str, value: Any) -> dict[str, Any]:
+    group, _, name = option.rpartition(".")
+    new = {key: dict(one) if isinstance(one, dict) else one for key, one in values().items()}
+    (new[group] if group else new)[name] = value
+    return new
+
+
+def refused(option: str, value: Any) -> str:
+    with pytest.raises(UserError) as caught:
+        RunSettings.of(changed(option, value))
+    return str(caught.value)
+
+
+def declared() -> list[tuple[str, str]]:
+    """(option, what it must be) of every group that is declared as a whole."""
+    return [
+        (f"{group}.{one.name}", one.metadata["rule"].wanted)
+        for group, cls in GROUPS.items()
+        for one in fields(cls)
+    ]
+
+
+def wrong_types(wanted: str) -> list[Any]:
+    """Values that no option of this kind takes."""
+    always = [{"a": 1}]
+    if "number" in wanted:
+        return [*always, "some", True, math.nan, math.inf, *([2.5] if "finite" not in wanted else [])]
+    return [*always, 3, 1.5] if not wanted.startswith("{") and "options" not in wanted else [3, "some"]
+
+
+def test_every_documented_option_is_declared() -> None:
+    documented = {f"{group}.{name}" for group in GROUPS for name in values()[group]}
+    assert documented == {option for option, _ in declared()}
+
+
+@pytest.mark.parametrize(("option", "wanted"), declared())
+def test_other_types_are_refused(option: str, wanted: str) -> None:
+    for value in wrong_types(wanted):
+        said = refused(option, value)
+        assert said.startswith(f"{option}=") and f"must be {wanted}" in said and "\n" not in said, (
+            value,
+            said,
+        )
+
+
+@pytest.mark.parametrize(("option", "value"), [(o, v) for o, wrong in OUT_OF_RANGE.items() for v in wrong])
+def test_values_out_of_range_are_refused(option: str, value: Any) -> None:
+    said = refused(option, value)
+    assert option.removeprefix("env.") in said and "must be" in said and "\n" not in said
+
+
+def test_every_bounded_option_is_tried_out_of_range() -> None:
+    bounded = {
+        option
+        for option, wanted in declared()
+        if any(word in wanted for word in ("least", "most", "above", "below", "one of"))
+    }
+    assert bounded - {"dataset.seed"} <= set(OUT_OF_RANGE)
+
+
+@pytest.mark.parametrize("option", ["trainer.updates", "collector.num_envs", "model.window", "dataset.kind"])
+def test_null_is_refused_where_it_means_nothing(option: str) -> None:
+    assert refused(option, None).startswith(f"{option}=None: must be ")
+
+
+def test_a_configuration_of_something_else_is_one_line() -> None:
+    with pytest.raises(UserError, match="the configuration has no device"):
+        RunSettings.of({"seed": 0}, saved=True)
+
+
+def test_an_option_that_does_not_exist_names_the_nearest() -> None:
+    said = refused("collector.num_env", 3)
+    assert said.startswith("collector.num_env: there is no such option") and "collector.num_envs" in said
+
+
+def test_what_a_saved_run_says_of_old_options(capsys) -> None:
+    run = RunSettings.of(changed("collector.calmest", 0.5), saved=True)
+    assert "collector.calmest" in capsys.readouterr().out and "calmest" not in run.values["collector"]
+
+
+# -- models and planners: types by the constructor's annotations ------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("group", "file"),
+    [
+        (group, path.stem)
+        for group in ("model", "planner")
+        for path in sorted((FOLDER / group).glob("*.yaml"))
+    ],
+)
+def test_options_of_models_and_planners_refuse_other_types(group: str, file: str) -> None:
+    run = RunSettings.of(compose(f"{group}={file}", "scale=laptop"))
+    part = getattr(run, group)
+    tried = 0
+    for name, value in part.options.items():
+        if not isinstance(value, bool | int | float):
+            continue
+        tried += 1
+        for wrong in (
+            "some",
+            [1],
+            3 if isinstance(value, bool) else True,
+            *([2.5] if type(value) is int else []),
+        ):
+            with pytest.raises(UserError) as caught:
+                if group == "model":
+                    part.family.validate({**part.options, name: wrong})
+                else:
+                    registry.validate(part.name, {name: wrong})
+            assert str(caught.value).startswith(f"{group}.{name}={wrong!r}: must be "), wrong
+    assert tried >= 3
+
+
+def test_a_planner_option_that_does_not_exist() -> None:
+    with pytest.raises(UserError, match=r"planner\.num_sample: .*planner\.num_samples"):
+        registry.validate("mppi", {"num_sample": 3})
+
+
+def test_settings_are_what_several_options_make_of_them() -> None:
+    run = RunSettings.of(compose("model=lewm", "env=reach_goal_image", "scale=laptop"))
+    assert (run.window, run.learning_rate, run.schedule, run.warmup) == (3, 5.0e-4, "cosine", 80)
+    assert (run.actor, run.objective_name, run.evaluation_period) == ("random", "goal_image", 1000)
+    other = run.changed(replay={"window": 5}, trainer={"lr": 1.0, "schedule": "constant", "warmup": 7})
+    assert (other.window, other.learning_rate, other.schedule, other.warmup) == (5, 1.0, "constant", 7)
+    assert run.values["replay"]["window"] is None, "the first is as it was"
+    assert RunSettings.of(run.values) == run
