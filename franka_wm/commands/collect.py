@@ -197,4 +197,6 @@ def _agent(part: str, checkpoint: str, options: dict[str, Any], overrides: list[
     if part not in agent.policies:
         raise UserError(f"collect: policy={part}: {checkpoint} has only {', '.join(agent.policies)}")
     settings = agent.settings
-    return Source(agent.env, agent.policies[part], settings.values, f"{part} of {checkpoint}", settings.seed)
+    return Source(
+        agent.env, agent.policies[part], dict(settings.values), f"{part} of {checkpoint}", settings.seed
+    )

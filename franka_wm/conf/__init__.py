@@ -26,8 +26,9 @@ RENAMED = {"model.fresh_values": "model.reanalyze"}
 
 def use_present_names(config: DictConfig) -> None:
     """Rename the options of a checkpoint that had other names when it was written, in place."""
-    for one in (config, config.get("whole_run")):
-        for old, new in RENAMED.items() if one is not None else ():
+    whole: DictConfig | None = config.get("whole_run")
+    for one in [config] if whole is None else [config, whole]:
+        for old, new in RENAMED.items():
             value = OmegaConf.select(one, old)
             if value is not None:
                 group, name = old.rsplit(".", 1)

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from types import MappingProxyType
+
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
 from franka_wm.envs import FrankaConfig, FrankaEnv
 from franka_wm.envs.kinematics import Kinematics
+from franka_wm.models.base import WorldModel
 from franka_wm.planning import MPPI
 from franka_wm.policies import PlannerPolicy
 
@@ -55,7 +58,7 @@ def commanded_path(env: FrankaEnv, plan: Tensor) -> Tensor:
     return env.kinematics.forward(torch.stack(targets, 1))
 
 
-class KinematicModel:
+class KinematicModel(WorldModel):
     """A world model that nobody trained: the arm's own geometry, as if it followed every command at once.
 
     The latent is (joint targets 7 [rad], goal 3 [m]). With it a planner can be watched before anything was learned;
@@ -65,9 +68,10 @@ class KinematicModel:
         env: Whose arm and actions these are.
     """
 
-    observation_keys = ["joint_target", "goal"]
+    observation_sizes = MappingProxyType({"joint_target": 7, "goal": 3})
 
     def __init__(self, env: FrankaEnv):
+        super().__init__()
         self.config, self.kinematics = env.config, env.kinematics
 
     def encode(self, observation: TensorDictBase) -> Tensor:

@@ -159,7 +159,7 @@ def make_objective(run: RunSettings, model: Any) -> Any:
             model.encode_goal,
             embed=model.embed,
             goals=goal_pictures(model.image_sizes),
-            metric=o.metric,
+            metric=o.metric,  # pyright: ignore[reportArgumentType]  # one of its choices
             summed=o.summed,
         )
     parts: list[tuple[float, Any]] = [(1.0, chosen)]
