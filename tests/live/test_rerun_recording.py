@@ -63,6 +63,6 @@ def test_bad_names_are_one_line(small_env, tmp_path: Path) -> None:
     policies = {"ik": OraclePolicy(env.kinematics, env.config)}
     with pytest.raises(UserError, match=r"must end in \.rrd"):
         record_episode(env, policies, tmp_path / "episode.bin")
-    with pytest.raises(UserError, match="policy='planner': choose from oracle; that one needs a checkpoint"):
+    with pytest.raises(UserError, match="policy='planner': choose from ik; that one needs a checkpoint"):
         record_episode(env, policies, tmp_path / "episode.rrd", policy="planner")
     assert not list(tmp_path.iterdir())

@@ -244,16 +244,17 @@ def test_an_exception_while_it_plays_ends_it(monkeypatch: pytest.MonkeyPatch) ->
 BUSY = """
 import signal
 import time
+from franka_wm.commands.view import parse
 from franka_wm.live import view
 signal.signal(signal.SIGINT, signal.default_int_handler)  # may have been inherited as ignored
-stage = view.build(view.parse({cheap!r}))
+stage = view.build(parse({cheap!r}))
 real = stage.policies["noop"]
 def slow(tensordict):
     print("deciding", flush=True)
     time.sleep(60)
     return real(tensordict)
 stage.policies["noop"] = slow
-view.serve(stage, view.parse(["policy=noop", "port=0"]))
+view.serve(stage, parse(["policy=noop", "port=0"]))
 """
 
 

@@ -252,7 +252,7 @@ def test_recorded_data_go_on_where_they_were(train, made: Counter[str], monkeypa
         "trainer=offline",
         "dataset=lerobot",
         f"dataset.root={tmp_path}/data",
-        "dataset.workers=0",
+        "dataset.workers=1",
         *sizes,
     ]
     data += [f"dataset.cache_dir={tmp_path}/cache", "env=reach_fixed", "dataset.validation_fraction=0.3"]

@@ -150,7 +150,7 @@ def test_ctrl_c_leaves_a_dataset(tmp_path, load) -> None:
         (["out=x", "fmt=exact"], "fmt: no such option; there are out, episodes, policy, checkpoint, format"),
         (
             ["out=x", "env.imag_size=3"],
-            "env.imag_size: no such option; there are env.kind, env.urdf_path, env.im",
+            "env.imag_size: no such option; did you mean env.image_size?",
         ),
         (["out=x", "seed=abc"], "seed=abc: must be a whole number"),
         (["out=x", "seed=null"], "seed=None: must be a whole number"),
