@@ -14,6 +14,7 @@ from franka_wm.commands import main as cli
 from franka_wm.commands.evaluate import default_folder, parse, to_json
 from franka_wm.errors import UserError
 from franka_wm.evaluation import diagnose
+from franka_wm.models import WorldModel
 from franka_wm.report import diagnostics
 
 POLICIES = {"planner", "policy", "noop", "random", "ik"}
@@ -153,7 +154,7 @@ def test_json_has_no_nan() -> None:
 # -- models that lack parts --------------------------------------------------------------------------------
 
 
-class Blind(torch.nn.Module):
+class Blind(WorldModel):
     """A representation alone: no dynamics, no value, no policy."""
 
     observation_sizes = {"state": 20}
