@@ -174,7 +174,8 @@ def _first_comment(file: Path) -> str:
 
 def tasks() -> dict[str, str]:
     """The tasks: files in ``envs/tasks``, whose names ``env.task`` takes, with their first line."""
-    files = sorted(file for file in (PACKAGE / "envs" / "tasks").glob("*.py") if file.stem[0] != "_")
+    bases = ("__init__", "base", "torch_task")
+    files = sorted(file for file in (PACKAGE / "envs" / "tasks").glob("*.py") if file.stem not in bases)
     return {file.stem: _first_line(file.read_text(encoding="utf-8")) for file in files}
 
 
