@@ -68,6 +68,13 @@ def franka(wheel: Path, tmp_path_factory: pytest.TempPathFactory) -> Callable[..
     return run
 
 
+@pytest.fixture(scope="module")
+def run_folder(franka: Callable[..., str], tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("run") / "smoke"
+    franka("train", "scale=smoke", "device=cpu", f"hydra.run.dir={folder}")
+    return folder
+
+
 def test_wheel_brings_its_data_and_nothing_else(wheel: Path) -> None:
     names = zipfile.ZipFile(wheel).namelist()
     data = {name for name in names if not name.endswith(".py") and ".dist-info/" not in name}
@@ -80,6 +87,18 @@ def test_wheel_brings_its_data_and_nothing_else(wheel: Path) -> None:
 
 def test_version(franka: Callable[..., str], wheel: Path) -> None:
     assert franka("--version").split()[-1] == franka_wm.__version__ == wheel.name.split("-")[1]
+
+
+def test_train_writes_a_run(run_folder: Path) -> None:
+    assert (run_folder / "evaluation.json").is_file()
+    assert (run_folder / "report.html").is_file()
+
+
+def test_evaluate_and_report(franka: Callable[..., str], run_folder: Path, tmp_path: Path) -> None:
+    franka("evaluate", f"checkpoint={run_folder}", f"out={tmp_path}", "episodes=4", "device=cpu")
+    assert json.loads((tmp_path / "evaluation.json").read_text())
+    franka("report", str(run_folder), f"out={tmp_path}/page.html")
+    assert "<html" in (tmp_path / "page.html").read_text()[:2000]
 
 
 def test_collect(franka: Callable[..., str], tmp_path: Path) -> None:
