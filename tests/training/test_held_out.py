@@ -69,7 +69,7 @@ def meet(a: torch.Tensor, b: torch.Tensor) -> bool:
 
 def test_no_episode_of_the_evaluation_occurs_in_training(run: Run, worlds, trained) -> None:
     watching = Watching()
-    during = during_training(worlds[1], {"policy": watching}, **run.during)
+    during = during_training(run.settings.evaluation, worlds[1], {"policy": watching})
     assert during()
     evaluate_run(
         run.settings, run.folder, worlds[1], {"policy": watching}, counters={}, say=lambda text: None

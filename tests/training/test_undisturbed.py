@@ -81,7 +81,7 @@ def test_validation_losses_do_not_change_the_weights(train, tmp_path: Path) -> N
         "workers=0",
     ]
     assert main([*arguments, "env.substeps=1", "env.episode_length=8", "device=cpu", "seed=0"]) == 0
-    data = ["trainer=offline", "dataset=lerobot", f"dataset.root={tmp_path}/data", "dataset.workers=0"]
+    data = ["trainer=offline", "dataset=lerobot", f"dataset.root={tmp_path}/data", "dataset.workers=1"]
     data += [f"dataset.cache_dir={tmp_path}/cache", "env=reach_fixed", "dataset.validation_fraction=0.3"]
     data += ["trainer.updates=6", "trainer.updates_per_batch=1"]
     runs = [

@@ -64,7 +64,7 @@ def test_a_run_gets_stacks_from_it(exact: Any, settled: Callable, tmp_path: Any)
         "trainer=offline",
         f"dataset.root={exact.root}",
         f"dataset.cache_dir={tmp_path}",
-        "dataset.workers=0",
+        "dataset.workers=1",
     )
     cfg = settled(*overrides, "env.frame_stack=3")
     check(cfg)
