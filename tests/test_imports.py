@@ -1,4 +1,4 @@
-"""The rooms of docs/architecture.md: imports point down only, and no files import one another in a circle."""
+"""The rooms of docs/architecture.md: imports point down only, no files import one another in a circle, none is long."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
 
 ROOT = Path(__file__).parents[1]
+LONGEST = 450  # lines of a file
 PAGE = ROOT / "docs" / "architecture.md"
 FILES = {
     ".".join(file.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__"): file
@@ -79,3 +80,12 @@ def test_no_circle_of_files() -> None:
         TopologicalSorter({module: imports(module, types=False) for module in FILES}).prepare()
     except CycleError as error:
         raise AssertionError(" → ".join(reversed(error.args[1]))) from None
+
+
+def test_no_file_is_long() -> None:
+    """A file has one concern: split it by that, not by its length."""
+    folders = ("franka_wm", "tests", "benchmarks", "scripts", "examples")
+    files = [ROOT / "train.py", *(file for folder in folders for file in (ROOT / folder).rglob("*.py"))]
+    lengths = {file: len(file.read_text(encoding="utf-8").splitlines()) for file in files}
+    assert len(lengths) > 300
+    assert not [f"{f.relative_to(ROOT)}: {n} lines" for f, n in lengths.items() if n > LONGEST]

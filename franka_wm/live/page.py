@@ -13,9 +13,10 @@ from typing import Any
 import numpy as np
 
 from franka_wm.errors import UserError
+from franka_wm.live.frame import Frame
 from franka_wm.live.gate import Gate, is_number
 from franka_wm.live.scene import Scene
-from franka_wm.live.session import SPEEDS, Frame, Session
+from franka_wm.live.session import SPEEDS, Session
 from franka_wm.live.settings import Setting
 from franka_wm.live.shapes import arm_shapes
 from franka_wm.report.style import BLUE, VERMILION, policy_name

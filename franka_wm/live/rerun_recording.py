@@ -8,7 +8,8 @@ from typing import Any
 
 from franka_wm.errors import UserError
 from franka_wm.files import atomic_write
-from franka_wm.live.session import Frame, Session
+from franka_wm.live.frame import Frame
+from franka_wm.live.session import Session
 from franka_wm.live.shapes import arm_shapes
 from franka_wm.report.style import BLUE, VERMILION
 

@@ -13,7 +13,7 @@ from franka_wm.live.shapes import Shape, wxyz
 if TYPE_CHECKING:
     import viser
 
-    from franka_wm.live.session import Frame
+    from franka_wm.live.frame import Frame
 
 EYE, LOOK_AT = (1.42, 1.00, 0.90), (0.12, 0.13, 0.40)
 """Where the page's camera starts [m]: the whole arm and its reach, seen from its left front."""
@@ -27,7 +27,7 @@ DARKEST = 44
 
 
 class Scene:
-    """What a :class:`~franka_wm.live.session.Frame` looks like.
+    """What a :class:`~franka_wm.live.frame.Frame` looks like.
 
     Args:
         server: Where to draw.

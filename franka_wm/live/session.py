@@ -8,7 +8,6 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +20,7 @@ from franka_wm.console import say
 from franka_wm.envs import FrankaEnv
 from franka_wm.errors import UserError
 from franka_wm.live.commanded import commanded_path
+from franka_wm.live.frame import Frame
 from franka_wm.live.recorder import DatasetRecorder, VideoRecorder
 from franka_wm.live.settings import Setting, planner_settings, rebuilt, work
 from franka_wm.policies.names import refuse_old_name
@@ -34,42 +34,6 @@ BUDGET = 1.0
 
 PREFERRED = ("planner", "ik", "noop")
 """Which policy starts, the first one that there is."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class Frame:
-    """What there is to see of the first world, copied to the host.
-
-    Attributes:
-        steps: Simulated since the session began.
-        episode: Counts from 0.
-        stepped: Whether this is a step's end; otherwise something was set by hand.
-        policy: Who acts.
-        bodies: Poses of the moving links (bodies, 7): position [m], quaternion xyzw.
-        tool, goal: (3,) [m].
-        path: Tool positions that the plan commands (H + 1, 3) [m]; None where the policy has no plan.
-        reward: Of the last step; 0.0 before the first.
-        distance: From tool to goal, at the last step's end, before any reset [m].
-        success: Of the last step.
-        decision: Time that the policy took for the last step [s].
-        recording: Steps recorded so far; None where nothing is recorded.
-        recording_full: Whether the recording has come to its end by itself: further steps are not in it.
-    """
-
-    steps: int
-    episode: int
-    stepped: bool
-    policy: str
-    bodies: np.ndarray
-    tool: np.ndarray
-    goal: np.ndarray
-    path: np.ndarray | None
-    reward: float
-    distance: float
-    success: bool
-    decision: float
-    recording: int | None
-    recording_full: bool = False
 
 
 class Session:

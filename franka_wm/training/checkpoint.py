@@ -15,12 +15,10 @@ between the renames leaves no `NAME`, but a whole `NAME.old`, and that is what `
 reads. `NAME.old` is removed only while a whole `NAME` exists.
 """
 
-import hashlib
 import json
 import os
 import random
 import shutil
-import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -35,26 +33,18 @@ from safetensors import SafetensorError
 from safetensors.torch import load_file
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor, nn
-from torch.optim import Optimizer
 
 from franka_wm.conf import use_present_names
 from franka_wm.errors import UserError
+from franka_wm.training.manifest import MANIFEST, Manifest, read_manifest, saved_at, sync, write_manifest
+from franka_wm.training.optimizer_state import Optimizers, load_optimizer_state, optimizer_state
 from franka_wm.training.tree import read_tree, save_tensors, tree_files, write_json, write_tree
-from franka_wm.version import __version__
-
-FORMAT_VERSION = 1
 
 FIRST_STAGE = "pretrained"
 """Folder of the first stage, in that of its run."""
 
-type Optimizers = Optimizer | Mapping[str, Optimizer]
-
-_MANIFEST = "manifest.json"
 _WRITING = ".writing"
 _OLD = ".old"
-# How an optimizer runs, not what it has learned: kept from the optimizer that is loaded into, so that a
-# checkpoint from a GPU (fused, capturable) goes on on a CPU and the other way round.
-_EXECUTION_FLAGS = ("capturable", "differentiable", "foreach", "fused")
 
 
 # -- saving ----------------------------------------------------------------------------------------------
@@ -97,7 +87,7 @@ def save_checkpoint(
     with _explained(target):
         # Renaming would fail only after everything has been written; this is the place to say it.
         if (target.exists() and not target.is_dir()) or (
-            target.is_dir() and not (target / _MANIFEST).exists() and any(target.iterdir())
+            target.is_dir() and not (target / MANIFEST).exists() and any(target.iterdir())
         ):
             raise UserError(f"{target} exists and is not a checkpoint; choose another folder or remove it.")
         target.parent.mkdir(parents=True, exist_ok=True)
@@ -124,11 +114,7 @@ def _write_contents(
 ) -> None:
     save_tensors(_tensor_state(model), folder / "model.safetensors")
     if optimizer is not None:
-        state = {
-            name: {"type": type(one).__name__, "state_dict": one.state_dict()}
-            for name, one in _by_name(optimizer).items()
-        }
-        write_tree(folder, "optimizer", state)
+        write_tree(folder, "optimizer", optimizer_state(optimizer))
     write_tree(folder, "rng", _rng_state())
     if replay is not None:
         write_tree(folder, "replay", {"batch_size": list(replay.batch_size), "entries": _entries(replay)})
@@ -137,19 +123,7 @@ def _write_contents(
     OmegaConf.save(_resolved(config), folder / "config.yaml")
     write_json(folder / "counters.json", {name: _plain_number(name, n) for name, n in counters.items()})
 
-    files = sorted(folder.iterdir())
-    for path in files:
-        _sync(path)
-    manifest = {
-        "format_version": FORMAT_VERSION,
-        "franka_wm": __version__,
-        "model": type(model).__name__,
-        "saved_at_ns": time.time_ns(),
-        "files": {p.name: {"bytes": p.stat().st_size, "sha256": _sha256(p)} for p in files},
-    }
-    write_json(folder / _MANIFEST, manifest)
-    _sync(folder / _MANIFEST)
-    _sync(folder)
+    write_manifest(folder, type(model).__name__)
 
 
 def _swap_in(writing: Path, target: Path) -> None:
@@ -165,7 +139,7 @@ def _swap_in(writing: Path, target: Path) -> None:
         if old.exists() and not target.exists():
             os.rename(old, target)
         raise
-    _sync(target.parent)
+    sync(target.parent)
     # What matters is in place; a leftover here is removed by the next save.
     shutil.rmtree(old, ignore_errors=True)
 
@@ -179,16 +153,19 @@ class Checkpoint:
 
     Attributes:
         folder: where it was read from.
-        model_name: class name of the model that was saved.
         config: the resolved configuration.
         counters: the numbers that were saved.
     """
 
     folder: Path
-    model_name: str
     config: DictConfig
     counters: dict[str, int | float]
-    _files: Mapping[str, Mapping[str, Any]]
+    _manifest: Manifest
+
+    @property
+    def model_name(self) -> str:
+        """Class name of the model that was saved."""
+        return self._manifest.model
 
     def load_model(self, model: nn.Module) -> None:
         """Copy the saved weights and buffers into `model`, in place, whatever device it is on.
@@ -226,27 +203,7 @@ class Checkpoint:
             raise UserError(
                 f"checkpoint {self.folder} was saved without an optimizer; start a new run from its weights."
             )
-        optimizers = _by_name(optimizer)
-        if saved.keys() != optimizers.keys():
-            raise UserError(
-                f"checkpoint {self.folder} holds the optimizers {sorted(saved)}, asked for are "
-                f"{sorted(optimizers)}; resume with the trainer that wrote it."
-            )
-        fitted = {}
-        for name, one in optimizers.items():
-            difference = _optimizer_difference(saved[name], one)
-            if difference is not None:
-                raise UserError(
-                    f"optimizer {name!r} of checkpoint {self.folder} does not fit: {difference}; "
-                    "build model and optimizer from the checkpoint's config.yaml."
-                )
-            fitted[name] = _as_it_runs_here(saved[name]["state_dict"], one)
-        for name, one in optimizers.items():
-            rates = [group["lr"] for group in one.param_groups]
-            one.load_state_dict(fitted[name])
-            for group, rate in zip(one.param_groups, rates, strict=True):
-                if isinstance(rate, Tensor):  # a captured graph reads this very tensor
-                    group["lr"] = rate.copy_(torch.as_tensor(group["lr"]))
+        load_optimizer_state(saved, optimizer, f"checkpoint {self.folder}")
 
     def restore_rng(self) -> None:
         """Set torch's (CPU and CUDA), NumPy's and Python's global generators to their saved states.
@@ -270,7 +227,7 @@ class Checkpoint:
         """
         # By far the largest file, and evaluation never opens it: its checksum waits until here.
         for name in tree_files("replay"):
-            _check_sum(self.folder, name, self._files)
+            self._manifest.check_sum(self.folder, name)
         saved = self._tree("replay")
         if saved is None:
             return None
@@ -281,7 +238,7 @@ class Checkpoint:
         return self._tree("extra")
 
     def _tree(self, name: str) -> Any:
-        return read_tree(self.folder, name) if f"{name}.json" in self._files else None
+        return read_tree(self.folder, name) if f"{name}.json" in self._manifest.files else None
 
 
 def load_checkpoint(folder: str | Path) -> Checkpoint:
@@ -295,31 +252,15 @@ def load_checkpoint(folder: str | Path) -> Checkpoint:
     path = _find(Path(folder).resolve())
     if path is None:
         raise UserError(
-            f"no checkpoint at {folder}: a checkpoint is a folder with a {_MANIFEST}; "
+            f"no checkpoint at {folder}: a checkpoint is a folder with a {MANIFEST}; "
             "give the folder that a training run wrote."
         )
-    try:
-        manifest = json.loads((path / _MANIFEST).read_bytes())
-        version, model_name, files = manifest["format_version"], manifest["model"], dict(manifest["files"])
-        if not all(
-            isinstance(one["bytes"], int) and isinstance(one["sha256"], str) for one in files.values()
-        ):
-            raise ValueError("files")
-    except (OSError, ValueError, KeyError, TypeError) as error:
-        raise UserError(
-            f"checkpoint {path} is damaged: {_MANIFEST} cannot be read ({type(error).__name__}); "
-            "use another checkpoint."
-        ) from error
-    if version != FORMAT_VERSION:
-        raise UserError(
-            f"checkpoint {path} has format version {version}, this franka_wm {__version__} reads "
-            f"{FORMAT_VERSION}; use the franka_wm that wrote it ({manifest.get('franka_wm', 'unknown')})."
-        )
-    for name in files:
-        _check_size(path, name, files)
-    for name in files:
+    manifest = read_manifest(path)
+    for name in manifest.files:
+        manifest.check_size(path, name)
+    for name in manifest.files:
         if name not in tree_files("replay"):
-            _check_sum(path, name, files)
+            manifest.check_sum(path, name)
     config = OmegaConf.load(path / "config.yaml")
     if not isinstance(config, DictConfig):
         raise UserError(
@@ -333,7 +274,7 @@ def load_checkpoint(folder: str | Path) -> Checkpoint:
         )
     use_present_names(config)
     counters = json.loads((path / "counters.json").read_bytes())
-    return Checkpoint(path, model_name, config, counters, files)
+    return Checkpoint(path, config, counters, manifest)
 
 
 def latest_checkpoint(folder: str | Path) -> Path:
@@ -353,7 +294,7 @@ def latest_checkpoint(folder: str | Path) -> Path:
     found = _found(places) or _found([run / FIRST_STAGE / "checkpoints"])
     if not found:
         raise UserError(
-            f"no checkpoint in {folder}: expected a checkpoint (a folder with a {_MANIFEST}) or a run's "
+            f"no checkpoint in {folder}: expected a checkpoint (a folder with a {MANIFEST}) or a run's "
             "folder that holds one; give a folder that a training run wrote."
         )
     return max(found)[1]
@@ -364,7 +305,7 @@ def _found(places: Sequence[Path]) -> list[tuple[int, Path]]:
     inside = [entry for place in places if place.is_dir() for entry in place.iterdir() if entry.is_dir()]
     # A NAME.old that lost its NAME to a kill stands for NAME.
     names = {p.with_name(p.name.removesuffix(_OLD)) for p in inside if not p.name.endswith(_WRITING)}
-    return [(_saved_at(whole), name) for name in names if (whole := _find(name)) is not None]
+    return [(saved_at(whole), name) for name in names if (whole := _find(name)) is not None]
 
 
 # -- comparing -------------------------------------------------------------------------------------------
@@ -384,35 +325,6 @@ def _first_difference(saved: Mapping[str, Tensor], here: Mapping[str, Tensor]) -
     return None if unknown is None else f"{unknown} is in the checkpoint but not in the model"
 
 
-def _optimizer_difference(saved: Mapping[str, Any], optimizer: Optimizer) -> str | None:
-    """In words, why the saved state is for another optimizer, or None. torch checks only the counts."""
-    if saved["type"] != type(optimizer).__name__:
-        return f"it is {saved['type']}, here is {type(optimizer).__name__}"
-    groups = saved["state_dict"]["param_groups"]
-    if [len(g["params"]) for g in groups] != [len(g["params"]) for g in optimizer.param_groups]:
-        return "its groups hold other numbers of parameters"
-    for group, group_here in zip(groups, optimizer.param_groups, strict=True):
-        for index, parameter in zip(group["params"], group_here["params"], strict=True):
-            for name, value in saved["state_dict"]["state"].get(index, {}).items():
-                if isinstance(value, Tensor) and value.ndim > 0 and value.shape != parameter.shape:
-                    return (
-                        f"{name} of parameter {index} has shape {tuple(value.shape)}, "
-                        f"the parameter {tuple(parameter.shape)}"
-                    )
-    return None
-
-
-def _as_it_runs_here(state: Mapping[str, Any], optimizer: Optimizer) -> dict[str, Any]:
-    """The saved state with the execution flags, and the kind of learning rate, that `optimizer` has."""
-    groups = []
-    for saved, here in zip(state["param_groups"], optimizer.param_groups, strict=True):
-        group = {**saved, **{flag: here[flag] for flag in _EXECUTION_FLAGS if flag in here}}
-        if isinstance(group["lr"], Tensor) and not isinstance(here["lr"], Tensor):
-            group["lr"] = group["lr"].item()
-        groups.append(group)
-    return {"state": state["state"], "param_groups": groups}
-
-
 # -- parts of the state ------------------------------------------------------------------------------------
 
 
@@ -425,10 +337,6 @@ def _unwrap(model: nn.Module) -> nn.Module:
 
 def _tensor_state(model: nn.Module) -> dict[str, Tensor]:
     return {name: value for name, value in model.state_dict().items() if isinstance(value, Tensor)}
-
-
-def _by_name(optimizer: Optimizers) -> dict[str, Optimizer]:
-    return {"optimizer": optimizer} if isinstance(optimizer, Optimizer) else dict(optimizer)
 
 
 def _rng_state() -> dict[str, Any]:
@@ -485,50 +393,7 @@ def _sibling(folder: Path, suffix: str) -> Path:
 def _find(folder: Path) -> Path | None:
     """`folder` if it is a checkpoint, else its predecessor that a killed save has moved aside, else None."""
     candidates: Sequence[Path] = (folder, _sibling(folder, _OLD))
-    return next((path for path in candidates if (path / _MANIFEST).is_file()), None)
-
-
-def _saved_at(folder: Path) -> int:
-    """Time of saving [ns]; a damaged manifest counts as the oldest."""
-    try:
-        return int(json.loads((folder / _MANIFEST).read_bytes())["saved_at_ns"])
-    except (OSError, ValueError, KeyError, TypeError):
-        return -1
-
-
-def _sync(path: Path) -> None:
-    """Make sure that a file's content, or a folder's list of names, has reached the disk."""
-    descriptor = os.open(path, os.O_RDONLY)
-    try:
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)
-
-
-def _sha256(path: Path) -> str:
-    with path.open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()
-
-
-def _check_size(folder: Path, name: str, files: Mapping[str, Mapping[str, Any]]) -> None:
-    expected = files[name]["bytes"]
-    path = folder / name
-    if not path.is_file():
-        raise UserError(f"checkpoint {folder} is damaged: {name} is missing; use another checkpoint.")
-    actual = path.stat().st_size
-    if actual != expected:
-        raise UserError(
-            f"checkpoint {folder} is damaged: {name} has {actual} bytes, {expected} were written; "
-            "copy it again or use another checkpoint."
-        )
-
-
-def _check_sum(folder: Path, name: str, files: Mapping[str, Mapping[str, Any]]) -> None:
-    if name in files and _sha256(folder / name) != files[name]["sha256"]:
-        raise UserError(
-            f"checkpoint {folder} is damaged: {name} has the right size but other content than was written; "
-            "copy it again or use another checkpoint."
-        )
+    return next((path for path in candidates if (path / MANIFEST).is_file()), None)
 
 
 @contextmanager

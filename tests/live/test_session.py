@@ -12,7 +12,8 @@ import pytest
 import torch
 
 from franka_wm.errors import UserError
-from franka_wm.live.session import Frame, Session
+from franka_wm.live.frame import Frame
+from franka_wm.live.session import Session
 
 LEFT, RIGHT = (0.40, 0.25, 0.45), (0.40, -0.25, 0.45)
 

@@ -10,8 +10,8 @@ from typing import Any
 import pytest
 import yaml
 
-from benchmarks.results import records, render, running
-from benchmarks.results.__main__ import main, overview
+from benchmarks.results import records, render
+from benchmarks.results.__main__ import overview
 from benchmarks.results.rows import Row, Section, load_rows
 from benchmarks.results.state import composed, state
 from franka_wm import source
@@ -416,62 +416,3 @@ def test_committed_pages_are_what_the_files_say() -> None:
 def test_readme_without_its_place_is_refused() -> None:
     with pytest.raises(UserError, match="needs the lines"):
         render.with_tables("# a readme", "tables")
-
-
-# -- running ------------------------------------------------------------------------------------------------
-
-
-def test_runs_on_cores_have_them_alone() -> None:
-    import os
-
-    with pytest.raises(UserError, match="cores"):
-        running.Machine(jobs=len(os.sched_getaffinity(0)) + 1, threads=1).slots(ROW)
-    ((before, after, environment),) = running.Machine(threads=1).slots(ROW)
-    assert before[:2] == ["taskset", "-c"] and len(before[2].split(",")) == 1 and not after
-    assert environment["OMP_NUM_THREADS"] == "1"
-
-
-def test_runs_on_gpus_are_spread_over_them() -> None:
-    from dataclasses import replace
-
-    row = replace(ROW, section=Section(title="One GPU", arguments="scale=gpu"))
-    slots = running.Machine(jobs=2, devices=("cuda:0", "cuda:1"), commit="abc").slots(row)
-    assert [after for _, after, _ in slots] == [["device=cuda:0"]] * 2 + [["device=cuda:1"]] * 2
-    assert all(environment["FRANKA_WM_COMMIT"] == "abc" for _, _, environment in slots)
-    assert all("OMP_NUM_THREADS" not in environment for _, _, environment in slots)
-
-
-def test_a_run_that_fails_is_told_and_leaves_no_file(tmp_path) -> None:
-    from dataclasses import replace
-
-    row = replace(ROW, arguments="env=reach_fixed trainer.updates=-1")
-    failed = running.run(
-        row, running.Machine(threads=1), seeds=[100], out=tmp_path / "out", place=tmp_path / "place"
-    )
-    assert len(failed) == 1 and "trainer.updates" in failed[0]
-    assert not (tmp_path / "place").exists()
-
-
-@pytest.mark.slow
-def test_a_row_is_run_and_collected(tmp_path, capsys) -> None:
-    from dataclasses import replace
-
-    words = "env=reach_fixed evaluation.episodes=2 evaluation.video_episodes=0 logger=none"
-    row = replace(ROW, arguments=words, seeds=(100,))
-    place = tmp_path / "place"
-    assert running.run(row, running.Machine(threads=1), seeds=[100], out=tmp_path / "out", place=place) == []
-    (record,) = records.read(row, place)
-    assert state(row, [record]) == ("fresh", [])
-    files = record["code"]["files"]
-    assert {"train.py", "franka_wm/models/tdmpc2.py", "franka_wm/envs/robots/fr3.urdf"} <= set(files)
-    assert "franka_wm/models/lewm.py" not in files  # never imported
-    assert record["training"]["updates"] == 30 and record["policies"]["planner"]["episodes"] == 2
-
-
-def test_commands(tmp_path, capsys) -> None:
-    assert main(["list", "--results", str(tmp_path)]) == 0
-    assert "reach-cpu" in capsys.readouterr().out
-    assert main(["run", "no-such-row"]) == 1
-    assert main(["collect", "reach-cpu", str(tmp_path), "--jobs", "1", "--results", str(tmp_path)]) == 1
-    err = capsys.readouterr().err
-    assert "no row 'no-such-row'; there are reach-cpu" in err and "finished" in err

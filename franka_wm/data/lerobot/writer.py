@@ -13,40 +13,34 @@ nothing but the folder.
 
 from __future__ import annotations
 
-import fcntl
 import json
-import multiprocessing
 import os
 import re
 import shutil
-import signal
-import subprocess
-import sys
-import time
-import traceback
 from collections.abc import Iterable, Mapping
-from importlib import import_module
-from multiprocessing.connection import Connection, wait
+from multiprocessing.connection import wait
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from franka_wm.data.lerobot.episodes import Episode
-from franka_wm.data.lerobot.merge import merge
 from franka_wm.data.lerobot.provenance import read_provenance
 from franka_wm.data.lerobot.schema import Schema
-from franka_wm.data.lerobot.shard import check_episode, write_shard
+from franka_wm.data.lerobot.shard import check_episode
+from franka_wm.data.lerobot.shard_workers import (
+    LOCK,
+    PARTIAL,
+    InProcess,
+    Worker,
+    lock_folder,
+    wait_for_orphans,
+)
 from franka_wm.data.lerobot.terminal import TERMINAL_FOLDER
 from franka_wm.errors import UserError
 
 SHARD_BYTES = 64_000_000
 """Pictures and numbers of one shard in memory, before they are compressed."""
-
-ORPHANS_HAVE = 60.0
-"""Seconds that writing processes of a killed run get to finish their shard."""
-
-_PARTIAL = ".partial"
 
 
 class DatasetWriter:
@@ -87,7 +81,7 @@ class DatasetWriter:
         self.shard_frames = default_shard_frames(schema) if shard_frames is None else shard_frames
         self._buffer: list[Episode] = []
         self._buffered = 0
-        self._workers: list[_Worker | _Here] = []
+        self._workers: list[Worker | InProcess] = []
         self._session = dict(provenance)
         self._number_of_workers = workers
         self._lock = None
@@ -106,13 +100,13 @@ class DatasetWriter:
             )
         try:
             (self.working / "shards").mkdir(parents=True, exist_ok=True)
-            self._lock = _locked(self.working / "lock")
+            self._lock = lock_folder(self.working / "lock")
         except OSError as error:
             raise UserError(
                 f"out={self.out}: cannot write there ({error.strerror}); choose another"
             ) from error
         try:
-            _wait_for_orphans(self.working / "lock.workers")
+            wait_for_orphans(self.working / LOCK)
             self._recover()
         except UserError:
             if self._shards():
@@ -134,7 +128,7 @@ class DatasetWriter:
                 (self.working / "shards").mkdir()
             shutil.rmtree(previous, ignore_errors=True)
         shutil.rmtree(merged, ignore_errors=True)
-        for folder in (self.working / "shards").glob("*" + _PARTIAL):
+        for folder in (self.working / "shards").glob("*" + PARTIAL):
             shutil.rmtree(folder)
         kept = self._shards()
         self._check_schema(state)
@@ -171,7 +165,7 @@ class DatasetWriter:
 
     def _shards(self) -> list[Path]:
         return sorted(
-            folder for folder in (self.working / "shards").glob("shard-*") if folder.suffix != _PARTIAL
+            folder for folder in (self.working / "shards").glob("shard-*") if folder.suffix != PARTIAL
         )
 
     def keys(self) -> set[int]:
@@ -192,7 +186,7 @@ class DatasetWriter:
         """
         if not self._workers:
             numbers = range(self._number_of_workers)
-            self._workers = [_Worker(self.working, number) for number in numbers] or [_Here()]
+            self._workers = [Worker(self.working, number) for number in numbers] or [InProcess()]
         if wait:
             for worker in self._workers:
                 worker.send(("nothing",))
@@ -222,7 +216,7 @@ class DatasetWriter:
         self._next_shard += 1
         self._buffer, self._buffered = [], 0
 
-    def _idle_worker(self) -> _Worker | _Here:
+    def _idle_worker(self) -> Worker | InProcess:
         for worker in self._workers:
             if not worker.busy:
                 return worker
@@ -231,7 +225,7 @@ class DatasetWriter:
 
     def _receive(self) -> None:
         """Waits until at least one busy process has answered."""
-        busy = [worker for worker in self._workers if isinstance(worker, _Worker) and worker.busy]
+        busy = [worker for worker in self._workers if isinstance(worker, Worker) and worker.busy]
         ready = wait([worker.connection for worker in busy])
         for worker in busy:
             if worker.connection in ready:
@@ -324,140 +318,3 @@ def _totals(folder: Path) -> tuple[int, int]:
     """Episodes and frames of a dataset."""
     info = json.loads((folder / "meta" / "info.json").read_text(encoding="utf-8"))
     return info["total_episodes"], info["total_frames"]
-
-
-def _locked(path: Path) -> int:
-    """A lock that ends with this process, however it ends."""
-    descriptor = os.open(path, os.O_RDWR | os.O_CREAT, 0o644)
-    try:
-        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError:
-        os.close(descriptor)
-        raise UserError(
-            f"another process is writing {path.parent}; wait for it, or choose another out"
-        ) from None
-    return descriptor
-
-
-def _wait_for_orphans(path: Path) -> None:
-    """Writing processes outlive a killed run until their shard is done; they hold this lock together."""
-    descriptor = os.open(path, os.O_RDWR | os.O_CREAT, 0o644)
-    try:
-        deadline = time.monotonic() + ORPHANS_HAVE
-        while True:
-            try:
-                fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-                return
-            except BlockingIOError:
-                if time.monotonic() > deadline:
-                    raise UserError(
-                        f"a process of an earlier run still writes {path.parent}; end it"
-                    ) from None
-                time.sleep(0.05)
-    finally:
-        os.close(descriptor)
-
-
-# -- the other processes -----------------------------------------------------------------------------------------
-
-
-class _Worker:
-    """A process that writes shards, and the connection to it. It ends when this process does, however that ends.
-
-    A plain subprocess and not one of ``multiprocessing``, which would import the program's main module there, and
-    with it, as a rule, torch and the simulator.
-    """
-
-    def __init__(self, working: Path, number: int):
-        self.connection, theirs = multiprocessing.Pipe()
-        self.log = working / f"worker-{number}.log"
-        code = f"from {__name__} import work; work()"
-        path = os.pathsep.join(entry for entry in sys.path if entry)
-        with self.log.open("w") as log:
-            self._process = subprocess.Popen(
-                [sys.executable, "-c", code, str(theirs.fileno()), str(working)],
-                pass_fds=[theirs.fileno()],
-                stdin=subprocess.DEVNULL,
-                stderr=log,  # encoders and progress bars talk there
-                env=os.environ | {"PYTHONPATH": path, "SVT_LOG": "1", "OMP_NUM_THREADS": "1"},
-            )
-        theirs.close()
-        self.busy = False
-
-    def send(self, job: tuple[Any, ...]) -> None:
-        try:
-            self.connection.send(job)
-        except OSError as error:
-            raise self._died() from error
-        self.busy = True
-
-    def receive(self) -> None:
-        try:
-            problem = self.connection.recv()
-        except (EOFError, OSError) as error:
-            raise self._died() from error
-        self.busy = False
-        _raise(problem)
-
-    def _died(self) -> UserError:
-        self.busy = False
-        self._process.wait()
-        return UserError(
-            f"a writing process ended (exit code {self._process.returncode}; {self.log} may say why); what is "
-            "finished is kept, go on with resume=true"
-        )
-
-    def stop(self) -> None:
-        self.connection.close()  # it reads the end of the connection, and ends
-        try:
-            self._process.wait(30)
-        except subprocess.TimeoutExpired:
-            self._process.kill()
-            self._process.wait()
-
-
-class _Here:
-    """Does the same jobs in this process."""
-
-    busy = False
-
-    def send(self, job: tuple[Any, ...]) -> None:
-        _raise(_do(*job))
-
-    def stop(self) -> None: ...
-
-
-def _raise(problem: str | None) -> None:
-    if problem is not None:
-        raise UserError(f"writing failed: {problem}; what is finished is kept, go on with resume=true")
-
-
-def _do(kind: str, *job: Any) -> str | None:
-    """Does a job; what went wrong, in one line."""
-    try:
-        {"shard": _write_shard, "merge": merge, "nothing": lambda: None}[kind](*job)
-    except Exception as error:  # every reason goes to the one who asked
-        traceback.print_exc()
-        return str(error) if isinstance(error, UserError) else f"{type(error).__name__}: {error}"
-    return None
-
-
-def work() -> None:
-    """A writing process: does jobs until the connection, whose number is its first argument, ends."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the process that sends the jobs
-    connection, working = Connection(int(sys.argv[1])), Path(sys.argv[2])
-    descriptor = os.open(working / "lock.workers", os.O_RDWR | os.O_CREAT, 0o644)
-    fcntl.flock(descriptor, fcntl.LOCK_SH)
-    for module in ("pandas", "pyarrow.parquet", "PIL.Image", "av"):  # now, while episodes are still gathered
-        import_module(module)
-    while True:
-        try:
-            connection.send(_do(*connection.recv()))
-        except (EOFError, OSError):  # no one is there any more
-            return
-
-
-def _write_shard(folder: Path, schema: Schema, episodes: list[Episode]) -> None:
-    partial = folder.with_name(folder.name + _PARTIAL)
-    write_shard(partial, schema, episodes)
-    os.rename(partial, folder)

@@ -19,7 +19,7 @@ import numpy as np
 import pytest
 import torch
 
-from franka_wm.data.lerobot import cache, decode, source
+from franka_wm.data.lerobot import build_cache, cache, decode, decode_workers, source
 from franka_wm.errors import UserError
 
 
@@ -73,10 +73,10 @@ def test_processes_give_the_same(
 ) -> None:
     root = request.getfixturevalue(kind)
     alone = opened(root).windows(torch.arange(10))
-    monkeypatch.setattr(cache, "ROWS_WORTH_A_PROCESS", 0)
-    monkeypatch.setattr(cache, "ROWS_PER_JOB", 5)
+    monkeypatch.setattr(decode_workers, "ROWS_WORTH_A_PROCESS", 0)
+    monkeypatch.setattr(build_cache, "ROWS_PER_JOB", 5)
     lines: list[str] = []
-    monkeypatch.setattr(cache, "PROGRESS_EVERY", 0.0)
+    monkeypatch.setattr(decode_workers, "PROGRESS_EVERY", 0.0)
     together = opened(root, workers=2, cache_dir=tmp_path / "other", say=lines.append)
     assert (together.windows(torch.arange(10)) == alone).all()
     assert any("rows/s" in line and "s left" in line for line in lines)
@@ -85,8 +85,8 @@ def test_processes_give_the_same(
 def test_an_error_in_a_worker_is_one_line(
     pictures: Path, opened: Callable, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    monkeypatch.setattr(cache, "ROWS_WORTH_A_PROCESS", 0)
-    monkeypatch.setattr(cache, "ROWS_PER_JOB", 5)
+    monkeypatch.setattr(decode_workers, "ROWS_WORTH_A_PROCESS", 0)
+    monkeypatch.setattr(build_cache, "ROWS_PER_JOB", 5)
     root = damaged_picture(pictures, tmp_path / "data")
     with pytest.raises(
         UserError, match=r"file-000\.parquet: a picture of observation\.images\.\w+ cannot be"
@@ -98,9 +98,9 @@ def test_an_error_in_a_worker_is_one_line(
 def test_a_worker_that_dies(
     pictures: Path, opened: Callable, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    monkeypatch.setattr(cache, "ROWS_WORTH_A_PROCESS", 0)
-    monkeypatch.setattr(cache, "ROWS_PER_JOB", 5)
-    start = cache._start_worker
+    monkeypatch.setattr(decode_workers, "ROWS_WORTH_A_PROCESS", 0)
+    monkeypatch.setattr(build_cache, "ROWS_PER_JOB", 5)
+    start = decode_workers._start_worker
     died = []
 
     def start_and_kill() -> subprocess.Popen[str]:
@@ -110,7 +110,7 @@ def test_a_worker_that_dies(
             died.append(process)
         return process
 
-    monkeypatch.setattr(cache, "_start_worker", start_and_kill)
+    monkeypatch.setattr(decode_workers, "_start_worker", start_and_kill)
     with pytest.raises(UserError, match=r"ended \(exit status -9\); if it is out of memory"):
         opened(pictures, workers=2)
     assert folders(tmp_path / "cache") == []
@@ -118,10 +118,10 @@ def test_a_worker_that_dies(
 
 KILLED = """
 import sys, time
-from franka_wm.data.lerobot import cache
+from franka_wm.data.lerobot import build_cache, cache, decode_workers
 from franka_wm.data.lerobot.opening import open_dataset
-cache.ROWS_WORTH_A_PROCESS, cache.ROWS_PER_JOB = 0, 5
-start = cache._start_worker
+decode_workers.ROWS_WORTH_A_PROCESS, build_cache.ROWS_PER_JOB = 0, 5
+start = decode_workers._start_worker
 def told():
     process = start()
     print("worker", process.pid, flush=True)
@@ -129,8 +129,8 @@ def told():
 def wait(*_):
     print("now", flush=True)
     time.sleep(60)
-cache._start_worker = told
-setattr(cache, sys.argv[3], wait)
+decode_workers._start_worker = told
+setattr(decode_workers if sys.argv[3] == "_drive" else build_cache, sys.argv[3], wait)
 open_dataset(sys.argv[1], window=2, batch_size=2, workers=2, cache_dir=sys.argv[2])
 """
 
@@ -174,14 +174,14 @@ def test_two_at_once(
 ) -> None:
     """One builds, the other waits and says so."""
     builds, lines, counts = [], [], []
-    build = cache._build
+    build = cache.build_cache
 
     def slowly(*args: object) -> None:
         builds.append(1)
         time.sleep(1.0)
         build(*args)  # type: ignore[arg-type]
 
-    monkeypatch.setattr(cache, "_build", slowly)
+    monkeypatch.setattr(cache, "build_cache", slowly)
     threads = [
         threading.Thread(target=lambda: counts.append(len(opened(pictures, say=lines.append))))
         for _ in range(2)
@@ -232,13 +232,13 @@ def test_changed_while_read(
 ) -> None:
     root = tmp_path / "data"
     shutil.copytree(pictures, root)
-    run = cache._run
+    run = build_cache.run_jobs
 
     def touched(*args: object) -> None:
         run(*args)  # type: ignore[arg-type]
         os.utime(root / "meta" / "info.json")
 
-    monkeypatch.setattr(cache, "_run", touched)
+    monkeypatch.setattr(build_cache, "run_jobs", touched)
     with pytest.raises(UserError, match="was changed while it was read"):
         opened(root)
     assert folders(tmp_path / "cache") == []

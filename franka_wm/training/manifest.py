@@ -1,0 +1,114 @@
+"""The checkpoint's manifest: what was written, by name, size and SHA-256, so that damage is found before it is read."""
+
+import hashlib
+import json
+import os
+import time
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from franka_wm.errors import UserError
+from franka_wm.training.tree import write_json
+from franka_wm.version import __version__
+
+FORMAT_VERSION = 1
+MANIFEST = "manifest.json"
+
+
+class Manifest(NamedTuple):
+    """What a checkpoint's manifest says.
+
+    Attributes:
+        model: class name of the model that was saved.
+        files: name of every other file → `bytes` and `sha256`.
+    """
+
+    model: str
+    files: Mapping[str, Mapping[str, Any]]
+
+    def check_size(self, folder: Path, name: str) -> None:
+        """Raise a `UserError` unless the file is there and as long as it was written."""
+        expected = self.files[name]["bytes"]
+        path = folder / name
+        if not path.is_file():
+            raise UserError(f"checkpoint {folder} is damaged: {name} is missing; use another checkpoint.")
+        actual = path.stat().st_size
+        if actual != expected:
+            raise UserError(
+                f"checkpoint {folder} is damaged: {name} has {actual} bytes, {expected} were written; "
+                "copy it again or use another checkpoint."
+            )
+
+    def check_sum(self, folder: Path, name: str) -> None:
+        """Raise a `UserError` if the manifest has the file, with other content than there is."""
+        if name in self.files and _sha256(folder / name) != self.files[name]["sha256"]:
+            raise UserError(
+                f"checkpoint {folder} is damaged: {name} has the right size but other content than was written; "
+                "copy it again or use another checkpoint."
+            )
+
+
+def write_manifest(folder: Path, model: str) -> None:
+    """Write the manifest of all files of `folder`, and make sure that they have reached the disk."""
+    files = sorted(folder.iterdir())
+    for path in files:
+        sync(path)
+    manifest = {
+        "format_version": FORMAT_VERSION,
+        "franka_wm": __version__,
+        "model": model,
+        "saved_at_ns": time.time_ns(),
+        "files": {p.name: {"bytes": p.stat().st_size, "sha256": _sha256(p)} for p in files},
+    }
+    write_json(folder / MANIFEST, manifest)
+    sync(folder / MANIFEST)
+    sync(folder)
+
+
+def read_manifest(folder: Path) -> Manifest:
+    """The manifest of a checkpoint.
+
+    Raises:
+        UserError: it cannot be read, or has another format.
+    """
+    try:
+        manifest = json.loads((folder / MANIFEST).read_bytes())
+        version, model, files = manifest["format_version"], manifest["model"], dict(manifest["files"])
+        if not all(
+            isinstance(one["bytes"], int) and isinstance(one["sha256"], str) for one in files.values()
+        ):
+            raise ValueError("files")
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise UserError(
+            f"checkpoint {folder} is damaged: {MANIFEST} cannot be read ({type(error).__name__}); "
+            "use another checkpoint."
+        ) from error
+    if version != FORMAT_VERSION:
+        raise UserError(
+            f"checkpoint {folder} has format version {version}, this franka_wm {__version__} reads "
+            f"{FORMAT_VERSION}; use the franka_wm that wrote it ({manifest.get('franka_wm', 'unknown')})."
+        )
+    return Manifest(model, files)
+
+
+def saved_at(folder: Path) -> int:
+    """Time of saving [ns]; a damaged manifest counts as the oldest."""
+    try:
+        return int(json.loads((folder / MANIFEST).read_bytes())["saved_at_ns"])
+    except (OSError, ValueError, KeyError, TypeError):
+        return -1
+
+
+def sync(path: Path) -> None:
+    """Make sure that a file's content, or a folder's list of names, has reached the disk."""
+    descriptor = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
+
+
+def _sha256(path: Path) -> str:
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()

@@ -1,0 +1,198 @@
+"""A dataset that was not finished: what a kill leaves, and going on from there."""
+
+from __future__ import annotations
+
+import os
+import random
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pyarrow.parquet as pq
+import pytest
+
+from dataset_episodes import check_terminals, compare
+from franka_wm.data.lerobot.merge import merge
+from franka_wm.data.lerobot.provenance import describe, read_provenance
+from franka_wm.data.lerobot.schema import EPISODE_KEY
+from franka_wm.data.lerobot.writer import DatasetWriter
+from franka_wm.errors import UserError
+
+
+def test_a_folder_that_exists_is_not_touched(tmp_path, make_schema, make_episode, write) -> None:
+    schema = make_schema()
+    root = write(tmp_path / "set", schema, [make_episode(schema, 0)])
+    with pytest.raises(UserError, match="resume=true"):
+        DatasetWriter(root, schema, provenance={})
+    other = tmp_path / "other"
+    other.mkdir()
+    for resume in (True, False):
+        with pytest.raises(UserError):
+            DatasetWriter(other, schema, provenance={}, resume=resume)
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["other", "set"]
+
+
+def test_goes_on_with_what_is_finished(tmp_path, make_schema, make_episode, load) -> None:
+    schema = make_schema()
+    episodes = [make_episode(schema, i) for i in range(6)]
+    out = tmp_path / "set"
+    with DatasetWriter(
+        out, schema, provenance=describe(policy="first", seed=1, config={}), workers=0, shard_frames=7
+    ) as writer:
+        writer.add(episodes[:3])
+    assert not out.exists()
+    (tmp_path / "set.writing/shards/shard-00003.partial").mkdir()  # the number of the next
+    with pytest.raises(UserError, match="unfinished"):
+        DatasetWriter(out, schema, provenance={})
+    with pytest.raises(UserError, match="other features"):
+        DatasetWriter(out, make_schema(size=8), provenance={}, resume=True)
+    for kept, added in ((3, episodes[3:5]), (5, episodes[5:])):  # the unfinished one, then the finished one
+        with DatasetWriter(
+            out,
+            schema,
+            provenance=describe(policy="then", seed=2, config={}),
+            workers=0,
+            shard_frames=7,
+            resume=True,
+        ) as writer:
+            assert writer.resumed == kept
+            writer.add(added)
+            assert writer.finish() == out
+    compare(load(out), schema, episodes)
+    check_terminals(out, schema, episodes)
+    provenance = read_provenance(out)
+    assert provenance is not None
+    assert [(s["policy"], s["episodes"]) for s in provenance["sessions"]] == [
+        ("first", 3),
+        ("then", 2),
+        ("then", 1),
+    ]
+    assert [p.name for p in tmp_path.iterdir()] == ["set"]
+
+
+@pytest.mark.parametrize("moved", [False, True])
+def test_a_kill_while_the_finished_dataset_moves(
+    tmp_path, moved, make_schema, make_episode, write, load
+) -> None:
+    schema = make_schema()
+    episodes = [make_episode(schema, i) for i in range(3)]
+    out, working = write(tmp_path / "set", schema, episodes[:2]), tmp_path / "set.writing"
+    with DatasetWriter(out, schema, provenance={}, workers=0, resume=True) as writer:
+        writer.add(episodes[2:])
+        writer.flush()
+        merge(
+            working / "merged",
+            [out, *sorted((working / "shards").iterdir())],
+            {"schema": schema.to_dict(), "sessions": []},
+        )
+        writer._save_state(replacing=True)
+    os.rename(out, working / "previous")
+    if moved:
+        os.rename(working / "merged", out)
+    write(out, schema, [], resume=True)
+    compare(load(out), schema, episodes)
+
+
+def test_two_writers_do_not_mix(tmp_path, make_schema, make_episode) -> None:
+    schema = make_schema()
+    with DatasetWriter(tmp_path / "set", schema, provenance={}, workers=0, shard_frames=1) as writer:
+        writer.add([make_episode(schema, 0)])
+        with pytest.raises(UserError, match="another process is writing"):
+            DatasetWriter(tmp_path / "set", schema, provenance={}, resume=True)
+
+
+def test_processes_write_the_same(tmp_path, make_schema, make_episode, write, load) -> None:
+    schema = make_schema()
+    episodes = [make_episode(schema, i) for i in range(6)]
+    root = write(tmp_path / "set", schema, episodes, workers=2, shard_frames=7)
+    compare(load(root), schema, episodes)
+    assert [p.name for p in tmp_path.iterdir()] == ["set"]
+
+
+def test_a_writing_process_that_dies_is_one_line(tmp_path, make_schema, make_episode, write, load) -> None:
+    schema = make_schema()
+    episodes = [make_episode(schema, i) for i in range(4)]
+    out = tmp_path / "set"
+    with DatasetWriter(out, schema, provenance={}, workers=1, shard_frames=7) as writer:
+        writer.add(episodes[:2])
+        writer.flush()
+        worker = writer._workers[0]
+        os.kill(worker._process.pid, signal.SIGKILL)  # pyright: ignore[reportAttributeAccessIssue]
+        with pytest.raises(UserError, match="a writing process ended"):
+            writer.add(episodes[2:])
+            writer.flush()
+    write(out, schema, episodes[2:], resume=True)
+    compare(load(out), schema, episodes)
+
+
+KILLED = """
+import os, pickle, sys
+from franka_wm.data.lerobot.writer import DatasetWriter
+schema, episodes = pickle.load(open(sys.argv[1], "rb"))
+options = dict(provenance={"policy": "p"}, workers=2, shard_frames=21, resume=True)
+with DatasetWriter(sys.argv[2], schema, **options) as writer:
+    writer.start(wait=True)
+    print("ready", flush=True)
+    there = writer.keys()
+    writer.add(episode for episode in episodes if episode.key not in there)
+    writer.finish()
+"""
+
+
+def _kill_and_go_on(tmp_path, schema, episodes, load, moments: list[float]) -> None:
+    import pickle
+
+    code, given = tmp_path / "run.py", tmp_path / "given.pkl"
+    code.write_text(KILLED)
+    given.write_bytes(pickle.dumps((schema, episodes)))
+    out, finished = tmp_path / "set", 0
+    by_key = {episode.key: episode for episode in episodes}
+    for moment in moments:
+        with subprocess.Popen(
+            [sys.executable, str(code), str(given), str(out)], stdout=subprocess.PIPE, start_new_session=True
+        ) as process:
+            assert process.stdout is not None
+            process.stdout.readline()
+            time.sleep(moment)
+            os.killpg(process.pid, signal.SIGKILL) if moment < 0.5 else process.kill()
+        if out.exists():  # it was done, and the kill met it while it removed its shards
+            continue
+        shards = sorted((tmp_path / "set.writing/shards").glob("shard-*[0-9]"))
+        for shard in shards[:2]:  # what is there is a dataset of whole episodes, without going on
+            keys = [key for key in by_key if key in set(_keys(shard))]
+            compare(load(shard), schema, [by_key[key] for key in keys])
+        finished = max(finished, len(shards))
+    with DatasetWriter(out, schema, provenance={}, workers=0, resume=True) as writer:
+        assert writer.resumed >= finished  # at least an episode in each of the shards that were there
+        there = writer.keys()
+        writer.add(episode for episode in episodes if episode.key not in there)
+        writer.finish()
+    dataset = load(out)
+    keys = list(dict.fromkeys(dataset.hf_dataset.with_format("numpy")[EPISODE_KEY][:].tolist()))
+    assert len(keys) == dataset.num_episodes
+    assert set(keys) == {episode.key for episode in episodes}
+    compare(dataset, schema, [by_key[key] for key in keys])
+
+
+def _keys(root: Path) -> np.ndarray:
+    files = sorted((root / "data").glob("*/*.parquet"))
+    return np.unique(
+        np.concatenate([pq.read_table(f, columns=[EPISODE_KEY])[EPISODE_KEY].to_numpy() for f in files])
+    )
+
+
+def test_a_kill_leaves_whole_episodes(tmp_path, make_schema, make_episode, load) -> None:
+    schema = make_schema()
+    episodes = [make_episode(schema, i) for i in range(30)]
+    _kill_and_go_on(tmp_path, schema, episodes, load, [0.0, 1.2])
+
+
+@pytest.mark.slow
+def test_kills_at_ten_random_moments_leave_whole_episodes(tmp_path, make_schema, make_episode, load) -> None:
+    schema = make_schema(size=32)
+    episodes = [make_episode(schema, i) for i in range(120)]
+    moments = [random.Random(i).uniform(0.0, 2.0) for i in range(10)]
+    _kill_and_go_on(tmp_path, schema, episodes, load, moments)
