@@ -28,7 +28,7 @@ import torch
 from common import publish
 from torchrl.collectors import Collector
 
-from franka_wm.commands.collect import OPTIONS, open_source
+from franka_wm.commands.collect import open_source
 from franka_wm.data.lerobot.collect import Source, gather
 from franka_wm.data.lerobot.episodes import Episode, EpisodeCutter
 from franka_wm.data.lerobot.provenance import describe
@@ -108,10 +108,15 @@ def writing(arguments: argparse.Namespace) -> list[dict[str, Any]]:
 
     wp.config.log_level = wp.LOG_WARNING
     torch.set_num_threads(1)
-    options = OPTIONS | {"num_envs": 16, "episodes": arguments.episodes}
     source = open_source(
-        options,
-        [f"env.image_size={arguments.size}", f"env.episode_length={arguments.length}", "env=reach_pixels"],
+        "random",
+        overrides=[
+            f"env.image_size={arguments.size}",
+            f"env.episode_length={arguments.length}",
+            "env=reach_pixels",
+        ],
+        num_envs=16,
+        episodes=arguments.episodes,
     )
     rows = []
     place = Path(tempfile.mkdtemp())

@@ -1,174 +1,200 @@
-"""What the verbs that deal with datasets share: ``key=value`` arguments, and the configuration that the rest names."""
+"""Verbs and their options, declared once: click commands whose options are words, ``name=value``, as Hydra has them.
+
+@verb("evaluate")
+@word("checkpoint", "a run's folder, or hf:user/name", metavar="FOLDER", required=True)
+@word("episodes", "per policy", whole(2), 100)
+def evaluate(checkpoint: str, episodes: int) -> None:
+
+``--name=value``, ``--name value`` and, for true or false, ``--name`` are taken, too. click brings types and completion.
+Nothing heavy is imported here or at the top of a verb's file: arguments are checked first.
+"""
 
 from __future__ import annotations
 
-import difflib
-import re
-from collections.abc import Mapping, Sequence
+import math
+from collections.abc import Callable, Iterator, Sequence
+from difflib import get_close_matches
 from pathlib import Path
 from typing import Any
 
-from franka_wm import conf
+import click
+
 from franka_wm.errors import UserError
 
-CHECKOUT = Path(__file__).parents[2]
-"""Top of the repository, where ``benchmarks`` is, if the package runs from one."""
+FLAG = click.BOOL
 
 
-def split(
-    verb: str, arguments: Sequence[str], known: Mapping[str, Any], *, more: bool = False
-) -> tuple[dict[str, Any], list[str]]:
-    """Arguments as ``key=value``, where ``--key=value`` and ``--flag`` are taken, too.
+class _Real(click.FloatRange):
+    """A finite number."""
 
-    Args:
-        verb: For messages.
-        arguments: After the verb.
-        known: Name → default; a value given must be of the default's type (a whole number, true or false, text).
-        more: Whether other keys are allowed; they come back as they are.
-
-    Returns:
-        The known ones, and the others.
-
-    Raises:
-        UserError: An unknown key, or a value of another kind.
-    """
-    values, others = dict(known), []
-    for argument in arguments:
-        key, equals, text = argument.removeprefix("--").partition("=")
-        key = key.replace("-", "_") if argument.startswith("--") else key
-        if key in known and (equals or isinstance(known[key], bool)):
-            values[key] = _value(verb, key, text if equals else "true", known[key])
-        elif more and equals and not argument.startswith("--"):
-            others.append(argument)
-        else:
-            raise UserError(
-                f"{verb}: {argument!r} is not one of {', '.join(f'{k}=…' for k in known)}"
-                + (" or a configuration's key=value" if more else "")
-            )
-    return values, others
+    def convert(self, value: Any, param: Any, ctx: Any) -> float:
+        number = super().convert(value, param, ctx)
+        return number if math.isfinite(number) else self.fail("not finite", param, ctx)
 
 
-def _value(verb: str, key: str, text: str, default: Any) -> Any:
-    if isinstance(default, bool):
-        if text.lower() not in ("true", "false"):
-            raise UserError(f"{verb}: {key}={text}: must be true or false")
-        return text.lower() == "true"
-    if isinstance(default, int):
-        if not text.isdigit():
-            raise UserError(f"{verb}: {key}={text}: must be a whole number of at least 0")
-        return int(text)
-    return text
+def whole(least: int = 0, most: int | None = None) -> click.IntRange:
+    """A whole number from ``least`` to ``most``."""
+    return click.IntRange(least, most)
 
 
-def required(verb: str, values: Mapping[str, Any], *names: str) -> None:
-    """Raises ``UserError`` if one of them was not given."""
-    for name in names:
-        if values[name] in ("", None):
-            raise UserError(f"{verb}: give {name}=…; franka-wm {verb} --help")
+def real(above: float) -> click.FloatRange:
+    """A finite number above ``above``."""
+    return _Real(min=above, min_open=True)
 
 
-def compose(overrides: Sequence[str], options: Sequence[str] = ()) -> Any:
-    """The configuration of ``conf/`` with Hydra's overrides, as ``train.py`` would see it.
-
-    Raises:
-        UserError: One line, for an override that Hydra refuses.
-    """
-    from hydra.errors import HydraException
-    from omegaconf.errors import OmegaConfBaseException
-
-    try:
-        return conf.compose(*overrides)
-    except (HydraException, OmegaConfBaseException) as error:
-        raise UserError(explain(str(error), allowed=_allowed(str(error), overrides, options))) from error
-
-
-_MISSING = re.compile(r"Could not find '([^']+)/([^'/]+)'")
-_UNKNOWN = re.compile(r"Could not override '([^']+)'")
-
-
-def explain(message: str, *, allowed: Sequence[str] = ()) -> str:
-    """What Hydra and OmegaConf say of an override, in one line.
-
-    Args:
-        message: Theirs, of many lines: with the choices of a group, how to append, where configurations are.
-        allowed: Keys that there are in the place of an unknown one.
-    """
-    lines = [line.strip() for line in message.splitlines() if line.strip()]
-    missing, unknown = _MISSING.search(message), _UNKNOWN.search(message)
-    if missing is not None:
-        choices = [line for line in message.splitlines() if line.startswith("\t") and "provider=" not in line]
-        names = [line.strip() for line in choices]
-        return (
-            f"{missing[1]}={missing[2]}: must be one of {', '.join(names)}{did_you_mean(missing[2], names)}"
+def wanted(kind: click.ParamType) -> str:
+    """What a value must be, in words."""
+    if isinstance(kind, click.Choice):
+        return f"one of {', '.join(kind.choices)}"
+    if isinstance(kind, click.IntRange):
+        return f"a whole number of at least {kind.min}" + (
+            "" if kind.max is None else f", at most {kind.max}"
         )
-    if unknown is not None:
-        near = did_you_mean(unknown[1], allowed)
-        return f"{unknown[1]}: no such option{near or '; there are ' + ', '.join(allowed)}"
-    noise = ("full_key:", "object_type", "Config search path", "provider=", "See https://", "Set the env")
-    return "; ".join(line for line in lines if not line.startswith(noise))
+    return f"a finite number above {kind.min:g}" if isinstance(kind, click.FloatRange) else "true or false"
+
+
+class Word(click.Option):
+    """An option that is written, shown and refused as ``name=value``."""
+
+    def type_cast_value(self, ctx: click.Context, value: Any) -> Any:
+        try:
+            return super().type_cast_value(ctx, value)
+        except click.BadParameter as error:
+            raise UserError(f"{ctx.info_name}: {self.name}={value}: must be {wanted(self.type)}") from error
+
+    def get_help_record(self, ctx: click.Context) -> tuple[str, str]:
+        shown = self.metavar or (str(self.default).lower() if self.type is FLAG else self.default)
+        of = f"; {wanted(self.type)}" if isinstance(self.type, click.Choice) else ""
+        return f"{self.name}={shown}", f"{self.help}{of}"
+
+
+class Verb(click.Command):
+    """A command of words.
+
+    Args:
+        others: What other words, overrides of a configuration, begin with; they come as ``overrides``. ``None``: there
+            are none.
+        shown: How the help shows those, and what it says of them.
+        raw: The usage of a verb that reads its arguments itself; all come as ``arguments``.
+    """
+
+    def __init__(
+        self,
+        *args: Any,
+        others: str | None = None,
+        shown: tuple[str, str] = ("", ""),
+        raw: str = "",
+        **settings: Any,
+    ) -> None:
+        super().__init__(*args, **settings)
+        self.raw = raw
+        self.words = {str(one.name): one for one in self.params if isinstance(one, Word)}
+        self.others, self.shown = others, shown
+        if others is not None:
+            self.params.append(click.Argument(["overrides"], nargs=-1, metavar=f"[{shown[0]} …]"))
+
+    def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
+        if self.raw and not (self.add_help_option and args[:1] in (["--help"], ["-h"])):
+            ctx.params["arguments"] = args
+            return args
+        if not args and any(one.required for one in self.params) and not ctx.resilient_parsing:
+            click.echo(ctx.get_help())
+            ctx.exit(2)
+        try:
+            rest = super().parse_args(ctx, list(self._as_options(args)))
+        except click.MissingParameter as error:
+            one = error.param
+            name = f"{one.name}=…" if isinstance(one, Word) else one and one.make_metavar(ctx)
+            raise UserError(f"{self.name}: give {name}; franka-wm {self.name} --help") from error
+        except click.UsageError as error:
+            raise UserError(f"{self.name}: {error.format_message()}") from error
+        for word in ctx.params.get("overrides", ()):
+            if "=" not in word:
+                raise UserError(f"{self.name}: {word!r} is not name=value; franka-wm {self.name} --help")
+        return rest
+
+    def _as_options(self, args: Sequence[str]) -> Iterator[str]:
+        """Words as click's options; what is neither a word nor an option stays as it is."""
+        seen: set[str] = set()
+        for argument in args:
+            dashed = argument.startswith("--")
+            name, equals, value = argument.removeprefix("--").partition("=")
+            name = name.replace("-", "_") if dashed else name
+            if argument == "--help":
+                yield argument
+            elif name in self.words and (equals or dashed):
+                if name in seen:
+                    raise UserError(f"{self.name}: {name}= is given twice")
+                if equals and not value:
+                    raise UserError(f"{self.name}: {argument}: a value is missing")
+                seen.add(name)
+                value = "true" if not equals and self.words[name].type is FLAG else value
+                yield f"--{name}={value}" if value else f"--{name}"
+            elif dashed or (equals and not self._is_other(argument) and not Path(argument).exists()):
+                raise UserError(f"{self.name}: {no_such_option(name, list(self.words))}")
+            else:
+                yield argument
+
+    def _is_other(self, argument: str) -> bool:
+        return self.others is not None and argument.startswith(self.others)
+
+    def format_usage(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        needed = [f"{one.name}={one.metavar}" for one in self.words.values() if one.required]
+        more = ["[name=value …]"] if len(needed) < len(self.words) else []
+        arguments = [one.make_metavar(ctx) for one in self.params if isinstance(one, click.Argument)]
+        overrides = [] if self.others is None else [arguments.pop()]
+        raw = [self.raw] if self.raw else []
+        pieces = [*raw, *arguments, *needed, *more, *overrides]
+        formatter.write_usage(ctx.command_path, " ".join(pieces), prefix="usage: ")
+
+    def format_options(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        rows = [one.get_help_record(ctx) for one in self.words.values()]
+        rows += [self.shown] if self.others is not None else []
+        formatter.write_paragraph()
+        with formatter.indentation():
+            formatter.write_dl([*rows, ("--help", "print this")])
+
+
+def word(
+    name: str,
+    help: str,
+    kind: click.ParamType | type = str,
+    default: Any = None,
+    *,
+    metavar: str | None = None,
+    required: bool = False,
+) -> Callable[[Any], Any]:
+    """Declare an option of a verb.
+
+    Args:
+        name: As it is written before ``=``, and as the verb's function takes it.
+        help: What it is, in a line.
+        kind: Its values: text, ``FLAG``, :func:`whole`, :func:`real` or ``click.Choice``.
+        default: Without it; ``None`` reaches the function as such.
+        metavar: What the help shows as its value where there is no default.
+        required: Whether it must be given.
+    """
+    given: dict[str, Any] = {} if required else {"default": default}  # for click also None is a default
+    return click.option(
+        f"--{name}", name, cls=Word, type=kind, help=help, metavar=metavar, required=required, **given
+    )
+
+
+def verb(name: str, **settings: Any) -> Callable[[Any], Verb]:
+    """Make a function a verb; the first paragraphs of its docstring, up to a form feed, are its help."""
+    width = {"max_content_width": 110, "help_option_names": ["--help", "-h"]}
+    return click.command(
+        name, cls=Verb, context_settings=width | settings.pop("context_settings", {}), **settings
+    )
 
 
 def did_you_mean(word: str, known: Sequence[str]) -> str:
     """``; did you mean NAME?`` for the nearest of the known words; empty if none is near."""
-    near = difflib.get_close_matches(word, known, n=1, cutoff=0.75)
+    near = get_close_matches(word, known, n=1, cutoff=0.75)
     return f"; did you mean {near[0]}?" if near else ""
 
 
-def _allowed(message: str, overrides: Sequence[str], options: Sequence[str]) -> list[str]:
-    """The keys beside the one that an override names in vain; at the top, the verb's own, too."""
-    from omegaconf import DictConfig, OmegaConf
-
-    unknown = _UNKNOWN.search(message)
-    if unknown is None:
-        return []
-    # With the same choices of groups: other environments have other options.
-    chosen = [o for o in overrides if "." not in o.partition("=")[0] and o.partition("=")[0] != unknown[1]]
-    node: Any = conf.compose(*chosen)
-    place = unknown[1].rpartition(".")[0] if "/" not in unknown[1] and "@" not in unknown[1] else ""
-    found = OmegaConf.select(node, place) if place else node
-    if isinstance(found, DictConfig):
-        return [
-            f"{place}.{key}" if place else str(key)
-            for key in dict.fromkeys([*([] if place else options), *found])
-        ]
-    return [*options, *(str(key) for key in node)]
-
-
-def number(cfg: Any, key: str, kind: type[int] | type[float] = int) -> Any:
-    """The number at ``key`` of a configuration.
-
-    Raises:
-        UserError: There is something else.
-    """
-    from omegaconf import OmegaConf
-
-    value = OmegaConf.select(cfg, key)
-    if isinstance(value, bool) or not isinstance(value, int if kind is int else int | float):
-        raise UserError(f"{key}={value}: must be a {'whole ' if kind is int else ''}number")
-    return kind(value)
-
-
-def wants_help(arguments: list[str], usage: str) -> bool:
-    """Prints the usage if that is what is asked for."""
-    asked = any(argument in ("--help", "-h") for argument in arguments)
-    if asked:
-        print(f"usage: franka-wm {usage}")
-    return asked
-
-
-def split_arguments(arguments: list[str], options: set[str], usage: str) -> tuple[list[str], dict[str, str]]:
-    """Folders, and what stands as ``name=value``.
-
-    Raises:
-        UserError: an option that does not exist.
-    """
-    folders, given = [], {}
-    for argument in arguments:
-        name, equals, value = argument.partition("=")
-        if equals and name in options:
-            given[name] = value
-        elif argument.startswith("-") or (equals and not Path(argument).exists()):
-            raise UserError(f"unknown option {argument!r}; usage: franka-wm {usage}")
-        else:
-            folders.append(argument)
-    return folders, given
+def no_such_option(name: str, known: Sequence[str]) -> str:
+    """One line about an option that does not exist: the nearest one, or all."""
+    near = did_you_mean(name, known)
+    return f"{name}: no such option{near or '; there are ' + ', '.join(known) if known else ''}"

@@ -4,88 +4,100 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from franka_wm.commands.arguments import compose, number, required, split
-from franka_wm.console import say
-from franka_wm.data.lerobot.collect import Source, gather
+import click
+
+from franka_wm.commands.arguments import FLAG, verb, whole, word
+from franka_wm.commands.overrides import compose, number
+from franka_wm.console import announced, say
 from franka_wm.data.lerobot.schema import FORMATS, schema_for
 from franka_wm.errors import UserError
 from franka_wm.policies.names import refuse_old_name
-from franka_wm.seeding import derive_seed
 
-OPTIONS: dict[str, Any] = {
-    "out": "",
-    "episodes": 100,
-    "policy": "random",
-    "checkpoint": "",
-    "format": "exact",
-    "num_envs": 0,
-    "workers": 2,
-    "shard_frames": 0,
-    "resume": False,
-}
-
-USAGE = f"""usage: franka-wm collect out=FOLDER [key=value …]
-
-  out=FOLDER          where the dataset goes; it appears whole, at the end
-  episodes=100        how many, with those of a resumed one
-  policy=random       random (smooth motion), noop, ik (inverse kinematics), or a trained agent: a run's
-                      folder, a checkpoint, hf:user/name
-  policy=planner      which part of an agent acts: planner or policy; then checkpoint=… is the agent
-  format=exact        {"; ".join(f"{name}: {line}" for name, line in FORMATS.items())}
-  num_envs=…          worlds at once; collector.num_envs if not given
-  workers=2           writing processes
-  resume=true         go on with an unfinished dataset, or add to a finished one
-  env=reach_pixels    any option of train.py: env=…, env.image_size=…, seed=…, device=…, collector.smoothness=…
-
-Ctrl-C stops and leaves a dataset of the whole episodes so far."""
+if TYPE_CHECKING:
+    from franka_wm.data.lerobot.collect import Source
 
 _SIMPLE = ("random", "noop", "ik")
 _PARTS = ("planner", "policy")
 
 
-def collect(arguments: Sequence[str]) -> int:
-    """The verb."""
-    import warp as wp
+@verb(
+    "collect",
+    others="",
+    shown=(
+        "KEY=VALUE",
+        "any option of train.py: env=…, env.image_size=…, seed=…, device=…, collector.smoothness=…",
+    ),
+)
+@word("out", "where the dataset goes; it appears whole, at the end", metavar="FOLDER", required=True)
+@word("episodes", "how many, with those of a resumed one", whole(1), 100)
+@word(
+    "policy",
+    "random (smooth motion), noop, ik (inverse kinematics), or an agent: a run's folder, a checkpoint, hf:user/name",
+    default="random",
+)
+@word("checkpoint", "an agent of which only a part acts: policy=planner or policy=policy", metavar="RUN")
+@word(
+    "format",
+    "how images are stored: bit for bit, small, or small and nearly exact",
+    click.Choice([*FORMATS]),
+    "exact",
+)
+@word("num_envs", "worlds at once; collector.num_envs if not given", whole(1), metavar="N")
+@word("workers", "writing processes", whole(), 2)
+@word("shard_frames", "steps in one file, at most", whole(1), metavar="N")
+@word("resume", "go on with an unfinished dataset, or add to a finished one", FLAG, False)
+def collect(
+    out: str,
+    episodes: int,
+    policy: str,
+    checkpoint: str | None,
+    format: str,
+    num_envs: int | None,
+    overrides: Sequence[str],
+    **writing: Any,
+) -> int:
+    """Gather a LeRobot dataset with any policy.
 
-    wp.config.log_level = wp.LOG_WARNING  # its list of compiled modules drowns what there is to say
-    if not arguments or arguments[0] in ("--help", "-h"):
-        print(USAGE)
-        return 0
-    options, overrides = split("collect", arguments, OPTIONS, more=True)
-    required("collect", options, "out")
-    if options["episodes"] < 1:
-        raise UserError("collect: episodes=0: must be at least 1")
-    if options["format"] not in FORMATS:
-        raise UserError(f"collect: format={options['format']!r}: must be one of {', '.join(FORMATS)}")
-    source = open_source(options, overrides)
-    out, whole = gather(
-        source,
-        out=options["out"],
-        episodes=options["episodes"],
-        format=options["format"],
-        workers=options["workers"],
-        shard_frames=options["shard_frames"] or None,
-        resume=options["resume"],
-    )
-    if not whole:
-        say(f"stopped; what was gathered is in {out}; add the rest with resume=true")
+    Ctrl-C stops and leaves a dataset of the whole episodes so far.
+    """
+    source = open_source(policy, checkpoint, overrides, episodes=episodes, num_envs=num_envs, format=format)
+    from franka_wm.data.lerobot.collect import gather
+
+    folder, complete = gather(source, out=out, episodes=episodes, format=format, **writing)
+    if not complete:
+        say(f"stopped; what was gathered is in {folder}; add the rest with resume=true")
         return 130
-    say(f"dataset: {out}")
+    say(f"dataset: {folder}")
     return 0
 
 
 # -- who acts ------------------------------------------------------------------------------------------------------
 
 
-def open_source(options: dict[str, Any], overrides: list[str]) -> Source:
-    """Builds the worlds and the policy that the options name.
+def open_source(
+    name: str,
+    checkpoint: str | None = None,
+    overrides: Sequence[str] = (),
+    *,
+    episodes: int,
+    num_envs: int | None = None,
+    format: str = "exact",
+) -> Source:
+    """Build the worlds and the policy.
+
+    Args:
+        name: Of the policy, or where an agent is.
+        checkpoint: The agent, if ``name`` is one of its parts.
+        overrides: Of the configuration of train.py; of an agent's, ``env.KEY=VALUE``, ``seed`` and ``device`` alone.
+        episodes: How many will be played.
+        num_envs: Worlds at once.
+        format: Of the dataset's images.
 
     Raises:
         UserError: One line, for what cannot be built.
     """
-    name, checkpoint = options["policy"], options["checkpoint"]
     if not Path(name).exists():
         refuse_old_name("collect: policy", name)
     if name in _PARTS and not checkpoint:
@@ -101,26 +113,26 @@ def open_source(options: dict[str, Any], overrides: list[str]) -> Source:
             )
         name, checkpoint = "", name
     if name in _SIMPLE:
-        return _simple(name, options, overrides)
-    return _agent(name, checkpoint, options, overrides)
+        return _simple(name, overrides, episodes, num_envs, format)
+    return _agent(name, str(checkpoint), overrides, num_envs or min(64, episodes))
 
 
-def _simple(name: str, options: dict[str, Any], overrides: list[str]) -> Source:
+def _simple(name: str, overrides: Sequence[str], episodes: int, num_envs: int | None, format: str) -> Source:
     from omegaconf import OmegaConf
 
-    from franka_wm.commands.entry import with_scale
-    from franka_wm.console import announced, say
-    from franka_wm.envs import FrankaConfig, FrankaEnv
-    from franka_wm.training.settings import plain
-
-    cfg = compose(with_scale(overrides), tuple(OPTIONS))
+    cfg = compose(overrides, tuple(collect.words))  # checked before anything heavy is imported
     seed, smoothness = number(cfg, "seed"), number(cfg, "collector.smoothness", float)
-    worlds = options["num_envs"] or min(number(cfg, "collector.num_envs"), options["episodes"])
+    number(cfg, "collector.num_envs")
+    from franka_wm.commands.entry import with_scale
+    from franka_wm.envs import FrankaConfig, FrankaEnv
+
+    cfg = compose(with_scale(list(overrides)))
+    worlds = num_envs or min(number(cfg, "collector.num_envs"), episodes)
     if cfg.env.kind != "franka":
         raise UserError(
             f"collect: env.kind={cfg.env.kind!r}: datasets are gathered from the arm (env=reach, …)"
         )
-    values = plain(cfg.env)
+    values: Any = OmegaConf.to_container(cfg.env, resolve=True)
     added = [key for key in ("state", "joint_target") if key not in values["observations"]]
     if added:
         say(f"env.observations: adding {' and '.join(added)}, which a dataset always has")
@@ -128,13 +140,15 @@ def _simple(name: str, options: dict[str, Any], overrides: list[str]) -> Source:
     del values["kind"]
     urdf_path = values.pop("urdf_path")
     config = FrankaConfig.from_mapping(values)
-    schema_for(config, format=options["format"])  # refuses what cannot be stored before anything is built
+    schema_for(config, format=format)  # refuses what cannot be stored before anything is built
     with announced(f"building {worlds} worlds; a machine's first start compiles kernels for a minute or two"):
         env = FrankaEnv(config, num_envs=worlds, device=cfg.device, seed=seed, urdf_path=urdf_path)
     cfg.env.observations = values["observations"]
     import torch
 
+    from franka_wm.data.lerobot.collect import Source
     from franka_wm.policies.scripted import NoopPolicy, OraclePolicy, SmoothRandomPolicy
+    from franka_wm.seeding import derive_seed
 
     makers: dict[str, Callable[[], Any]] = {
         "noop": lambda: NoopPolicy(env.action_dim),
@@ -152,13 +166,10 @@ def _simple(name: str, options: dict[str, Any], overrides: list[str]) -> Source:
     return Source(env, makers[name](), kept, name, seed)
 
 
-def _agent(part: str, checkpoint: str, options: dict[str, Any], overrides: list[str]) -> Source:
+def _agent(part: str, checkpoint: str, overrides: Sequence[str], worlds: int) -> Source:
     from omegaconf import OmegaConf
     from omegaconf.errors import OmegaConfBaseException
     from yaml import YAMLError
-
-    from franka_wm.console import announced
-    from franka_wm.training.load import load_agent
 
     changes: dict[str, Any] = {}
     seed, device = None, "auto"
@@ -185,14 +196,11 @@ def _agent(part: str, checkpoint: str, options: dict[str, Any], overrides: list[
             *changes["observations"],
             *(key for key in ("state", "joint_target") if key not in changes["observations"]),
         ]
+    from franka_wm.data.lerobot.collect import Source
+    from franka_wm.training.load import load_agent
+
     with announced(f"loading {checkpoint}"):
-        agent = load_agent(
-            checkpoint,
-            num_envs=options["num_envs"] or min(64, options["episodes"]),
-            device=device,
-            env_changes=changes,
-            seed=seed,
-        )
+        agent = load_agent(checkpoint, num_envs=worlds, device=device, env_changes=changes, seed=seed)
     part = part or ("planner" if "planner" in agent.policies else "policy")
     if part not in agent.policies:
         raise UserError(f"collect: policy={part}: {checkpoint} has only {', '.join(agent.policies)}")

@@ -2,34 +2,25 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
-from franka_wm.commands.view import view
-from franka_wm.errors import UserError
+from franka_wm.commands.arguments import verb
+from franka_wm.commands.view import show, view
 
 AGENT = Path(__file__).parents[1] / "demo_agent"
 """A checkpoint without optimiser and replay; ``make demo-agent`` writes it."""
 
-USAGE = """usage: franka-wm demo [key=value …]
 
-The live page with a small trained agent: drag the goal, and the planner moves the arm there. Nothing is trained or
-downloaded.
+@verb(
+    "demo",
+    params=[one for name, one in view.words.items() if name != "checkpoint"],
+    others=view.others,
+    shown=view.shown,
+)
+def demo(**options: Any) -> None:
+    """Show a small trained agent in the browser. Drag the goal, and the planner moves the arm there.
 
-  port=8080  seconds=S  seed=0  device=auto  policy=NAME  rerun=FILE.rrd  env.KEY=VALUE    as for franka-wm view"""
-
-
-def demo(arguments: Sequence[str]) -> None:
-    """Serve the page of :func:`franka_wm.commands.view.view` with the packaged agent.
-
-    Raises:
-        UserError: Another checkpoint was named, or what ``view`` refuses.
+    Nothing is trained or downloaded. For an agent of your own: franka-wm view checkpoint=RUN.
     """
-    if any(argument in ("--help", "-h") for argument in arguments):
-        print(USAGE)
-        return
-    if any(argument.lstrip("-").startswith("checkpoint=") for argument in arguments):
-        raise UserError(
-            "demo: shows the agent of the package; for another one: franka-wm view checkpoint=RUN"
-        )
-    view([f"checkpoint={AGENT}", *arguments])
+    show(checkpoint=str(AGENT), **options)

@@ -10,7 +10,7 @@ from typing import Any
 
 from omegaconf import DictConfig
 
-from franka_wm.commands.arguments import compose
+from franka_wm.commands.overrides import compose
 from franka_wm.console import say
 from franka_wm.errors import FrankaError
 

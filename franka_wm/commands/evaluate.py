@@ -3,111 +3,36 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from franka_wm.console import announced, say
+from franka_wm.commands.arguments import FLAG, verb, whole, word
 from franka_wm.errors import UserError
-from franka_wm.evaluation import diagnose
-from franka_wm.evaluation.decoder import Imagined
-from franka_wm.evaluation.open_loop import NothingToPredictError
-from franka_wm.evaluation.protocol import EPISODES, Evaluation, describe, evaluate_agent, protocol
-from franka_wm.evaluation.results import COMMAND, to_json
-from franka_wm.evaluation.robustness import check_shiftable, note, robustness
-from franka_wm.files import atomic_write
-from franka_wm.report.diagnostics import (
-    diagnostic_tables,
-    evaluation_markdown,
-    terminal,
-    timing_table,
+
+
+@verb("evaluate")
+@word("checkpoint", "a run's folder, a checkpoint in it, or hf:user/name", metavar="FOLDER", required=True)
+@word("out", "where results go (RUN/evaluation; for hf: outputs/evaluation/user--name)", metavar="FOLDER")
+@word("episodes", "per policy, on fixed held-out seeds", whole(2), 100)
+@word("device", "auto, cpu, cuda, cuda:K", default="auto")
+@word(
+    "open_loop",
+    "latent error by horizon, rank correlation, value calibration, imagined beside real",
+    FLAG,
+    True,
 )
-from franka_wm.report.table import evaluation_tables, markdown
-from franka_wm.training.load import load_agent
+@word("probes", "what can be read off the latents; their spectrum", FLAG, True)
+@word("robustness", "the same in shifted worlds: looks, camera, dynamics, delay, noise", FLAG, False)
+def evaluate(checkpoint: str, out: str | None, **options: Any) -> None:
+    """Evaluate a checkpoint on held-out episodes. Success, predictions, latents, robustness.
 
-WORLDS = 256
-"""Simulated at once, at most; more episodes are played in rounds."""
-
-Say = Callable[[str], None]
-
-USAGE = """usage: franka-wm evaluate checkpoint=FOLDER [key=value …]
-
-  checkpoint=FOLDER   a run's folder, a checkpoint in it, or hf:user/name
-  out=FOLDER          where results go; RUN/evaluation, or outputs/evaluation/user--name for hf:
-  episodes=100        per policy, on fixed held-out seeds
-  device=auto         auto, cpu, cuda, cuda:K
-  open_loop=true      latent error by horizon, rank correlation, value calibration, imagined beside real
-  probes=true         what can be read off the latents; their spectrum
-  robustness=false    the same in shifted worlds: looks, camera, dynamics, delay, noise
-
-Writes evaluation.json and evaluation.md (the same twice on a CPU), timing.json, imagined.png, imagined.mp4."""
-
-
-@dataclass(frozen=True)
-class Options:
-    """What was asked for on the command line."""
-
-    checkpoint: str
-    out: Path
-    episodes: int = EPISODES
-    device: str = "auto"
-    open_loop: bool = True
-    probes: bool = True
-    robustness: bool = False
-
-
-def main(arguments: list[str]) -> int:
-    """The verb. Arguments are ``key=value``; see :data:`USAGE`.
-
-    Raises:
-        UserError: One line, for bad arguments and unusable checkpoints.
+    Writes evaluation.json and evaluation.md (the same twice on a CPU), timing.json, imagined.png, imagined.mp4.
     """
-    if not arguments or arguments[0] in ("--help", "-h"):
-        print(USAGE)
-        return 0 if arguments else 2
-    import warp as wp
+    place = default_folder(checkpoint) if out is None else Path(out)
+    check_folder(place)
+    from franka_wm.commands.evaluate_checkpoint import Options, run
 
-    wp.config.log_level = wp.LOG_WARNING
-    run(parse(arguments))
-    return 0
-
-
-def parse(arguments: list[str]) -> Options:
-    """``key=value`` … as :class:`Options`.
-
-    Raises:
-        UserError: An argument that is none, twice, unknown, or of the wrong kind; no checkpoint.
-    """
-    known = ("checkpoint", "out", "episodes", "device", "open_loop", "probes", "robustness")
-    given: dict[str, str] = {}
-    for argument in arguments:
-        name, equals, value = argument.partition("=")
-        if not equals or not value:
-            raise UserError(
-                f"evaluate: {argument!r} is not key=value; franka-wm evaluate --help lists the keys"
-            )
-        if name not in known:
-            raise UserError(f"evaluate: unknown key {name!r}; choose from {', '.join(known)}")
-        if name in given:
-            raise UserError(f"evaluate: {name}= is given twice")
-        given[name] = value
-    if "checkpoint" not in given:
-        raise UserError(
-            "evaluate: give checkpoint=FOLDER (a run's folder, a checkpoint in it, or hf:user/name)"
-        )
-    values: dict[str, Any] = dict(given)
-    if "episodes" in given:
-        if not given["episodes"].isdecimal() or int(given["episodes"]) < 2:
-            raise UserError(f"evaluate: episodes={given['episodes']}: must be a whole number of at least 2")
-        values["episodes"] = int(given["episodes"])
-    for name in ("open_loop", "probes", "robustness"):
-        if name in given:
-            if given[name] not in ("true", "false"):
-                raise UserError(f"evaluate: {name}={given[name]}: must be true or false")
-            values[name] = given[name] == "true"
-    values["out"] = Path(given["out"]) if "out" in given else default_folder(given["checkpoint"])
-    return Options(**values)
+    run(Options(checkpoint=checkpoint, out=place, **options))
 
 
 def default_folder(checkpoint: str) -> Path:
@@ -117,54 +42,6 @@ def default_folder(checkpoint: str) -> Path:
     folder = Path(checkpoint)
     run = next((f for f in (folder, *folder.parents) if (f / "checkpoints").is_dir()), folder)
     return run / "evaluation"
-
-
-def run(options: Options) -> dict[str, Any]:
-    """Evaluates, prints tables, writes files; returns the content of ``evaluation.json``.
-
-    Raises:
-        UserError: The checkpoint cannot be used, or the folder not be written.
-    """
-    from rich.console import Console
-
-    check_folder(options.out)
-    console = Console(width=120)
-    with announced(f"loading {options.checkpoint} and building {min(options.episodes, WORLDS)} worlds"):
-        agent = load_agent(options.checkpoint, num_envs=min(options.episodes, WORLDS), device=options.device)
-    if options.robustness:
-        check_shiftable(agent)
-    say(f"{options.episodes} held-out episodes for each of {', '.join(agent.policies)} …")
-    evaluation = evaluate_agent(
-        agent, episodes=options.episodes, report=lambda name, r: say(describe(name, r))
-    )
-    described = protocol(agent.settings, agent.env, evaluation, by=COMMAND, counters=agent.counters)
-    results = {
-        "protocol": {"checkpoint": options.checkpoint, **described},
-        "policies": evaluation.policies,
-    }
-    for table in evaluation_tables(evaluation.policies):
-        if table.rows:
-            console.print(terminal(table))
-    console.print(terminal(timing_table(evaluation.seconds, evaluation.worlds)))
-    imagined = None
-    if options.open_loop or options.probes:
-        say("held-out episodes for the diagnostics …")
-        held = diagnose.hold_out(agent, pictures=options.open_loop)
-        if options.open_loop:
-            imagined = _look_ahead(agent, held, evaluation, results, say)
-        if options.probes:
-            _look_inside(agent, held, results, say)
-    if options.robustness:
-        _shift(agent, options, results, say)
-    tables = diagnostic_tables(results, agent.env.config)
-    for title, table in tables.items():
-        console.print(terminal(table, title))
-    text = "\n".join(
-        [evaluation_markdown(evaluation), *(f"### {t}\n\n{markdown(table)}" for t, table in tables.items())]
-    )
-    _write(options.out, results, text, evaluation, None if imagined is None else imagined[0])
-    say(f"results: {options.out}")
-    return results
 
 
 def check_folder(folder: Path) -> None:
@@ -178,72 +55,3 @@ def check_folder(folder: Path) -> None:
         raise UserError(f"evaluate: out={folder}: {there} is a file; give a folder for the results")
     if not os.access(there, os.W_OK | os.X_OK):
         raise UserError(f"evaluate: out={folder}: {there} may not be written to; give another folder")
-
-
-def _look_ahead(
-    agent: Any, held: diagnose.Held, evaluation: Evaluation, results: dict[str, Any], say: Say
-) -> tuple[Imagined, Any, Any] | None:
-    say("predictions without looking …")
-    ahead: dict[str, Any]
-    try:
-        ahead = diagnose.open_loop(agent, held)
-    except NothingToPredictError as error:
-        ahead = {"not_measured": str(error)}
-        say(f"warning: open loop not measured: {error}")
-    results["open_loop"] = ahead
-    say("values against true returns …")
-    results["calibration"] = diagnose.calibration(agent)
-    results["health"] = diagnose.health(agent, evaluation)
-    imagined = diagnose.imagine(agent, held, say=say)
-    if imagined is not None:
-        ahead["decoder"] = imagined[2]
-    return imagined
-
-
-def _look_inside(agent: Any, held: diagnose.Held, results: dict[str, Any], say: Say) -> None:
-    say("what can be read off the latents …")
-    results["probes"] = diagnose.probes(held, agent.model)
-    results["spectrum"], results["latents"] = diagnose.representation(held, agent.model)
-    warning = results["spectrum"]["warning"]
-    if warning:
-        results.setdefault("health", {}).setdefault("warnings", []).append(warning)
-        say(f"warning: {warning}")
-
-
-def _shift(agent: Any, options: Options, results: dict[str, Any], say: Say) -> None:
-    say("the same in shifted worlds …")
-
-    def told(case: str, found: Mapping[str, Any]) -> None:
-        parts = (f"{describe(p, r).strip()} {r['verdict']}" for p, r in found.items())
-        say(f"  {case}: {'   '.join(parts)}")
-
-    episodes = min(options.episodes, WORLDS)
-    results["robustness"] = robustness(agent, episodes=episodes, report=told)
-    results["protocol"]["robustness episodes"] = episodes
-    if note(episodes):
-        results["protocol"]["robustness note"] = note(episodes)
-        say(f"note: {note(episodes)}")
-
-
-def _write(
-    folder: Path, results: dict[str, Any], text: str, evaluation: Evaluation, imagined: Imagined | None
-) -> None:
-    """Every file whole; the one that others read, last."""
-    if imagined is not None:
-        from franka_wm.video import write_png, write_video
-
-        write_png(imagined.strip, folder / "imagined.png")
-        write_video(
-            imagined.frames.repeat_interleave(2, 1).repeat_interleave(2, 2), folder / "imagined.mp4", fps=5
-        )
-    seconds = {
-        name: {"seconds_per_decision": s, "worlds": evaluation.worlds}
-        for name, s in evaluation.seconds.items()
-    }
-    for name, content in (
-        ("timing.json", to_json(seconds)),
-        ("evaluation.md", text),
-        ("evaluation.json", to_json(results)),
-    ):
-        with atomic_write(folder / name) as path:
-            path.write_text(content)

@@ -2,39 +2,38 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import Any
 
-from franka_wm.commands.arguments import required, split
+import click
+
+from franka_wm.commands.arguments import verb, whole, word
 from franka_wm.console import announced
-from franka_wm.data.lerobot.export import arm_config, export_replay, tell
 from franka_wm.data.lerobot.schema import FORMATS
 from franka_wm.errors import UserError
 
-OPTIONS: dict[str, Any] = {"source": "", "out": "", "format": "exact", "workers": 2}
 
-USAGE = f"""usage: franka-wm export source=RUN out=FOLDER [key=value …]
+@verb("export")
+@word("source", "a run's folder, or a checkpoint in it", metavar="RUN", required=True)
+@word("out", "where the dataset goes; it appears whole, at the end", metavar="FOLDER", required=True)
+@word(
+    "format",
+    "how images are stored: bit for bit, small, or small and nearly exact",
+    click.Choice([*FORMATS]),
+    "exact",
+)
+@word("workers", "writing processes", whole(), 2)
+def export(source: str, out: str, format: str, workers: int) -> None:
+    """Write a run's replay as a LeRobot dataset.
 
-  source=RUN        a run's folder, or a checkpoint in it, saved with its replay (trainer.checkpoint_replay=true)
-  out=FOLDER        where the dataset goes; it appears whole, at the end
-  format=exact      {"; ".join(f"{name}: {line}" for name, line in FORMATS.items())}
-  workers=2         writing processes
-
-Only whole episodes are written; how many partial ones the buffer holds is said."""
-
-
-def export(arguments: Sequence[str]) -> int:
-    """The verb."""
+    The checkpoint must have been saved with its replay (trainer.checkpoint_replay=true). Only whole episodes are
+    written; how many partial ones the buffer holds is said.
+    """
     from omegaconf import OmegaConf
 
+    from franka_wm.data.lerobot.export import arm_config, export_replay, tell
     from franka_wm.training.checkpoint import latest_checkpoint, load_checkpoint
 
-    if not arguments or arguments[0] in ("--help", "-h"):
-        print(USAGE)
-        return 0
-    options, _ = split("export", arguments, OPTIONS)
-    required("export", options, "source", "out")
-    checkpoint = load_checkpoint(latest_checkpoint(options["source"]))
+    checkpoint = load_checkpoint(latest_checkpoint(source))
     data = checkpoint.replay()
     if data is None:
         raise UserError(
@@ -45,12 +44,11 @@ def export(arguments: Sequence[str]) -> int:
         done = export_replay(
             data,
             config=arm_config(resolved),
-            out=options["out"],
+            out=out,
             seed=int(resolved["seed"]),
-            policy=f"training run {options['source']}",
+            policy=f"training run {source}",
             settings=resolved,
-            format=options["format"],
-            workers=options["workers"],
+            format=format,
+            workers=workers,
         )
     tell(done)
-    return 0

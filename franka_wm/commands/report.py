@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-from franka_wm.commands.arguments import split_arguments, wants_help
-from franka_wm.errors import UserError
-from franka_wm.report.page import write_page
+import click
+
+from franka_wm.commands.arguments import verb, word
 
 
-def report(arguments: list[str]) -> None:
-    """``franka-wm report RUN [out=…]``: writes the page of a run."""
-    usage = "report RUN [out=PAGE.html]"
-    if wants_help(arguments, usage):
-        return
-    folders, options = split_arguments(arguments, {"out"}, usage)
-    if len(folders) != 1:
-        raise UserError(f"report needs one folder of a run, got {len(folders)}: franka-wm report outputs/RUN")
-    print(write_page(folders[0], options.get("out")))
+@verb("report")
+@click.argument("run", metavar="RUN")
+@word("out", "another place for the page", metavar="PAGE.html")
+def report(run: str, out: str | None) -> None:
+    """Write a run's page. It is report.html, one self-contained file."""
+    from franka_wm.report.page import write_page
+
+    print(write_page(run, out))

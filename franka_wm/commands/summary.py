@@ -4,23 +4,24 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from franka_wm.errors import UserError
-from franka_wm.evaluation.results import Result
-from franka_wm.report.run import but_for_the_seed, read_config
-from franka_wm.report.seeds import read_evaluation, runs_of, seeds_table
+import click
+
+from franka_wm.commands.arguments import verb
 
 
-def summary(arguments: list[str]) -> None:
-    """``franka-wm summary RUN RUN …`` or ``franka-wm summary SWEEP``: runs of different seeds in one table.
+@verb("summary")
+@click.argument("folders", nargs=-1, required=True, metavar="RUN …|SWEEP")
+def summary(folders: tuple[str, ...]) -> None:
+    """Show runs of several seeds in one table.
 
     Runs that differ in more than their seed get a table for each configuration.
     """
-    if not arguments or arguments[0].startswith("-"):
-        raise UserError(
-            "summary needs folders of runs: franka-wm summary outputs/RUN outputs/RUN …, or multirun/SWEEP"
-        )
+    from franka_wm.evaluation.results import Result
+    from franka_wm.report.run import but_for_the_seed, read_config
+    from franka_wm.report.seeds import read_evaluation, runs_of, seeds_table
+
     groups: dict[str, dict[Path, Result]] = {}
-    for folder in arguments:
+    for folder in folders:
         for run in runs_of(folder):
             groups.setdefault(but_for_the_seed(read_config(run)), {})[run] = read_evaluation(run)
     for group in groups.values():

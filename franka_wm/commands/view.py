@@ -2,84 +2,81 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import fields
-from typing import Any
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
 
-from omegaconf import OmegaConf
-from omegaconf.errors import OmegaConfBaseException
-
+from franka_wm.commands.arguments import real, verb, whole, word
 from franka_wm.errors import UserError
-from franka_wm.live.page import import_viser
-from franka_wm.live.view import Options, build, record, serve
 
-USAGE = """usage: franka-wm view [key=value …]
-
-An arm in the browser, on this machine only: drag its goal, switch policies, move the planner's settings.
-
-  checkpoint=FOLDER   a run's folder, a checkpoint in it, or hf:user/name; without one the arm is moved by
-                      a planner that knows its geometry, inverse kinematics, random actions, or not at all
-  policy=NAME         who acts first: planner, policy, ik, random, noop
-  port=8080           of http://127.0.0.1; 0 takes a free one
-  out=FOLDER          where recordings go: videos and LeRobot datasets (the present folder)
-  seconds=S           ends after so long; without it, Ctrl-C ends it
-  seed=0  device=auto
-  env.KEY=VALUE       a field of the environment's configuration; episodes have no end unless
-                      env.episode_length is given
-  rerun=FILE.rrd      no page: writes one episode for the Rerun viewer (rerun FILE.rrd)"""
+if TYPE_CHECKING:
+    from franka_wm.live.view import Options
 
 
-def parse(arguments: Sequence[str]) -> Options:
-    """``key=value`` arguments as :class:`Options`.
+@verb(
+    "view",
+    others="env.",
+    shown=(
+        "env.KEY=VALUE",
+        "a field of the environment's configuration; episodes have no end unless env.episode_length is given",
+    ),
+)
+@word("checkpoint", "a run's folder, a checkpoint in it, or hf:user/name", metavar="FOLDER")
+@word("policy", "who acts first: planner, policy, ik, random, noop", metavar="NAME")
+@word("port", "of http://127.0.0.1; 0 takes a free one", whole(0, 65535), 8080)
+@word("out", "where recordings go: videos and LeRobot datasets", default=".")
+@word("seconds", "ends after so long; without it, Ctrl-C ends it", real(above=0), metavar="S")
+@word("seed", "of the world", whole(), 0)
+@word("device", "auto, cpu, cuda, cuda:K", default="auto")
+@word("rerun", "no page: writes one episode for the Rerun viewer", metavar="FILE.rrd")
+def view(**options: Any) -> None:
+    """Show an arm in the browser. Drag its goal, switch policies, move the planner's settings.
+
+    The page is served to this machine only.
+
+    Without a checkpoint the arm is moved by a planner that knows its geometry, by inverse kinematics, by random
+    actions, or not at all.
+    """
+    show(**options)
+
+
+def show(**given: Any) -> None:
+    """Serve the page, or record an episode.
 
     Raises:
-        UserError: An argument that is none of them, or a value that cannot be.
+        UserError: A bad value, a missing extra, or a checkpoint that cannot be shown.
     """
-    options = Options()
-    known = {f.name for f in fields(Options)}
-    numbers: Mapping[str, Callable[[str], Any]] = {"port": int, "seed": int, "seconds": float}
-    for argument in arguments:
-        key, equals, value = argument.partition("=")
-        key = key.lstrip("-")
-        if equals and key.startswith("env."):
-            try:
-                given: Any = OmegaConf.to_container(OmegaConf.from_dotlist([argument]))
-                options.env |= given["env"]
-            except OmegaConfBaseException as error:
-                raise UserError(f"{argument}: {error}") from error
-            continue
-        if not equals or not value or key == "env" or key not in known:
-            raise UserError(
-                f"view: {argument!r} is not key=value with a key that it knows; see franka-wm view --help"
-            )
-        try:
-            setattr(options, key, numbers.get(key, str)(value))
-        except ValueError as error:
-            raise UserError(f"view: {argument}: must be a number") from error
-    if not 0 <= options.port <= 65535:
-        raise UserError(f"view: port={options.port}: must be from 0 to 65535")
-    if options.rerun is not None and not options.rerun.endswith(".rrd"):
-        raise UserError(f"view: rerun={options.rerun}: must end in .rrd")
-    if options.seconds is not None and not 0 < options.seconds < float("inf"):
-        raise UserError(f"view: seconds={options.seconds:g}: must be above 0 and finite")
-    return options
+    options = options_of(**given)
+    from franka_wm.live.page import import_viser
+    from franka_wm.live.view import build, record, serve
 
-
-def view(arguments: Sequence[str]) -> None:
-    """The verb.
-
-    Raises:
-        UserError: Bad arguments, a missing extra, or a checkpoint that cannot be shown.
-    """
-    if any(argument in ("--help", "-h") for argument in arguments):
-        print(USAGE)
-        return
-    import warp as wp
-
-    wp.config.log_level = wp.LOG_WARNING  # its list of compiled modules drowns what there is to say
-    options = parse(arguments)
     if options.rerun is not None:
         record(options)
         return
     import_viser()  # before anything that takes time
     serve(build(options), options)
+
+
+def options_of(overrides: Sequence[str], rerun: str | None, **given: Any) -> Options:
+    """The words of the verb as options.
+
+    Args:
+        overrides: ``env.KEY=VALUE`` …
+        rerun: File for the Rerun viewer.
+        given: The other fields of the options.
+
+    Raises:
+        UserError: A value that cannot be.
+    """
+    from omegaconf import OmegaConf
+    from omegaconf.errors import OmegaConfBaseException
+    from yaml import YAMLError
+
+    if rerun is not None and not rerun.endswith(".rrd"):
+        raise UserError(f"view: rerun={rerun}: must end in .rrd")
+    try:
+        env: Any = OmegaConf.to_container(OmegaConf.from_dotlist(list(overrides)))
+    except (YAMLError, OmegaConfBaseException) as error:
+        raise UserError(f"view: {' '.join(overrides)}: not a value as in YAML ({error})") from error
+    from franka_wm.live.view import Options
+
+    return Options(rerun=rerun, env=env.get("env", {}), **given)

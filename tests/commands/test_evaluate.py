@@ -9,11 +9,12 @@ from types import SimpleNamespace
 import pytest
 import torch
 
-from franka_wm.commands import evaluate
+from franka_wm.commands import evaluate_checkpoint
 from franka_wm.commands import main as cli
-from franka_wm.commands.evaluate import default_folder, parse, to_json
-from franka_wm.errors import UserError
+from franka_wm.commands.evaluate import default_folder
+from franka_wm.commands.evaluate import evaluate as verb
 from franka_wm.evaluation import diagnose
+from franka_wm.evaluation.results import to_json
 from franka_wm.models import WorldModel
 from franka_wm.report import diagnostics
 
@@ -71,11 +72,13 @@ def test_the_closed_loop_alone(run_folder: Path, tmp_path: Path, capsys) -> None
         (["episodes=5"], "give checkpoint="),
         (["checkpoint=a", "episodes=1"], "episodes=1"),
         (["checkpoint=a", "episodes=many"], "episodes=many"),
-        (["checkpoint=a", "probes=yes"], "true or false"),
-        (["checkpoint=a", "fast=true"], "unknown key 'fast'"),
+        (["checkpoint=a", "probes=perhaps"], "true or false"),
+        (["checkpoint=a", "fast=true"], "fast: no such option; there are checkpoint, out"),
+        (["checkpoint=a", "--robustnes"], "robustnes: no such option; did you mean robustness?"),
         (["checkpoint=a", "checkpoint=b"], "given twice"),
-        (["outputs/run"], "not key=value"),
-        (["checkpoint="], "not key=value"),
+        (["outputs/run"], "give checkpoint="),
+        (["checkpoint="], "checkpoint=: a value is missing"),
+        (["checkpoint=a", "outputs/run"], "unexpected extra argument (outputs/run)"),
     ],
 )
 def test_bad_arguments(arguments: list[str], says: str, capsys) -> None:
@@ -103,10 +106,10 @@ def test_results_that_cannot_be_written_are_refused_before_playing(out: str, tmp
 
 
 def test_shifting_what_is_no_arm_is_refused_before_playing(tmp_path: Path, monkeypatch, capsys) -> None:
-    monkeypatch.setattr(evaluate, "load_agent", lambda *a, **k: SimpleNamespace(env=object()))
-    monkeypatch.setattr(evaluate, "evaluate_agent", lambda *a, **k: pytest.fail("played"))
+    monkeypatch.setattr(evaluate_checkpoint, "load_agent", lambda *a, **k: SimpleNamespace(env=object()))
+    monkeypatch.setattr(evaluate_checkpoint, "evaluate_agent", lambda *a, **k: pytest.fail("played"))
     arguments = ["checkpoint=gym", f"out={tmp_path}/out", "robustness=true"]
-    monkeypatch.setattr(evaluate, "protocol", lambda *a: pytest.fail("went on"))
+    monkeypatch.setattr(evaluate_checkpoint, "protocol", lambda *a: pytest.fail("went on"))
     assert cli.main(["evaluate", *arguments]) == 1
     captured = capsys.readouterr()
     assert captured.err.count("\n") == 1 and "only the arm can be shifted" in captured.err
@@ -119,7 +122,7 @@ def test_latents_that_never_change_are_said(agent, monkeypatch) -> None:
     for other in ("calibration", "health"):
         monkeypatch.setattr(diagnose, other, lambda *a: {})
     results, said = {}, []
-    assert evaluate._look_ahead(agent, held, None, results, said.append) is None  # type: ignore[arg-type]
+    assert evaluate_checkpoint._look_ahead(agent, held, None, results, said.append) is None  # type: ignore[arg-type]
     assert "no latent changes within 1 steps" in results["open_loop"]["not_measured"]
     assert sum("warning: open loop not measured" in line for line in said) == 1
     assert "no latent changes" in diagnostics.findings(results)["open loop, not measured"]
@@ -131,11 +134,33 @@ def test_help(capsys) -> None:
     assert cli.main(["evaluate"]) == 2
 
 
-def test_options(tmp_path: Path) -> None:
-    options = parse(["checkpoint=a", "out=b", "episodes=7", "device=cpu", "robustness=true", "probes=false"])
-    assert (options.episodes, options.robustness, options.probes, options.open_loop) == (7, True, False, True)
-    with pytest.raises(UserError):
-        parse([])
+def test_options() -> None:
+    """Words, and options as other programs have them."""
+    words = [
+        "checkpoint=a",
+        "out=b",
+        "episodes=7",
+        "device=cpu",
+        "robustness=true",
+        "open_loop=true",
+        "probes=false",
+    ]
+    options = [
+        "--checkpoint",
+        "a",
+        "--out=b",
+        "--episodes",
+        "7",
+        "--device=cpu",
+        "--robustness",
+        "--open-loop",
+    ]
+    found = verb.make_context("evaluate", words).params
+    assert found == verb.make_context("evaluate", [*options, "--probes=false"]).params
+    assert found["episodes"] == 7 and found["robustness"] and not found["probes"] and found["open_loop"]
+
+
+def test_default_folder(tmp_path: Path) -> None:
     checkpoint = tmp_path / "run" / "checkpoints" / "latest"
     checkpoint.mkdir(parents=True)
     assert (

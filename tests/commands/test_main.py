@@ -1,5 +1,6 @@
 """``franka-wm``: what it prints, how it fails, and what it does not import."""
 
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -7,6 +8,7 @@ from pathlib import Path
 import pytest
 
 import franka_wm
+from franka_wm.commands import bench, listing
 from franka_wm.commands import main as cli
 
 
@@ -36,7 +38,7 @@ def test_robots_are_those_that_the_config_accepts() -> None:
     with pytest.raises(ValueError, match="must be one of") as error:
         FrankaConfig(robot="?")
     accepted = str(error.value).split("must be one of ")[1].split(", ")
-    assert sorted(cli.ROBOTS) == sorted(accepted)
+    assert sorted(listing.ROBOTS) == sorted(accepted)
 
 
 def test_tasks_are_those_that_the_config_accepts() -> None:
@@ -47,8 +49,8 @@ def test_tasks_are_those_that_the_config_accepts() -> None:
         FrankaConfig(task="?")
     accepted = str(error.value).split("must be one of ")[1].split(", ")
     # Another test in this process may have registered a task of its own.
-    assert sorted(cli.tasks()) == sorted(set(accepted) - set(_REGISTERED))
-    assert all(cli.tasks().values())
+    assert sorted(listing.tasks()) == sorted(set(accepted) - set(_REGISTERED))
+    assert all(listing.tasks().values())
 
 
 def test_unknown_verb_is_one_line_and_status_2(capsys: pytest.CaptureFixture[str]) -> None:
@@ -71,7 +73,7 @@ def test_version_and_help(capsys: pytest.CaptureFixture[str]) -> None:
     assert capsys.readouterr().out == f"franka-wm {franka_wm.__version__}\n"
     assert cli.main(["--help"]) == 0
     out = capsys.readouterr().out
-    assert all(f"franka-wm {verb}" in out for verb in cli.VERBS)
+    assert all(f"\n  {verb} " in out for verb in cli.VERBS)
 
 
 def test_the_package_runs_as_a_module() -> None:
@@ -86,16 +88,93 @@ def test_a_verb_is_one_line_in_the_table(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     (tmp_path / "a_verb.py").write_text(
+        "from franka_wm.commands.arguments import verb, word\n"
         "from franka_wm.errors import UserError\n"
-        "def run(arguments):\n"
-        "    if arguments: raise UserError('bad:\\n  ' + arguments[0])\n"
+        "@verb('try')\n"
+        "@word('x', 'what')\n"
+        "def run(x):\n"
+        "    if x: raise UserError('bad:\\n  ' + x)\n"
         "    return 7\n"
     )
     monkeypatch.syspath_prepend(str(tmp_path))
-    monkeypatch.setitem(cli.VERBS, "try", ("a_verb:run", "", "a verb"))
+    monkeypatch.setitem(cli.VERBS, "try", "a_verb:run")
     assert cli.main(["try"]) == 7
-    assert cli.main(["try", "x"]) == 1
-    assert capsys.readouterr().err == "error: bad: x\n"
+    assert cli.main(["try", "x=y"]) == 1
+    assert capsys.readouterr().err == "error: bad: y\n"
+
+
+HEAVY = {"torch", "tensordict", "torchrl", "newton", "warp", "pandas", "scipy", "matplotlib", "lerobot"}
+"""Modules that take seconds to import, or import those that do."""
+
+
+def run_and_list_imports(*arguments: str, cwd: Path) -> tuple[subprocess.CompletedProcess[str], set[str]]:
+    """A verb in a process of its own: its exit status and output, and which heavy modules it imported."""
+    code = (
+        "import sys; from franka_wm.commands.main import main; status = main(sys.argv[1:]);"
+        f"print(*sorted({HEAVY} & set(sys.modules))); sys.exit(status)"
+    )
+    command = [sys.executable, "-c", code, *arguments]
+    done = subprocess.run(command, capture_output=True, text=True, check=False, cwd=cwd)
+    return done, set(done.stdout.splitlines()[-1].split())
+
+
+@pytest.mark.parametrize("verb", [verb for verb in cli.VERBS if verb != "train"])
+def test_help_of_every_verb_has_one_form_and_imports_nothing_heavy(verb: str, tmp_path: Path) -> None:
+    """The usage, what it does, a line for each option; -h is the same."""
+    done, imported = run_and_list_imports(verb, "--help", cwd=tmp_path)
+    lines = done.stdout.splitlines()[:-1]
+    assert done.returncode == 0 and lines[0].startswith(f"usage: franka-wm {verb}") and not done.stderr
+    assert lines[2].startswith("  ") and lines[2].strip()[0].isupper()
+    assert [line.split() for line in lines if line.strip()][-1] == ["--help", "print", "this"]
+    assert not imported
+    assert run_and_list_imports(verb, "-h", cwd=tmp_path)[0].stdout == done.stdout
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (["list", "x"], "unexpected extra argument"),
+        (["evaluate", "checkpoint=x", "episode=3"], "did you mean episodes?"),
+        (["evaluate", "checkpoint=x", "episodes=1"], "episodes=1: must be a whole number of at least 2"),
+        (["evaluate", "episodes=3"], "give checkpoint="),
+        (["summary", "--x"], "x: no such option"),
+        (["report", "RUN", "ot=x.html"], "did you mean out?"),
+        (["compare", "A", "B", "--outt=x.html"], "did you mean out?"),
+        (["view", "prot=3"], "did you mean port?"),
+        (["view", "env.goal={"], "env.goal"),
+        (["demo", "port=x"], "port=x: must be a whole number"),
+        (["collect", "out=x", "episode=3"], "did you mean episodes?"),
+        (["collect", "out=x", "policy=smart"], "policy='smart': must be one of"),
+        (["collect", "out=x", "env.image_sise=3"], "did you mean env.image_size?"),
+        (["collect", "out=x", "seed=abc"], "seed=abc: must be a whole number"),
+        (["export", "source=x", "out=y", "format=gif"], "format=gif: must be one of exact, video"),
+        (["publish", "repo_id=user/name", "rot=x"], "did you mean root?"),
+        (["publish", "repo_id=user/name"], "give root=DATASET or checkpoint=RUN"),
+        (["bench", "envv"], "did you mean env?"),
+    ],
+)
+def test_bad_arguments_are_answered_before_anything_heavy_is_imported(
+    arguments: list[str], said: str, tmp_path: Path
+) -> None:
+    done, imported = run_and_list_imports(*arguments, cwd=tmp_path)
+    assert done.returncode == 1 and said in done.stderr and done.stderr.count("\n") == 1, done.stderr
+    assert done.stderr.startswith("error: ") and not imported
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_shells_complete_verbs_options_and_choices(monkeypatch: pytest.MonkeyPatch) -> None:
+    for words, wanted in (
+        ("franka-wm ev", "evaluate"),
+        ("franka-wm evaluate --epi", "--episodes"),
+        ("franka-wm export --format vid", "video_near_lossless"),
+    ):
+        variables = {"_FRANKA_WM_COMPLETE": "bash_complete", "COMP_WORDS": words}
+        variables["COMP_CWORD"] = str(len(words.split()) - 1)
+        command = [sys.executable, "-m", "franka_wm"]
+        done = subprocess.run(
+            command, capture_output=True, text=True, check=False, env=os.environ | variables
+        )
+        assert f"plain,{wanted}" in done.stdout.splitlines()
 
 
 def test_bench_runs_the_script_with_its_arguments_and_status(
@@ -107,7 +186,7 @@ def test_bench_runs_the_script_with_its_arguments_and_status(
     (tmp_path / "benchmarks" / "tiny.py").write_text(
         "import sys\nfrom common import FACTOR\nprint(FACTOR, sys.argv[1:])\nsys.exit(3)\n"
     )
-    monkeypatch.setattr(cli, "CHECKOUT", tmp_path)
+    monkeypatch.setattr(bench, "CHECKOUT", tmp_path)
     assert cli.main(["bench", "tiny", "--worlds", "4"]) == 3
     assert "2 ['--worlds', '4']" in capfd.readouterr().out
     assert cli.main(["bench", "common"]) == 1, "common is no benchmark"
@@ -116,7 +195,7 @@ def test_bench_runs_the_script_with_its_arguments_and_status(
 def test_outside_a_checkout_bench_says_so_and_list_still_lists(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr(cli, "CHECKOUT", tmp_path)
+    monkeypatch.setattr(bench, "CHECKOUT", tmp_path)
     assert cli.main(["bench", "env"]) == 1
     error = capsys.readouterr().err
     assert error.count("\n") == 1

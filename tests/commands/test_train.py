@@ -326,7 +326,9 @@ def test_in_a_process_of_its_own(tmp_path: Path) -> None:
 
 def test_help_explains_the_groups(tmp_path: Path) -> None:
     done = train("--help", cwd=tmp_path)
-    assert done.returncode == 0
+    assert done.returncode == 0 and done.stdout.startswith(
+        "usage: python train.py [group=choice …] [key=value …]"
+    )
     for word in ("env:", "model:", "planner:", "scale:", "reach_fixed_pixels", "resume", "num_samples"):
         assert word in done.stdout, word
 

@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from examples.add_a_task import HEIGHT, RaiseTool
-from franka_wm.commands.summary import summary
+from franka_wm.commands.main import main
 from franka_wm.envs import FrankaConfig, FrankaEnv
 from franka_wm.envs.tasks import Reach, Track
 from franka_wm.evaluation.closed_loop import play_episodes, reaches
@@ -115,7 +115,7 @@ def test_pages_curves_and_summaries_show_it(env: FrankaEnv, found: Evaluation, t
     assert "height [m]" in text and "success" in text and "final distance" not in text
     assert "as the task judges" in text
     assert "height [m]" in compare_page([read_run(tmp_path / f"run{k}") for k in range(2)])
-    summary([str(tmp_path / "run0"), str(tmp_path / "run1")])
+    assert main(["summary", str(tmp_path / "run0"), str(tmp_path / "run1")]) == 0
     assert "| policy | success [%] | return | height [m] |" in capsys.readouterr().out
     assert "final distance" not in seeds_table([found.policies])
     assert axis(read.rows) == "env_steps"

@@ -46,4 +46,6 @@ def test_demo_serves_the_page(capsys: pytest.CaptureFixture[str]) -> None:
 
 def test_demo_refuses_another_checkpoint(capsys: pytest.CaptureFixture[str]) -> None:
     assert cli.main(["demo", "checkpoint=x"]) == 1
-    assert "franka-wm view checkpoint=RUN" in capsys.readouterr().err
+    assert "demo: checkpoint: no such option" in capsys.readouterr().err
+    assert cli.main(["demo", "--help"]) == 0
+    assert "franka-wm view" in capsys.readouterr().out

@@ -16,12 +16,17 @@ import pytest
 from omegaconf import OmegaConf
 
 from franka_wm.commands import main as cli
-from franka_wm.commands.view import parse
+from franka_wm.commands.view import options_of
+from franka_wm.commands.view import view as view_verb
 from franka_wm.envs import FrankaConfig
 from franka_wm.errors import UserError
 from franka_wm.live import view
 
 CHEAP = ["env.substeps=2", "device=cpu"]
+
+
+def parse(arguments: list[str]) -> view.Options:
+    return options_of(**view_verb.make_context("view", arguments).params)
 
 
 def test_arguments() -> None:
@@ -34,13 +39,15 @@ def test_arguments() -> None:
 @pytest.mark.parametrize(
     ("argument", "said"),
     [
-        ("page=3", "'page=3' is not key=value with a key that it knows"),
-        ("--fast", "see franka-wm view --help"),
-        ("env=reach", "'env=reach' is not"),
-        ("port=http", "port=http: must be a number"),
-        ("port=70000", "must be from 0 to 65535"),
-        ("seconds=0", "must be above 0"),
-        ("seconds=nan", "must be above 0"),
+        ("page=3", "page: no such option; there are checkpoint, policy"),
+        ("--fast", "fast: no such option"),
+        ("env=reach", "env: no such option"),
+        ("sed=3", "sed: no such option; did you mean seed?"),
+        ("port", "'port' is not name=value; franka-wm view --help"),
+        ("port=http", "port=http: must be a whole number"),
+        ("port=70000", "must be a whole number of at least 0, at most 65535"),
+        ("seconds=0", "must be a finite number above 0"),
+        ("seconds=nan", "must be a finite number above 0"),
         ("rerun=x.txt", "rerun=x.txt: must end in .rrd"),
     ],
 )
@@ -244,22 +251,21 @@ def test_an_exception_while_it_plays_ends_it(monkeypatch: pytest.MonkeyPatch) ->
 BUSY = """
 import signal
 import time
-from franka_wm.commands.view import parse
 from franka_wm.live import view
 signal.signal(signal.SIGINT, signal.default_int_handler)  # may have been inherited as ignored
-stage = view.build(parse({cheap!r}))
+stage = view.build(view.Options(device="cpu", env={{"substeps": 2}}))
 real = stage.policies["noop"]
 def slow(tensordict):
     print("deciding", flush=True)
     time.sleep(60)
     return real(tensordict)
 stage.policies["noop"] = slow
-view.serve(stage, parse(["policy=noop", "port=0"]))
+view.serve(stage, view.Options(policy="noop", port=0))
 """
 
 
 def test_ctrl_c_ends_it_within_two_seconds_whatever_it_is_doing() -> None:
-    script = BUSY.format(cheap=list(CHEAP))
+    script = BUSY.format()
     with subprocess.Popen([sys.executable, "-c", script], stdout=subprocess.PIPE, text=True) as process:
         assert process.stdout is not None
         while "deciding" not in process.stdout.readline():

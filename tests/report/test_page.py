@@ -258,10 +258,10 @@ def test_the_verb_writes_and_says_where(make_run, tmp_path: Path, capsys) -> Non
     assert cli.main(["report", "--help"]) == 0
     assert "usage: franka-wm report RUN" in capsys.readouterr().out
     for arguments, says in (
-        (["report"], "needs one folder of a run, got 0"),
+        (["report", "out=x.html"], "report: give RUN"),
         (["report", str(tmp_path / "nowhere")], "is not a folder"),
         (["report", str(tmp_path / "a")], "holds neither config.yaml nor evaluation.json"),
-        (["report", str(run), "ot=x.html"], "unknown option 'ot=x.html'"),
+        (["report", str(run), "ot=x.html"], "report: ot: no such option; did you mean out?"),
     ):
         assert cli.main(arguments) == 1
         assert says in capsys.readouterr().err

@@ -12,7 +12,7 @@ import pytest
 import torch
 from torchrl.collectors import Collector
 
-from franka_wm.commands.collect import OPTIONS, open_source
+from franka_wm.commands.collect import open_source
 from franka_wm.commands.main import main
 from franka_wm.data.lerobot.collect import gather
 from franka_wm.data.lerobot.export import export_replay
@@ -124,11 +124,10 @@ def test_the_same_seed_gives_the_same_dataset(collected, tmp_path, load) -> None
 
 
 def test_ctrl_c_leaves_a_dataset(tmp_path, load) -> None:
-    options = OPTIONS | {"out": str(tmp_path / "set"), "num_envs": 4, "episodes": 100_000}
-    source = open_source(options, SMALL)
+    source = open_source("random", overrides=SMALL, num_envs=4, episodes=100_000)
     timer = threading.Timer(1.0, os.kill, (os.getpid(), signal.SIGINT))
     timer.start()
-    out, whole = gather(source, out=options["out"], episodes=options["episodes"], workers=0)
+    out, whole = gather(source, out=tmp_path / "set", episodes=100_000, workers=0)
     timer.join()
     assert not whole
     dataset = load(out)
@@ -142,6 +141,7 @@ def test_ctrl_c_leaves_a_dataset(tmp_path, load) -> None:
         (["episodes=3"], "give out="),
         (["out=x", "episodes=none"], "must be a whole number"),
         (["out=x", "episodes=0"], "at least 1"),
+        (["out=x", "policy=planner", "policy=ik"], "policy= is given twice"),
         (["out=x", "format=gif"], "must be one of exact, video"),
         (["out=x", "policy=planner"], "give checkpoint="),
         (["out=x", "policy=smooth"], "collect: policy=smooth: this policy is called random now"),
@@ -161,7 +161,7 @@ def test_ctrl_c_leaves_a_dataset(tmp_path, load) -> None:
         (["out=x", "policy=.", "env.goal=[1"], "is not a value as in YAML"),
         (["out=x", "env.fps=29.97"], "whole frames"),
         (["out=x", "env.observations=[depth]"], "depth has no place"),
-        (["out=x", "rubbish"], "is not one of"),
+        (["out=x", "rubbish"], "'rubbish' is not name=value"),
     ],
 )
 def test_bad_arguments_are_one_line(arguments, says, capsys, tmp_path, monkeypatch) -> None:

@@ -1,0 +1,159 @@
+"""What ``franka-wm evaluate`` does: everything that can be said about a checkpoint, from the checkpoint alone."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from franka_wm.console import announced, say
+from franka_wm.evaluation import diagnose
+from franka_wm.evaluation.decoder import Imagined
+from franka_wm.evaluation.open_loop import NothingToPredictError
+from franka_wm.evaluation.protocol import Evaluation, describe, evaluate_agent, protocol
+from franka_wm.evaluation.results import COMMAND, to_json
+from franka_wm.evaluation.robustness import check_shiftable, note, robustness
+from franka_wm.files import atomic_write
+from franka_wm.report.diagnostics import (
+    diagnostic_tables,
+    evaluation_markdown,
+    terminal,
+    timing_table,
+)
+from franka_wm.report.table import evaluation_tables, markdown
+from franka_wm.training.load import load_agent
+
+WORLDS = 256
+"""Simulated at once, at most; more episodes are played in rounds."""
+
+Say = Callable[[str], None]
+
+
+@dataclass(frozen=True)
+class Options:
+    """What was asked for on the command line."""
+
+    checkpoint: str
+    out: Path
+    episodes: int
+    device: str
+    open_loop: bool
+    probes: bool
+    robustness: bool
+
+
+def run(options: Options) -> dict[str, Any]:
+    """Evaluates, prints tables, writes files; returns the content of ``evaluation.json``.
+
+    Raises:
+        UserError: The checkpoint cannot be used, or the folder not be written.
+    """
+    from rich.console import Console
+
+    console = Console(width=120)
+    with announced(f"loading {options.checkpoint} and building {min(options.episodes, WORLDS)} worlds"):
+        agent = load_agent(options.checkpoint, num_envs=min(options.episodes, WORLDS), device=options.device)
+    if options.robustness:
+        check_shiftable(agent)
+    say(f"{options.episodes} held-out episodes for each of {', '.join(agent.policies)} …")
+    evaluation = evaluate_agent(
+        agent, episodes=options.episodes, report=lambda name, r: say(describe(name, r))
+    )
+    described = protocol(agent.settings, agent.env, evaluation, by=COMMAND, counters=agent.counters)
+    results = {
+        "protocol": {"checkpoint": options.checkpoint, **described},
+        "policies": evaluation.policies,
+    }
+    for table in evaluation_tables(evaluation.policies):
+        if table.rows:
+            console.print(terminal(table))
+    console.print(terminal(timing_table(evaluation.seconds, evaluation.worlds)))
+    imagined = None
+    if options.open_loop or options.probes:
+        say("held-out episodes for the diagnostics …")
+        held = diagnose.hold_out(agent, pictures=options.open_loop)
+        if options.open_loop:
+            imagined = _look_ahead(agent, held, evaluation, results, say)
+        if options.probes:
+            _look_inside(agent, held, results, say)
+    if options.robustness:
+        _shift(agent, options, results, say)
+    tables = diagnostic_tables(results, agent.env.config)
+    for title, table in tables.items():
+        console.print(terminal(table, title))
+    text = "\n".join(
+        [evaluation_markdown(evaluation), *(f"### {t}\n\n{markdown(table)}" for t, table in tables.items())]
+    )
+    _write(options.out, results, text, evaluation, None if imagined is None else imagined[0])
+    say(f"results: {options.out}")
+    return results
+
+
+def _look_ahead(
+    agent: Any, held: diagnose.Held, evaluation: Evaluation, results: dict[str, Any], say: Say
+) -> tuple[Imagined, Any, Any] | None:
+    say("predictions without looking …")
+    ahead: dict[str, Any]
+    try:
+        ahead = diagnose.open_loop(agent, held)
+    except NothingToPredictError as error:
+        ahead = {"not_measured": str(error)}
+        say(f"warning: open loop not measured: {error}")
+    results["open_loop"] = ahead
+    say("values against true returns …")
+    results["calibration"] = diagnose.calibration(agent)
+    results["health"] = diagnose.health(agent, evaluation)
+    imagined = diagnose.imagine(agent, held, say=say)
+    if imagined is not None:
+        ahead["decoder"] = imagined[2]
+    return imagined
+
+
+def _look_inside(agent: Any, held: diagnose.Held, results: dict[str, Any], say: Say) -> None:
+    say("what can be read off the latents …")
+    results["probes"] = diagnose.probes(held, agent.model)
+    results["spectrum"], results["latents"] = diagnose.representation(held, agent.model)
+    warning = results["spectrum"]["warning"]
+    if warning:
+        results.setdefault("health", {}).setdefault("warnings", []).append(warning)
+        say(f"warning: {warning}")
+
+
+def _shift(agent: Any, options: Options, results: dict[str, Any], say: Say) -> None:
+    say("the same in shifted worlds …")
+
+    def told(case: str, found: Mapping[str, Any]) -> None:
+        parts = (f"{describe(p, r).strip()} {r['verdict']}" for p, r in found.items())
+        say(f"  {case}: {'   '.join(parts)}")
+
+    episodes = min(options.episodes, WORLDS)
+    results["robustness"] = robustness(agent, episodes=episodes, report=told)
+    results["protocol"]["robustness episodes"] = episodes
+    if note(episodes):
+        results["protocol"]["robustness note"] = note(episodes)
+        say(f"note: {note(episodes)}")
+
+
+def _write(
+    folder: Path, results: dict[str, Any], text: str, evaluation: Evaluation, imagined: Imagined | None
+) -> None:
+    """Every file whole; the one that others read, last."""
+    if imagined is not None:
+        from franka_wm.video import write_png, write_video
+
+        write_png(imagined.strip, folder / "imagined.png")
+        write_video(
+            imagined.frames.repeat_interleave(2, 1).repeat_interleave(2, 2), folder / "imagined.mp4", fps=5
+        )
+    seconds = {
+        name: {"seconds_per_decision": s, "worlds": evaluation.worlds}
+        for name, s in evaluation.seconds.items()
+    }
+    for name, content in (
+        ("timing.json", to_json(seconds)),
+        ("evaluation.md", text),
+        ("evaluation.json", to_json(results)),
+    ):
+        with atomic_write(folder / name) as path:
+            path.write_text(content)

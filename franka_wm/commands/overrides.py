@@ -1,0 +1,85 @@
+"""Overrides of the configuration, ``group=choice`` and ``key=value``: composed, and in one line when they are wrong."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from typing import Any
+
+from franka_wm import conf
+from franka_wm.commands.arguments import did_you_mean, no_such_option
+from franka_wm.errors import UserError
+
+
+def compose(overrides: Sequence[str], options: Sequence[str] = ()) -> Any:
+    """The configuration of ``conf/`` with Hydra's overrides, as ``train.py`` would see it.
+
+    Raises:
+        UserError: One line, for an override that Hydra refuses.
+    """
+    from hydra.errors import HydraException
+    from omegaconf.errors import OmegaConfBaseException
+
+    try:
+        return conf.compose(*overrides)
+    except (HydraException, OmegaConfBaseException) as error:
+        raise UserError(explain(str(error), allowed=_allowed(str(error), overrides, options))) from error
+
+
+_MISSING = re.compile(r"Could not find '([^']+)/([^'/]+)'")
+_UNKNOWN = re.compile(r"Could not override '([^']+)'")
+
+
+def explain(message: str, *, allowed: Sequence[str] = ()) -> str:
+    """What Hydra and OmegaConf say of an override, in one line.
+
+    Args:
+        message: Theirs, of many lines: with the choices of a group, how to append, where configurations are.
+        allowed: Keys that there are in the place of an unknown one.
+    """
+    lines = [line.strip() for line in message.splitlines() if line.strip()]
+    missing, unknown = _MISSING.search(message), _UNKNOWN.search(message)
+    if missing is not None:
+        choices = [line for line in message.splitlines() if line.startswith("\t") and "provider=" not in line]
+        names = [line.strip() for line in choices]
+        return (
+            f"{missing[1]}={missing[2]}: must be one of {', '.join(names)}{did_you_mean(missing[2], names)}"
+        )
+    if unknown is not None:
+        return no_such_option(unknown[1], allowed)
+    noise = ("full_key:", "object_type", "Config search path", "provider=", "See https://", "Set the env")
+    return "; ".join(line for line in lines if not line.startswith(noise))
+
+
+def _allowed(message: str, overrides: Sequence[str], options: Sequence[str]) -> list[str]:
+    """The keys beside the one that an override names in vain; at the top, the verb's own, too."""
+    from omegaconf import DictConfig, OmegaConf
+
+    unknown = _UNKNOWN.search(message)
+    if unknown is None:
+        return []
+    # With the same choices of groups: other environments have other options.
+    chosen = [o for o in overrides if "." not in o.partition("=")[0] and o.partition("=")[0] != unknown[1]]
+    node: Any = conf.compose(*chosen)
+    place = unknown[1].rpartition(".")[0] if "/" not in unknown[1] and "@" not in unknown[1] else ""
+    found = OmegaConf.select(node, place) if place else node
+    if isinstance(found, DictConfig):
+        return [
+            f"{place}.{key}" if place else str(key)
+            for key in dict.fromkeys([*([] if place else options), *found])
+        ]
+    return [*options, *(str(key) for key in node)]
+
+
+def number(cfg: Any, key: str, kind: type[int] | type[float] = int) -> Any:
+    """The number at ``key`` of a configuration.
+
+    Raises:
+        UserError: There is something else.
+    """
+    from omegaconf import OmegaConf
+
+    value = OmegaConf.select(cfg, key)
+    if isinstance(value, bool) or not isinstance(value, int if kind is int else int | float):
+        raise UserError(f"{key}={value}: must be a {'whole ' if kind is int else ''}number")
+    return kind(value)
