@@ -1,4 +1,6 @@
-"""Options with a type and a range, declared where they are named: a frozen dataclass reads itself from a configuration.
+"""Options with a type and a range, declared where they are named.
+
+A frozen dataclass reads itself from a configuration:
 
 @dataclass(frozen=True)
 class ReplaySettings:
@@ -6,16 +8,23 @@ class ReplaySettings:
     hindsight: float | None = real(0.0, least=0, most=1, null="half, where goals can be exchanged")
 
 read(ReplaySettings, {"capacity": 0}, "replay")   # UserError: replay.capacity=0: must be a whole number …
+
+and a constructor (of a model, a planner) declares them by its annotations, and by bounds where there are some:
+
+check_arguments(TDMPC2, {"tau": 0}, "model", {"tau": Bounds(above=0, most=1)})   # UserError: model.tau=0: must be a …
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import MISSING, Field, dataclass, field, fields
 from difflib import get_close_matches
 from inspect import Parameter, signature
-from typing import Any
+from numbers import Integral, Real
+from types import NoneType, UnionType
+from typing import Any, Literal, NamedTuple, TypeGuard, Union, get_args, get_origin, get_type_hints
 
 from franka_wm.errors import UserError
 
@@ -27,71 +36,88 @@ class Rule:
     Attributes:
         fits: Whether a value that is not null does.
         wanted: The same in words, after "must be".
-        null: What null means; empty where it is not allowed.
+        null: What null means, or ""; None where null is not allowed.
     """
 
     fits: Callable[[Any], bool]
     wanted: str
-    null: str = ""
+    null: str | None = None
 
     def check(self, option: str, value: Any) -> None:
         """Raises a ``UserError`` that names the option and what is allowed, unless the value fits."""
-        if not (bool(self.null) if value is None else self.fits(value)):
-            null = f", or null ({self.null})" if self.null else ""
+        if not (self.null is not None if value is None else self.fits(value)):
+            null = "" if self.null is None else ", or null" + (self.null and f" ({self.null})")
             raise UserError(f"{option}={value!r}: must be {self.wanted}{null}")
 
 
-def is_whole(value: Any) -> bool:
+class Bounds(NamedTuple):
+    """Interval of numbers: from ``least`` to ``most``; ``above`` and ``below`` themselves are outside."""
+
+    least: float = -math.inf
+    above: float = -math.inf
+    most: float = math.inf
+    below: float = math.inf
+
+    def holds(self, number: float) -> bool:
+        """Whether a number lies inside; NaN never does."""
+        return self.least <= number <= self.most and self.above < number < self.below
+
+    def __str__(self) -> str:
+        words = ("of at least", "above", "of at most", "below")
+        said = [f"{word} {bound:g}" for word, bound in zip(words, self, strict=True) if math.isfinite(bound)]
+        return " " + " and ".join(said) if said else ""
+
+
+POSITIVE = Bounds(least=1)
+"""Sizes and counts."""
+FRACTION = Bounds(least=0, most=1)
+COEFFICIENT = Bounds(least=0)
+
+
+def is_whole(value: Any) -> TypeGuard[int]:
     """Whether it is an int; true and false are none."""
-    return isinstance(value, int) and not isinstance(value, bool)
+    return isinstance(value, Integral) and not isinstance(value, bool)
 
 
-def is_real(value: Any) -> bool:
+def is_real(value: Any) -> TypeGuard[float]:
     """Whether it is a finite number; true and false are none."""
-    return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
+    return isinstance(value, Real) and not isinstance(value, bool) and math.isfinite(value)
 
 
-def whole(default: Any = MISSING, *, least: int, even: bool = False, unit: str = "", null: str = "") -> Any:
+def whole_rule(*, least: int, even: bool = False, unit: str = "", null: str | None = None) -> Rule:
     """A whole number of at least ``least``; even, if asked for."""
     wanted = f"{'an even' if even else 'a whole'} number{unit and f' of {unit}'} of at least {least}"
-    return _option(default, Rule(lambda x: is_whole(x) and x >= least and not (even and x % 2), wanted, null))
+    return Rule(lambda x: is_whole(x) and x >= least and not (even and x % 2), wanted, null)
 
 
-def real(
-    default: Any = MISSING,
-    *,
-    least: float = -math.inf,
-    above: float = -math.inf,
-    most: float = math.inf,
-    below: float = math.inf,
-    unit: str = "",
-    null: str = "",
-) -> Any:
-    """A finite number within bounds: from ``least`` to ``most``, ``above`` and ``below`` themselves excluded."""
-    bounds = (("of at least", least), ("above", above), ("of at most", most), ("below", below))
-    said = " and ".join(f"{word} {bound:g}" for word, bound in bounds if math.isfinite(bound))
-    wanted = f"a finite number{unit and f' of {unit}'} {said}".strip()
-    return _option(
-        default, Rule(lambda x: is_real(x) and least <= x <= most and above < x < below, wanted, null)
-    )
+def whole(default: Any = MISSING, **rule: Any) -> Any:
+    """An option by :func:`whole_rule`."""
+    return _option(default, whole_rule(**rule))
 
 
-def flag(default: Any = MISSING, *, null: str = "") -> Any:
+def real(default: Any = MISSING, *, unit: str = "", null: str | None = None, **bounds: float) -> Any:
+    """A finite number within :class:`Bounds`."""
+    within = Bounds(**bounds)
+    wanted = f"a finite number{unit and f' of {unit}'}{within}"
+    return _option(default, Rule(lambda x: is_real(x) and within.holds(x), wanted, null))
+
+
+def flag(default: Any = MISSING, *, null: str | None = None) -> Any:
     """True or false."""
     return _option(default, Rule(lambda x: isinstance(x, bool), "true or false", null))
 
 
-def choice(default: Any = MISSING, *, of: Sequence[str], null: str = "") -> Any:
+def choice(default: Any = MISSING, *, of: Sequence[str], null: str | None = None) -> Any:
     """One of several words."""
     return _option(default, Rule(lambda x: isinstance(x, str) and x in of, f"one of {', '.join(of)}", null))
 
 
-def text(default: Any = MISSING, *, null: str = "") -> Any:
+def text(default: Any = MISSING, *, null: str | None = None) -> Any:
     """Any text that is not empty."""
     return _option(default, Rule(lambda x: isinstance(x, str) and bool(x), "text", null))
 
 
-def several(default: Any = MISSING, *, each: Any, null: str = "", example: str) -> Any:
+def several(default: Any = MISSING, *, each: Any, null: str | None = None, example: str) -> Any:
     """A list whose entries follow the rule of another option; it becomes a tuple."""
     rule: Rule = each.metadata["rule"]
     return _option(
@@ -104,7 +130,9 @@ def several(default: Any = MISSING, *, each: Any, null: str = "", example: str) 
     )
 
 
-def value(default: Any = MISSING, *, fits: Callable[[Any], bool], wanted: str, null: str = "") -> Any:
+def value(
+    default: Any = MISSING, *, fits: Callable[[Any], bool], wanted: str, null: str | None = None
+) -> Any:
     """Any other kind of value, by a test of one's own."""
     return _option(default, Rule(fits, wanted, null))
 
@@ -148,34 +176,87 @@ def unknown(option: str, known: Sequence[str]) -> str:
     return f"{option}: there is no such option; there are {', '.join(known)}"
 
 
-_TYPES = {
-    "int": (is_whole, "a whole number"),
-    "float": (is_real, "a finite number"),
-    "bool": (lambda x: isinstance(x, bool), "true or false"),
-    "str": (lambda x: isinstance(x, str), "text"),
-    "None": (lambda x: x is None, "null"),
-}
+def check_arguments(
+    cls: Callable[..., Any],
+    values: Mapping[str, Any],
+    prefix: str,
+    bounds: Mapping[str, Bounds] | None = None,
+) -> None:
+    """Hold values for a constructor against its annotations, and numbers against bounds.
 
+    ``int``, ``float``, ``bool``, ``str``, ``Literal`` and ``None``, and unions of them, are checked. The rest is left
+    to the class.
 
-def check_arguments(cls: Any, values: Mapping[str, Any], prefix: str) -> Mapping[str, Parameter]:
-    """The parameters of a constructor, after the values for it have been held against its annotations.
-
-    ``int``, ``float``, ``bool``, ``str`` and ``None``, and unions of them, are checked; others are left to the class.
+    Args:
+        cls: A class, whose bases' constructors count as well, or a function that makes one.
+        values: Name → value. Names that are no parameters are not looked at: see :func:`check_names`.
+        prefix: Of the options' names, for messages.
+        bounds: Of parameters that are numbers.
 
     Raises:
-        UserError: A name that it does not take, or a value of another type.
+        UserError: A value of another type, or out of bounds.
+    """
+    for name, annotation in _annotations(cls).items():
+        rule = _annotated(annotation, (bounds or {}).get(name, Bounds()))
+        if name in values and rule is not None:
+            rule.check(f"{prefix}.{name}", values[name])
+
+
+def check_names(cls: Callable[..., Any], names: Iterable[str], prefix: str) -> None:
+    """Refuse names that a constructor does not take.
+
+    Raises:
+        UserError: One line, with the nearest names that it does.
     """
     takes = signature(cls).parameters
-    known = [f"{prefix}.{name}" for name in takes if name != "self"]
-    for name, value in values.items():
+    if any(one.kind is Parameter.VAR_KEYWORD for one in takes.values()):
+        return
+    for name in names:
         if name not in takes:
-            if any(one.kind is Parameter.VAR_KEYWORD for one in takes.values()):
-                continue
-            raise UserError(unknown(f"{prefix}.{name}", known))
-        annotation = takes[name].annotation
-        spelled = annotation.__name__ if isinstance(annotation, type) else str(annotation)
-        kinds = [kind.strip() for kind in spelled.split("|")]
-        if all(kind in _TYPES for kind in kinds) and not any(_TYPES[kind][0](value) for kind in kinds):
-            wanted = " or ".join(_TYPES[kind][1] for kind in kinds)
-            raise UserError(f"{prefix}.{name}={value!r}: must be {wanted}")
-    return takes
+            raise UserError(unknown(f"{prefix}.{name}", [f"{prefix}.{one}" for one in takes]))
+
+
+def with_defaults(cls: type, values: Mapping[str, Any]) -> dict[str, Any]:
+    """`values`, and for those left out the defaults of the constructor of `cls`."""
+    parameters = signature(cls.__init__).parameters.values()
+    return {one.name: one.default for one in parameters if one.default is not one.empty} | dict(values)
+
+
+def _annotations(cls: Callable[..., Any]) -> dict[str, Any]:
+    """Types of all constructors' parameters, the nearest class's last."""
+    makers: list[Any] = [cls]
+    if isinstance(cls, type):
+        ours = (
+            one for one in reversed(cls.__mro__) if one.__module__.split(".")[0] not in ("builtins", "torch")
+        )
+        makers = [vars(one)["__init__"] for one in ours if "__init__" in vars(one)]
+    found: dict[str, Any] = {}
+    for one in makers:
+        # A name that is imported for type checkers only leaves that constructor's values to its class.
+        with suppress(NameError):
+            found |= get_type_hints(one)
+    found.pop("return", None)
+    return found
+
+
+def _annotated(annotation: Any, bounds: Bounds) -> Rule | None:
+    """What a parameter may be by its annotation; None where it is of another kind."""
+    kinds = get_args(annotation) if get_origin(annotation) in (Union, UnionType) else (annotation,)
+    rules = [_of_kind(kind, bounds) for kind in kinds if kind is not NoneType]
+    known = [one for one in rules if one is not None]
+    if len(known) < len(rules):
+        return None
+    null = "" if NoneType in kinds else None
+    return Rule(lambda x: any(one.fits(x) for one in known), " or ".join(one.wanted for one in known), null)
+
+
+def _of_kind(kind: Any, bounds: Bounds) -> Rule | None:
+    if get_origin(kind) is Literal:
+        return Rule(lambda x: x in get_args(kind), f"one of {', '.join(map(str, get_args(kind)))}")
+    rules = {
+        bool: Rule(lambda x: isinstance(x, bool), "true or false"),
+        int: Rule(lambda x: is_whole(x) and bounds.holds(x), f"a whole number{bounds}"),
+        float: Rule(lambda x: is_real(x) and bounds.holds(x), f"a finite number{bounds}"),
+        str: Rule(lambda x: isinstance(x, str), "text"),
+    }
+    return rules.get(kind)

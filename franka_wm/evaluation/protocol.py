@@ -22,6 +22,7 @@ from franka_wm.evaluation.closed_loop import (
 )
 from franka_wm.evaluation.results import END, FILE, point, to_json
 from franka_wm.files import atomic_write
+from franka_wm.options import is_whole
 from franka_wm.seeding import derive_seed, seeded
 from franka_wm.training.settings import EvaluationSettings, RunSettings
 from franka_wm.version import __version__
@@ -102,7 +103,7 @@ def evaluate_policies(
         UserError: Fewer than 2 episodes, or fewer seeds than rounds.
     """
     episodes = env.num_envs if episodes is None else episodes
-    if isinstance(episodes, bool) or not isinstance(episodes, int) or episodes < 2:
+    if not is_whole(episodes) or episodes < 2:
         raise UserError(
             f"episodes={episodes!r}: must be a whole number of at least 2, for the intervals; 100 or more are usual"
         )

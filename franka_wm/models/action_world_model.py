@@ -18,7 +18,6 @@ from franka_wm.models.history import FrameHistory, HistoryWorldModel
 from franka_wm.models.images import ImageSize, check_image_sizes, shared_image_size, stack_cameras
 from franka_wm.models.layers import mlp, unit_gain
 from franka_wm.models.normalizer import ObservationNormalizer
-from franka_wm.models.options import COEFFICIENT, FRACTION, POSITIVE, Range
 from franka_wm.models.regularizers import (
     CollapseGuard,
     CollapseName,
@@ -28,6 +27,7 @@ from franka_wm.models.regularizers import (
 )
 from franka_wm.models.transformer import MLPDynamics, TokenDynamics
 from franka_wm.models.windows import check_windows, window_of
+from franka_wm.options import COEFFICIENT, FRACTION, POSITIVE, Bounds
 
 
 class ActionWorldModel(HistoryWorldModel):
@@ -83,7 +83,7 @@ class ActionWorldModel(HistoryWorldModel):
         ModuleNotFoundError: `huggingface` without transformers.
     """
 
-    ranges: ClassVar[Mapping[str, Range]] = {
+    ranges: ClassVar[Mapping[str, Bounds]] = {
         **dict.fromkeys(
             ("action_dim", "encoder_width", "encoder_depth", "encoder_heads", "patch_size"), POSITIVE
         ),
@@ -92,7 +92,7 @@ class ActionWorldModel(HistoryWorldModel):
         **dict.fromkeys(("predictor_hidden_dim", "rollout", "guard_directions"), POSITIVE),
         **dict.fromkeys(("guard_coef", "weight_decay", "encoder_lr_scale"), COEFFICIENT),
         "ema": FRACTION,
-        "dropout": Range(0, 1, without_high=True),
+        "dropout": Bounds(least=0, below=1),
     }
 
     def __init__(

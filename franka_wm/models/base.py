@@ -12,7 +12,7 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor, nn
 
 from franka_wm.models.groups import ParameterGroup, decay_groups
-from franka_wm.models.options import Range, check_options
+from franka_wm.options import Bounds, check_arguments
 
 ABILITIES: Mapping[str, tuple[str, ...]] = MappingProxyType(
     {
@@ -43,7 +43,7 @@ class WorldModel(nn.Module):
     """Whether `loss` takes windows that go on past the end of an episode."""
     replay_keys: tuple[str, ...] = ()
     """Entries that the acting policy writes and `loss` reads."""
-    ranges: ClassVar[Mapping[str, Range]] = MappingProxyType({})
+    ranges: ClassVar[Mapping[str, Bounds]] = MappingProxyType({})
     """Option -> values that it may have. `validate` checks them."""
 
     # Abilities, see `ABILITIES`.
@@ -185,7 +185,7 @@ class WorldModel(nn.Module):
         Raises:
             UserError: one line with the option, its value and what is allowed.
         """
-        check_options(cls, options, cls.ranges)
+        check_arguments(cls, options, "model", cls.ranges)
 
     def _lacks(self, name: str) -> NotImplementedError:
         return NotImplementedError(f"{type(self).__name__} has no {name}; see docs/models.md")

@@ -22,7 +22,6 @@ from franka_wm.models.images import (
 )
 from franka_wm.models.layers import initialize
 from franka_wm.models.masks import Sampler, make_masks
-from franka_wm.models.options import COEFFICIENT, FRACTION, POSITIVE, Range
 from franka_wm.models.regularizers import (
     CollapseGuard,
     CollapseName,
@@ -38,6 +37,7 @@ from franka_wm.models.vision import (
     vit_size,
 )
 from franka_wm.models.windows import check_windows
+from franka_wm.options import COEFFICIENT, FRACTION, POSITIVE, Bounds
 
 # recipe -> (guard, masks, clips, tubelet): what it takes where nothing else is asked for
 RECIPES: dict[str, tuple[CollapseName, str | None, bool, int]] = {
@@ -99,7 +99,7 @@ class JEPA(WorldModel):
         ValueError: a setting that cannot work.
     """
 
-    ranges: ClassVar[Mapping[str, Range]] = {
+    ranges: ClassVar[Mapping[str, Bounds]] = {
         **dict.fromkeys(
             ("encoder_width", "encoder_depth", "encoder_heads", "patch_size", "tubelet"), POSITIVE
         ),
@@ -107,8 +107,8 @@ class JEPA(WorldModel):
         **dict.fromkeys(("ema_steps", "guard_directions", "global_views"), POSITIVE),
         **dict.fromkeys(("guard_coef", "weight_decay"), COEFFICIENT),
         **dict.fromkeys(("ema_start", "ema_end"), FRACTION),
-        "local_views": Range(0),
-        "mask_ratio": Range(0, 1, without_low=True, without_high=True),
+        "local_views": Bounds(least=0),
+        "mask_ratio": Bounds(above=0, below=1),
     }
 
     def __init__(

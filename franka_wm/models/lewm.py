@@ -16,7 +16,6 @@ from franka_wm.models.history import FrameHistory, HistoryWorldModel
 from franka_wm.models.images import ImageSize, check_image_sizes, shared_image_size, stack_cameras
 from franka_wm.models.layers import TwoHotSymlog, initialize, mlp, unit_gain, zero_head
 from franka_wm.models.normalizer import ObservationNormalizer
-from franka_wm.models.options import COEFFICIENT, FRACTION, POSITIVE, Range, with_defaults
 from franka_wm.models.regularizers import (
     ProjectionMLP,
     SIGReg,
@@ -27,6 +26,7 @@ from franka_wm.models.regularizers import (
 from franka_wm.models.transformer import CausalTransformer, block_causal_mask, hide_invalid
 from franka_wm.models.vision import ViT, vit_size
 from franka_wm.models.windows import check_windows, window_of
+from franka_wm.options import COEFFICIENT, FRACTION, POSITIVE, Bounds, with_defaults
 
 
 class LeWorldModel(HistoryWorldModel):
@@ -81,7 +81,7 @@ class LeWorldModel(HistoryWorldModel):
         ValueError: a setting that cannot work.
     """
 
-    ranges: ClassVar[Mapping[str, Range]] = {
+    ranges: ClassVar[Mapping[str, Bounds]] = {
         **dict.fromkeys(
             ("action_dim", "embed_dim", "state_embed_dim", "state_hidden_dim", "history"), POSITIVE
         ),
@@ -92,7 +92,7 @@ class LeWorldModel(HistoryWorldModel):
         **dict.fromkeys(("predictor_head_dim", "predictor_mlp", "sigreg_directions", "rollout"), POSITIVE),
         **dict.fromkeys(("sigreg_coef", "infonce_coef", "inverse_coef", "weight_decay"), COEFFICIENT),
         "discount": FRACTION,
-        "dropout": Range(0, 1, without_high=True),
+        "dropout": Bounds(least=0, below=1),
     }
 
     def __init__(

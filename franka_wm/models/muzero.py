@@ -14,10 +14,10 @@ from franka_wm.errors import UserError
 from franka_wm.models.groups import ParameterGroup, decay_groups
 from franka_wm.models.images import ImageSize, check_images
 from franka_wm.models.layers import NormedLinear, SimNorm, TwoHotSymlog, initialize, mlp
-from franka_wm.models.options import COEFFICIENT, FRACTION, POSITIVE, Range, with_defaults
 from franka_wm.models.returns import discount_per_step, n_step_returns, value_range
 from franka_wm.models.simplicial import SimplicialWorldModel
 from franka_wm.models.windows import check_windows
+from franka_wm.options import COEFFICIENT, FRACTION, POSITIVE, Bounds, with_defaults
 
 
 class MuZero(SimplicialWorldModel):
@@ -78,15 +78,15 @@ class MuZero(SimplicialWorldModel):
         True  # the loss looks for the end itself; windows within one episode seldom show what precedes it
     )
     replay_keys = ("search_policy", "search_value")
-    ranges: ClassVar[Mapping[str, Range]] = {
+    ranges: ClassVar[Mapping[str, Bounds]] = {
         **dict.fromkeys(
             ("num_actions", "latent_dim", "simnorm_dim", "encoder_dim", "encoder_layers"), POSITIVE
         ),
         **dict.fromkeys(("hidden_dim", "channels", "unroll", "n_step"), POSITIVE),
         **dict.fromkeys(("reward_coef", "value_coef", "policy_coef", "consistency_coef"), COEFFICIENT),
-        **dict.fromkeys(("projector_dim", "bins"), Range(2)),
+        **dict.fromkeys(("projector_dim", "bins"), Bounds(least=2)),
         "discount": FRACTION,
-        "random_shift": Range(0),
+        "random_shift": Bounds(least=0),
         "weight_decay": COEFFICIENT,
     }
     actions: Tensor

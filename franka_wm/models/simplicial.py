@@ -21,7 +21,7 @@ from franka_wm.models.normalizer import (
     register_statistics,
     standardize,
 )
-from franka_wm.models.options import with_defaults
+from franka_wm.options import with_defaults
 
 
 class SimplicialWorldModel(WorldModel):

@@ -25,11 +25,11 @@ from franka_wm.models.layers import (
     zero_head,
 )
 from franka_wm.models.normalizer import concatenate
-from franka_wm.models.options import COEFFICIENT, POSITIVE, Range, with_defaults
 from franka_wm.models.returns import discount_per_step, value_range
 from franka_wm.models.simplicial import SimplicialWorldModel
 from franka_wm.models.streams import side_stream
 from franka_wm.models.windows import check_windows, window_of
+from franka_wm.options import COEFFICIENT, POSITIVE, Bounds, with_defaults
 
 
 class TDMPC2(SimplicialWorldModel):
@@ -95,14 +95,14 @@ class TDMPC2(SimplicialWorldModel):
         ValueError: a size or coefficient that cannot work, or neither `episode_length` nor `discount`.
     """
 
-    ranges: ClassVar[Mapping[str, Range]] = {
+    ranges: ClassVar[Mapping[str, Bounds]] = {
         **dict.fromkeys(("action_dim", "latent_dim", "simnorm_dim", "encoder_dim"), POSITIVE),
         **dict.fromkeys(("encoder_layers", "hidden_dim", "value_members", "channels"), POSITIVE),
         **dict.fromkeys(("consistency_coef", "reward_coef", "value_coef", "termination_coef"), COEFFICIENT),
-        **dict.fromkeys(("num_q", "bins"), Range(2)),
-        **dict.fromkeys(("discount", "dropout"), Range(0, 1, without_high=True)),
-        "tau": Range(0, 1, without_low=True),
-        "random_shift": Range(0),
+        **dict.fromkeys(("num_q", "bins"), Bounds(least=2)),
+        **dict.fromkeys(("discount", "dropout"), Bounds(least=0, below=1)),
+        "tau": Bounds(above=0, most=1),
+        "random_shift": Bounds(least=0),
     }
 
     def __init__(

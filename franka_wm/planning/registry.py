@@ -8,7 +8,7 @@ from collections.abc import Mapping
 from importlib import import_module
 from typing import Any
 
-from franka_wm.options import check_arguments
+from franka_wm.options import check_arguments, check_names
 
 # name -> (module, class, whether it chooses among discrete actions, what it is in one line)
 _PLANNERS: dict[str, tuple[str, str, bool, str]] = {
@@ -78,6 +78,7 @@ def validate(name: str, options: Mapping[str, Any]) -> None:
     Raises:
         UserError: an option that it does not have, or a value of another type.
     """
+    check_names(planner(name), options, "planner")
     check_arguments(planner(name), options, "planner")
 
 

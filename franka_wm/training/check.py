@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+import torch
+
+from franka_wm import models
 from franka_wm.device import resolve_device
 from franka_wm.envs.external import ExternalConfig, check_external
 from franka_wm.envs.franka import check_robot
 from franka_wm.errors import UserError
+from franka_wm.models import WorldModel
 from franka_wm.training import build
 from franka_wm.training.loggers import check_loggers
 from franka_wm.training.settings import RunSettings
@@ -90,7 +94,7 @@ def _check_evaluation(run: RunSettings) -> None:
 
 
 def _check_parts(run: RunSettings) -> None:
-    """Builds what costs little, a model for the CPU among it, where the environment's sizes are known before it is."""
+    """Builds what costs little, where the environment's sizes are known before it is."""
     if isinstance(run.env.config, ExternalConfig):
         check_external(run.env.config)
     if not run.is_arm:
@@ -99,7 +103,7 @@ def _check_parts(run: RunSettings) -> None:
     if run.is_offline:
         return
     spaces = Spaces.of_config(run.env.arm, discrete=run.is_discrete)
-    model = build.make_model(run, spaces, "cpu")
+    model = _sketch(run, spaces)
     if run.objective_name == "goal_image":
         goals = build.goal_pictures(model.image_sizes).values()
         if not goals or any(goal not in spaces.image_sizes for goal in goals):
@@ -111,6 +115,17 @@ def _check_parts(run: RunSettings) -> None:
     build.make_objective(run, model)
     if model.has_next:
         build.make_planner(run, spaces.num_actions or spaces.action_dim)
+
+
+def _sketch(run: RunSettings, spaces: Spaces) -> WorldModel:
+    """The model's shapes: its constructor refuses what it would, but no weight is allocated or drawn.
+
+    A family of one's own, whose constructor may look at values, and one that reads weights are built whole.
+    """
+    reads = any(run.model.options.get(name) is not None for name in ("encoder_from", "huggingface"))
+    ours = run.model.family.__module__.startswith(f"{models.__name__}.")
+    with torch.device("meta" if ours and not reads else "cpu"):
+        return build.make_model(run, spaces)
 
 
 def _check_export(run: RunSettings) -> None:

@@ -9,6 +9,7 @@ from typing import Any
 from franka_wm.data.lerobot import schema
 from franka_wm.data.lerobot.source import Source
 from franka_wm.errors import UserError
+from franka_wm.options import is_whole
 
 AFTER = {
     "reward": schema.REWARD,
@@ -267,7 +268,7 @@ def _image_size(image_size: int | Sequence[int] | None) -> tuple[int, int] | Non
     if image_size is None:
         return None
     sides = (image_size, image_size) if isinstance(image_size, int) else tuple(image_size)
-    if len(sides) != 2 or not all(isinstance(s, int) and not isinstance(s, bool) and s > 0 for s in sides):
+    if len(sides) != 2 or not all(is_whole(side) and side > 0 for side in sides):
         raise UserError(f"dataset.image_size={image_size!r}: must be a number of pixels, or [height, width]")
     return sides[0], sides[1]
 

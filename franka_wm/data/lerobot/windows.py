@@ -16,6 +16,7 @@ from franka_wm.data.lerobot.cache import Cache
 from franka_wm.data.lerobot.mapping import FeatureMap
 from franka_wm.data.stacks import CHANNELS
 from franka_wm.errors import UserError
+from franka_wm.options import is_real, whole_rule
 from franka_wm.seeding import derive_seed, restore_generator
 
 SPLITS = ("train", "validation", "all")
@@ -111,12 +112,10 @@ class RecordedWindows:
         frame_stack: int = 1,
     ):
         for name, value in (("window", window), ("batch_size", batch_size), ("frame_stack", frame_stack)):
-            if isinstance(value, bool) or not isinstance(value, int) or value < 1:
-                raise UserError(f"{name}={value!r}: must be a whole number of at least 1")
+            whole_rule(least=1).check(name, value)
         if split not in SPLITS:
             raise UserError(f"split={split!r}: must be one of {', '.join(SPLITS)}")
-        number = isinstance(validation_fraction, (int, float)) and not isinstance(validation_fraction, bool)
-        if not number or not 0 <= validation_fraction < 1:
+        if not is_real(validation_fraction) or not 0 <= validation_fraction < 1:
             raise UserError(
                 f"dataset.validation_fraction={validation_fraction!r}: must be at least 0 and below 1"
             )

@@ -38,6 +38,7 @@ from franka_wm.data.lerobot.shard_workers import (
 )
 from franka_wm.data.lerobot.terminal import TERMINAL_FOLDER
 from franka_wm.errors import UserError
+from franka_wm.options import whole_rule
 
 SHARD_BYTES = 64_000_000
 """Pictures and numbers of one shard in memory, before they are compressed."""
@@ -72,9 +73,8 @@ class DatasetWriter:
         shard_frames: int | None = None,
         resume: bool = False,
     ):
-        for name, value, least in (("workers", workers, 0), ("shard_frames", shard_frames, 1)):
-            if value is not None and (isinstance(value, bool) or not isinstance(value, int) or value < least):
-                raise UserError(f"{name}={value!r}: must be a whole number of at least {least}")
+        whole_rule(least=0).check("workers", workers)
+        whole_rule(least=1, null="by their size").check("shard_frames", shard_frames)
         self.out = Path(out).absolute()
         self.schema = schema
         self.working = self.out.with_name(self.out.name + ".writing")

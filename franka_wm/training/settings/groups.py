@@ -13,7 +13,7 @@ from franka_wm import models
 from franka_wm.envs.config import FrankaConfig
 from franka_wm.envs.external import ExternalConfig, external_config
 from franka_wm.errors import UserError
-from franka_wm.options import choice, flag, is_whole, read, real, several, text, value, whole
+from franka_wm.options import choice, flag, is_whole, read, real, several, text, value, whole, whole_rule
 from franka_wm.policies.names import POLICIES
 from franka_wm.policies.planner import PRECISIONS
 from franka_wm.training.learner import SCHEDULES
@@ -228,12 +228,12 @@ class EnvSettings:
         kind = values["kind"]
         if kind == "franka":
             own = {k: v for k, v in values.items() if k not in ("kind", "urdf_path")}
-            _check_frames(own.get("frame_stack", 1))
+            whole_rule(least=1).check("env.frame_stack", own.get("frame_stack", 1))
             config = FrankaConfig.from_mapping(own)
             return cls(kind, config, values.get("urdf_path"), config.frame_stack, values)
         if kind == "none":
             frames = values.get("frame_stack", 1)
-            _check_frames(frames)
+            whole_rule(least=1).check("env.frame_stack", frames)
             return cls(kind, None, None, frames, values)
         return cls(kind, external_config(values), values=values)
 
@@ -258,11 +258,6 @@ class EnvSettings:
         if isinstance(self.config, FrankaConfig):
             return self.config.task
         return "none" if self.config is None else self.config.name
-
-
-def _check_frames(count: Any) -> None:
-    if not is_whole(count) or count < 1:
-        raise UserError(f"env.frame_stack={count!r}: must be a whole number of at least 1")
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,61 @@
+"""What is checked before anything is built costs no model."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from torch import nn
+
+from franka_wm import models
+from franka_wm.errors import UserError
+from franka_wm.training import build
+from franka_wm.training.check import check
+from franka_wm.training.spaces import Spaces
+
+MODELS = (
+    (),
+    ("env=reach_pixels", "model=tdmpc2_pixels"),
+    ("env=reach_fixed", "model=muzero", "planner=gumbel"),
+    ("env=reach_goal_image", "model=lewm"),
+    ("env=reach_goal_image", "model=action_world_model"),
+    ("env=reach_goal_image", "model=vjepa"),
+)
+
+
+def built(settings, monkeypatch) -> nn.Module:
+    """The model that a check looks at."""
+    made, make = [], build.make_model
+    monkeypatch.setattr(build, "make_model", lambda *given: made.append(make(*given)) or made[-1])
+    check(settings)
+    (model,) = made
+    return model
+
+
+@pytest.mark.parametrize("words", MODELS)
+def test_a_check_looks_at_the_shapes_of_the_very_model(words, settled, monkeypatch) -> None:
+    settings = settled("device=cpu", "scale=smoke", *words)
+    state = torch.get_rng_state()
+    sketch = built(settings, monkeypatch)
+    assert torch.equal(torch.get_rng_state(), state), "a check drew weights"
+    assert {one.device.type for one in sketch.state_dict().values() if torch.is_tensor(one)} == {"meta"}
+    whole = build.make_model(
+        settings, Spaces.of_config(settings.env.arm, discrete=settings.is_discrete), "cpu"
+    )
+    shapes = [{k: v.shape for k, v in one.named_parameters()} for one in (sketch, whole)]
+    assert shapes[0] == shapes[1] != {}
+
+
+def test_what_a_constructor_refuses_is_refused_by_the_check(settled) -> None:
+    with pytest.raises(UserError, match=r"model=vjepa|model=jepa.*patch_size must divide"):
+        check(settled("device=cpu", "scale=smoke", *MODELS[-1], "model.patch_size=7"))
+
+
+def test_a_family_of_ones_own_is_built_whole(settled, monkeypatch) -> None:
+    class Mine(models.family("tdmpc2")):
+        def __init__(self, **options):
+            super().__init__(**options)
+            self.norm = sum(float(one.norm()) for one in self.parameters())  # needs values
+
+    monkeypatch.setitem(models._REGISTERED, "mine", (Mine, ""))
+    sketch = built(settled("device=cpu", "scale=smoke", "model.name=mine"), monkeypatch)
+    assert {one.device.type for one in sketch.parameters()} == {"cpu"}
