@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from franka_wm.commands.arguments import FLAG, verb, whole, word
+from franka_wm.commands.arguments import FLAG, real, verb, whole, word
 from franka_wm.commands.overrides import compose, number
 from franka_wm.console import announced, say
 from franka_wm.data.lerobot.schema import FORMATS, schema_for
@@ -18,7 +18,7 @@ from franka_wm.policies.names import refuse_old_name
 if TYPE_CHECKING:
     from franka_wm.data.lerobot.collect import Source
 
-_SIMPLE = ("random", "noop", "ik")
+_SIMPLE = ("random", "noop", "ik", "expert")
 _PARTS = ("planner", "policy")
 
 
@@ -34,7 +34,8 @@ _PARTS = ("planner", "policy")
 @word("episodes", "how many, with those of a resumed one", whole(1), 100)
 @word(
     "policy",
-    "random (smooth motion), noop, ik (inverse kinematics), or an agent: a run's folder, a checkpoint, hf:user/name",
+    "random (smooth motion), noop, ik (inverse kinematics), expert (of tasks with a gripper), or an agent: a run's "
+    "folder, a checkpoint, hf:user/name",
     default="random",
 )
 @word("checkpoint", "an agent of which only a part acts: policy=planner or policy=policy", metavar="RUN")
@@ -47,6 +48,8 @@ _PARTS = ("planner", "policy")
 @word("num_envs", "worlds at once; collector.num_envs if not given", whole(1), metavar="N")
 @word("workers", "writing processes", whole(), 2)
 @word("shard_frames", "steps in one file, at most", whole(1), metavar="N")
+@word("success_only", "keep only episodes that end in success", FLAG, False)
+@word("noise", "of the expert's actions, standard deviation; it recovers from that", real(0.0), metavar="X")
 @word("resume", "go on with an unfinished dataset, or add to a finished one", FLAG, False)
 def collect(
     out: str,
@@ -55,6 +58,7 @@ def collect(
     checkpoint: str | None,
     format: str,
     num_envs: int | None,
+    noise: float | None,
     overrides: Sequence[str],
     **writing: Any,
 ) -> int:
@@ -62,7 +66,9 @@ def collect(
 
     Ctrl-C stops and leaves a dataset of the whole episodes so far.
     """
-    source = open_source(policy, checkpoint, overrides, episodes=episodes, num_envs=num_envs, format=format)
+    source = open_source(
+        policy, checkpoint, overrides, episodes=episodes, num_envs=num_envs, format=format, noise=noise
+    )
     from franka_wm.data.lerobot.collect import gather
 
     folder, complete = gather(source, out=out, episodes=episodes, format=format, **writing)
@@ -84,6 +90,7 @@ def open_source(
     episodes: int,
     num_envs: int | None = None,
     format: str = "exact",
+    noise: float | None = None,
 ) -> Source:
     """Build the worlds and the policy.
 
@@ -94,6 +101,7 @@ def open_source(
         episodes: How many will be played.
         num_envs: Worlds at once.
         format: Of the dataset's images.
+        noise: Of the expert's actions.
 
     Raises:
         UserError: One line, for what cannot be built.
@@ -112,12 +120,16 @@ def open_source(
                 f"collect: policy={name!r}: must be one of {', '.join(_SIMPLE)}, or the folder of a run"
             )
         name, checkpoint = "", name
+    if noise and name != "expert":
+        raise UserError(f"collect: noise={noise:g}: is for policy=expert")
     if name in _SIMPLE:
-        return _simple(name, overrides, episodes, num_envs, format)
+        return _simple(name, overrides, episodes, num_envs, format, noise or 0.0)
     return _agent(name, str(checkpoint), overrides, num_envs or min(64, episodes))
 
 
-def _simple(name: str, overrides: Sequence[str], episodes: int, num_envs: int | None, format: str) -> Source:
+def _simple(
+    name: str, overrides: Sequence[str], episodes: int, num_envs: int | None, format: str, noise: float
+) -> Source:
     from omegaconf import OmegaConf
 
     cfg = compose(overrides, tuple(collect.words))  # checked before anything heavy is imported
@@ -133,9 +145,11 @@ def _simple(name: str, overrides: Sequence[str], episodes: int, num_envs: int | 
             f"collect: env.kind={cfg.env.kind!r}: datasets are gathered from the arm (env=reach, …)"
         )
     values: Any = OmegaConf.to_container(cfg.env, resolve=True)
-    added = [key for key in ("state", "joint_target") if key not in values["observations"]]
+    needed = ("state", "joint_target", *(["objects"] if name == "expert" else []))
+    added = [key for key in needed if key not in values["observations"]]
     if added:
-        say(f"env.observations: adding {' and '.join(added)}, which a dataset always has")
+        what = "a dataset always has" if "objects" not in added else "the expert and a dataset need"
+        say(f"env.observations: adding {' and '.join(added)}, which {what}")
     values["observations"] = [*values["observations"], *added]
     del values["kind"]
     urdf_path = values.pop("urdf_path")
@@ -147,18 +161,21 @@ def _simple(name: str, overrides: Sequence[str], episodes: int, num_envs: int | 
     import torch
 
     from franka_wm.data.lerobot.collect import Source
+    from franka_wm.policies.expert import ExpertPolicy
     from franka_wm.policies.scripted import NoopPolicy, OraclePolicy, SmoothRandomPolicy
     from franka_wm.seeding import derive_seed
 
+    generator = torch.Generator(device=env.device).manual_seed(derive_seed("policies", seed, "collection"))
     makers: dict[str, Callable[[], Any]] = {
         "noop": lambda: NoopPolicy(env.action_dim),
         "ik": lambda: OraclePolicy(env.kinematics, config),
         "random": lambda: SmoothRandomPolicy(
             env.action_dim,
             smoothness=smoothness,
-            generator=torch.Generator(device=env.device).manual_seed(
-                derive_seed("policies", seed, "collection")
-            ),
+            generator=generator,
+        ),
+        "expert": lambda: ExpertPolicy(
+            env.simulation.task, env.kinematics, config, noise=noise, generator=generator
         ),
     }
     resolved: Any = OmegaConf.to_container(cfg, resolve=True)

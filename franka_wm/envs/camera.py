@@ -28,12 +28,13 @@ WRIST_FOV_DEGREES = 75.0
 GOAL_MARKER = "goal_marker"
 
 TURNS = {"front": 0.0, "side": -math.pi / 2.0}
-"""Where the fixed cameras stand: so far around the base's vertical axis from the config's front camera [rad]."""
+"""Where the fixed cameras stand: so far around the vertical axis through what they look at [rad]."""
 
 
 def camera_framing(config: FrankaConfig) -> tuple[tuple[float, float, float], tuple[float, float, float]]:
     """(eye, target) in world metres."""
-    return (config.camera_distance, 0.0, config.camera_height), (0.0, 0.0, config.camera_target_height)
+    target = (config.camera_target_distance, 0.0, config.camera_target_height)
+    return (config.camera_distance, 0.0, config.camera_height), target
 
 
 def look_at(eye, target) -> wp.transformf:
@@ -117,7 +118,8 @@ class Camera:
             direction=wp.vec3f(*(light / np.linalg.norm(light)).tolist()),
         )
         turn = wp.quat_from_axis_angle(wp.vec3f(0.0, 0.0, 1.0), TURNS.get(name, 0.0))
-        self._turn = wp.transformf(wp.vec3f(0.0, 0.0, 0.0), turn)
+        axis = wp.vec3f(config.camera_target_distance, 0.0, 0.0)
+        self._turn = wp.transformf(axis - wp.quat_rotate(turn, axis), turn)  # pyright: ignore[reportOperatorIssue]
         pose = self._turn * look_at(*camera_framing(config))  # pyright: ignore[reportOperatorIssue]
         self.transforms = wp.array([pose] * views, dtype=wp.transformf, device=model.device)
         self.views = wp.array(np.arange(views), dtype=int, device=model.device)

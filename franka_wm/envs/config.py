@@ -5,10 +5,16 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields
+from typing import TYPE_CHECKING
 
+from franka_wm.envs.constants import HAND_DIM, HOME, NUM_JOINTS, STATE_DIM
+from franka_wm.envs.scene import Scene
 from franka_wm.errors import UserError
 
-OBSERVATIONS = ("pixels", "depth", "segmentation", "goal_pixels", "state", "joint_target")
+if TYPE_CHECKING:
+    from franka_wm.envs.tasks import Task
+
+OBSERVATIONS = ("pixels", "depth", "segmentation", "goal_pixels", "state", "joint_target", "objects")
 """Observation groups that can be asked for; ``goal`` is always emitted."""
 
 IMAGES = ("pixels", "depth", "segmentation", "goal_pixels")
@@ -16,14 +22,6 @@ CAMERAS = ("front", "side", "wrist")
 ACTION_MODES = {"joint_delta": 7, "joint_position": 7, "ee_delta": 3}
 """Meaning of an action, and its size."""
 
-TASKS = ["reach", "track"]
-"""What ``task`` may be; :func:`franka_wm.envs.tasks.register` adds to it."""
-
-HOME = (0.0, -0.4, 0.0, -2.0, 0.0, 1.6, 0.8)
-"""Home pose of the seven arm joints [rad]."""
-
-NUM_JOINTS = 7
-STATE_DIM = 20
 MAX_IMAGE_SIZE = 2048
 
 
@@ -111,7 +109,7 @@ class FrankaConfig:
         action_penalty: Weight of the mean squared action in the reward.
         camera_distance: The eye's x [m].
         camera_height: The eye's z [m].
-        camera_target_height: The camera looks at (0, 0, this height) [m].
+        camera_target_height, camera_target_distance: The camera looks at (distance, 0, height) [m].
         camera_fov_degrees: Vertical field of view [degrees].
         enable_shadows: Cast shadows in ``pixels`` (about half the rendering speed).
         enable_textures: Use mesh textures where the robot has them.
@@ -129,7 +127,16 @@ class FrankaConfig:
             (the targets themselves, −1 and 1 at the joint limits) or ``"ee_delta"`` (tool displacement in the
             world, × ``ee_scale``, through differential inverse kinematics).
         ee_scale: Tool displacement per unit of action, for ``"ee_delta"`` [m].
-        task: ``"reach"`` (the goal stands still) or ``"track"`` (it moves on a circle).
+        task: What is asked of the arm; ``docs/tasks.md`` lists the tasks. It also says which scene, gripper and home
+            pose there are, where the config does not.
+        gripper: Drive both fingers by one command: one more action, −1 closed and 1 open. ``None``: if the task
+            needs it.
+        gripper_force: Largest force of each finger [N]; the Franka Hand's is 70 continuously.
+        scene: What stands around the arm: :class:`~franka_wm.envs.scene.Scene`, or the same as a mapping. ``None``:
+            the task's. With objects or obstacles there are contacts; they need the gripper.
+        max_contacts: Contacts for which there is room in each world, on average. ``None``: by the scene.
+        end_when_lost: End the episode where an object has left the table.
+        home: Joint angles at the start, before noise [rad]. ``None``: the task's.
         reward: ``"dense"`` (−tanh distance), ``"sparse"`` (1 where solved, else 0) or ``"normalized"`` (the part
             of the episode's initial distance that has been closed, at least −1); all minus the action penalty.
         track_radius, track_period: Of the circle [m] and of one turn [s], for ``task="track"``.
@@ -140,9 +147,9 @@ class FrankaConfig:
             and those of the steps before it. An episode begins with copies of its first.
         show_goal: Draw the goal as a small red ball in every picture.
         randomization: Ranges that each episode of each world draws from; :class:`Randomization`.
-        finger_opening: Each finger's distance from the closed position [m]; the fingers are held there.
-        observations: Which of ``("pixels", "depth", "segmentation", "goal_pixels", "state", "joint_target")`` are
-            emitted. ``goal`` always is.
+        finger_opening: Each finger's distance from the closed position [m]; without a gripper it is held there.
+        observations: Which of ``("pixels", "depth", "segmentation", "goal_pixels", "state", "joint_target",
+            "objects")`` are emitted. ``goal`` always is.
         episode_length: Control steps after which an episode is truncated.
         goal_sampling: ``"fixed"`` (``goal``) or ``"reachable"`` (the tool position of a random pose, drawn
             per world and episode).
@@ -173,6 +180,7 @@ class FrankaConfig:
     camera_distance: float = 1.15
     camera_height: float = 0.65
     camera_target_height: float = 0.45
+    camera_target_distance: float = 0.0
     camera_fov_degrees: float = 60.0
     enable_shadows: bool = False
     enable_textures: bool = False
@@ -184,6 +192,12 @@ class FrankaConfig:
     action_mode: str = "joint_delta"
     ee_scale: float = 0.05
     task: str = "reach"
+    gripper: bool | None = None
+    gripper_force: float = 20.0
+    scene: Scene | None = None
+    max_contacts: int | None = None
+    end_when_lost: bool = True
+    home: tuple[float, ...] | None = None
     reward: str = "dense"
     track_radius: float = 0.1
     track_period: float = 4.0
@@ -242,13 +256,19 @@ class FrankaConfig:
             ("camera_distance", -100.0, 100.0, "m"),
             ("camera_height", -100.0, 100.0, "m"),
             ("camera_target_height", -100.0, 100.0, "m"),
+            ("camera_target_distance", -100.0, 100.0, "m"),
+            ("gripper_force", 1.0, 70.0, "N"),
         ):
             self._check_real(name, low, high, unit)
         if self.mesh_detail is not None:
             self._check_real("mesh_detail", 0.0, 0.1, "m")
-        if self.camera_distance == 0 and self.camera_height == self.camera_target_height:
+        if (self.camera_distance, self.camera_height) == (
+            self.camera_target_distance,
+            self.camera_target_height,
+        ):
             raise UserError(
-                "camera_distance=0 and camera_height=camera_target_height: the eye sits on its target; move one"
+                f"camera_distance={self.camera_distance:g} and camera_height=camera_target_height: the eye sits on "
+                "its target; move one"
             )
         for name in ("target_ke", "target_kd"):
             value = getattr(self, name)
@@ -261,6 +281,7 @@ class FrankaConfig:
             raise UserError(f"goal={self.goal}: give three finite numbers (x, y, z) in metres")
         self._check_choice("solver", ("auto", "mujoco", "featherstone"))
         from franka_wm.envs.robots.sources import SOURCES  # here: robots need this module
+        from franka_wm.envs.tasks import TASKS
 
         self._check_choice("robot", tuple(SOURCES))
         self._check_choice("goal_sampling", ("fixed", "reachable"))
@@ -268,8 +289,8 @@ class FrankaConfig:
         self._check_choice("task", TASKS)
         self._check_choice("reward", ("dense", "sparse", "normalized"))
         self._check_choice("auto_reset", ("native", "standard"))
-        for name in (f.name for f in fields(self) if isinstance(f.default, bool)):
-            if not isinstance(getattr(self, name), bool):
+        for name in (f.name for f in fields(self) if isinstance(f.default, bool) or f.name == "gripper"):
+            if not isinstance(getattr(self, name), bool) and (name != "gripper" or self.gripper is not None):
                 raise UserError(f"{name}={getattr(self, name)!r}: must be true or false")
         for name, known in (("observations", OBSERVATIONS), ("cameras", CAMERAS)):
             chosen = getattr(self, name)
@@ -283,6 +304,7 @@ class FrankaConfig:
             raise UserError(
                 "limit_velocity needs target_ke above 0: it limits how far the servo's set point may lead"
             )
+        self._check_scene()
         if self.solver == "featherstone" and self.substeps % 2:
             raise UserError(
                 f"substeps={self.substeps} with solver=featherstone: must be even (it swaps two state buffers); "
@@ -290,9 +312,46 @@ class FrankaConfig:
             )
 
     @property
+    def task_class(self) -> type[Task]:
+        """The class of the task."""
+        from franka_wm.envs.tasks import task_class
+
+        return task_class(self.task)
+
+    @property
+    def has_gripper(self) -> bool:
+        """Whether the fingers are driven: as asked for, or because the task needs it."""
+        return self.task_class.gripper if self.gripper is None else self.gripper
+
+    @property
+    def surroundings(self) -> Scene | None:
+        """What stands around the arm: as given, or the task's; ``None``: nothing."""
+        return self.task_class.scene if self.scene is None else self.scene
+
+    @property
+    def start_pose(self) -> tuple[float, ...]:
+        """Joint angles at the start, before noise, (7,) [rad]."""
+        return self.home or self.task_class.home or HOME
+
+    @property
     def action_dim(self) -> int:
-        """Size of an action."""
-        return ACTION_MODES[self.action_mode]
+        """Size of an action; the gripper's is the last."""
+        return ACTION_MODES[self.action_mode] + self.has_gripper
+
+    @property
+    def state_dim(self) -> int:
+        """Size of ``state``."""
+        return STATE_DIM + HAND_DIM * self.has_gripper
+
+    @property
+    def target_dim(self) -> int:
+        """Size of ``joint_target``: the joints', and the fingers' with a gripper."""
+        return NUM_JOINTS + self.has_gripper
+
+    @property
+    def num_objects(self) -> int:
+        """How many bodies move freely."""
+        return len(self.surroundings.objects) if self.surroundings else 0
 
     @property
     def images(self) -> tuple[str, ...]:
@@ -312,6 +371,28 @@ class FrankaConfig:
         if unknown:
             raise UserError(f"unknown environment option {unknown[0]!r}; known: {', '.join(sorted(known))}")
         return cls(**dict(values))
+
+    def _check_scene(self) -> None:
+        """Scene, gripper and what they need of the rest."""
+        if self.scene is not None:
+            object.__setattr__(self, "scene", Scene.of(self.scene))
+        if self.home is not None:
+            ok = isinstance(self.home, Sequence) and not isinstance(self.home, str)
+            if not ok or len(self.home) != NUM_JOINTS or not all(_is_number(q) for q in self.home):
+                raise UserError(f"home={self.home!r}: give {NUM_JOINTS} joint angles [rad], or null")
+            object.__setattr__(self, "home", tuple(float(q) for q in self.home))
+        if self.max_contacts is not None:
+            self._check_whole("max_contacts", 1, 10_000, "contacts of a world")
+        if self.task_class.gripper and not self.has_gripper:
+            raise UserError(f"gripper=false: task={self.task} needs the gripper; leave it at null")
+        if self.surroundings and not self.has_gripper:
+            raise UserError("scene: contacts need the fingers as bodies of their own; set gripper=true")
+        if self.has_gripper and self.solver == "featherstone":
+            raise UserError("gripper and scene need solver=mujoco")
+        if "objects" in self.observations and not self.num_objects:
+            raise UserError(
+                f"observations: task={self.task} has no objects; leave objects out, or give a scene"
+            )
 
     def _check_whole(self, name: str, low: int, high: int, unit: str) -> None:
         value = getattr(self, name)

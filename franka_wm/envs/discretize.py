@@ -8,7 +8,7 @@ import torch
 from torchrl.data import Categorical, Composite
 from torchrl.envs.transforms import Transform
 
-from franka_wm.envs.config import NUM_JOINTS
+from franka_wm.envs.constants import NUM_JOINTS
 from franka_wm.errors import UserError
 
 

@@ -11,6 +11,7 @@ import multiprocessing
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 
 import torch
@@ -20,10 +21,10 @@ from torchrl.envs import EnvBase
 
 from franka_wm.device import resolve_device
 from franka_wm.envs.camera import Camera, as_torch, camera_framing
-from franka_wm.envs.config import STATE_DIM, FrankaConfig
+from franka_wm.envs.config import FrankaConfig
 from franka_wm.envs.frames import FrameStack
 from franka_wm.envs.kinematics import check_robot
-from franka_wm.envs.simulation import STATISTICS, Simulation
+from franka_wm.envs.simulation import Simulation
 from franka_wm.envs.specs import observation_spec
 from franka_wm.envs.tasks import Task, goal_distance
 from franka_wm.errors import UserError
@@ -55,12 +56,15 @@ class FrankaEnv(EnvBase):
     key                 shape, dtype            meaning
     ==================  ======================  ==================================================================
     ``pixels``          (N, H, W, 3) uint8      the camera; present when asked for; 3 · ``frame_stack`` channels
-    ``state``           (N, 20) float32         joints 7 [rad], velocities 7 [rad/s], tool 3 [m], tool − goal 3 [m]
+    ``state``           (N, 20) float32         joints 7 [rad], velocities 7 [rad/s], tool 3 [m], tool − goal 3 [m];
+                                                with a gripper 28: fingers 2 [m], their speeds 2, tool's x y z w
+    ``objects``         (N, 13 · K) float32     of each: position, x y z w, velocity, angular velocity; if asked for
     ``joint_target``    (N, 7) float32          the servo's commanded angles [rad]; present when asked for
     ``goal``            (N, 3) float32          reach target in the world [m]
     ``success``         (N, 1) bool             tool within ``success_distance`` of the goal
     ``is_init``         (N, 1) bool             first observation of an episode
-    ``action``          (N, 7) float32          in [−1, 1]: change of the joint targets, × ``action_scale``
+    ``action``          (N, 7) float32          in [−1, 1]: change of the joint targets, × ``action_scale``; an eighth
+                                                is the gripper's: −1 closed, 1 open
     ``reward``          (N, 1) float32          −tanh(distance) − penalty · mean(action²)
     ``done``, …         (N, 1) bool             ``terminated`` by success (if asked), ``truncated`` by time
     ==================  ======================  ==================================================================
@@ -110,10 +114,12 @@ class FrankaEnv(EnvBase):
             raise UserError(f"num_envs={num_envs!r}: must be a whole number of at least 1")
         device = resolve_device(device)
         super().__init__(device=device, batch_size=torch.Size([num_envs]))
-        self.config = config
-        self.num_envs = num_envs
         if task is None:
             check_robot(config, urdf_path)
+        else:
+            config = task.config = replace(config, **task.brings())
+        self.config = config
+        self.num_envs = num_envs
         started = time.perf_counter()
         seed = own_seed() if seed is None else seed
         log.info("building %d worlds on %s with seed %d", num_envs, device, seed)
@@ -123,9 +129,7 @@ class FrankaEnv(EnvBase):
             "built in %.1f s; the first reset and step compile what is not cached yet",
             time.perf_counter() - started,
         )
-        self._restart = (
-            False  # whether finished worlds begin their next episode inside the step that is under way
-        )
+        self._restart = False  # whether the step under way begins the next episode of finished worlds
         self._stack = FrameStack(config.frame_stack) if config.frame_stack > 1 else None
         self._stacked = [
             key for key in self.simulation.renderer.images if self._stack and key.startswith("pixels")
@@ -324,7 +328,7 @@ class FrankaEnv(EnvBase):
 
     @property
     def state_dim(self) -> int:
-        return STATE_DIM
+        return self.config.state_dim
 
     @property
     def terminates(self) -> bool:
@@ -438,13 +442,7 @@ class FrankaEnv(EnvBase):
 
         Returns:
             ``episodes`` (count), ``return``, ``length``, ``success`` (at the end), ``success_once`` (means;
-            absent when no episode ended) and ``nonfinite`` (count of broken worlds).
+            absent when no episode ended), ``nonfinite`` (count of broken worlds) and, with a scene, ``overflow``
+            (count of steps that lost contacts for want of room; such a world is truncated).
         """
-        sums = self.simulation.tensors.statistics.sum(0).tolist()
-        if clear:
-            self.simulation.tensors.statistics.zero_()
-        totals = dict(zip(STATISTICS, sums, strict=True))
-        out = {"episodes": totals["episodes"], "nonfinite": totals["nonfinite"]}
-        if totals["episodes"]:
-            out |= {key: totals[key] / totals["episodes"] for key in STATISTICS[1:-1]}
-        return out
+        return self.simulation.statistics(clear=clear)

@@ -20,8 +20,9 @@ import numpy as np
 import torch
 from tensordict import TensorDictBase
 
-from franka_wm.envs.config import NUM_JOINTS, TASKS, FrankaConfig
+from franka_wm.envs.config import NUM_JOINTS, FrankaConfig
 from franka_wm.envs.franka import FrankaEnv
+from franka_wm.envs.tasks import TASKS
 from franka_wm.errors import UserError
 
 try:

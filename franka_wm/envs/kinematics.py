@@ -16,7 +16,8 @@ import numpy as np
 import torch
 import warp as wp
 
-from franka_wm.envs.config import HOME, FrankaConfig
+from franka_wm.envs.config import FrankaConfig
+from franka_wm.envs.constants import HOME
 from franka_wm.envs.robots import Robot, load_robot
 from franka_wm.errors import UserError
 
@@ -45,7 +46,8 @@ class Kinematics:
         self._parent = stack(list(robot.parent_frames))
         child_r, child_p = stack(list(robot.child_frames))
         self._child_inverse = (child_r.mT.contiguous(), -(child_r.mT @ child_p.unsqueeze(-1)).squeeze(-1))
-        self._tool = stack([robot.tool_frame])[1][0]
+        turned, tool = stack([robot.tool_frame])
+        self._tool, self._tool_turned = tool[0], turned[0]
         self.lower = torch.from_numpy(robot.lower).to(device)
         self.upper = torch.from_numpy(robot.upper).to(device)
         axes = torch.from_numpy(robot.axes).to(device)
@@ -55,7 +57,10 @@ class Kinematics:
         self._cross = torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], -1).view(-1, 3, 3)
         self._eye = torch.eye(3, device=device)
 
-    def _chain(self, q: torch.Tensor) -> tuple[torch.Tensor, list[torch.Tensor], list[torch.Tensor]]:
+    def _chain(
+        self, q: torch.Tensor
+    ) -> tuple[torch.Tensor, list[torch.Tensor], list[torch.Tensor], torch.Tensor]:
+        """Tool (..., 3), origins and directions of the joints, rotation of the tool's link (..., 3, 3)."""
         rotation = self._eye.expand(*q.shape[:-1], 3, 3)
         position = torch.zeros(*q.shape[:-1], 3, device=q.device, dtype=q.dtype)
         origins, directions = [], []
@@ -71,18 +76,24 @@ class Kinematics:
             )  # Rodrigues
             position = position + rotation @ self._child_inverse[1][j]
             rotation = rotation @ self._child_inverse[0][j]
-        return position + rotation @ self._tool, origins, directions
+        return position + rotation @ self._tool, origins, directions, rotation
 
     def forward(self, q: torch.Tensor) -> torch.Tensor:
         """Tool position: (..., 7) [rad] → (..., 3) [m]."""
         return self._chain(q)[0]
+
+    def upright(self, q: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """Tool position (..., 3) [m] and how far the hand is turned around the vertical axis (...,) [rad]."""
+        tool, _, _, rotation = self._chain(q)
+        x_axis = (rotation @ self._tool_turned)[..., 0]
+        return tool, torch.atan2(x_axis[..., 1], x_axis[..., 0])
 
     def jacobian(self, q: torch.Tensor) -> torch.Tensor:
         """Derivative of the tool position: (..., 7) → (..., 3, 7) [m/rad]."""
         return self._forward_and_jacobian(q)[1]
 
     def _forward_and_jacobian(self, q: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        tool, origins, directions = self._chain(q)
+        tool, origins, directions, _ = self._chain(q)
         columns = [torch.linalg.cross(d, tool - o) for o, d in zip(origins, directions, strict=True)]
         return tool, torch.stack(columns, -1)
 
@@ -112,6 +123,48 @@ class Kinematics:
             # A 3×3 solve by its adjugate: batched LAPACK calls cost more than the whole chain.
             step = jacobian.mT @ (_inverse3(gram) @ error)
             q = torch.clamp(q + step.squeeze(-1).clamp(-0.5, 0.5), self.lower, self.upper)
+        return q
+
+    def solve_upright(
+        self,
+        goal: torch.Tensor,
+        yaw: torch.Tensor,
+        start: torch.Tensor,
+        *,
+        iterations: int = 8,
+        damping: float = 1e-4,
+    ) -> torch.Tensor:
+        """As :meth:`solve`, with the hand pointing straight down, turned by ``yaw`` around the vertical axis.
+
+        Args:
+            goal: (..., 3) [m].
+            yaw: (...,) [rad]; at 0 the tool's x points along x, and the fingers move along y.
+            start, iterations, damping: As there; damping of metres and radians alike.
+
+        Returns:
+            (..., 7) [rad].
+        """
+        q, zero = start, torch.zeros_like(yaw)
+        c, s, one = torch.cos(yaw), torch.sin(yaw), torch.ones_like(yaw)
+        wanted = torch.stack([c, s, zero, s, -c, zero, zero, zero, -one], -1).unflatten(-1, (3, 3)).mT
+        ridge = damping * torch.eye(6, device=q.device, dtype=q.dtype)
+        for _ in range(iterations):
+            tool, origins, directions, rotation = self._chain(q)
+            turn = wanted @ (rotation @ self._tool_turned).mT  # its antisymmetric part is the way to turn
+            aside = 0.5 * torch.stack(
+                [
+                    turn[..., 2, 1] - turn[..., 1, 2],
+                    turn[..., 0, 2] - turn[..., 2, 0],
+                    turn[..., 1, 0] - turn[..., 0, 1],
+                ],
+                -1,
+            )
+            error = torch.cat([goal - tool, aside], -1)
+            linear = [torch.linalg.cross(d, tool - o) for o, d in zip(origins, directions, strict=True)]
+            jacobian = torch.cat([torch.stack(linear, -1), torch.stack(directions, -1)], -2)
+            solved, _ = torch.linalg.solve_ex(jacobian @ jacobian.mT + ridge, error.unsqueeze(-1))
+            step = (jacobian.mT @ solved).squeeze(-1)
+            q = torch.clamp(q + step.clamp(-0.3, 0.3), self.lower, self.upper)
         return q
 
     def reachable(self, goal: Sequence[float], *, tolerance: float = 0.01) -> bool:

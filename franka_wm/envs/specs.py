@@ -9,7 +9,8 @@ from collections.abc import Sequence
 import torch
 from torchrl.data import Binary, Bounded, Composite, Unbounded
 
-from franka_wm.envs.config import STATE_DIM, FrankaConfig
+from franka_wm.envs.config import FrankaConfig
+from franka_wm.envs.constants import MOST_OPEN, OBJECT_DIM
 from franka_wm.envs.kinematics import Kinematics
 
 
@@ -34,10 +35,17 @@ def observation_spec(
             shape = (n, size, size, channels)
             entries[key] = Bounded(0, 255, shape=shape, dtype=torch.uint8, device=device)
     if "state" in config.observations:
-        entries["state"] = Unbounded(shape=(n, STATE_DIM), device=device)
+        entries["state"] = Unbounded(shape=(n, config.state_dim), device=device)
     if "joint_target" in config.observations:
         low, high = (limit.expand(n, -1) for limit in (kinematics.lower, kinematics.upper))
+        if config.has_gripper:
+            low, high = (
+                torch.nn.functional.pad(low, (0, 1)),
+                torch.nn.functional.pad(high, (0, 1), value=MOST_OPEN),
+            )
         entries["joint_target"] = Bounded(low, high, device=device)
+    if "objects" in config.observations:
+        entries["objects"] = Unbounded(shape=(n, OBJECT_DIM * config.num_objects), device=device)
     entries["goal"] = Unbounded(shape=(n, 3), device=device)
     entries["success"] = Binary(shape=(n, 1), dtype=torch.bool, device=device)
     entries["is_init"] = Binary(shape=(n, 1), dtype=torch.bool, device=device)

@@ -191,7 +191,7 @@ def verdict_of_success(
 
 def _chosen(policies: Mapping[str, Any]) -> list[str]:
     own = [name for name in ("planner", "policy") if name in policies][:1]
-    return own + [name for name in ("ik",) if name in policies]
+    return own + [name for name in ("ik", "expert") if name in policies]
 
 
 def _compared(played: TensorDictBase, before: TensorDictBase, success_distance: float) -> dict[str, Any]:

@@ -2,8 +2,9 @@
 
 from franka_wm.errors import UserError
 
-POLICIES = ("planner", "policy", "noop", "random", "ik")
-"""The planner; the learned policy alone; doing nothing; smooth random motion; inverse kinematics with true geometry."""
+POLICIES = ("planner", "policy", "noop", "random", "ik", "expert")
+"""The planner; the learned policy alone; doing nothing; smooth random motion; inverse kinematics with true geometry;
+a task's own plan with true positions of objects."""
 
 RENAMED = {"oracle": "ik", "smooth": "random"}
 """Names of earlier versions, which old files still hold."""

@@ -108,6 +108,7 @@ POLICY_COLOURS = {
     "random": ORANGE,
     "noop": BLACK,
     "ik": GREEN,
+    "expert": GREEN,
 }
 
 POLICY_LEGEND = {
@@ -116,6 +117,7 @@ POLICY_LEGEND = {
     "random": "smooth random motion",
     "noop": "does nothing",
     "ik": "inverse kinematics with the true geometry",
+    "expert": "a scripted plan with the true positions of all objects",
 }
 """What the names of policies mean, for readers of tables."""
 

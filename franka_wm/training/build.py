@@ -21,6 +21,7 @@ from franka_wm.envs.external import ExternalConfig, ExternalEnv
 from franka_wm.errors import UserError
 from franka_wm.planning import registry
 from franka_wm.policies import ExploringPolicy, ModelPolicy, PlannerPolicy, SearchPolicy
+from franka_wm.policies.expert import ExpertPolicy
 from franka_wm.policies.scripted import (
     DiscreteOraclePolicy,
     DiscretePolicy,
@@ -55,14 +56,15 @@ def make_env(
 
 
 def make_evaluation_env(run: RunSettings, *, num_envs: int | None = None, **changes: Any) -> Any:
-    """The same task for evaluation: with what ``ik`` reads, and the pictures that the model reads."""
+    """The same task for evaluation: with what ``ik`` and ``expert`` read, and the pictures that the model reads."""
     num_envs = run.evaluation.episodes if num_envs is None else num_envs
     if run.is_arm:
         read = run.model.observations or ()
         goal = ("goal_pixels",) if run.objective_name == "goal_image" else ()
-        pictures = [o for o in run.env.arm.observations if o not in ("state", "joint_target")]
+        vectors = ["state", "joint_target"] + ["objects"] * (run.env.arm.num_objects > 0)
+        pictures = [o for o in run.env.arm.observations if o not in vectors]
         used = [o for o in pictures if any(key == o or key.startswith(f"{o}_") for key in (*read, *goal))]
-        changes = {"observations": [*used, "state", "joint_target"]} | changes
+        changes = {"observations": [*used, *vectors]} | changes
     return make_env(run, num_envs=num_envs, seed=evaluation_seed(run.seed), **changes)
 
 
@@ -211,7 +213,7 @@ def make_policies(
 
 
 def make_scripted_policies(env: Any, *, seed: int = 0, smoothness: float = 0.7) -> dict[str, Any]:
-    """Policies that need no model: ``noop``, ``random`` and, for the arm, ``ik``."""
+    """Policies that need no model: ``noop``, ``random`` and, for the arm, ``ik``; with a gripper ``expert``."""
     generator = torch.Generator(device=env.device).manual_seed(seed)
     discrete = not env.action_spec.dtype.is_floating_point
     arm = isinstance(env, (FrankaEnv, TransformedFrankaEnv))
@@ -225,7 +227,12 @@ def make_scripted_policies(env: Any, *, seed: int = 0, smoothness: float = 0.7) 
     if discrete:
         moves: Any = env.transform
         scripted = {name: DiscretePolicy(policy, moves.table) for name, policy in scripted.items()}
-        scripted["ik"] = DiscreteOraclePolicy(env.kinematics, env.config, moves.table)
+        if not env.config.has_gripper:
+            scripted["ik"] = DiscreteOraclePolicy(env.kinematics, env.config, moves.table)
+    elif arm and env.config.has_gripper:
+        task = env.simulation.task
+        if task.expert is not None and env.config.action_mode != "ee_delta":
+            scripted["expert"] = ExpertPolicy(task, env.kinematics, env.config)
     elif arm:
         scripted["ik"] = OraclePolicy(env.kinematics, env.config)
     return scripted

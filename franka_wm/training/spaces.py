@@ -8,7 +8,8 @@ from typing import Any
 
 import torch
 
-from franka_wm.envs.config import IMAGES, NUM_JOINTS, STATE_DIM, FrankaConfig
+from franka_wm.envs.config import IMAGES, FrankaConfig
+from franka_wm.envs.constants import OBJECT_DIM
 from franka_wm.envs.discretize import discrete_action_table
 from franka_wm.envs.tasks import make_task
 from franka_wm.errors import UserError
@@ -91,7 +92,11 @@ class Spaces:
         channels["goal_pixels"] = channels["pixels"]
         size = config.image_size
         images = {name: (size, size, channels.get(key, 3)) for key in pictures for name in names[key]}
-        vectors = {"state": STATE_DIM, "joint_target": NUM_JOINTS}
+        vectors = {
+            "state": config.state_dim,
+            "joint_target": config.target_dim,
+            "objects": OBJECT_DIM * config.num_objects,
+        }
         moves = discrete_action_table(config.action_dim).shape[0]
         return cls(
             observation_sizes={key: size for key, size in vectors.items() if key in config.observations}

@@ -274,6 +274,8 @@ class Trainer:
                     text += f"   success {100 * episodes['success']:.0f} %"
             if episodes.get("nonfinite"):
                 text += f"   {episodes['nonfinite']:.0f} worlds broke and were reset"
+            if episodes.get("overflow"):
+                text += f"   {episodes['overflow']:.0f} times too little room for contacts (env.max_contacts)"
         metrics = self.learner.metrics()
         if not text and "loss" in metrics:
             text = f"loss {metrics['loss']:.4g}"

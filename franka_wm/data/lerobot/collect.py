@@ -12,13 +12,17 @@ import numpy as np
 from franka_wm.console import count, duration, say
 from franka_wm.data.lerobot.episodes import Episode, EpisodeCutter
 from franka_wm.data.lerobot.provenance import describe
-from franka_wm.data.lerobot.schema import SEED, schema_for
+from franka_wm.data.lerobot.schema import SEED, SUCCESS, schema_for
 from franka_wm.data.lerobot.writer import DatasetWriter, default_shard_frames
+from franka_wm.errors import UserError
 from franka_wm.interrupt import interruptible
 from franka_wm.seeding import derive_seed
 
 BATCH = 8192
 """Steps of all worlds in one batch of the collector, about."""
+
+HOPELESS = 200
+"""Episodes without a success after which ``success_only`` gives up."""
 
 
 @dataclass
@@ -49,6 +53,7 @@ def gather(
     workers: int = 2,
     shard_frames: int | None = None,
     resume: bool = False,
+    success_only: bool = False,
     every: float = 10.0,
 ) -> tuple[Path, bool]:
     """Runs the policy until there are so many episodes, and writes them.
@@ -62,13 +67,14 @@ def gather(
         out, workers, shard_frames, resume: As for :class:`~franka_wm.data.lerobot.writer.DatasetWriter`.
         episodes: In all.
         format: Of pictures.
+        success_only: Keep only episodes that end in success.
         every: Seconds between lines of progress.
 
     Returns:
         The dataset's folder, and whether all episodes are there (not after Ctrl-C).
 
     Raises:
-        UserError: One line.
+        UserError: One line; with ``success_only`` also where none of the first episodes succeeds.
     """
     from torchrl.collectors import Collector
 
@@ -93,7 +99,7 @@ def gather(
         writer.start()
         seed = derive_seed("collection", source.seed, writer.resumed)
         source.env.set_seed(seed)
-        quota = np.full(worlds, left // worlds) + (np.arange(worlds) < left % worlds)
+        chosen = _Choice(np.full(worlds, left // worlds) + (np.arange(worlds) < left % worlds), success_only)
         cutter = EpisodeCutter(schema, seed=seed, discrete=_table(source.env))
         collector = Collector(
             source.env,
@@ -111,7 +117,7 @@ def gather(
             while writer.episodes < episodes and not stop():
                 batch = next(batches)
                 steps += batch.numel()
-                writer.add(episode for episode in cutter.push(batch) if _wanted(episode, quota))
+                writer.add(episode for episode in cutter.push(batch) if chosen.takes(episode))
                 now = time.perf_counter()
                 if now - said >= every or writer.episodes >= episodes:
                     rate = (writer.episodes - before) / (now - started)
@@ -126,9 +132,34 @@ def gather(
         return writer.finish(), whole
 
 
-def _wanted(episode: Episode, quota: np.ndarray) -> bool:
-    _, world, number = episode.rows[SEED][0]
-    return number < quota[world]
+class _Choice:
+    """The first episodes of each world, or the first that succeed.
+
+    Args:
+        quota: (worlds,) how many of each.
+        success_only: Whether others do not count.
+    """
+
+    def __init__(self, quota: np.ndarray, success_only: bool):
+        self._left, self._success_only = quota.copy(), success_only
+        self._seen = self._taken = 0
+
+    def takes(self, episode: Episode) -> bool:
+        """Whether this one is kept; called for all in the order of their ends."""
+        self._seen += 1
+        if self._success_only and not episode.rows[SUCCESS][-1, 0]:
+            if self._seen >= HOPELESS and not self._taken:
+                raise UserError(
+                    f"collect: none of {self._seen} episodes succeeded; success_only=true would never end: "
+                    "take another policy, or success_only=false"
+                )
+            return False
+        world = episode.rows[SEED][0][1]
+        if self._left[world] <= 0:
+            return False
+        self._left[world] -= 1
+        self._taken += 1
+        return True
 
 
 def _table(env: Any) -> Any:

@@ -215,8 +215,8 @@ def _by_convention(
             key = name.removeprefix(_OBSERVATION).replace(".", "_")
             key = "goal" if ours and name == schema.GOAL else key
             usable = spec.get("dtype") in NUMBERS and len(spec["shape"]) == 1
-        elif ours and name == schema.TARGET:
-            key, usable = "joint_target", True
+        elif ours and name in (schema.TARGET, schema.OBJECTS):
+            key, usable = name, True
         else:
             continue
         if not usable or key in observed or key in ("action", *AFTER, *RESERVED):

@@ -9,7 +9,9 @@ feature                            shape, dtype        meaning
 =================================  ==================  ===========================================================
 ``observation.images.<camera>``    (H, W, 3) uint8     the camera's picture
 ``observation.images.goal``        (H, W, 3) uint8     the arm at the goal, seen by the first camera
-``observation.state``              (20,) float32       joints 7 [rad], velocities 7 [rad/s], tool 3, tool − goal 3 [m]
+``observation.state``              (20,) float32       joints 7 [rad], velocities 7 [rad/s], tool 3, tool − goal 3 [m];
+                                                       with a gripper (28,): fingers 2 [m], their speeds 2, tool's
+                                                       quaternion 4, and one number more in actions and targets
 ``observation.environment_state``  (3,) float32        the goal [m]
 ``action``                         (A,) float32        in [−1, 1]
 ``next.reward``                    (1,) float32
@@ -20,6 +22,7 @@ feature                            shape, dtype        meaning
 ``joint_positions``                (7,) float32        [rad]; the first seven of the state
 ``tool_position``                  (3,) float32        [m]
 ``joint_target``                   (7,) float32        the servo's commanded angles [rad]
+``objects``                        (13 · K,) float32   of each object: position, quaternion, two velocities
 ``seed``                           (3,) int64          seed of the run, world, episode: what the episode's draws
                                                        depend on; the episode is −1 where it is not known
 ``episode_key``                    (1,) int64          fingerprint of the episode's numbers
@@ -53,7 +56,7 @@ IMAGE_PREFIX = "observation.images."
 STATE, GOAL, ACTION = "observation.state", "observation.environment_state", "action"
 REWARD, DONE, TERMINATED = "next.reward", "next.done", "next.terminated"
 TRUNCATED, SUCCESS = "next.truncated", "next.success"
-JOINTS, TOOL, TARGET = "joint_positions", "tool_position", "joint_target"
+JOINTS, TOOL, TARGET, OBJECTS = "joint_positions", "tool_position", "joint_target", "objects"
 SEED, EPISODE_KEY = "seed", "episode_key"
 
 AUTOMATIC = ("timestamp", "frame_index", "episode_index", "index", "task_index")
@@ -76,6 +79,17 @@ _STATE_NAMES = [
     *(f"{joint}.vel" for joint in _JOINT_NAMES),
     *_named("tool"),
     *_named("tool_minus_goal"),
+]
+_HAND_NAMES = [
+    *(f"finger_{i}.pos" for i in (1, 2)),
+    *(f"finger_{i}.vel" for i in (1, 2)),
+    *(f"tool.q{axis}" for axis in "xyzw"),
+]
+_OBJECT_NAMES = [
+    *_AXES,
+    *(f"q{axis}" for axis in "xyzw"),
+    *(f"v{axis}" for axis in _AXES),
+    *(f"w{axis}" for axis in _AXES),
 ]
 _ACTION_NAMES = {
     "joint_delta": [f"{joint}.target_change" for joint in _JOINT_NAMES],
@@ -167,7 +181,7 @@ def schema_for(
     if keys is None:
         keys = [
             *(_image_keys(config)),
-            *(o for o in ("state", "joint_target") if o in config.observations),
+            *(o for o in ("state", "joint_target", "objects") if o in config.observations),
             "goal",
         ]
     features: dict[str, dict[str, Any]] = {}
@@ -193,10 +207,10 @@ def schema_for(
             }
             sources[feature] = key
     if "state" in keys:
-        observed(STATE, "state", _STATE_NAMES)
+        observed(STATE, "state", _STATE_NAMES + _HAND_NAMES * config.has_gripper)
     if "goal" in keys:
         observed(GOAL, "goal", _named("goal"))
-    names = _ACTION_NAMES[config.action_mode]
+    names = _ACTION_NAMES[config.action_mode] + ["gripper.target"] * config.has_gripper
     features[ACTION] = _vector(len(names), names)
     features[REWARD] = {"dtype": "float32", "shape": (1,), "names": ["reward"]}
     for flag in (DONE, TERMINATED, TRUNCATED, *([SUCCESS] if success else [])):
@@ -207,7 +221,11 @@ def schema_for(
         features[TOOL] = _vector(3, _named("tool"))
         derived[TOOL] = ("state", len(_STATE_NAMES) - 6, len(_STATE_NAMES) - 3)
     if "joint_target" in keys:
-        observed(TARGET, "joint_target", [f"{joint}.target" for joint in _JOINT_NAMES])
+        targets = [f"{joint}.target" for joint in _JOINT_NAMES] + ["gripper.target"] * config.has_gripper
+        observed(TARGET, "joint_target", targets)
+    if "objects" in keys and config.surroundings:
+        bodies = [body.name for body in config.surroundings.objects]
+        observed(OBJECTS, "objects", [f"{body}.{name}" for body in bodies for name in _OBJECT_NAMES])
     features[SEED] = {"dtype": "int64", "shape": (3,), "names": ["run", "world", "episode"]}
     features[EPISODE_KEY] = {"dtype": "int64", "shape": (1,), "names": ["episode_key"]}
     return Schema(
@@ -216,7 +234,7 @@ def schema_for(
         derived=derived,
         fps=round(config.fps),
         robot_type=_robot_type(config),
-        task=_TASKS[config.task],
+        task=config.task_class.words,
         format=format,
     )
 
@@ -246,12 +264,6 @@ def episode_key(columns: Mapping[str, np.ndarray]) -> int:
         digest.update(f"{name}:{array.dtype}:{array.shape[0]};".encode())
         digest.update(array.tobytes())
     return int.from_bytes(digest.digest(), "little") >> 12
-
-
-_TASKS = {
-    "reach": "Move the tool to the goal position and hold it there.",
-    "track": "Follow the moving goal with the tool.",
-}
 
 
 def _image_keys(config: FrankaConfig) -> list[str]:

@@ -24,7 +24,7 @@ from tensordict import TensorDictBase
 
 from franka_wm.data.lerobot import schema
 from franka_wm.data.lerobot.provenance import read_provenance
-from franka_wm.envs.config import STATE_DIM, FrankaConfig
+from franka_wm.envs.config import FrankaConfig
 from franka_wm.envs.gym import REACH_V0, FrankaVectorEnv
 from franka_wm.errors import UserError
 
@@ -32,8 +32,8 @@ from franka_wm.errors import UserError
 class RecordedView(FrankaVectorEnv):
     """N arms that observe what a dataset of this package holds, under the keys that LeRobot reads.
 
-    As :class:`~franka_wm.envs.gym.FrankaVectorEnv`, but ``agent_pos`` is the whole state (N, 20), and ``pixels`` has
-    every camera and, if observed, ``goal``.
+    As :class:`~franka_wm.envs.gym.FrankaVectorEnv`, but ``agent_pos`` is the whole state (N, 20), or (N, 28) with a
+    gripper, and ``pixels`` has every camera and, if observed, ``goal``.
     """
 
     def __init__(self, num_envs: int = 1, **options: Any):
@@ -50,7 +50,7 @@ class RecordedView(FrankaVectorEnv):
         if self._pictures:
             picture = spaces.Box(0, 255, (config.image_size, config.image_size, 3), np.uint8)
             entries["pixels"] = spaces.Dict(dict.fromkeys(self._pictures, picture))
-        entries["agent_pos"] = spaces.Box(-np.inf, np.inf, (STATE_DIM,), np.float32)
+        entries["agent_pos"] = spaces.Box(-np.inf, np.inf, (config.state_dim,), np.float32)
         entries["environment_state"] = spaces.Box(-np.inf, np.inf, (3,), np.float32)
         self.single_observation_space = spaces.Dict(entries)
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
@@ -90,7 +90,7 @@ class FrankaWMEnv(EnvConfig):
     def __post_init__(self) -> None:
         values = dict(REACH_V0) if self.dataset is None else recorded_settings(self.dataset)
         config = FrankaConfig.from_mapping(values | self.options)
-        if config.action_dim != 7:
+        if config.action_mode == "ee_delta":
             raise UserError(
                 f"action_mode={config.action_mode}: lerobot-eval drives joints here; use a dataset of joint actions"
             )
@@ -99,7 +99,7 @@ class FrankaWMEnv(EnvConfig):
         recorded = schema.schema_for(config)
         self.features = {
             "action": PolicyFeature(FeatureType.ACTION, (config.action_dim,)),
-            "agent_pos": PolicyFeature(FeatureType.STATE, (STATE_DIM,)),
+            "agent_pos": PolicyFeature(FeatureType.STATE, (config.state_dim,)),
             "environment_state": PolicyFeature(FeatureType.ENV, (3,)),
         }
         self.features_map = {

@@ -1,6 +1,7 @@
 """The Warp kernels of a control step, by concern. One thread per world unless a kernel says otherwise.
 
-``servo`` turns actions into joint targets, ``observation`` reads the arm, ``episodes`` ends and begins episodes,
+``servo`` turns actions into joint targets, ``observation`` reads the arm, ``bodies`` is about
+fingers and objects, ``episodes`` ends and begins episodes,
 ``randomization`` draws what each episode has anew, ``images`` aims cameras and places images.
 The kernels of a task are in the task's file.
 

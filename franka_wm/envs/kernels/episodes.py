@@ -14,6 +14,7 @@ def end_step(
     reward: wp.array2d[float],
     success: wp.array2d[wp.bool],
     broken: wp.array[wp.bool],
+    cut: wp.array[wp.bool],
     episode_length: int,
     terminate_on_success: bool,
     # in and out
@@ -31,7 +32,8 @@ def end_step(
     """Ends episodes and keeps their statistics.
 
     A broken world is truncated, not terminated: all rewards are negative, so an end worth 0 would pay an
-    agent for breaking the simulation. A world that is stepped on after its end, without a reset, stays done by
+    agent for breaking the simulation. So is a world that is ``cut`` short: what comes then has no reward of its own,
+    but is not worth 0 either. A world that is stepped on after its end, without a reset, stays done by
     time or success, and is not counted again.
     """
     world = wp.tid()
@@ -44,7 +46,7 @@ def end_step(
     once = episode_success[world, 0] or solved
     episode_success[world, 0] = once
     stops = terminate_on_success and once
-    late = (count >= episode_length) or broken[world] or over
+    late = (count >= episode_length) or broken[world] or cut[world] or over
     terminated[world, 0] = stops
     truncated[world, 0] = late and not stops
     finished = stops or late
@@ -105,6 +107,8 @@ def reset_pose(
     for k in range(history.shape[1]):
         for j in range(history.shape[2]):
             history[world, k, j] = 0.0
-            if absolute:  # what a late action leaves in force is the pose, not the middle of the limits
+            if (
+                absolute and j < JOINTS
+            ):  # what a late action leaves in force is the pose, not the middle of the limits
                 middle = 0.5 * (lower[j] + upper[j])
                 history[world, k, j] = (target[world, j] - middle) / (0.5 * (upper[j] - lower[j]))

@@ -48,7 +48,7 @@ def blur_state(
     """``state`` as seen: noise on joint angles and, ten times as much, on velocities."""
     world = wp.tid()
     rng = wp.rand_init(int(episode_rng(seed[0], world, episode[world], 3)), step_count[world, 0])
-    for i in range(STATE):
+    for i in range(state.shape[1]):
         value = state[world, i]
         if i < JOINTS:
             value += noise * wp.randn(rng)

@@ -10,7 +10,7 @@ would be the same one.
 # Warp reads annotations as types: no `from __future__ import annotations` here.
 import warp as wp
 
-from franka_wm.envs.kernels.functions import episode_rng
+from franka_wm.envs.kernels.functions import JOINTS, episode_rng
 
 
 @wp.kernel(enable_backward=False)
@@ -90,7 +90,7 @@ def draw_dynamics(
     if not mask[world]:
         return
     rng = episode_rng(seed[0], world, episode[world], 5)
-    for j in range(ke.shape[1]):
+    for j in range(wp.min(ke.shape[1], JOINTS)):  # the arm's joints
         ke[world, j] = plain_ke[world, j] * (1.0 + wp.randf(rng, -gains, gains))
         kd[world, j] = plain_kd[world, j] * (1.0 + wp.randf(rng, -gains, gains))
         armature[world, j] = plain_armature[world, j] * (1.0 + wp.randf(rng, -armature_width, armature_width))

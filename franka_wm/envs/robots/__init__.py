@@ -17,8 +17,9 @@ import newton
 import numpy as np
 import warp as wp
 
-from franka_wm.envs.config import HOME, NUM_JOINTS, FrankaConfig
-from franka_wm.envs.robots import meshes
+from franka_wm.envs.config import FrankaConfig
+from franka_wm.envs.constants import NUM_FINGERS, NUM_JOINTS
+from franka_wm.envs.robots import gripper, meshes
 from franka_wm.envs.robots.sources import SOURCES, Source, detail, urdf_source
 from franka_wm.errors import UserError
 
@@ -36,6 +37,7 @@ class Robot:
         joint_names: The seven arm joints.
         lower, upper: Joint limits, (7,) [rad].
         velocity_limit: Joint speed limits, (7,) [rad/s].
+        finger_speed: Speed limit of a finger [m/s]; 0 where fingers are held.
         parent_frames: Frame of each joint in its parent link, (7, 7) as x y z qx qy qz qw.
         child_frames: Frame of each joint in its own link, likewise.
         axes: Joint axes, (7, 3).
@@ -47,6 +49,7 @@ class Robot:
     lower: np.ndarray
     upper: np.ndarray
     velocity_limit: np.ndarray
+    finger_speed: float
     parent_frames: np.ndarray
     child_frames: np.ndarray
     axes: np.ndarray
@@ -61,7 +64,7 @@ def add_robot(
     *,
     visuals: bool = True,
 ) -> Robot:
-    """Adds the arm to ``builder``: seven driven joints, fingers held, fixed links merged.
+    """Adds the arm to ``builder``: seven driven joints, fingers held or driven, fixed links merged.
 
     Gains, armature, effort and angle limits are set; with ``gravity_compensation`` the solver cancels the
     weight of every link.
@@ -78,7 +81,10 @@ def add_robot(
     """
     path = urdf_source(config, urdf_path)
     root = _parse(path)
-    _hold_fingers(root, config.finger_opening)
+    if config.has_gripper:
+        gripper.free_fingers(root)
+    else:
+        _hold_fingers(root, config.finger_opening)
     drawn = _prepare_shapes(root, path, visuals)
     builder.add_urdf(
         ET.tostring(root, encoding="unicode"),
@@ -91,7 +97,10 @@ def add_robot(
             builder, body, drawn.get(label.rsplit("/", 1)[-1], []), detail(SOURCES[config.robot], config)
         )
     movable = [j for j in range(builder.joint_count) if builder.joint_type[j] != newton.JointType.FIXED]
-    if len(movable) != NUM_JOINTS or builder.joint_coord_count != NUM_JOINTS:
+    if config.has_gripper:
+        movable = movable[: len(movable) - gripper.check(builder, path)]
+    fingers = NUM_FINGERS * config.has_gripper
+    if len(movable) != NUM_JOINTS or builder.joint_coord_count != NUM_JOINTS + fingers:
         names = ", ".join(builder.joint_label[j] for j in movable)
         raise UserError(
             f"{path.name}: needs exactly {NUM_JOINTS} arm joints beside the fingers, has {len(movable)} ({names})"
@@ -102,12 +111,14 @@ def add_robot(
     _set_inertia(builder, merged)
     carrier = builder.body_label.index(tool_link)
 
-    joints = range(builder.joint_count)
-    builder.joint_q[:NUM_JOINTS] = HOME
-    builder.joint_target_q[:NUM_JOINTS] = HOME
+    joints = range(NUM_JOINTS)
+    builder.joint_q[:NUM_JOINTS] = config.start_pose
+    builder.joint_target_q[:NUM_JOINTS] = config.start_pose
     builder.joint_target_ke[:NUM_JOINTS] = config.gains("target_ke")
     builder.joint_target_kd[:NUM_JOINTS] = config.gains("target_kd")
     builder.joint_armature[:NUM_JOINTS] = [config.joint_armature] * NUM_JOINTS
+    if config.has_gripper:
+        gripper.drive(builder, config)
     if config.gravity_compensation:
         _compensate_gravity(builder)
     return Robot(
@@ -115,6 +126,7 @@ def add_robot(
         lower=np.array(builder.joint_limit_lower[:NUM_JOINTS], dtype=np.float32),
         upper=np.array(builder.joint_limit_upper[:NUM_JOINTS], dtype=np.float32),
         velocity_limit=np.array(builder.joint_velocity_limit[:NUM_JOINTS], dtype=np.float32),
+        finger_speed=gripper.speed_limit(builder) if config.has_gripper else 0.0,
         parent_frames=np.array([list(builder.joint_X_p[j]) for j in joints], dtype=np.float32),
         child_frames=np.array([list(builder.joint_X_c[j]) for j in joints], dtype=np.float32),
         axes=np.array([list(builder.joint_axis[j]) for j in joints], dtype=np.float32),

@@ -11,31 +11,37 @@ import torch
 import warp as wp
 
 from franka_wm.envs.camera import camera_framing, look_at
-from franka_wm.envs.config import NUM_JOINTS, STATE_DIM, FrankaConfig
+from franka_wm.envs.config import FrankaConfig
+from franka_wm.envs.constants import NUM_JOINTS, OBJECT_DIM
 
-STATISTICS = ("episodes", "return", "length", "success", "success_once", "nonfinite")
-"""Columns of :attr:`Arrays.statistics`; all but the first and last are sums over finished episodes."""
+STATISTICS = ("episodes", "return", "length", "success", "success_once", "nonfinite", "overflow")
+"""Columns of :attr:`Arrays.statistics`: counts of episodes, of broken worlds, of steps that lost contacts; else sums
+over finished episodes."""
 
 
 @dataclass(frozen=True)
 class Arrays[T]:
     """The arrays of N worlds, one row for each: as torch tensors or as Warp arrays, over the same memory.
 
-    The next launch overwrites them, so clone what is kept. The 20 numbers of a state are joints 7 [rad], velocities
-    7 [rad/s], tool 3 [m], tool − goal 3 [m].
+    The next launch overwrites them, so clone what is kept. The S = 20 numbers of a state are joints 7 [rad], velocities
+    7 [rad/s], tool 3 [m], tool − goal 3 [m]; with a gripper S = 28: fingers 2 [m], their speeds 2 [m/s], and the tool's
+    quaternion x y z w follow. The 13 of each of K objects are position 3 [m], quaternion x y z w, velocity 3 [m/s],
+    angular velocity 3 [rad/s], in the world's frame.
 
     Attributes:
         action: (N, A), written before a step; not clipped.
         applied: (N, A) what of it arrives at the arm: late and noisy, if asked for.
-        state, joint_target, goal: The present observation, (N, 20), (N, 7) [rad], (N, 3) [m].
-        next_state, next_joint_target, next_goal: What the last step led to, before any reset.
-        true_state, next_true_state: (N, 20) without observation noise; the same memory where there is none.
+        state, joint_target, goal: The present observation, (N, S), (N, 7) [rad] with the fingers' set point [m]
+            behind it where there is a gripper, (N, 3) [m].
+        objects: (N, 13 · K) the same of the objects.
+        next_state, next_joint_target, next_goal, next_objects: What the last step led to, before any reset.
+        true_state, next_true_state: (N, S) without observation noise; the same memory where there is none.
         reward, success: Of the last step, (N, 1) float and bool: what a task writes.
         terminated, truncated, done: Of the last step, (N, 1) bool.
         step_count: (N, 1) int32, steps done in the episode.
         episode_return, episode_success: Of the episode so far, (N, 1): sum of rewards; any success.
         ended: (N,) bool: the episode is over, and the next one has not begun.
-        statistics: (N, 6) float64, see :data:`STATISTICS`.
+        statistics: (N, 7) float64, see :data:`STATISTICS`.
         task_goal: (N, 3) the goal of the episode [m], which ``goal`` and ``state`` observe.
         goal_q: (N, 7) joints that reach it [rad].
         goal_center, phase: (N, 3) [m] and (N,) [rad], of the circle that a moving goal follows.
@@ -47,11 +53,16 @@ class Arrays[T]:
         brightness: (N,) factor of this episode's images.
         poses: (N,) transforms, (N, 7) in torch: the front camera of this episode.
         broken: (N,) bool: the last step was no longer finite.
+        overflow: (N,) int32, MuJoCo's bits of the last step: contacts were lost for want of room.
+        cut: (N,) bool: the last step ended the episode before its time: lost contacts, or a lost object.
         seed: (1,) int32; with world and ``episode`` it decides all randomness.
         episode: (N,) int32, number of the episode, from 0.
         reset_mask: (N + 1,) bool: which worlds begin their next episode; the last entry is Newton's global world.
         mask: (N,) bool: the worlds' part of it.
         joint_q, joint_qd, control: (N, 7) Newton's joints [rad], [rad/s] and set points [rad].
+        rest_q, rest_qd, rest_control: What Newton's arrays have behind the arm's joints: two fingers [m], then of each
+            object x y z and the quaternion x y z w, and linear and angular velocity.
+        grip: (N,) the fingers' set point [m].
         body_q: (N, B) transforms, (N, B, 7) in torch: Newton's frames of the moving links.
         origins, directions: (N, 7) vectors, (N, 7, 3) in torch: scratch memory of the differential inverse kinematics.
     """
@@ -61,9 +72,11 @@ class Arrays[T]:
     state: T
     joint_target: T
     goal: T
+    objects: T
     next_state: T
     next_joint_target: T
     next_goal: T
+    next_objects: T
     true_state: T
     next_true_state: T
     reward: T
@@ -88,6 +101,8 @@ class Arrays[T]:
     brightness: T
     poses: T
     broken: T
+    overflow: T
+    cut: T
     seed: T
     episode: T
     reset_mask: T
@@ -95,6 +110,10 @@ class Arrays[T]:
     joint_q: T
     joint_qd: T
     control: T
+    rest_q: T
+    rest_qd: T
+    rest_control: T
+    grip: T
     body_q: T
     origins: T
     directions: T
@@ -125,7 +144,9 @@ def allocate(
     def newtons(array: wp.array, *size: int) -> torch.Tensor:
         return wp.to_torch(array).view(n, -1, *size)
 
-    observed, next_observed = zeros(n, STATE_DIM), zeros(n, STATE_DIM)
+    q, qd, control_q = (newtons(a) for a in (state.joint_q, state.joint_qd, control.joint_target_q))
+    arm, size = NUM_JOINTS, config.state_dim
+    observed, next_observed = zeros(n, size), zeros(n, size)
     noisy = bool(config.randomization.observation_noise)
     framing = torch.tensor(list(look_at(*camera_framing(config))), device=device)
     reset_mask = flags(n + 1)
@@ -133,14 +154,16 @@ def allocate(
         action=zeros(n, actions),
         applied=zeros(n, actions),
         state=observed,
-        joint_target=zeros(n, NUM_JOINTS),
+        joint_target=zeros(n, config.target_dim),
         goal=zeros(n, 3),
+        objects=zeros(n, OBJECT_DIM * config.num_objects),
         next_state=next_observed,
-        next_joint_target=zeros(n, NUM_JOINTS),
+        next_joint_target=zeros(n, config.target_dim),
         next_goal=zeros(n, 3),
+        next_objects=zeros(n, OBJECT_DIM * config.num_objects),
         # Without noise what is seen is what is true: the same memory, and no launch between them.
-        true_state=zeros(n, STATE_DIM) if noisy else observed,
-        next_true_state=zeros(n, STATE_DIM) if noisy else next_observed,
+        true_state=zeros(n, size) if noisy else observed,
+        next_true_state=zeros(n, size) if noisy else next_observed,
         reward=zeros(n, 1),
         success=flags(n, 1),
         terminated=flags(n, 1),
@@ -163,13 +186,19 @@ def allocate(
         brightness=torch.ones(n, device=device),
         poses=framing.repeat(n, 1),
         broken=flags(n),
+        overflow=zeros(n, dtype=torch.int32),
+        cut=flags(n),
         seed=torch.full((1,), as_int32(seed), dtype=torch.int32, device=device),
         episode=torch.full((n,), -1, dtype=torch.int32, device=device),
         reset_mask=reset_mask,
         mask=reset_mask[:n],
-        joint_q=newtons(state.joint_q),
-        joint_qd=newtons(state.joint_qd),
-        control=newtons(control.joint_target_q),
+        joint_q=q[:, :arm],
+        joint_qd=qd[:, :arm],
+        control=control_q[:, :arm],
+        rest_q=q[:, arm:],
+        rest_qd=qd[:, arm:],
+        rest_control=control_q[:, arm:],
+        grip=zeros(n),
         body_q=newtons(state.body_q, 7),
         origins=zeros(n, NUM_JOINTS, 3),
         directions=zeros(n, NUM_JOINTS, 3),

@@ -12,8 +12,13 @@ import torch
 import warp as wp
 
 from franka_wm.envs.camera import GOAL_MARKER, GROUND, wrist_mount
-from franka_wm.envs.config import HOME, NUM_JOINTS, FrankaConfig
+from franka_wm.envs.config import FrankaConfig
+from franka_wm.envs.constants import NUM_JOINTS
 from franka_wm.envs.robots import Robot, add_robot
+from franka_wm.envs.simulation.bodies import add_scene, contact_options
+
+FLOOR = -0.75
+"""Height of the ground below a table [m]."""
 
 
 def build_model(
@@ -23,6 +28,8 @@ def build_model(
     arm = newton.ModelBuilder()
     newton.solvers.SolverMuJoCo.register_custom_attributes(arm)
     robot = add_robot(arm, config, urdf_path)
+    if config.surroundings:
+        add_scene(arm, config.surroundings, robot.tool_body)
     scene = newton.ModelBuilder()
     newton.solvers.SolverMuJoCo.register_custom_attributes(scene)
     if config.show_goal:
@@ -35,7 +42,8 @@ def build_model(
         scene.default_bvh_cfg.mesh_constructor = "cubql"
     scene.replicate(arm, num_envs)
     ground = newton.ModelBuilder.ShapeConfig(has_shape_collision=False, has_particle_collision=False)
-    scene.add_ground_plane(cfg=ground, color=GROUND)
+    # The arm stands on the table, where there is one, and that on the floor.
+    scene.add_ground_plane(height=FLOOR if config.surroundings else 0.0, cfg=ground, color=GROUND)
     return scene.finalize(device=device), robot
 
 
@@ -43,13 +51,17 @@ def make_solver(model: newton.Model, config: FrankaConfig) -> newton.solvers.Sol
     """The physics that ``config.solver`` names; MuJoCo's steps a state in place, Featherstone's from one to another."""
     if config.solver == "featherstone":
         return newton.solvers.SolverFeatherstone(model)
-    return newton.solvers.SolverMuJoCo(
+    options = contact_options(config) if config.surroundings else {"disable_contacts": True}
+    solver = newton.solvers.SolverMuJoCo(
         model,
         iterations=config.solver_iterations,
         ls_iterations=config.solver_ls_iterations,
-        disable_contacts=True,
         disable_sensors=True,
+        **options,
     )
+    if config.surroundings:  # overflow is counted, not printed by every thread
+        solver.mjw_model.opt.warn_overflow = 0
+    return solver
 
 
 @dataclass(frozen=True)
@@ -89,7 +101,7 @@ class Chain:
             return wp.array(values, dtype=wp.transformf, device=device)
 
         return cls(
-            home=numbers(HOME),
+            home=numbers(config.start_pose),
             lower=numbers(robot.lower),
             upper=numbers(robot.upper),
             lead=numbers(_lead(robot, config)),

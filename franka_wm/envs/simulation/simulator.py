@@ -11,6 +11,7 @@ Without the second line, for who resets finished worlds by himself, it is anothe
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable, Mapping
 from pathlib import Path
 
@@ -18,16 +19,20 @@ import newton
 import torch
 import warp as wp
 
-from franka_wm.envs.config import NUM_JOINTS, FrankaConfig
+from franka_wm.envs.config import FrankaConfig
+from franka_wm.envs.constants import NUM_JOINTS
 from franka_wm.envs.kernels import episodes, observation, randomization, servo
 from franka_wm.envs.kinematics import Kinematics
 from franka_wm.envs.randomize import Randomizer
 from franka_wm.envs.simulation import state as worlds
-from franka_wm.envs.simulation.arrays import allocate, as_int32
+from franka_wm.envs.simulation.arrays import STATISTICS, allocate, as_int32
+from franka_wm.envs.simulation.bodies import Bodies
 from franka_wm.envs.simulation.build import Chain, build_model, make_solver
 from franka_wm.envs.simulation.graph import Recorder, Recording
 from franka_wm.envs.simulation.images import Renderer
 from franka_wm.envs.tasks import Task, make_task
+
+log = logging.getLogger(__name__)
 
 
 class Simulation:
@@ -75,6 +80,7 @@ class Simulation:
         self.tensors, self.warp = allocate(
             config, self.model, self.newton_state, self.control, seed=seed, draws=draws
         )
+        self.bodies = Bodies(self) if config.has_gripper else None
         self.randomizer = Randomizer(self)
         self.recorder = Recorder(device)
         self.renderer = Renderer(self)
@@ -82,6 +88,7 @@ class Simulation:
         newton.eval_fk(self.model, self.model.joint_q, self.model.joint_qd, self.newton_state)
         self._step_graphs: dict[bool, Recording] = {}
         self._reset_graph: Recording | None = None
+        self._overflowed = False
 
     # -- what a user of this class calls ------------------------------------------------------------------
 
@@ -110,6 +117,22 @@ class Simulation:
         """The next reset of each world is its episode 0 of this seed."""
         self.tensors.seed.fill_(as_int32(seed))
         self.tensors.episode.fill_(-1)
+
+    def statistics(self, *, clear: bool = True) -> dict[str, float]:
+        """Counts and means over the episodes that ended since the last call; one host sync."""
+        totals = dict(zip(STATISTICS, self.tensors.statistics.sum(0).tolist(), strict=True))
+        if clear:
+            self.tensors.statistics.zero_()
+        counts = ("episodes", "nonfinite", *(["overflow"] if self.config.surroundings else []))
+        out = {key: totals[key] for key in counts}
+        if out.get("overflow") and not self._overflowed:
+            self._overflowed = True
+            log.warning(
+                "contacts were lost for want of room, those worlds were truncated: raise max_contacts"
+            )
+        if totals["episodes"]:
+            out |= {key: totals[key] / totals["episodes"] for key in STATISTICS[1:5]}
+        return out
 
     def get_state(self) -> dict[str, torch.Tensor]:
         """A copy of everything that the worlds' futures depend on, by name, each (N, …)."""
@@ -145,7 +168,10 @@ class Simulation:
             self.tensors.mask.fill_(True)
             self._launch_reset_and_observe()
 
-        arrays = [*self.warp, self.newton_state.body_qd, *worlds.solver_memory(self).values()]
+        state = self.newton_state
+        arrays = [array for array in self.warp if array.is_contiguous]
+        arrays += [state.joint_q, state.joint_qd, self.control.joint_target_q]  # whose columns have names
+        arrays += [state.body_qd, *worlds.solver_memory(self).values()]
         arrays += [*self.randomizer.arrays(), *self.renderer.arrays()]
         # MuJoCo's copy of the physical values is not among the arrays.
         return self.recorder.record(launches, arrays, reset_everywhere, self.randomizer.apply)
@@ -170,7 +196,7 @@ class Simulation:
         w = self.warp
         self._launch_control_step()
         self.launch_forward_kinematics(w.broken)  # their links are not finite yet; a reset would mend them
-        self._launch_observe(w.true_state, w.joint_target, w.goal)
+        self._launch_observe(w.true_state, w.joint_target, w.goal, w.objects)
         self._launch_noise(w.true_state, w.state)
 
     def _launch_control_step(self) -> None:
@@ -178,16 +204,21 @@ class Simulation:
         self._launch_action()
         self.launch_physics()
         self.task.advance(self)
-        self._launch_observe(w.next_true_state, w.next_joint_target, w.next_goal)
+        self._launch_observe(w.next_true_state, w.next_joint_target, w.next_goal, w.next_objects)
+        if self.bodies:
+            self.bodies.launch_mark_nonfinite()
         self._launch(
             observation.catch_nonfinite,
             w.true_state, w.joint_target, w.next_true_state, w.next_joint_target, w.target, w.joint_q, w.joint_qd,
             w.broken,
         )  # fmt: skip
+        if self.bodies:
+            self.bodies.launch_restore()
+            self.bodies.launch_cut_short()
         self.task.reward_and_success(self)
         self._launch(
             episodes.end_step,
-            w.reward, w.success, w.broken, cfg.episode_length, cfg.terminate_on_success,
+            w.reward, w.success, w.broken, w.cut, cfg.episode_length, cfg.terminate_on_success,
             w.step_count, w.episode_return, w.episode_success, w.ended, w.statistics,
             w.terminated, w.truncated, w.done, w.reset_mask,
         )  # fmt: skip
@@ -212,16 +243,22 @@ class Simulation:
             absolute = cfg.action_mode == "joint_position"
             inputs = [absolute, cfg.action_scale, c.lower, c.upper, c.lead, w.joint_q, w.target, w.control]
             self._launch_joints(servo.apply_joint_action, action, *inputs)
+        if self.bodies:
+            self.bodies.launch_grip(action)
 
     def launch_physics(self) -> None:
         """The physics of one control step."""
         state, spare, w = self.newton_state, self._spare_state, self.warp
+        if self.bodies:
+            self.bodies.begin_step()
         for _ in range(self.config.substeps):
             if self.config.limit_velocity:
-                q = state.joint_q.reshape((self.num_envs, NUM_JOINTS))
+                q = w.joint_q if spare is None else state.joint_q.reshape((self.num_envs, NUM_JOINTS))
                 self._launch_joints(servo.limit_speed, w.target, self.chain.lead, q, w.control)
             if spare is None:
                 self.solver.step(state, state, self.control, None, self._dt)
+                if self.bodies:
+                    self.bodies.after_substep()
             else:
                 state.clear_forces()
                 self.solver.step(state, spare, self.control, None, self._dt)
@@ -237,20 +274,26 @@ class Simulation:
             w.target, w.control, w.step_count, w.episode_return, w.episode_success, w.ended, w.history,
             cfg.action_mode == "joint_position",
         )  # fmt: skip
+        if self.bodies:
+            self.bodies.launch_place(w.mask)
         self.randomizer.launch(w.mask)
         if self.task.num_draws:
             self._launch(randomization.draw_uniform, w.mask, w.seed, w.episode, w.draws)
         self.task.reset(self, w.mask)
         self.launch_forward_kinematics(w.mask)
-        self._launch_observe(w.true_state, w.joint_target, w.goal)
+        self._launch_observe(w.true_state, w.joint_target, w.goal, w.objects)
         self.task.begin(self, w.mask)
         self._launch_noise(w.true_state, w.state)
         self.renderer.launch_reset()
 
-    def _launch_observe(self, state: wp.array, joint_target: wp.array, goal: wp.array) -> None:
+    def _launch_observe(
+        self, state: wp.array, joint_target: wp.array, goal: wp.array, objects: wp.array
+    ) -> None:
         w, c = self.warp, self.chain
         inputs = [w.joint_q, w.joint_qd, w.body_q, c.tool_body, c.tool_frame, w.target, w.task_goal]
         self._launch(observation.observe, *inputs, state, joint_target, goal)
+        if self.bodies:
+            self.bodies.launch_observe(state, joint_target, objects)
 
     def _launch_noise(self, state: wp.array, out: wp.array) -> None:
         noise, w = self.config.randomization.observation_noise, self.warp
@@ -260,6 +303,8 @@ class Simulation:
     def launch_forward_kinematics(self, mask: wp.array) -> None:
         """Frames of the links of the masked worlds from their joints."""
         s = self.newton_state
+        if self.bodies:
+            mask = self.bodies.articulation_mask(mask)
         newton.eval_fk(self.model, s.joint_q, s.joint_qd, s, mask=mask)
 
     def _launch(self, kernel: wp.Kernel, *inputs) -> None:

@@ -4,20 +4,48 @@ A task is a subclass of :class:`Task`, which launches Warp kernels, or of :class
 batched tensors; ``docs/tasks.md`` walks through both. :func:`register` gives it a name.
 """
 
-from franka_wm.envs.config import TASKS, FrankaConfig
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
 from franka_wm.envs.tasks.base import Task
+from franka_wm.envs.tasks.lift import Lift
 from franka_wm.envs.tasks.reach import Reach, goal_distance, reach_reward
 from franka_wm.envs.tasks.torch_task import TorchTask
 from franka_wm.envs.tasks.track import Track
 
-__all__ = ["Reach", "Task", "TorchTask", "Track", "goal_distance", "make_task", "reach_reward", "register"]
+if TYPE_CHECKING:
+    from franka_wm.envs.config import FrankaConfig
+
+__all__ = [
+    "Lift",
+    "Reach",
+    "Task",
+    "TorchTask",
+    "Track",
+    "goal_distance",
+    "make_task",
+    "reach_reward",
+    "register",
+    "task_class",
+]
+
+_BUILT_IN: dict[str, type[Task]] = {"reach": Reach, "track": Track, "lift": Lift}
 
 _REGISTERED: dict[str, type[Task]] = {}
+
+TASKS = list(_BUILT_IN)
+"""What ``task`` may be; :func:`register` adds to it."""
+
+
+def task_class(name: str) -> type[Task]:
+    """The class that a name stands for."""
+    return _REGISTERED[name] if name in _REGISTERED else _BUILT_IN[name]
 
 
 def make_task(config: FrankaConfig) -> Task:
     """The task that ``config.task`` names."""
-    return ({"reach": Reach, "track": Track} | _REGISTERED)[config.task](config)
+    return task_class(config.task)(config)
 
 
 def register(name: str, task: type[Task]) -> None:

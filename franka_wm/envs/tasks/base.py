@@ -3,17 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import torch
 import warp as wp
 from tensordict import TensorDict, TensorDictBase
 
-from franka_wm.envs.config import FrankaConfig
+from franka_wm.envs.scene import Scene
 from franka_wm.errors import UserError
 
 if TYPE_CHECKING:
+    from franka_wm.envs.config import FrankaConfig
     from franka_wm.envs.simulation import Simulation
+    from franka_wm.envs.tasks.manipulation import Aim, Sight
 
 
 class Task:
@@ -27,9 +29,17 @@ class Task:
     Attributes:
         num_draws: How many random numbers, uniform in [0, 1), each episode of each world gets in ``sim.warp.draws``
             before ``reset``. They depend on seed, world and episode alone.
+        gripper: Whether the task needs driven fingers.
+        scene: What stands around the arm, where the config does not say.
+        home: Joint angles at the start [rad], where the config does not say; ``None``: the arm's.
+        words: The task in words, for datasets.
     """
 
     num_draws = 0
+    gripper = False
+    scene: Scene | None = None
+    home: tuple[float, ...] | None = None
+    words = "Do what the reward asks for."
 
     def __init__(self, config: FrankaConfig):
         self.config = config
@@ -55,6 +65,12 @@ class Task:
         A class attribute is enough: ``goal_distance = True``.
         """
         return False
+
+    def brings(self) -> dict[str, Any]:
+        """Fields of the config that a task given as an object sets, where the config leaves them to the task."""
+        config = self.config
+        own = {"gripper": self.gripper or None, "scene": self.scene, "home": self.home}
+        return {name: value for name, value in own.items() if getattr(config, name) is None}
 
     def reset(self, sim: Simulation, mask: wp.array) -> None:
         """Writes ``sim.warp.task_goal`` (N, 3), and ``sim.warp.goal_q`` (N, 7) if known, where ``mask`` (N,)."""
@@ -88,6 +104,10 @@ class Task:
         have been reset already.
         """
         return {}
+
+    expert: Callable[[Sight], Aim] | None = None
+    """Where the hand shall be next, from what is seen (a method in torch, for all worlds at once, without a host sync):
+    what makes the task solvable by ``policy=expert``."""
 
     relabel: Callable[[TensorDictBase, torch.Tensor], TensorDictBase] | None = None
     """Recorded transitions as if the goal had been another, where the task can say so in torch: see `Reach.relabel`."""

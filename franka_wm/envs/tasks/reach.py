@@ -9,11 +9,11 @@ import torch
 import warp as wp
 from tensordict import TensorDictBase
 
-from franka_wm.envs.config import HOME, FrankaConfig
 from franka_wm.envs.kernels import JOINTS, chain_forward, episode_rng
 from franka_wm.envs.tasks.base import Task, with_goal
 
 if TYPE_CHECKING:
+    from franka_wm.envs.config import FrankaConfig
     from franka_wm.envs.simulation import Simulation
 
 REWARDS = {"dense": 0, "sparse": 1, "normalized": 2}
@@ -153,7 +153,9 @@ class Reach(Task):
     every world and episode. **Reward**: :func:`reach_reward`. **Success**: tool within ``success_distance``.
     """
 
-    def __init__(self, config: FrankaConfig):
+    words = "Move the tool to the goal position and hold it there."
+
+    def __init__(self, config: "FrankaConfig"):
         super().__init__(config)
         self._fixed: tuple[wp.array, wp.array] | None = None
 
@@ -182,7 +184,9 @@ class Reach(Task):
             if self._fixed is None:
                 point = torch.tensor(self.config.goal, dtype=torch.float32)
                 pose = sim.kinematics.solve(
-                    point.to(sim.device), torch.tensor(HOME, device=sim.device), iterations=60
+                    point.to(sim.device),
+                    torch.tensor(self.config.start_pose, device=sim.device),
+                    iterations=60,
                 )
                 self._fixed = (
                     wp.array(self.config.goal, dtype=float, device=sim.device),

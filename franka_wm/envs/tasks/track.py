@@ -7,11 +7,11 @@ from typing import TYPE_CHECKING
 
 import warp as wp
 
-from franka_wm.envs.config import FrankaConfig
 from franka_wm.envs.kernels import episode_rng
 from franka_wm.envs.tasks.reach import Reach
 
 if TYPE_CHECKING:
+    from franka_wm.envs.config import FrankaConfig
     from franka_wm.envs.simulation import Simulation
 
 
@@ -50,7 +50,9 @@ class Track(Reach):
     is the goal's position at that moment. **Reward** and **success**: as in :class:`Reach`, at that moment.
     """
 
-    def __init__(self, config: FrankaConfig):
+    words = "Follow the moving goal with the tool."
+
+    def __init__(self, config: "FrankaConfig"):
         super().__init__(config)
         self._center: wp.array | None = None
 

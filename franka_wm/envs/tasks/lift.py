@@ -1,0 +1,108 @@
+# pyright: reportAttributeAccessIssue=false, reportIndexIssue=false, reportArgumentType=false, reportOperatorIssue=false, reportCallIssue=false
+# (Kernels are Warp's language: pyright knows neither its arrays nor its vectors.)
+"""Lift: raise a cube."""
+
+# Warp reads annotations as types: no `from __future__ import annotations` here.
+import math
+from typing import TYPE_CHECKING
+
+import torch
+import warp as wp
+
+from franka_wm.envs.scene import Body, Scene
+from franka_wm.envs.tasks.base import Task
+from franka_wm.envs.tasks.manipulation import (
+    READY,
+    Aim,
+    Sight,
+    effort,
+    fetch,
+    holds,
+    nearness,
+    place_of,
+    tool_of,
+)
+
+if TYPE_CHECKING:
+    from franka_wm.envs.simulation import Simulation
+
+HEIGHT = 0.20
+"""How far up [m]."""
+
+
+@wp.kernel(enable_backward=False)
+def goal_above(mask: wp.array[wp.bool], rest_q: wp.array2d[float], height: float, goal: wp.array2d[float]):
+    world = wp.tid()
+    if mask[world]:
+        for i in range(3):
+            goal[world, i] = rest_q[world, 2 + i]  # behind the two fingers: the first object
+        goal[world, 2] += height
+
+
+@wp.kernel(enable_backward=False)
+def lift_reward_and_success(
+    state: wp.array2d[float],
+    joint_target: wp.array2d[float],
+    objects: wp.array2d[float],
+    goal: wp.array2d[float],
+    action: wp.array2d[float],
+    sparse: bool,
+    penalty: float,
+    height: float,
+    reward: wp.array2d[float],
+    success: wp.array2d[wp.bool],
+):
+    world = wp.tid()
+    cube = place_of(objects, world, 0)
+    risen = wp.clamp(1.0 - (goal[world, 2] - cube[2]) / height, 0.0, 1.0)
+    solved = cube[2] >= goal[world, 2]
+    value = 0.25 * nearness(wp.length(tool_of(state, world) - cube))
+    if holds(state, joint_target, cube, world):
+        value += 0.25 + 0.5 * risen
+    if sparse:
+        value = wp.where(solved, 1.0, 0.0)
+    reward[world, 0] = value - penalty * effort(action, world)
+    success[world, 0] = solved
+
+
+class Lift(Task):
+    """Raise a cube by 20 cm.
+
+    **Scene**: a table and a cube of 4 cm and 50 g. **Randomization**: the cube stands within 10 cm in x and 15 cm in y
+    of (0.5, 0) m, turned by up to 45°. **Goal**: 20 cm above where the cube stood. **Success**: the cube's centre is
+    that high (LiftCube of ManiSkill2: Gu et al. 2023). **Reward**, dense, in [0, 1]: a quarter for the tool's nearness
+    to the cube, 1 − tanh(5 · distance), a quarter for holding it, half for how far it has risen while held; sparse: 1
+    where it succeeds. Both minus ``action_penalty`` · mean(action²).
+    """
+
+    gripper = True
+    scene = Scene(objects=(Body(name="cube", at=(0.5, 0.0), spread=(0.10, 0.15), turn=math.pi / 4),))
+    home = READY
+    words = "Lift the cube."
+
+    @property
+    def reward_bounds(self) -> tuple[float, float]:
+        return -self.config.action_penalty, 1.0
+
+    def reset(self, sim: "Simulation", mask: wp.array) -> None:
+        w = sim.warp
+        wp.launch(goal_above, sim.num_envs, [mask, w.rest_q, HEIGHT, w.task_goal], device=sim.device)
+
+    def reward_and_success(self, sim: "Simulation") -> None:
+        w, c = sim.warp, self.config
+        wp.launch(
+            lift_reward_and_success,
+            sim.num_envs,
+            [
+                w.next_true_state, w.next_joint_target, w.next_objects, w.task_goal, w.action, c.reward == "sparse",
+                c.action_penalty, HEIGHT, w.reward, w.success,
+            ],
+            device=sim.device,
+        )  # fmt: skip
+
+    def measures(self, sim: "Simulation") -> dict[str, torch.Tensor]:
+        return {"cube's height [m]": sim.tensors.next_objects[:, 2]}
+
+    def expert(self, sight: Sight) -> Aim:
+        """Grasp the cube from above and bring it a little higher than the goal."""
+        return fetch(sight, 0, sight.goal + sight.goal.new_tensor([0.0, 0.0, 0.03]))[0]

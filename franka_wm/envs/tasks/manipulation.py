@@ -1,0 +1,184 @@
+# pyright: reportAttributeAccessIssue=false, reportIndexIssue=false, reportArgumentType=false, reportOperatorIssue=false, reportCallIssue=false
+# (Kernels are Warp's language: pyright knows neither its arrays nor its vectors.)
+"""What tasks with a gripper share: reading hand and objects in kernels, and what an expert sees and wants."""
+
+# Warp reads annotations as types: no `from __future__ import annotations` here.
+import math
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Self
+
+import torch
+import warp as wp
+from tensordict import TensorDictBase
+
+from franka_wm.envs.constants import MOST_OPEN, NUM_JOINTS, OBJECT_DIM
+
+if TYPE_CHECKING:
+    from franka_wm.envs.kinematics import Kinematics
+
+READY = (0.0, 0.1, 0.0, -2.3, 0.0, 2.4, 0.785)
+"""Joint angles with the hand upright, 0.3 m above the middle of the table [rad]."""
+
+EACH = wp.constant(OBJECT_DIM)
+GRIP = wp.constant(NUM_JOINTS)
+
+
+@wp.func
+def place_of(objects: wp.array2d[float], world: int, body: int) -> wp.vec3f:
+    """Position of an object [m]."""
+    at = EACH * body
+    return wp.vec3f(objects[world, at], objects[world, at + 1], objects[world, at + 2])
+
+
+@wp.func
+def speed_of(objects: wp.array2d[float], world: int, body: int) -> float:
+    """Speed of an object [m/s]."""
+    at = EACH * body + 7
+    return wp.length(wp.vec3f(objects[world, at], objects[world, at + 1], objects[world, at + 2]))
+
+
+@wp.func
+def tool_of(state: wp.array2d[float], world: int) -> wp.vec3f:
+    """Position of the tool, between the fingers [m]."""
+    return wp.vec3f(state[world, 14], state[world, 15], state[world, 16])
+
+
+@wp.func
+def holds(state: wp.array2d[float], joint_target: wp.array2d[float], at: wp.vec3f, world: int) -> bool:
+    """Whether the fingers are stopped by something at ``at``: they were told to close further, and do not."""
+    near = wp.length(tool_of(state, world) - at) < 0.025
+    pressed = state[world, 20] - joint_target[world, GRIP] > 0.003
+    return near and pressed and wp.abs(state[world, 22]) < 0.1
+
+
+@wp.func
+def nearness(distance: float) -> float:
+    """1 at no distance [m], 0.24 at 20 cm, 0 far away."""
+    return 1.0 - wp.tanh(5.0 * distance)
+
+
+@wp.func
+def fastest_joint(state: wp.array2d[float], world: int) -> float:
+    """Largest speed of the arm's joints [rad/s]."""
+    speed = float(0.0)
+    for j in range(7):
+        speed = wp.max(speed, wp.abs(state[world, 7 + j]))
+    return speed
+
+
+@wp.func
+def effort(action: wp.array2d[float], world: int) -> float:
+    """Mean squared action, as it is applied."""
+    total = float(0.0)
+    for j in range(action.shape[1]):
+        a = wp.clamp(action[world, j], -1.0, 1.0)
+        if wp.isfinite(action[world, j]):
+            total += a * a
+    return total / float(action.shape[1])
+
+
+# -- experts --------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Sight:
+    """What an expert sees of N worlds.
+
+    Attributes:
+        tool, target: (N, 3) where the tool is, and where the servo is told to bring it [m].
+        yaw, target_yaw: (N,) of the hand, pointing down; at 0 the fingers move along y [rad].
+        opening, closing: (N,) each finger's distance from the closed position [m], and how fast it falls [m/s].
+        command: (N,) the fingers' set point [m].
+        objects: (N, K, 13), see :data:`~franka_wm.envs.constants.OBJECT_DIM`.
+        goal: (N, 3) [m].
+    """
+
+    tool: torch.Tensor
+    target: torch.Tensor
+    yaw: torch.Tensor
+    target_yaw: torch.Tensor
+    opening: torch.Tensor
+    closing: torch.Tensor
+    command: torch.Tensor
+    objects: torch.Tensor
+    goal: torch.Tensor
+
+    @classmethod
+    def of(cls, observation: TensorDictBase, kinematics: "Kinematics") -> Self:
+        """From ``state`` (N, 28), ``joint_target`` (N, 8), ``objects`` (N, 13 · K) and ``goal``."""
+        state, objects = observation.get("state"), observation.get("objects")
+        x, y, z, w = state[..., 24:28].unbind(-1)
+        target, target_yaw = kinematics.upright(observation.get("joint_target")[..., :NUM_JOINTS])
+        return cls(
+            tool=state[..., 14:17],
+            target=target,
+            target_yaw=target_yaw,
+            yaw=torch.atan2(2 * (x * y + z * w), 1 - 2 * (y * y + z * z)),
+            opening=state[..., 20:22].mean(-1),
+            closing=-state[..., 22:24].mean(-1),
+            command=observation.get("joint_target")[..., NUM_JOINTS],
+            objects=objects.unflatten(-1, (-1, OBJECT_DIM)),
+            goal=observation.get("goal"),
+        )
+
+    def body(self, number: int) -> tuple[torch.Tensor, torch.Tensor]:
+        """Place (N, 3) [m] of an object and its angle around the vertical axis (N,) [rad]."""
+        one = self.objects[..., number, :]
+        x, y, z, w = one[..., 3:7].unbind(-1)
+        return one[..., :3], torch.atan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
+
+    @property
+    def squeezes(self) -> torch.Tensor:
+        """(N,) bool: the fingers are stopped by something."""
+        return (self.opening - self.command > 0.003) & (self.closing.abs() < 0.1)
+
+
+@dataclass(frozen=True)
+class Aim:
+    """Where an expert wants the hand, which points down: (N, 3) [m], yaw (N,) [rad], each finger's opening (N,) [m]."""
+
+    tool: torch.Tensor
+    yaw: torch.Tensor
+    opening: torch.Tensor
+
+
+def quarter_turn(angle: torch.Tensor, near: torch.Tensor) -> torch.Tensor:
+    """The angle nearest to ``near`` that is ``angle`` up to quarter turns: how to grasp a box."""
+    quarter = 0.5 * math.pi
+    return near + torch.remainder(angle - near + 0.5 * quarter, quarter) - 0.5 * quarter
+
+
+def fetch(sight: Sight, number: int, to: torch.Tensor, *, above: float = 0.08) -> tuple[Aim, torch.Tensor]:
+    """Grasps an object from above and brings it to ``to``; begins anew where it was lost. It remembers nothing.
+
+    Over the object, down, close, and once the fingers are stopped by it, on to ``to``.
+
+    Args:
+        sight: What is seen.
+        number: Of the object.
+        to: (N, 3) where its centre shall be [m].
+        above: Height over the object in which the hand gets into place [m].
+
+    Returns:
+        Where the hand shall be, and (N,) bool: the object is held.
+    """
+    place, angle = sight.body(number)
+    yaw = quarter_turn(angle, sight.yaw)
+    away = place - sight.tool
+    aside, below = away[..., :2].norm(dim=-1), away[..., 2].abs()
+    closing = sight.command < 0.9 * MOST_OPEN
+    slack = torch.where(closing, 2.0, 1.0)  # what has begun goes on
+    there = (aside < 0.008 * slack) & (below < 0.010 * slack)
+    held = there & sight.squeezes & closing
+    over = (aside < 0.02) & ((yaw - sight.yaw).abs() < 0.15)
+    up = torch.zeros_like(place)
+    up[..., 2] = above
+    hover = place + up
+    hover[..., :2] = torch.where(
+        (below < 0.5 * above)[..., None] & ~over[..., None], sight.tool[..., :2], hover[..., :2]
+    )
+    tool = torch.where((over | there)[..., None], place, hover)
+    tool = torch.where((there & closing)[..., None], sight.target, tool)
+    tool = torch.where(held[..., None], sight.target + (to - place), tool)
+    opening = torch.where(there, 0.0, MOST_OPEN)
+    return Aim(tool, torch.where(there, sight.target_yaw, yaw), opening), held

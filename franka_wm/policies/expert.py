@@ -1,0 +1,107 @@
+"""Experts: what a task says of where the hand shall be, turned into actions of all worlds by inverse kinematics."""
+
+# TorchRL declares in_keys and out_keys as properties, and lets classes set them as plain lists.
+# pyright: reportIncompatibleMethodOverride=false
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import torch
+from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModuleBase
+
+from franka_wm.envs.config import FrankaConfig
+from franka_wm.envs.constants import MOST_OPEN, NUM_JOINTS
+from franka_wm.envs.kinematics import Kinematics
+from franka_wm.envs.tasks import Task
+from franka_wm.envs.tasks.manipulation import Aim, Sight
+from franka_wm.errors import UserError
+from franka_wm.seeding import restore_generator
+
+FAST, SLOW = 0.5, 0.15
+"""Of the hand [m/s]: on its way, and within :data:`NEAR` of where it shall be."""
+NEAR = 0.04
+TURN = 2.0
+"""Of the hand around the vertical axis [rad/s]."""
+
+
+class ExpertPolicy(TensorDictModuleBase):
+    """What a task can show: its own plan (``Task.expert``) from the true positions of all objects.
+
+    The hand points down and moves straight, at up to 0.5 m/s; joint targets follow by inverse kinematics from those
+    that are there. It keeps nothing from step to step, so it goes on from any state.
+
+    Args:
+        task: The environment's.
+        kinematics: The arm's.
+        config: The environment's: what an action means.
+        noise: Standard deviation of noise on the joints' part of the action.
+        generator: Source of the noise.
+
+    Raises:
+        UserError: The task has no expert, or actions are tool displacements.
+    """
+
+    in_keys = ["state", "joint_target", "objects", "goal"]  # pyright: ignore[reportAssignmentType]
+    out_keys = ["action"]  # pyright: ignore[reportAssignmentType]
+
+    def __init__(
+        self,
+        task: Task,
+        kinematics: Kinematics,
+        config: FrankaConfig,
+        *,
+        noise: float = 0.0,
+        generator: torch.Generator | None = None,
+    ):
+        super().__init__()
+        if task.expert is None:
+            raise UserError(
+                f"policy=expert: task={config.task} has none; a task says it with a method expert"
+            )
+        if config.action_mode == "ee_delta":
+            raise UserError("policy=expert: drives joints; use env.action_mode=joint_delta or joint_position")
+        self.task, self.kinematics, self.config = task, kinematics, config
+        self.noise, self.generator = noise, generator
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        k, c = self.kinematics, self.config
+        for key in self.in_keys:
+            if tensordict.get(key, None) is None:
+                raise UserError(f"the expert reads {key}; add it to the environment's observations")
+        sight = Sight.of(tensordict, k)
+        assert self.task.expert is not None
+        aim = self.task.expert(sight)
+        target = tensordict.get("joint_target")[..., :NUM_JOINTS]
+        joints = self._follow(sight, aim, target)
+        if c.action_mode == "joint_position":
+            action = 2 * (joints - k.lower) / (k.upper - k.lower) - 1
+        else:
+            action = (joints - target) / c.action_scale
+        if self.noise:
+            action = action + self.noise * torch.randn(
+                action.shape, device=action.device, generator=self.generator
+            )
+        grip = 2 * aim.opening / MOST_OPEN - 1
+        return tensordict.set("action", torch.cat([action, grip.unsqueeze(-1)], -1).clamp(-1.0, 1.0))
+
+    def _follow(self, sight: Sight, aim: Aim, target: torch.Tensor) -> torch.Tensor:
+        """Joint targets one step nearer to the aim, (N, 7) [rad]."""
+        k, fps = self.kinematics, self.config.fps
+        tool, yaw = sight.target, sight.target_yaw
+        way = aim.tool - tool
+        distance = way.norm(dim=-1, keepdim=True).clamp_min(1e-9)
+        pace = (SLOW + (FAST - SLOW) * (distance / NEAR - 1).clamp(0, 1)) / fps
+        tool = tool + way * (pace / distance).clamp_max(1.0)
+        turn = torch.remainder(aim.yaw - yaw + torch.pi, 2 * torch.pi) - torch.pi
+        return k.solve_upright(tool, yaw + turn.clamp(-TURN / fps, TURN / fps), target)
+
+    def get_state(self) -> dict[str, torch.Tensor | None]:
+        """Where the generator stands."""
+        return {"generator": None if self.generator is None else self.generator.get_state()}
+
+    def set_state(self, state: Mapping[str, torch.Tensor | None], device: torch.device | str = "cpu") -> bool:
+        """Goes on from what :meth:`get_state` gave; ``False`` where the generator is of another kind of device."""
+        known = state["generator"]
+        return self.generator is None or known is None or restore_generator(self.generator, known)
