@@ -94,40 +94,6 @@ def horizon_error(
     }
 
 
-def ranks(x: Tensor) -> Tensor:
-    """Ranks from 1 (n,), equal values sharing their mean rank."""
-    _, inverse, counts = torch.unique(x, sorted=True, return_inverse=True, return_counts=True)
-    last = counts.cumsum(0).double()
-    return (last - (counts.double() - 1) / 2)[inverse]
-
-
-def spearman(x: Tensor, y: Tensor) -> Interval:
-    """Spearman's rank correlation with its 95 % interval.
-
-    The interval is Fisher's z with the variance (1 + ρ² / 2) / (n − 3) of Bonett & Wright, "Sample size
-    requirements for estimating Pearson, Kendall and Spearman correlations", Psychometrika 65 (2000).
-
-    Args:
-        x, y: (n,), n ≥ 4.
-
-    Returns:
-        In [−1, 1]; NaN where one of them never varies.
-
-    Raises:
-        ValueError: Other shapes.
-    """
-    if x.dim() != 1 or x.shape != y.shape or x.numel() < 4:
-        raise ValueError(
-            f"give two vectors of the same length, at least 4, not {tuple(x.shape)}, {tuple(y.shape)}"
-        )
-    rho = correlation(ranks(x), ranks(y))
-    if math.isnan(rho) or abs(rho) >= 1:
-        return Interval(rho, rho, rho)
-    half = 1.959964 * math.sqrt((1 + rho * rho / 2) / (x.numel() - 3))
-    z = math.atanh(rho)
-    return Interval(rho, math.tanh(z - half), math.tanh(z + half))
-
-
 def correlation(x: Tensor, y: Tensor) -> float:
     """Pearson's correlation of two vectors; NaN where one of them never varies."""
     a, b = (v.double() - v.double().mean() for v in (x, y))
@@ -163,7 +129,7 @@ def grouped_spearman(
             f"give two vectors of the same length, at least 4, and (n, 2) groups, not {tuple(x.shape)}, "
             f"{tuple(y.shape)}, {tuple(groups.shape)}"
         )
-    rho = correlation(ranks(x), ranks(y))
+    rho = correlation(_ranks(x), _ranks(y))
     # Episodes that no pair is from cannot be told from those that do not exist.
     names, groups = torch.unique(groups, return_inverse=True)
     if math.isnan(rho) or names.numel() < 2:
@@ -188,6 +154,13 @@ def grouped_spearman(
         return Interval(rho, rho, rho)
     low, high = torch.quantile(draws, torch.tensor([0.025, 0.975], dtype=torch.double)).tolist()
     return Interval(rho, max(-1.0, min(low, rho)), min(1.0, max(high, rho)))
+
+
+def _ranks(x: Tensor) -> Tensor:
+    """Ranks from 1 (n,), equal values sharing their mean rank."""
+    from scipy.stats import rankdata
+
+    return torch.from_numpy(rankdata(x.cpu().numpy()))
 
 
 def _centred_ranks(place: Tensor, values: int, weights: Tensor, total: Tensor) -> Tensor:

@@ -15,30 +15,6 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 
-def beside(videos: Sequence[Tensor], *, gap: int = 4, shade: int = 255) -> Tensor:
-    """Rollouts beside each other as one video.
-
-    Args:
-        videos: each (T, H, W, 3) uint8, all of one shape; at least one.
-        gap: between them [px].
-        shade: of the gap, 0 … 255.
-
-    Returns:
-        (T, H, Σ W + gaps, 3), the width made even where it is odd, as H.264 needs it.
-
-    Raises:
-        UserError: shapes differ or are no videos.
-    """
-    _check(videos)
-    t, height, _, _ = videos[0].shape
-    between = videos[0].new_full((t, height, gap, 3), shade)
-    parts = [part for video in videos for part in (between, video)][1:]
-    joined = torch.cat(parts, 2)
-    if joined.shape[2] % 2:
-        joined = torch.cat([joined, videos[0].new_full((t, height, 1, 3), shade)], 2)
-    return joined
-
-
 def strip_figure(
     rows: Mapping[str, Tensor],
     *,

@@ -10,7 +10,6 @@ Code names a colour by its light value (`BLUE`, `INK`, …); a theme translates 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 
-from franka_wm.errors import UserError
 from franka_wm.policies.names import RENAMED
 
 BLACK = "#000000"
@@ -88,17 +87,6 @@ DARK = Theme(
     },
 )
 THEMES = {theme.name: theme for theme in (LIGHT, DARK)}
-
-
-def theme_named(name: str) -> Theme:
-    """One of `THEMES`.
-
-    Raises:
-        UserError: there is none of that name.
-    """
-    if name not in THEMES:
-        raise UserError(f"no theme {name!r}; choose from {', '.join(THEMES)}.")
-    return THEMES[name]
 
 
 POLICY_COLOURS = {

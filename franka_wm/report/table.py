@@ -1,32 +1,25 @@
-"""Tables of an evaluation: Markdown, LaTeX, JSON, a terminal's, from the dict that `evaluation.json` holds.
+"""Tables of an evaluation, from the dict that `evaluation.json` holds.
 
-`evaluation_table` and `nested_table` make a `Table` of texts; `markdown`, `latex` and `html` write any of them.
-`records` and `data_frame` give the numbers themselves.
+`evaluation_tables` and `nested_table` make a `Table` of texts; `markdown` and `html` write any of them.
+`data_frame` gives the numbers themselves to pandas, which writes LaTeX, JSON, CSV and more.
 """
 
 import html as escaping
-import json
-import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from franka_wm.errors import UserError
-from franka_wm.files import atomic_write
-from franka_wm.report.style import BLACK, centimetres, policy_colour, policy_name
+from franka_wm.report.style import centimetres, policy_name
 
 if TYPE_CHECKING:
     from pandas import DataFrame
-    from rich.table import Table as RichTable
 
 # {policy: {"final_distance": interval, "success": {distance: interval}, "return": interval, "episodes": n}},
 # where an interval is {"mean", "low", "high"}; a policy may hold more numbers and intervals. Of tasks whose success is
 # not a distance to a goal there is none, "success" is one interval, and "measures" holds those of the task's own.
 type Evaluation = Mapping[str, Mapping[str, Any]]
 
-REQUIRED = ("final_distance", "success", "return", "episodes")
-OUTCOME = (*REQUIRED, "measures")
+OUTCOME = ("final_distance", "success", "return", "episodes", "measures")
 
 # key -> (title, factor to that unit, digits). Keys of rates by distance have the distance after them.
 TITLES: dict[str, tuple[str, float, int]] = {
@@ -54,26 +47,15 @@ class Table:
 # -- making ----------------------------------------------------------------------------------------------
 
 
-def evaluation_table(evaluation: Evaluation) -> Table:
+def evaluation_tables(evaluation: Evaluation) -> tuple[Table, Table]:
     """One row per policy, `mean (low – high)` in every cell; distances [m] in centimetres, rates in percent.
 
-    Columns beside the `REQUIRED` ones come from whatever numbers and intervals the policies hold.
-
-    Raises:
-        UserError: a policy lacks one of the `REQUIRED` entries, or an interval one of its numbers.
-    """
-    header, rows = _cells(evaluation)
-    return Table(header, [[policy_name(policy), *cells] for policy, cells in rows])
-
-
-def evaluation_tables(evaluation: Evaluation) -> tuple[Table, Table]:
-    """`evaluation_table` in two that are less wide: how episodes ended, and what was measured on the way.
-
-    Policies may lack entries; the second table has no rows where nothing more was measured.
+    The first table says how episodes ended, the second what was measured on the way; it has no rows where nothing
+    more was. Columns beside the `OUTCOME` come from whatever numbers and intervals the policies hold.
     """
     tables = []
     for outcome in (True, False):
-        header, rows = _cells(evaluation, strict=False, keep=lambda name, o=outcome: (name in OUTCOME) is o)
+        header, rows = _cells(evaluation, lambda name, o=outcome: (name in OUTCOME) is o)
         named = [[policy_name(policy), *cells] for policy, cells in rows] if len(header) > 1 else []
         tables.append(Table(header, named))
     return tables[0], tables[1]
@@ -121,47 +103,6 @@ def markdown(table: Table) -> str:
     return "\n".join(text) + "\n"
 
 
-def latex(table: Table, *, caption: str | None = None, label: str | None = None) -> str:
-    """As a LaTeX `tabular` with the rules of booktabs; inside a `table` if there is a caption or a label.
-
-    What LaTeX would take for a command is escaped.
-    """
-    lines = [" & ".join(map(latex_escape, row)) + r" \\" for row in (table.header, *table.rows)]
-    body = "\n".join(
-        [
-            rf"\begin{{tabular}}{{l{'r' * (len(table.header) - 1)}}}",
-            r"\toprule",
-            lines[0],
-            r"\midrule",
-            *lines[1:],
-            r"\bottomrule",
-            r"\end{tabular}",
-        ]
-    )
-    if caption is None and label is None:
-        return body + "\n"
-    around = [r"\begin{table}", r"\centering"]
-    around += [] if caption is None else [rf"\caption{{{latex_escape(caption)}}}"]
-    around += [] if label is None else [rf"\label{{{label}}}"]
-    return "\n".join([*around, body, r"\end{table}"]) + "\n"
-
-
-def latex_escape(text: str) -> str:
-    """Text that LaTeX prints as it is: `50 % of a_b` → `50 \\% of a\\_b`."""
-    special = {
-        "\\": r"\textbackslash{}",
-        "~": r"\textasciitilde{}",
-        "^": r"\textasciicircum{}",
-        "–": "--",
-        "−": "$-$",
-        "×": r"$\times$",
-        "²": r"$^2$",
-        "±": r"$\pm$",
-    }
-    special |= {one: f"\\{one}" for one in "&%$#_{}"}
-    return "".join(special.get(one, one) for one in text)
-
-
 def html(table: Table, *, kind: str = "") -> str:
     """As an HTML `<table>`; an interval in brackets goes on a line of its own, so that a phone has room for it."""
     head = "".join(f'<th scope="col">{escaping.escape(cell)}</th>' for cell in table.header)
@@ -173,106 +114,25 @@ def html(table: Table, *, kind: str = "") -> str:
     return f"<table{attribute}><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table>"
 
 
-def markdown_table(evaluation: Evaluation) -> str:
-    """`evaluation_table` as Markdown.
-
-    Raises:
-        UserError: a policy lacks one of the entries.
-    """
-    return markdown(evaluation_table(evaluation))
-
-
-def latex_table(evaluation: Evaluation, *, caption: str | None = None, label: str | None = None) -> str:
-    """`evaluation_table` as LaTeX; see `latex`.
-
-    Raises:
-        UserError: a policy lacks one of the entries.
-    """
-    return latex(evaluation_table(evaluation), caption=caption, label=label)
-
-
-def write_tables(evaluation: Evaluation, folder: str | Path, *, name: str = "evaluation") -> list[Path]:
-    """Write `name.md`, `name.tex` and `name.csv` (plain numbers) into a folder.
-
-    Raises:
-        UserError: a policy lacks one of the entries, or a file cannot be written.
-    """
-    texts = {
-        "md": markdown_table(evaluation),
-        "tex": latex_table(evaluation),
-        "csv": data_frame(evaluation).to_csv(index=False),
-    }
-    paths = []
-    for ending, text in texts.items():
-        path = Path(folder) / f"{name}.{ending}"
-        with atomic_write(path) as temporary:
-            temporary.write_text(text)
-        paths.append(path)
-    return paths
-
-
 # -- numbers ---------------------------------------------------------------------------------------------
 
 
-def records(values: Mapping[str, Any], *, first: str = "policy") -> list[dict[str, Any]]:
-    """Any dict of dicts as flat records with plain numbers, in SI units as they were measured.
-
-    An interval becomes three entries: `name`, `name/low`, `name/high`.
-    """
-    out = []
-    for name, value in values.items():
-        record: dict[str, Any] = {first: name}
-        for path, leaf in _leaves(value if isinstance(value, Mapping) else {"value": value}):
-            key = "/".join(path)
-            if isinstance(leaf, Mapping):
-                record |= {
-                    key if part == "mean" else f"{key}/{part}": number for part, number in leaf.items()
-                }
-            else:
-                record[key] = leaf
-        out.append(record)
-    return out
-
-
-def json_table(values: Mapping[str, Any], *, first: str = "policy") -> str:
-    """`records` as JSON. Numbers that JSON does not know (NaN, infinity) become null."""
-    clean = [
-        {k: None if isinstance(v, float) and not math.isfinite(v) else v for k, v in record.items()}
-        for record in records(values, first=first)
-    ]
-    return json.dumps(clean, indent=2, allow_nan=False) + "\n"
-
-
 def data_frame(values: Mapping[str, Any], *, first: str = "policy") -> "DataFrame":
-    """`records` as a pandas table, for what a spreadsheet or a notebook does next."""
+    """Any dict of dicts as a pandas table of plain numbers, in SI units as they were measured.
+
+    An interval becomes three columns: `name`, `name/low`, `name/high`.
+    """
     from pandas import DataFrame
 
-    return DataFrame(records(values, first=first))
-
-
-# -- the terminal ------------------------------------------------------------------------------------------
-
-
-def terminal_table(evaluation: Evaluation, title: str | None = None) -> "RichTable":
-    """`evaluation_table` as a `rich` table, to be printed by the caller's console.
-
-    Raises:
-        UserError: a policy lacks one of the entries.
-    """
-    from rich.markup import escape
-    from rich.table import Table as RichTable
-
-    header, rows = _cells(evaluation)
-    table = RichTable(title=title)
-    table.add_column(header[0])
-    for name in header[1:]:
-        table.add_column(escape(name), justify="right")  # [cm] would be taken for a style
-    for policy, cells in rows:
-        # Black, "doing nothing", would be invisible on most terminals.
-        colour = policy_colour(policy)
-        name = escape(policy_name(policy))
-        table.add_row(name if colour == BLACK else f"[{colour}]{name}[/]", *cells)
-    return table
+    rows = []
+    for name, value in values.items():
+        row: dict[str, Any] = {first: name}
+        for path, leaf in _leaves(value if isinstance(value, Mapping) else {"value": value}):
+            key = "/".join(path)
+            parts = leaf.items() if isinstance(leaf, Mapping) else [("mean", leaf)]
+            row |= {key if part == "mean" else f"{key}/{part}": number for part, number in parts}
+        rows.append(row)
+    return DataFrame(rows)
 
 
 # -- cells -----------------------------------------------------------------------------------------------
@@ -284,23 +144,15 @@ def is_interval(value: Any) -> bool:
 
 
 def _cells(
-    evaluation: Evaluation, *, strict: bool = True, keep: Callable[[str], bool] = lambda name: True
+    evaluation: Evaluation, keep: Callable[[str], bool]
 ) -> tuple[list[str], list[tuple[str, list[str]]]]:
-    """Column titles, and the cells of every policy without its name."""
-    reaches = any("final_distance" in result for result in evaluation.values())
-    required = REQUIRED if reaches else REQUIRED[2:]  # elsewhere there is no goal to be away from
+    """Column titles, and the cells of every policy without its name, of the entries to keep."""
     flat = {}
     for policy, result in evaluation.items():
-        for name in required if strict else ():
-            if name not in result:
-                raise UserError(
-                    f"the evaluation lacks {name!r}; every policy needs {', '.join(required[:-1])} and "
-                    f"{required[-1]}, every interval mean, low and high."
-                )
         leaves = _leaves(result)
         flat[policy] = {path: leaf for path, leaf in leaves if not isinstance(leaf, str) and keep(path[0])}
     found = dict.fromkeys(path for row in flat.values() for path in row)
-    # What is required frames the rest: distance and success first, return and the number of episodes last.
+    # The outcome frames the rest: distance and success first, return and the number of episodes last.
     places = {"final_distance": 0, "success": 1, "success_once": 2, "return": 4, "episodes": 5}
     paths = sorted(found, key=lambda path: (places.get(path[0], 3), *_by_distance(path)))
     rows = [

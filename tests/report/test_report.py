@@ -9,13 +9,12 @@ import numpy as np
 import pytest
 import torch
 from PIL import Image
-from rich.console import Console
 
 from franka_wm.errors import UserError
 from franka_wm.files import atomic_write
 from franka_wm.report import style
 from franka_wm.report.curves import plot_learning_curves
-from franka_wm.report.table import markdown_table, terminal_table
+from franka_wm.report.table import evaluation_tables, markdown
 from franka_wm.video import tile_frames, write_gif, write_png, write_video
 
 # -- video -----------------------------------------------------------------------------------------------
@@ -217,8 +216,8 @@ def evaluation() -> dict[str, dict]:
     }
 
 
-def test_markdown_table_has_units_order_and_intervals() -> None:
-    lines = markdown_table(evaluation()).splitlines()
+def test_markdown_has_units_order_and_intervals() -> None:
+    lines = markdown(evaluation_tables(evaluation())[0]).splitlines()
     assert lines[0] == (
         "| policy | final distance [cm] | success at 5 cm [%] | success at 2.5 cm [%] "
         "| success at 1 cm [%] | return | episodes |"
@@ -229,22 +228,6 @@ def test_markdown_table_has_units_order_and_intervals() -> None:
         "| -3.00 (-1.50 – -4.50) | 64 |"
     )
     assert [line.split(" | ")[0] for line in lines[2:]] == ["| planner", "| noop", "| mine"]
-
-
-def test_terminal_table_shows_the_same_numbers() -> None:
-    console = Console(width=200, record=True, file=open("/dev/null", "w"))  # noqa: SIM115
-    console.print(terminal_table(evaluation(), title="reach"))
-    text = console.export_text()
-    assert "reach" in text
-    for cell in ("planner", "noop", "mine", "2.12 (1.06 – 3.18)", "final distance [cm]", "64"):
-        assert cell in text
-
-
-def test_an_incomplete_evaluation_is_named() -> None:
-    incomplete = evaluation()
-    del incomplete["noop"]["return"]
-    with pytest.raises(UserError, match="lacks 'return'"):
-        markdown_table(incomplete)
 
 
 def test_policies_that_are_compared_have_different_colours() -> None:

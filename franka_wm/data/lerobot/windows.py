@@ -119,7 +119,7 @@ class RecordedWindows:
             raise UserError(
                 f"dataset.validation_fraction={validation_fraction!r}: must be at least 0 and below 1"
             )
-        self.recording, self.split_name, self.seed = recording, split, seed
+        self.recording, self.seed = recording, seed
         self.window, self.batch_size = window, batch_size
         self.validation_fraction = validation_fraction
         self.device = recording.device
@@ -299,15 +299,6 @@ class RecordedWindows:
                 action = np.where(half > 0, (action - centre) / np.maximum(half, 1e-30), 0.0)
             out["action"] = _moments(action, self.device)
         return out
-
-    def observation_statistics(self, keys: Sequence[str]) -> tuple[Tensor, Tensor]:
-        """Mean and standard deviation of vector observations, one behind the other, for a model's input.
-
-        A component that hardly changes gets a standard deviation of 1e-3, so that dividing is safe.
-        """
-        statistics = self.statistics()
-        mean = torch.cat([statistics[key].mean for key in keys])
-        return mean, torch.cat([statistics[key].std for key in keys]).clamp_min(1e-3)
 
     def recorded_action(self, action: Tensor) -> Tensor:
         """Actions (…, A) as given out → in the dataset's own units."""
