@@ -14,7 +14,6 @@ import time
 from dataclasses import replace
 
 import torch
-import warp as wp
 from common import publish, rate
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
@@ -137,7 +136,6 @@ def main() -> None:
     parser.add_argument("--seconds", type=float, default=2.0)
     parser.add_argument("--out")
     arguments = parser.parse_args()
-    wp.config.log_level = wp.LOG_WARNING
     device = str(resolve_device(arguments.device))
     worlds = arguments.worlds or ([4096, 16384] if device.startswith("cuda") else [64])
     rows = []

@@ -104,9 +104,7 @@ def size(folder: Path, frames: int) -> float:
 
 
 def writing(arguments: argparse.Namespace) -> list[dict[str, Any]]:
-    import warp as wp
 
-    wp.config.log_level = wp.LOG_WARNING
     torch.set_num_threads(1)
     source = open_source(
         "random",

@@ -30,7 +30,6 @@ from franka_wm.policies.scripted import SmoothRandomPolicy
 
 def record(folder: Path, episodes: int, format: str, window: int, batch_size: int) -> tuple[Path, Any]:
     """A dataset of episodes of 50 steps, and a replay buffer with the same steps."""
-    import warp as wp
     from torchrl.collectors import Collector
 
     from franka_wm.data.lerobot.episodes import EpisodeCutter
@@ -38,7 +37,6 @@ def record(folder: Path, episodes: int, format: str, window: int, batch_size: in
     from franka_wm.data.lerobot.schema import schema_for
     from franka_wm.data.lerobot.writer import DatasetWriter
 
-    wp.config.log_level = wp.LOG_WARNING  # its list of compiled modules drowns the table
     config = FrankaConfig(
         observations=("pixels", "state"), goal_sampling="reachable", substeps=4, episode_length=50
     )

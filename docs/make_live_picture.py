@@ -11,7 +11,6 @@ import time
 from pathlib import Path
 
 import torch
-import warp as wp
 from selenium import webdriver
 from selenium.webdriver.chrome.service import Service
 
@@ -31,7 +30,6 @@ GOALS = ((0.35, 0.30, 0.55), (0.55, -0.20, 0.35), (0.42, 0.36, 0.60))
 
 def main() -> None:
     torch.manual_seed(0)
-    wp.config.log_level = wp.LOG_WARNING
     stage = build(parse([*sys.argv[1:], "device=cpu"]))
     session = Session(stage.env, stage.policies, policy="planner", seed=4)
     page = Page(session, port=0, title=stage.title)

@@ -6,7 +6,6 @@ python docs/make_pictures.py
 from pathlib import Path
 
 import torch
-import warp as wp
 
 from franka_wm.envs import FrankaConfig, FrankaEnv
 from franka_wm.video import tile_frames, write_png
@@ -15,7 +14,6 @@ FOLDER = Path(__file__).parent / "images"
 
 
 def main() -> None:
-    wp.config.log_level = wp.LOG_WARNING
     config = FrankaConfig(
         observations=("state",), enable_shadows=True, gravity_compensation=True, pose_noise=0.5
     )

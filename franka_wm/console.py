@@ -2,17 +2,64 @@
 
 from __future__ import annotations
 
+import io
 import sys
 import threading
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import TextIO
+from pathlib import Path
+from typing import Any, TextIO
 
 
 def say(text: str, stream: TextIO | None = None) -> None:
     """One line, at once."""
     print(text, file=sys.stdout if stream is None else stream, flush=True)
+
+
+class _Copied:
+    """A stream whose text also goes into the log."""
+
+    def __init__(self, stream: TextIO) -> None:
+        self._stream = stream
+
+    def write(self, text: str) -> int:
+        if _log is not None:
+            _log.write(text)
+        return self._stream.write(text)
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._stream, name)
+
+
+_log: TextIO | None = None
+"""Copy of what the terminal shows: in memory until there is a file for it."""
+
+
+@contextmanager
+def terminal_log() -> Iterator[None]:
+    """Copies what Python prints meanwhile to stdout and stderr, for :func:`log_to`."""
+    global _log
+    streams = sys.stdout, sys.stderr
+    _log = io.StringIO()
+    sys.stdout, sys.stderr = (_Copied(stream) for stream in streams)  # type: ignore[assignment]
+    try:
+        yield
+    finally:
+        sys.stdout, sys.stderr = streams
+        _log.close()
+        _log = None
+
+
+def log_to(path: Path) -> None:
+    """Goes on with the copy in a file, at its end; what was printed before comes first."""
+    global _log
+    if _log is None:
+        return
+    text = _log.getvalue() if isinstance(_log, io.StringIO) else ""
+    _log.close()
+    _log = path.open("a", encoding="utf-8", buffering=1)
+    _log.write(text)
 
 
 def duration(seconds: float) -> str:

@@ -10,7 +10,6 @@ from typing import Any
 
 import pytest
 import torch
-import warp as wp
 from omegaconf import DictConfig
 
 from franka_wm import conf
@@ -20,7 +19,6 @@ from franka_wm.training.settings import RunSettings
 
 ROOT = Path(__file__).resolve().parents[1]
 
-wp.config.log_level = wp.LOG_WARNING
 
 SMALL = {"substeps": 2, "gravity_compensation": True, "observations": ("state", "joint_target")}
 

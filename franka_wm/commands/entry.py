@@ -4,14 +4,18 @@ from __future__ import annotations
 
 import functools
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn, TextIO
 
-from omegaconf import DictConfig
+from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.errors import OverrideParseException
+from omegaconf import DictConfig, OmegaConf
+from omegaconf.errors import OmegaConfBaseException
 
-from franka_wm.commands.overrides import compose
-from franka_wm.console import say
+from franka_wm import conf
+from franka_wm.commands.overrides import compose, explain
+from franka_wm.console import say, terminal_log
 from franka_wm.errors import FrankaError
 
 INTERRUPTED = 130
@@ -25,21 +29,59 @@ def run_command(main: Callable[[], Any], arguments: list[str] | None = None) -> 
         main: Reads ``sys.argv``, as Hydra's are.
         arguments: After the program's name; the command line's if not given.
     """
-    arguments = sys.argv[1:] if arguments is None else arguments
-    sys.argv[1:] = arguments
-    sweeps = any(a in ("-m", "--multirun") for a in arguments)
-    asks_hydra = any(a.startswith("-") and a not in ("-m", "--multirun") for a in arguments)
-    if not asks_hydra and not sweeps:
-        check_overrides(arguments)
-    import warp as wp  # from here on: what takes seconds to import
+    with terminal_log():
+        _run(main, sys.argv[1:] if arguments is None else arguments)
 
-    wp.config.log_level = wp.LOG_WARNING  # its list of compiled modules drowns what a run has to say
-    if not asks_hydra:
-        sys.argv[1:] = arguments = with_scale(arguments)
-        problem = check_command(arguments)
+
+def _run(main: Callable[[], Any], arguments: list[str]) -> None:
+    asked = hydra_flags(arguments)
+    flags = [a for a in arguments if a not in asked.overrides]
+    overrides = list(asked.overrides)
+    elsewhere = asked.config_dir or asked.config_name or asked.config_path or asked.experimental_rerun
+    if not (elsewhere or asked.hydra_help or asked.shell_completion):
+        for one in swept(overrides) if asked.multirun else [overrides]:
+            check_overrides(one)
+    only_shows = asked.help or asked.hydra_help or asked.shell_completion or asked.info
+    if not (elsewhere or only_shows):
+        overrides = with_scale(overrides, sys.stderr if asked.cfg else sys.stdout)
+        problem = None if asked.cfg or asked.multirun else check_command(overrides)
         if problem is not None:
             fail(problem)
+    sys.argv[1:] = [*flags, *overrides]
     main()
+
+
+def hydra_flags(arguments: list[str]) -> Any:
+    """The flags of Hydra on a command line, read by its own parser; ``overrides`` are the other arguments."""
+    from hydra._internal.utils import get_args_parser
+
+    parser = get_args_parser()
+    parser.error = lambda message: fail(f"{message}; python train.py --hydra-help lists the flags")  # type: ignore
+    return parser.parse_intermixed_args(arguments)
+
+
+def swept(overrides: list[str]) -> Iterator[list[str]]:
+    """What a sweep will compose: the first value of each list ``a=1,2``, and every choice of each group once.
+
+    Lists that only Hydra can expand (``glob``) are left to it.
+    """
+    try:
+        parsed = OverridesParser.create().parse_overrides(overrides)
+    except OverrideParseException as error:
+        fail(explain(str(error)))
+    known = [o for o in parsed if not o.is_sweep_override() or o.is_choice_sweep() or o.is_range_sweep()]
+    values = [
+        [f"{str(o.input_line).partition('=')[0]}={value}" for value in o.sweep_string_iterator()]
+        if o.is_sweep_override()
+        else [str(o.input_line)]
+        for o in known
+    ]
+    first = [choices[0] for choices in values]
+    yield first
+    for k, o in enumerate(known):
+        if (conf.FOLDER / o.key_or_group).is_dir():
+            for choice in values[k][1:]:
+                yield [*first[:k], choice, *first[k + 1 :]]
 
 
 def one_line_errors(main: Callable[[DictConfig], Any]) -> Callable[[DictConfig], Any]:
@@ -64,19 +106,22 @@ def one_line_errors(main: Callable[[DictConfig], Any]) -> Callable[[DictConfig],
 def check_overrides(arguments: list[str]) -> None:
     """Composes the configuration alone, so that a typo is answered before torch or the simulator are imported."""
     try:
-        compose([a for a in arguments if a != "scale=auto"])
+        cfg = compose([a for a in arguments if a != "scale=auto"])
+        OmegaConf.to_container(cfg, resolve=True)
     except FrankaError as error:
         fail(str(error))
+    except OmegaConfBaseException as error:
+        fail(explain(str(error)))
 
 
-def fail(message: str) -> None:
+def fail(message: str) -> NoReturn:
     """Says what is wrong and exits with status 1."""
     print(f"error: {message}", file=sys.stderr, flush=True)
     sys.exit(1)
 
 
-def with_scale(arguments: list[str]) -> list[str]:
-    """Adds ``scale=gpu`` or ``scale=laptop`` where none, or ``scale=auto``, is given."""
+def with_scale(arguments: list[str], stream: TextIO | None = None) -> list[str]:
+    """Adds ``scale=gpu`` or ``scale=laptop`` where none, or ``scale=auto``, is given; says so on ``stream``."""
     given = next((a for a in arguments if a.startswith("scale=")), None)
     if given not in (None, "scale=auto"):
         return arguments
@@ -86,7 +131,7 @@ def with_scale(arguments: list[str]) -> list[str]:
     on_gpu = device.startswith("cuda") or (device == "auto" and torch.cuda.is_available())
     scale = "gpu" if on_gpu else "laptop"
     if not any(a.startswith("resume=") for a in arguments):
-        say(f"scale={scale}, by the device; choose with scale=laptop, gpu or smoke")
+        say(f"scale={scale}, by the device; choose with scale=laptop, gpu or smoke", stream)
     return [a for a in arguments if a != given] + [f"scale={scale}"]
 
 
@@ -95,8 +140,6 @@ def check_command(arguments: list[str]) -> str | None:
     from franka_wm.training.run import check_once, import_plugins, occupied, resumed, unwritable
     from franka_wm.training.settings import RunSettings
 
-    if any(a in ("-m", "--multirun") for a in arguments):
-        return None  # sweeps are resolved by Hydra itself
     try:
         cfg = compose(arguments)
         import_plugins(cfg.plugins)

@@ -16,7 +16,7 @@ import torch
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf
 
-from franka_wm.console import announced, say
+from franka_wm.console import announced, log_to, say
 from franka_wm.data.lerobot.export import export_run
 from franka_wm.device import resolve_device
 from franka_wm.errors import FrankaError, UserError
@@ -196,6 +196,7 @@ def start(cfg: DictConfig) -> Run:
     problem = occupied(folder, settings.resume)  # also of a sweep, whose folders only Hydra knows
     if problem is not None:
         raise UserError(problem)
+    log_to(folder / "train.log")
     OmegaConf.save(OmegaConf.create(dict(settings.values)), folder / "config.yaml")
     write_versions(folder, device)
     say(f"device {device}   seed {settings.seed}   results in {folder}")

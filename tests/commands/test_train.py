@@ -53,6 +53,18 @@ def test_what_it_says(run) -> None:
     assert any(line.startswith("updates 30/30") for line in lines)
     assert "compiles kernels" in done.stdout
     assert "Traceback" not in done.stderr
+    for noise in ("Module ", "Warp", "CUDA driver"):
+        assert noise not in done.stdout + done.stderr
+
+
+def test_train_log_holds_what_the_terminal_showed(run) -> None:
+    """Lines of both streams in their order, those before the folder was named, tables, and the last line."""
+    folder, done = run
+    log = (folder / "train.log").read_text().splitlines()
+    for stream in (done.stdout, done.stderr):
+        rest = iter(log)
+        assert all(line in rest for line in stream.splitlines())
+    assert len(log) == len(done.stdout.splitlines()) + len(done.stderr.splitlines())
 
 
 def test_evaluation_json(run) -> None:
@@ -188,7 +200,6 @@ def refuse(tmp_path: Path, monkeypatch, capfd):
             runpy.run_path(str(TRAIN), run_name="__main__")
         assert caught.value.code == 1
         text = capfd.readouterr().err
-        text = "\n".join(line for line in text.splitlines() if not line.startswith("Warp CUDA warning"))
         assert_one_line(text)
         return text
 
@@ -379,21 +390,39 @@ def test_a_resumed_run_s_folder_has_the_name_of_the_first(resume: str | None, na
 
 
 @pytest.mark.parametrize(
-    ("argument", "said"),
+    ("arguments", "said"),
     [
         ("env.image_sise=3", "env.image_sise: no such option; did you mean env.image_size?"),
         ("model=tdmcp2", "did you mean tdmpc2?"),
+        ("--cfg job env.image_sise=3", "did you mean env.image_size?"),
+        ("seed=1 --cfg job --resolve env.fps=${nope}", "Interpolation key 'nope' not found"),
+        ("--help model=tdmcp2", "did you mean tdmpc2?"),
+        ("--info defaults modle=tdmpc2", "did you mean model?"),
+        ("--multirun seed=0,1 env.image_sise=3,4", "did you mean env.image_size?"),
+        ("-m env=reach,raech", "did you mean reach?"),
+        ("-m env=[", "no viable alternative at input '['"),
+        ("--cfg jbo", "invalid choice: 'jbo' (choose from 'job', 'hydra', 'all')"),
+        ("--fast", "unrecognized arguments: --fast"),
     ],
 )
 @pytest.mark.parametrize("program", [[str(TRAIN)], ["-m", "franka_wm", "train"]])
 def test_a_typo_is_answered_before_torch_and_the_simulator_load(
-    program: list[str], argument: str, said: str, tmp_path: Path
+    program: list[str], arguments: str, said: str, tmp_path: Path
 ) -> None:
-    command = [sys.executable, "-X", "importtime", *program, argument]
+    command = [sys.executable, "-X", "importtime", *program, *arguments.split()]
     done = subprocess.run(command, capture_output=True, text=True, check=False, cwd=tmp_path)
     lines = [line for line in done.stderr.splitlines() if not line.startswith("import time:")]
-    assert done.returncode == 1 and lines == [line for line in lines if line.startswith("error: ")]
-    assert len(lines) == 1 and lines[0].endswith(said) and "+" not in lines[0]
+    assert done.returncode == 1 and lines == [line for line in lines if line.startswith("error: ")], lines
+    assert len(lines) == 1 and said in lines[0] and "+env" not in lines[0] and done.stdout == ""
     loaded = {line.rsplit("|", 1)[-1].strip() for line in done.stderr.splitlines()}
     assert "hydra" in loaded and not loaded & {"torch", "newton", "warp", "torchrl", "pandas"}
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_cfg_shows_the_configuration_that_would_run(tmp_path: Path) -> None:
+    """Options may stand before and after the flag; the scale is that of the device, which is said elsewhere."""
+    done = train("device=cpu", "--cfg", "job", "--resolve", "env.substeps=7", cwd=tmp_path)
+    assert done.returncode == 0 and "scale=laptop, by the device" in done.stderr
+    shown = OmegaConf.create(done.stdout)
+    assert (shown.scale, shown.device, shown.env.substeps) == ("laptop", "cpu", 7)
     assert list(tmp_path.iterdir()) == []

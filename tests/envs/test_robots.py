@@ -14,7 +14,7 @@ import pytest
 import torch
 from torchrl.envs.utils import check_env_specs
 
-from franka_wm.commands import main as cli
+from franka_wm.commands import listing
 from franka_wm.envs import FrankaConfig, FrankaEnv
 from franka_wm.envs.robots import SOURCES, Source, load_robot, meshes, sources
 from franka_wm.errors import UserError
@@ -76,7 +76,7 @@ def random_joints(robot, count: int = 50) -> torch.Tensor:
 
 
 def test_the_command_line_lists_every_robot() -> None:
-    assert set(cli.ROBOTS) == set(SOURCES)
+    assert set(listing.ROBOTS) == set(SOURCES)
 
 
 def test_unknown_robot_names_the_known_ones() -> None:

@@ -19,11 +19,21 @@ import warp as wp
 
 from franka_wm.envs.config import FrankaConfig
 from franka_wm.envs.constants import NUM_FINGERS, NUM_JOINTS
+from franka_wm.envs.quiet import start_warp
 from franka_wm.envs.robots import gripper, meshes
 from franka_wm.envs.robots.sources import SOURCES, Source, detail, urdf_source
 from franka_wm.errors import UserError
 
-__all__ = ["SOURCES", "TOOL_LINKS", "Robot", "Source", "add_robot", "load_robot", "urdf_source"]
+__all__ = [
+    "SOURCES",
+    "TOOL_LINKS",
+    "Robot",
+    "Source",
+    "add_robot",
+    "arm_builder",
+    "load_robot",
+    "urdf_source",
+]
 
 TOOL_LINKS = ("fr3_hand_tcp", "panda_hand_tcp", "hand_tcp", "tool0", "tcp", "fr3_hand", "panda_hand")
 """Links that may be the tool, in order of preference."""
@@ -57,6 +67,14 @@ class Robot:
     tool_frame: np.ndarray
 
 
+def arm_builder() -> newton.ModelBuilder:
+    """An empty builder for one world, with the MuJoCo attributes registered."""
+    start_warp()
+    builder = newton.ModelBuilder()
+    newton.solvers.SolverMuJoCo.register_custom_attributes(builder)
+    return builder
+
+
 def add_robot(
     builder: newton.ModelBuilder,
     config: FrankaConfig,
@@ -70,7 +88,7 @@ def add_robot(
     weight of every link.
 
     Args:
-        builder: An empty builder for one world, with the MuJoCo attributes registered.
+        builder: What :func:`arm_builder` gives.
         config: Gains, armature, finger opening, choice of robot.
         urdf_path: Overrides the robot that the config names.
         visuals: Whether it is drawn.
@@ -137,8 +155,7 @@ def add_robot(
 
 def load_robot(config: FrankaConfig, urdf_path: str | Path | None = None) -> Robot:
     """The robot's description alone, without a simulation."""
-    builder = newton.ModelBuilder()
-    newton.solvers.SolverMuJoCo.register_custom_attributes(builder)
+    builder = arm_builder()
     return add_robot(builder, config, urdf_path, visuals=False)
 
 

@@ -14,7 +14,7 @@ import warp as wp
 from franka_wm.envs.camera import GOAL_MARKER, GROUND, wrist_mount
 from franka_wm.envs.config import FrankaConfig
 from franka_wm.envs.constants import NUM_JOINTS
-from franka_wm.envs.robots import Robot, add_robot
+from franka_wm.envs.robots import Robot, add_robot, arm_builder
 from franka_wm.envs.simulation.bodies import add_scene, contact_options
 
 FLOOR = -0.75
@@ -25,8 +25,7 @@ def build_model(
     config: FrankaConfig, num_envs: int, device: str, urdf_path: str | Path | None = None
 ) -> tuple[newton.Model, Robot]:
     """N copies of the robot, and the ground that all of them share."""
-    arm = newton.ModelBuilder()
-    newton.solvers.SolverMuJoCo.register_custom_attributes(arm)
+    arm = arm_builder()
     robot = add_robot(arm, config, urdf_path)
     if config.surroundings:
         add_scene(arm, config.surroundings, robot.tool_body)
