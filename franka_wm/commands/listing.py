@@ -1,11 +1,15 @@
-"""``franka-wm list``: what can be named in a configuration. It reads files, and imports neither simulator nor torch."""
+"""``franka-wm list``: what can be named in a configuration. Without plugins it reads files alone."""
 
 from __future__ import annotations
 
 import ast
+import inspect
+import json
+from collections.abc import Sequence
 from pathlib import Path
 
-from franka_wm.commands.arguments import verb
+from franka_wm.commands.arguments import verb, word
+from franka_wm.errors import UserError
 
 # The values of FrankaConfig.robot, which lives in a package that imports the simulator.
 ROBOTS = {
@@ -19,26 +23,91 @@ ROBOTS = {
 PACKAGE = Path(__file__).parents[1]
 
 
-@verb("list")
-def show_list() -> None:
-    """List what can be chosen. Environments, models, planners, experiments and more, each with a line."""
+@verb(
+    "list",
+    others="hydra.searchpath=",
+    shown=("hydra.searchpath=[file://FOLDER]", "configuration groups of your own, as for train"),
+)
+@word("plugins", "also what these modules of your own register, as for train", metavar="[MODULE,…]")
+def show_list(plugins: str | None, overrides: Sequence[str]) -> None:
+    """List what can be chosen. Environments, models, planners, experiments and more, each with a line.
+
+    Datasets are those below ./datasets.
+    """
+    folders = [PACKAGE / "conf"]
+    folders += [
+        Path(one.removeprefix("file://")) for word in overrides for one in _list(word.partition("=")[2])
+    ]
+    for folder in folders:
+        if not folder.is_dir():
+            raise UserError(f"list: hydra.searchpath: {folder} is not a folder")
     sections = {
-        "environments (env=)": options("env"),
-        "robots (env.robot=)": ROBOTS | options("env/robot"),
+        "environments (env=)": options("env", folders),
+        "robots (env.robot=)": ROBOTS | options("env/robot", folders),
         "tasks (env.task=)": tasks(),
-        "models (model=)": options("model"),
-        "planners (planner=)": options("planner"),
-        "experiments (experiment=)": options("experiment"),
+        "models (model=)": options("model", folders),
+        "planners (planner=)": options("planner", folders),
+        "pretraining (pretrain=)": options("pretrain", folders),
+        "recorded data (dataset=)": options("dataset", folders),
+        "datasets (dataset=lerobot dataset.root=)": datasets(Path("datasets")),
+        "scales (scale=)": options("scale", folders),
+        "experiments (experiment=)": options("experiment", folders),
     }
+    if plugins is not None:
+        sections |= registered(_list(plugins))
     for title, entries in sections.items():
-        print(title)
+        if entries:
+            print(title)
         for name, line in entries.items():
             print(f"  {name:24s} {line}".rstrip())
 
 
-def options(group: str) -> dict[str, str]:
+def _list(text: str) -> list[str]:
+    return [one.strip() for one in text.strip("[]").split(",") if one.strip()]
+
+
+def options(group: str, folders: Sequence[Path] = (PACKAGE / "conf",)) -> dict[str, str]:
     """The options of a configuration group: file name → its first comment line."""
-    return {file.stem: _first_comment(file) for file in sorted((PACKAGE / "conf" / group).glob("*.yaml"))}
+    files = sorted(file for folder in folders for file in (folder / group).glob("*.yaml"))
+    return {file.stem: _first_comment(file) for file in files}
+
+
+def registered(plugins: Sequence[str]) -> dict[str, dict[str, str]]:
+    """What modules of the user's register: title → name → line."""
+    from franka_wm import models
+    from franka_wm.envs import tasks
+    from franka_wm.planning import registry
+    from franka_wm.training.run import import_plugins
+
+    def known() -> dict[str, dict[str, str]]:
+        of_tasks = {name: inspect.getdoc(tasks.task_class(name)) or "" for name in tasks.TASKS}
+        return {
+            "models of your plugins (model.name=)": models.available(),
+            "planners of your plugins (planner.name=)": registry.available(),
+            "tasks of your plugins (env.task=)": {
+                name: text.split("\n")[0] for name, text in of_tasks.items()
+            },
+        }
+
+    before = known()
+    import_plugins(plugins)
+    return {
+        title: {name: line for name, line in entries.items() if name not in before[title]}
+        for title, entries in known().items()
+    }
+
+
+def datasets(folder: Path) -> dict[str, str]:
+    """LeRobot datasets one level below a folder: path → what is in it."""
+    found = {}
+    for file in sorted(folder.glob("*/meta/info.json")):
+        try:
+            info = json.loads(file.read_text(encoding="utf-8"))
+            line = f"{info['total_episodes']:,} episodes, {info['total_frames']:,} steps"
+        except (OSError, ValueError, KeyError, TypeError) as error:
+            line = f"{file.relative_to(file.parents[1])} cannot be read ({error!r})"
+        found[str(file.parents[1])] = line
+    return found
 
 
 def _first_comment(file: Path) -> str:

@@ -32,6 +32,31 @@ def test_list_names_everything_with_one_line(capsys: pytest.CaptureFixture[str])
     assert all(len(entry) == 2 for entry in entries), "an entry has no description"
 
 
+def test_list_shows_what_is_one_s_own(tmp_path: Path) -> None:
+    """Plugins, their configuration groups, datasets in ./datasets; without them, what the package has."""
+    examples = Path(franka_wm.__file__).parents[1] / "examples"
+    (tmp_path / "examples").symlink_to(examples)
+    for name, text in (("whole", '{"total_episodes": 1200, "total_frames": 60000}'), ("broken", "{")):
+        (tmp_path / "datasets" / name / "meta").mkdir(parents=True)
+        (tmp_path / "datasets" / name / "meta" / "info.json").write_text(text)
+    command = [sys.executable, "-m", "franka_wm", "list"]
+    plugins = [f"examples.add_a_{kind}" for kind in ("model", "planner", "task")]
+    own = [f"plugins=[{','.join(plugins)}]", "hydra.searchpath=[file://examples/conf]"]
+    shown = [
+        subprocess.run([*command, *words], capture_output=True, text=True, check=True, cwd=tmp_path).stdout
+        for words in ([], own)
+    ]
+    names = [{tuple(line.split()) for line in text.splitlines()} for text in shown]
+    more = {line[0] for line in names[1] - names[0] if line[0] not in ("models", "planners", "tasks")}
+    assert more == {"linear", "shooting", "raise_tool"}
+    assert "planner.name=" in shown[1] and "planner.name=" not in shown[0]
+    for text in shown:
+        assert "datasets/whole           1,200 episodes, 60,000 steps" in text
+        assert "datasets/broken          meta/info.json cannot be read" in text
+        for choice in ("vjepa", "two_stages", "lerobot", "laptop"):
+            assert f"\n  {choice} " in text
+
+
 def test_robots_are_those_that_the_config_accepts() -> None:
     from franka_wm.envs import FrankaConfig
 
@@ -133,7 +158,9 @@ def test_help_of_every_verb_has_one_form_and_imports_nothing_heavy(verb: str, tm
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
-        (["list", "x"], "unexpected extra argument"),
+        (["list", "x"], "'x' is not name=value"),
+        (["list", "hydra.searchpath=[file://nowhere]"], "nowhere is not a folder"),
+        (["list", "plugin=x"], "did you mean plugins?"),
         (["evaluate", "checkpoint=x", "episode=3"], "did you mean episodes?"),
         (["evaluate", "checkpoint=x", "episodes=1"], "episodes=1: must be a whole number of at least 2"),
         (["evaluate", "episodes=3"], "give checkpoint="),
