@@ -3,6 +3,7 @@
 Nothing here knows a model family: models enter as callables.
 """
 
+from franka_wm.planning.base import Planner
 from franka_wm.planning.cem import CEM
 from franka_wm.planning.gradient import GradientPlanner
 from franka_wm.planning.icem import ICEM
@@ -17,7 +18,6 @@ from franka_wm.planning.objectives import (
     Smoothness,
     Sum,
 )
-from franka_wm.planning.sampling import Planner
 
 __all__ = [
     "CEM",

@@ -1,29 +1,22 @@
 """Planning by gradient: Adam on the actions, through the model and the objective."""
 
-from typing import Literal, get_args
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import ClassVar, Literal
 
 import torch
 from tensordict import TensorDict
 from torch import Tensor
 
+from franka_wm.errors import UserError
+from franka_wm.options import Bounds
+from franka_wm.planning.base import ContinuousPlanner, Next, Prior
 from franka_wm.planning.objectives import Score
-from franka_wm.planning.sampling import (
-    Next,
-    Prior,
-    explored,
-    gaussian_candidates,
-    require_bounds,
-    require_counts,
-    require_samples,
-    roll_prior,
-    rollout,
-    warm_start,
-)
-
-Bound = Literal["clamp", "tanh"]
+from franka_wm.planning.sampling import explored, gaussian_candidates, rollout
 
 
-class GradientPlanner:
+@dataclass(kw_only=True, eq=False)
+class GradientPlanner(ContinuousPlanner):
     """Ascends the objective's gradient from several starts per environment and keeps the best plan seen.
 
     Adam (Kingma & Ba, arXiv:1412.6980) on whole action sequences, by backpropagation through the model's
@@ -56,39 +49,27 @@ class GradientPlanner:
         ValueError: a setting that cannot work.
     """
 
-    def __init__(
-        self,
-        *,
-        action_dim: int,
-        horizon: int = 5,
-        num_samples: int = 16,
-        num_policy_samples: int = 0,
-        iterations: int = 20,
-        lr: float = 0.1,
-        betas: tuple[float, float] = (0.9, 0.999),
-        std: float = 0.5,
-        explore_std: float = 0.1,
-        bound: Bound = "clamp",
-        low: float = -1.0,
-        high: float = 1.0,
-    ) -> None:
-        require_counts(action_dim=action_dim, horizon=horizon, num_samples=num_samples, iterations=iterations)
-        require_samples(num_samples, num_policy_samples)
-        if not lr > 0.0:
-            raise ValueError(f"lr must be positive, got {lr}")
-        first, second = betas
+    horizon: int = 5
+    num_samples: int = 16
+    iterations: int = 20
+    lr: float = 0.1
+    betas: tuple[float, float] = (0.9, 0.999)
+    std: float = 0.5
+    explore_std: float = 0.1
+    bound: Literal["clamp", "tanh"] = "clamp"
+
+    ranges: ClassVar[Mapping[str, Bounds]] = {
+        **ContinuousPlanner.ranges,
+        "lr": Bounds(above=0),
+        **dict.fromkeys(("std", "explore_std"), Bounds(least=0)),
+    }
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        first, second = self.betas
         if not (0.0 <= first < 1.0 and 0.0 <= second < 1.0):
-            raise ValueError(f"betas must be in [0, 1), got {first} and {second}")
-        if not (std >= 0.0 and explore_std >= 0.0):
-            raise ValueError(f"std and explore_std must not be negative, got {std} and {explore_std}")
-        if bound not in get_args(Bound):
-            raise ValueError(f"bound={bound!r}: must be one of {', '.join(get_args(Bound))}")
-        require_bounds(low, high)
-        self.action_dim, self.horizon, self.iterations = action_dim, horizon, iterations
-        self.num_samples, self.num_policy_samples = num_samples, num_policy_samples
-        self.lr, self.betas, self.std, self.explore_std = lr, (first, second), std, explore_std
-        self.bound: Bound = bound
-        self.low, self.high = low, high
+            raise UserError(f"planner.betas={self.betas}: both must be at least 0 and below 1")
+        self.betas = first, second  # may have come as a list
 
     @torch.no_grad()
     def plan(
@@ -103,18 +84,10 @@ class GradientPlanner:
         explore: bool = False,
         generator: torch.Generator | None = None,
     ) -> TensorDict:
-        """Plan for E environments.
+        """See `Planner.plan`; with `explore`, the noise has the deviation `explore_std`.
 
         Args:
-            z: current latents (E, D).
-            next: (z (..., D), action (..., A)) -> next latents (..., D), differentiable.
-            objective: (trajectory (E, S, H+1, D), actions (E, S, H, A)) -> scores (E, S), higher is better,
-                differentiable.
-            prior: a policy z (..., D) -> actions (..., A), unrolled for `num_policy_samples` starts.
-            previous: the `plan` of the last call (E, H, A); the first start is this, shifted by one step.
-            is_init: (E, 1) bool; where True, `previous` belongs to another episode and is dropped.
-            explore: add noise of `explore_std` to the returned action.
-            generator: source of the planner's own noise, on the device of z; `prior` draws its own.
+            next, objective: differentiable.
 
         Returns:
             TensorDict of batch size [E]: `action` (E, A), the first of the best plan; `plan` (E, H, A), the
@@ -153,14 +126,7 @@ class GradientPlanner:
         value = torch.where(torch.isfinite(value), value, torch.zeros_like(value))
         return TensorDict(
             {
-                "action": explored(
-                    plan[:, 0],
-                    self.explore_std,
-                    explore,
-                    low=self.low,
-                    high=self.high,
-                    generator=generator,
-                ),
+                "action": explored(plan[:, 0], self.explore_std, explore, generator=generator, **self.bounds),
                 "plan": plan,
                 "value": value,
             },
@@ -177,28 +143,16 @@ class GradientPlanner:
         generator: torch.Generator | None,
     ) -> Tensor:
         """Where the search starts (E, S, H, A): the warm start, the policy's, and some around the former."""
-        bounds = {"low": self.low, "high": self.high}
-        warm = warm_start(
-            z,
-            previous,
-            is_init,
-            horizon=self.horizon,
-            action_dim=self.action_dim,
-            low=self.low,
-            high=self.high,
-        )
-        parts = [warm.clamp(self.low, self.high).unsqueeze(1)]
-        guided = 0 if prior is None else self.num_policy_samples
-        if prior is not None and guided:
-            parts.append(roll_prior(z, next, prior, samples=guided, horizon=self.horizon, **bounds))
+        warm = self.start(z, previous, is_init)
+        guided = self.guided(z, next, prior)
         scattered = gaussian_candidates(
             warm,
             torch.full_like(warm, self.std),
-            self.num_samples - guided - 1,
+            self.num_samples - 1 - sum(one.shape[1] for one in guided),
             generator=generator,
-            **bounds,
+            **self.bounds,
         )
-        return torch.cat((*parts, scattered), dim=1)
+        return torch.cat((warm.clamp(self.low, self.high).unsqueeze(1), *guided, scattered), dim=1)
 
     def _ascent(self, z: Tensor, next: Next, objective: Score, free: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """The free variable's actions, their scores (E, S), and the scores' gradient, where finite."""

@@ -1,27 +1,18 @@
 """iCEM: the cross-entropy method with coloured noise and memory (Pinneri et al., CoRL 2020, arXiv:2008.06389)."""
 
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import ClassVar
+
 import torch
 from tensordict import TensorDict
 from torch import Tensor
 
+from franka_wm.options import FRACTION, Bounds
+from franka_wm.planning.base import Next, Prior
+from franka_wm.planning.cem import CEM
 from franka_wm.planning.objectives import Score
-from franka_wm.planning.sampling import (
-    Next,
-    Prior,
-    best,
-    explored,
-    refit,
-    require_bounds,
-    require_counts,
-    require_deviations,
-    require_fraction,
-    require_is_init,
-    require_samples,
-    roll_prior,
-    rollout,
-    take,
-    warm_start,
-)
+from franka_wm.planning.sampling import best, explored, refit, require_is_init, rollout, take
 
 
 def coloured_noise(
@@ -58,7 +49,8 @@ def coloured_noise(
     return series * (length / power.sqrt())
 
 
-class ICEM:
+@dataclass(kw_only=True, eq=False)
+class ICEM(CEM):
     """iCEM: good plans from few candidates, for real-time control (Pinneri et al., arXiv:2008.06389).
 
     What it adds to `CEM`, with the published defaults:
@@ -102,50 +94,27 @@ class ICEM:
         ValueError: a setting that cannot work.
     """
 
-    def __init__(
-        self,
-        *,
-        action_dim: int,
-        horizon: int = 30,
-        num_samples: int = 40,
-        num_policy_samples: int = 0,
-        num_elites: int = 10,
-        iterations: int = 3,
-        noise_beta: float = 3.0,
-        reuse: float = 0.3,
-        decay: float = 1.25,
-        momentum: float = 0.1,
-        std: float = 0.5,
-        min_std: float = 0.05,
-        low: float = -1.0,
-        high: float = 1.0,
-    ) -> None:
-        require_counts(
-            action_dim=action_dim,
-            horizon=horizon,
-            num_samples=num_samples,
-            num_elites=num_elites,
-            iterations=iterations,
-        )
-        require_samples(num_samples, num_policy_samples, num_elites)
-        if not noise_beta >= 0.0:
-            raise ValueError(f"noise_beta must not be negative, got {noise_beta}")
-        if not 0.0 <= reuse <= 1.0:
-            raise ValueError(f"reuse must be in [0, 1], got {reuse}")
-        if not decay >= 1.0:
-            raise ValueError(f"decay must be at least 1, got {decay}")
-        require_fraction(momentum=momentum)
-        require_deviations(std, min_std)
-        require_bounds(low, high)
-        self.action_dim, self.horizon, self.iterations = action_dim, horizon, iterations
-        self.num_samples, self.num_policy_samples, self.num_elites = (
-            num_samples,
-            num_policy_samples,
-            num_elites,
-        )
-        self.noise_beta, self.reuse, self.decay, self.momentum = noise_beta, reuse, decay, momentum
-        self.std, self.min_std, self.low, self.high = std, min_std, low, high
-        self.num_kept = int(reuse * num_elites)
+    horizon: int = 30
+    num_samples: int = 40
+    num_elites: int = 10
+    iterations: int = 3
+    noise_beta: float = 3.0
+    reuse: float = 0.3
+    decay: float = 1.25
+    momentum: float = 0.1
+    std: float = 0.5
+
+    ranges: ClassVar[Mapping[str, Bounds]] = {
+        **CEM.ranges,
+        "noise_beta": Bounds(least=0),
+        "reuse": FRACTION,
+        "decay": Bounds(least=1),
+    }
+
+    @property
+    def num_kept(self) -> int:
+        """R: elites that are carried on."""
+        return int(self.reuse * self.num_elites)
 
     def population(self) -> list[int]:
         """How many candidates are drawn in each iteration; the reused elites come on top."""
@@ -165,42 +134,25 @@ class ICEM:
         explore: bool = False,
         generator: torch.Generator | None = None,
     ) -> TensorDict:
-        """Plan for E environments.
+        """See `Planner.plan`; with `explore`, the noise has the final standard deviation.
 
         Args:
-            z: current latents (E, D), float32 or float64.
-            next: (z (..., D), action (..., A)) -> next latents (..., D).
-            objective: (trajectory (E, S, H+1, D), actions (E, S, H, A)) -> scores (E, S), higher is better.
-            prior: a policy z (..., D) -> actions (..., A), unrolled for `num_policy_samples` candidates.
+            z: float32 or float64.
             previous: the `plan` of the last call (E, 1 + R, H, A): mean and elites, both shifted by one
                 step. The step that comes into sight repeats the mean's last action; elites draw theirs.
-            is_init: (E, 1) bool; where True, `previous` belongs to another episode and is dropped.
-            explore: add noise of the final standard deviation to the returned action.
-            generator: source of the planner's own noise, on the device of z; `prior` draws its own.
 
         Returns:
             TensorDict of batch size [E]: `action` (E, A), the first of the best plan (of the mean, if no
             score is finite); `plan` (E, 1 + R, H, A), the final mean and the elites to keep; `best`, the best
             plan, and `std`, both (E, H, A); `value` (E, 1), the score of the best plan.
-
-        Raises:
-            ValueError: `previous` or `is_init` has another shape.
         """
         carried = (z.shape[0], 1 + self.num_kept, self.horizon, self.action_dim)
         if previous is not None and previous.shape != carried:
             raise ValueError(
                 f"previous must have shape (E, 1 + R, H, A) = {carried}, got {tuple(previous.shape)}"
             )
-        bounds = {"low": self.low, "high": self.high}
-        mean = warm_start(
-            z,
-            None if previous is None else previous[:, 0],
-            is_init,
-            horizon=self.horizon,
-            action_dim=self.action_dim,
-            repeat_last=True,
-            **bounds,
-        ).clamp(self.low, self.high)
+        cold = None if previous is None else previous[:, 0]
+        mean = self.start(z, cold, is_init, repeat_last=True).clamp(self.low, self.high)
         std = torch.full_like(mean, self.std)
         guided = 0 if prior is None else self.num_policy_samples
 
@@ -209,8 +161,7 @@ class ICEM:
             if i == 0:
                 drawn = self._draw(mean, std, population - guided + self.num_kept, generator)
                 pool = [self._shifted(previous, is_init, drawn), drawn[:, self.num_kept :]]
-                if prior is not None and guided:
-                    pool.append(roll_prior(z, next, prior, samples=guided, horizon=self.horizon, **bounds))
+                pool += self.guided(z, next, prior)
             else:
                 pool = [kept, self._draw(mean, std, population, generator)]
             if i == self.iterations - 1:
@@ -227,7 +178,7 @@ class ICEM:
         winner = torch.where(elites.valid[:, :1, None], chosen[:, 0], mean)
         return TensorDict(
             {
-                "action": explored(winner[:, 0], std[:, 0], explore, generator=generator, **bounds),
+                "action": explored(winner[:, 0], std[:, 0], explore, generator=generator, **self.bounds),
                 "plan": torch.cat((mean.unsqueeze(1), kept), dim=1),
                 "best": winner,
                 "std": std,

@@ -1,16 +1,19 @@
 """Monte Carlo tree search in a learned model, for all environments at once and without a loop over depth."""
 
 import math
-from collections.abc import Callable
-from typing import Literal
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import ClassVar, Literal
 
 import torch
 from tensordict import TensorDict
 from torch import Tensor
 
+from franka_wm.options import COEFFICIENT, FRACTION, POSITIVE, Bounds, check_arguments
 from franka_wm.planning.tree import Recurrent, Tree
 
 
+@dataclass(kw_only=True, eq=False)
 class MCTS:
     """Tree search over a model of E environments, as MuZero or as Gumbel MuZero acts.
 
@@ -56,52 +59,32 @@ class MCTS:
         ValueError: a setting that cannot work.
     """
 
-    def __init__(
-        self,
-        *,
-        num_actions: int,
-        num_simulations: int = 50,
-        variant: Literal["puct", "gumbel"] = "puct",
-        max_depth: int | None = None,
-        pb_c_init: float = 1.25,
-        pb_c_base: float = 19652.0,
-        dirichlet_alpha: float = 0.3,
-        dirichlet_fraction: float = 0.25,
-        temperature: float = 1.0,
-        max_num_considered_actions: int = 16,
-        c_visit: float = 50.0,
-        c_scale: float = 0.1,
-    ) -> None:
-        for name, count in (
-            ("num_actions", num_actions),
-            ("num_simulations", num_simulations),
-            ("max_num_considered_actions", max_num_considered_actions),
-            ("max_depth", 1 if max_depth is None else max_depth),
-        ):
-            if count < 1:
-                raise ValueError(f"{name} must be at least 1, got {count}")
-        if variant not in ("puct", "gumbel"):
-            raise ValueError(f"variant must be puct or gumbel, got {variant!r}")
-        for name, value in (("pb_c_base", pb_c_base), ("dirichlet_alpha", dirichlet_alpha)):
-            if not value > 0.0:
-                raise ValueError(f"{name} must be positive, got {value}")
-        for name, value in (
-            ("pb_c_init", pb_c_init),
-            ("temperature", temperature),
-            ("c_visit", c_visit),
-            ("c_scale", c_scale),
-        ):
-            if not value >= 0.0:
-                raise ValueError(f"{name} must not be negative, got {value}")
-        if not 0.0 <= dirichlet_fraction <= 1.0:
-            raise ValueError(f"dirichlet_fraction must be in [0, 1], got {dirichlet_fraction}")
-        self.num_actions, self.num_simulations, self.variant = num_actions, num_simulations, variant
+    num_actions: int
+    num_simulations: int = 50
+    variant: Literal["puct", "gumbel"] = "puct"
+    max_depth: int | None = None
+    pb_c_init: float = 1.25
+    pb_c_base: float = 19652.0
+    dirichlet_alpha: float = 0.3
+    dirichlet_fraction: float = 0.25
+    temperature: float = 1.0
+    max_num_considered_actions: int = 16
+    c_visit: float = 50.0
+    c_scale: float = 0.1
+
+    ranges: ClassVar[Mapping[str, Bounds]] = {
+        **dict.fromkeys(("num_actions", "num_simulations", "max_depth"), POSITIVE),
+        "max_num_considered_actions": POSITIVE,
+        **dict.fromkeys(("pb_c_base", "dirichlet_alpha"), Bounds(above=0)),
+        **dict.fromkeys(("pb_c_init", "temperature", "c_visit", "c_scale"), COEFFICIENT),
+        "dirichlet_fraction": FRACTION,
+    }
+
+    def __post_init__(self) -> None:
+        check_arguments(MCTS, vars(self), "planner", self.ranges)
         # No path is longer than the number of simulations.
-        self.max_depth = None if max_depth is None or max_depth >= num_simulations else max_depth
-        self.pb_c_init, self.pb_c_base = pb_c_init, pb_c_base
-        self.dirichlet_alpha, self.dirichlet_fraction = dirichlet_alpha, dirichlet_fraction
-        self.temperature, self.max_num_considered_actions = temperature, max_num_considered_actions
-        self.c_visit, self.c_scale = c_visit, c_scale
+        if self.max_depth is not None and self.max_depth >= self.num_simulations:
+            self.max_depth = None
 
     @torch.no_grad()
     def search(

@@ -1,29 +1,24 @@
 """Model-predictive path integral control for all environments at once."""
 
-from collections.abc import Callable
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import ClassVar
 
 import torch
 from tensordict import TensorDict
 from torch import Tensor
 
+from franka_wm.errors import UserError
+from franka_wm.options import Bounds
+from franka_wm.planning.base import ElitePlanner, Next, Prior
 from franka_wm.planning.objectives import Score
-from franka_wm.planning.sampling import (
-    best,
-    explored,
-    gaussian_candidates,
-    require_bounds,
-    require_counts,
-    require_samples,
-    roll_prior,
-    rollout,
-    take,
-    warm_start,
-)
+from franka_wm.planning.sampling import best, explored, gaussian_candidates, rollout, take
 
 __all__ = ["MPPI", "Score"]
 
 
-class MPPI:
+@dataclass(kw_only=True, eq=False)
+class MPPI(ElitePlanner):
     """MPPI as in TD-MPC2 (Hansen, Su & Wang, arXiv:2310.16828): elites, policy candidates, warm start.
 
     Each of E environments has its own Gaussian over plans (H, A). An iteration draws S candidates, keeps the
@@ -59,100 +54,56 @@ class MPPI:
         ValueError: a setting that cannot work.
     """
 
-    def __init__(
-        self,
-        *,
-        action_dim: int,
-        horizon: int = 3,
-        num_samples: int = 512,
-        num_policy_samples: int = 24,
-        num_elites: int = 64,
-        iterations: int = 6,
-        min_std: float = 0.05,
-        max_std: float = 2.0,
-        temperature: float = 0.5,
-        low: float = -1.0,
-        high: float = 1.0,
-        normalize: bool = True,
-    ) -> None:
-        require_counts(
-            action_dim=action_dim,
-            horizon=horizon,
-            num_samples=num_samples,
-            num_elites=num_elites,
-            iterations=iterations,
-        )
-        require_samples(num_samples, num_policy_samples, num_elites, all_by_policy=True)
-        if not 0.0 < min_std <= max_std:
-            raise ValueError(f"need 0 < min_std <= max_std, got {min_std} and {max_std}")
-        if not temperature > 0.0:
-            raise ValueError(f"temperature must be positive, got {temperature}")
-        require_bounds(low, high)
-        self.action_dim, self.horizon, self.iterations = action_dim, horizon, iterations
-        self.num_samples, self.num_policy_samples, self.num_elites = (
-            num_samples,
-            num_policy_samples,
-            num_elites,
-        )
-        self.min_std, self.max_std, self.temperature = min_std, max_std, temperature
-        self.low, self.high, self.normalize = low, high, normalize
+    horizon: int = 3
+    num_samples: int = 512
+    num_policy_samples: int = 24
+    num_elites: int = 64
+    iterations: int = 6
+    min_std: float = 0.05
+    max_std: float = 2.0
+    temperature: float = 0.5
+    normalize: bool = True
+
+    ranges: ClassVar[Mapping[str, Bounds]] = {
+        **ElitePlanner.ranges,
+        **dict.fromkeys(("min_std", "max_std", "temperature"), Bounds(above=0)),
+    }
+    all_by_policy: ClassVar[bool] = True
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.min_std > self.max_std:
+            raise UserError(f"planner.min_std={self.min_std}: must be at most max_std={self.max_std}")
 
     @torch.no_grad()
     def plan(
         self,
         z: Tensor,
-        next: Callable[[Tensor, Tensor], Tensor],
+        next: Next,
         objective: Score,
         *,
-        prior: Callable[[Tensor], Tensor] | None = None,
+        prior: Prior | None = None,
         previous: Tensor | None = None,
         is_init: Tensor | None = None,
         explore: bool = False,
         generator: torch.Generator | None = None,
     ) -> TensorDict:
-        """Plan for E environments.
-
-        Args:
-            z: current latents (E, D).
-            next: (z (..., D), action (..., A)) -> next latents (..., D).
-            objective: (trajectory (E, S, H+1, D), actions (E, S, H, A)) -> scores (E, S), higher is better.
-            prior: a policy z (..., D) -> actions (..., A), unrolled for `num_policy_samples` candidates.
-            previous: the `plan` of the last call (E, H, A); the search starts there, shifted by one step.
-            is_init: (E, 1) bool; where True, `previous` belongs to another episode and is dropped.
-            explore: add noise of the final standard deviation to the returned action.
-            generator: source of the planner's own noise, on the device of z; `prior` draws its own.
+        """See `Planner.plan`; with `explore`, the noise has the final standard deviation.
 
         Returns:
             TensorDict of batch size [E]: `action` (E, A); `plan`, the final mean, and `std`, both (E, H, A);
             `value` (E, 1), the weighted score of the last elites; `effective_samples` (E, 1), 1 / Σ w² of
             their weights, between 1 and `num_elites`.
-
-        Raises:
-            ValueError: `previous` or `is_init` has another shape.
         """
-        drawn = self.num_samples if prior is None else self.num_samples - self.num_policy_samples
-        bounds = {"low": self.low, "high": self.high}
-        mean = warm_start(
-            z,
-            previous,
-            is_init,
-            horizon=self.horizon,
-            action_dim=self.action_dim,
-            low=self.low,
-            high=self.high,
-        )
+        mean = self.start(z, previous, is_init)
         std = torch.full_like(mean, self.max_std)
-        from_prior = None
-        if prior is not None and self.num_policy_samples:
-            from_prior = roll_prior(
-                z, next, prior, samples=self.num_policy_samples, horizon=self.horizon, **bounds
-            )
+        given = self.guided(z, next, prior)
+        drawing = self.num_samples - sum(one.shape[1] for one in given)
 
         value = effective = mean.new_zeros(z.shape[0], 1)
         for _ in range(self.iterations):
-            actions = gaussian_candidates(mean, std, drawn, generator=generator, **bounds)
-            if from_prior is not None:
-                actions = torch.cat((from_prior, actions), dim=1)
+            drawn = gaussian_candidates(mean, std, drawing, generator=generator, **self.bounds)
+            actions = torch.cat((*given, drawn), dim=1)
             scores = objective(rollout(z, actions, next), actions)
 
             elite_scores, weights, index = self._elites(scores)
@@ -167,7 +118,7 @@ class MPPI:
 
         return TensorDict(
             {
-                "action": explored(mean[:, 0], std[:, 0], explore, generator=generator, **bounds),
+                "action": explored(mean[:, 0], std[:, 0], explore, generator=generator, **self.bounds),
                 "plan": mean,
                 "std": std,
                 "value": value,

@@ -73,13 +73,14 @@ def planner(name: str) -> Any:
 
 
 def validate(name: str, options: Mapping[str, Any]) -> None:
-    """Check options against the types that the planner's constructor declares.
+    """Check options against the types that the planner's constructor declares, and its `ranges` where it has some.
 
     Raises:
-        UserError: an option that it does not have, or a value of another type.
+        UserError: an option that it does not have, or a value of another type or out of range.
     """
-    check_names(planner(name), options, "planner")
-    check_arguments(planner(name), options, "planner")
+    cls = planner(name)
+    check_names(cls, options, "planner")
+    check_arguments(cls, options, "planner", getattr(cls, "ranges", None))
 
 
 def make(name: str, **arguments: Any) -> Any:

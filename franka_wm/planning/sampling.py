@@ -4,83 +4,10 @@ E environments, S candidates, H steps, A action components, D the size of a late
 """
 
 from collections.abc import Callable
-from typing import NamedTuple, Protocol
+from typing import NamedTuple
 
 import torch
-from tensordict import TensorDict
 from torch import Tensor
-
-from franka_wm.planning.objectives import Score
-
-Next = Callable[[Tensor, Tensor], Tensor]
-"""(z (..., D), action (..., A)) -> next latents (..., D)."""
-
-Prior = Callable[[Tensor], Tensor]
-"""A policy: z (..., D) -> actions (..., A)."""
-
-
-class Planner(Protocol):
-    """Interface of a planner; see `franka_wm.planning.MPPI.plan` for the shapes."""
-
-    def plan(
-        self,
-        z: Tensor,
-        next: Next,
-        objective: Score,
-        *,
-        prior: Prior | None = None,
-        previous: Tensor | None = None,
-        is_init: Tensor | None = None,
-        explore: bool = False,
-        generator: torch.Generator | None = None,
-    ) -> TensorDict: ...
-
-
-# ---------------------------------------------------------------------- settings
-
-
-def require_counts(**counts: int) -> None:
-    """Raises ValueError naming the first of `counts` that is below 1."""
-    for name, count in counts.items():
-        if count < 1:
-            raise ValueError(f"{name} must be at least 1, got {count}")
-
-
-def require_fraction(**fractions: float) -> None:
-    """Raises ValueError naming the first of `fractions` outside [0, 1)."""
-    for name, value in fractions.items():
-        if not 0.0 <= value < 1.0:
-            raise ValueError(f"{name} must be in [0, 1), got {value}")
-
-
-def require_samples(
-    num_samples: int, num_policy_samples: int, num_elites: int | None = None, *, all_by_policy: bool = False
-) -> None:
-    """Raises ValueError unless `num_samples` has room for the policy's candidates and the elites.
-
-    Args:
-        all_by_policy: whether the policy may make all of them.
-    """
-    if not 0 <= num_policy_samples <= num_samples - (not all_by_policy):
-        raise ValueError(
-            f"num_policy_samples must be in [0, num_samples={num_samples}{']' if all_by_policy else ')'}, "
-            f"got {num_policy_samples}"
-        )
-    if num_elites is not None and num_elites > num_samples:
-        raise ValueError(f"num_elites must not exceed num_samples={num_samples}, got {num_elites}")
-
-
-def require_deviations(std: float, min_std: float) -> None:
-    """Raises ValueError unless a search may start with `std` and end with `min_std`."""
-    if not 0.0 <= min_std <= std or not std > 0.0:
-        raise ValueError(f"need 0 <= min_std <= std and std > 0, got {min_std} and {std}")
-
-
-def require_bounds(low: float, high: float) -> None:
-    """Raises ValueError unless `low` < `high`."""
-    if not low < high:
-        raise ValueError(f"low must be below high, got [{low}, {high}]")
-
 
 # ---------------------------------------------------------------------- the start of a search
 
@@ -130,7 +57,7 @@ def require_is_init(is_init: Tensor, envs: int) -> None:
 # ---------------------------------------------------------------------- candidates
 
 
-def rollout(z: Tensor, actions: Tensor, next: Next) -> Tensor:
+def rollout(z: Tensor, actions: Tensor, next: Callable[[Tensor, Tensor], Tensor]) -> Tensor:
     """Latents (E, ...) and candidates (E, S, H, A) -> trajectories (E, S, H+1, ...) that start at `z`."""
     latents = [z.unsqueeze(1).expand(z.shape[0], actions.shape[1], *z.shape[1:])]
     for t in range(actions.shape[2]):
@@ -139,7 +66,14 @@ def rollout(z: Tensor, actions: Tensor, next: Next) -> Tensor:
 
 
 def roll_prior(
-    z: Tensor, next: Next, prior: Prior, *, samples: int, horizon: int, low: float, high: float
+    z: Tensor,
+    next: Callable[[Tensor, Tensor], Tensor],
+    prior: Callable[[Tensor], Tensor],
+    *,
+    samples: int,
+    horizon: int,
+    low: float,
+    high: float,
 ) -> Tensor:
     """Candidates of a policy (E, samples, H, A), each unrolled from `z`."""
     latent = z.unsqueeze(1).expand(z.shape[0], samples, *z.shape[1:])

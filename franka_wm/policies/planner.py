@@ -14,8 +14,8 @@ from tensordict.nn.probabilistic import interaction_type
 from torch import Tensor, nn
 
 from franka_wm.models.base import WorldModel
+from franka_wm.planning.base import Planner
 from franka_wm.planning.objectives import Objective, RewardPlusValue, Score, as_objective
-from franka_wm.planning.sampling import Planner
 from franka_wm.policies.capture import GraphCache
 from franka_wm.policies.settings import settings
 

@@ -92,7 +92,7 @@ def test_settings_rebuild_the_planner_between_two_steps(make_session) -> None:
 def test_a_setting_that_cannot_be_leaves_the_planner_as_it_is(make_session) -> None:
     session = make_session(policy="planner")
     before = session.planner
-    with pytest.raises(UserError, match="num_elites must not exceed"):
+    with pytest.raises(UserError, match="num_elites=200: must be at most num_samples"):
         session.set_planner(num_elites=200)
     with pytest.raises(UserError, match="MPPI has no setting 'sharpness'"):
         session.set_planner(sharpness=1.0)
