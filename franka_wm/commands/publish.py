@@ -17,7 +17,7 @@ from franka_wm.errors import UserError
 @word("private", "whether only you can see it", FLAG, True)
 @word("license", "as the Hub names licenses", default="apache-2.0")
 @word("update", "the repository exists already: replace what is in it", FLAG, False)
-@word("dry_run", "show what would be sent, and send nothing", FLAG, False)
+@word("dry_run", "show what would be sent, write the card to outputs/publish, and send nothing", FLAG, False)
 def publish(root: str | None, checkpoint: str | None, repo_id: str, **shared: Any) -> None:
     """Send a dataset or a model to the Hugging Face Hub.
 

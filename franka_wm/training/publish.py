@@ -14,7 +14,15 @@ from franka_wm.console import announced, say
 from franka_wm.data.lerobot.card import model_card
 from franka_wm.data.lerobot.hub import check_repo_id, explained
 from franka_wm.data.lerobot.paths import shortened, without_paths
-from franka_wm.data.lerobot.publish import README, check_name, files_of, hub_client, send, show_files
+from franka_wm.data.lerobot.publish import (
+    README,
+    check_name,
+    files_of,
+    hub_client,
+    send,
+    show_files,
+    write_card,
+)
 from franka_wm.errors import UserError
 from franka_wm.training.checkpoint import latest_checkpoint, load_checkpoint
 from franka_wm.untrusted import UntrustedFolder
@@ -44,7 +52,7 @@ def publish_model(
         files = files_of(staged)
         show_files(files, staged, repo_id, private, "model")
         if dry_run:
-            say("dry run: nothing was sent")
+            write_card(staged, repo_id)
             return
         api = hub_client(repo_id)
         with explained(repo_id):

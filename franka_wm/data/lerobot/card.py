@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 from collections.abc import Mapping
+from importlib.metadata import PackageNotFoundError, metadata
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from huggingface_hub import DatasetCard, DatasetCardData, ModelCard, ModelCardData
 
 from franka_wm.data.lerobot.paths import without_paths
 from franka_wm.data.lerobot.provenance import read_provenance
@@ -25,11 +28,30 @@ _CITATION = """```bibtex
 ```"""
 
 
-def front_matter(**values: Any) -> str:
-    """The YAML that the Hub reads."""
-    from omegaconf import OmegaConf
+VISUALIZER = "https://huggingface.co/spaces/lerobot/visualize_dataset?path="
+"""LeRobot's page that plays the episodes of a public dataset."""
 
-    return f"---\n{OmegaConf.to_yaml(OmegaConf.create(values))}---\n"
+UNITS = {
+    "observation.state": "rad, rad/s, m (and quaternions)",
+    "observation.environment_state": "m",
+    "action": "−1 to 1",
+    "joint_positions": "rad",
+    "tool_position": "m",
+    "joint_target": "rad",
+    "objects": "m, quaternions, m/s, rad/s",
+    "timestamp": "s",
+}
+"""Of the features that have one, in datasets of this project."""
+
+
+def _project() -> str:
+    """The project's name; a link where the installed package knows its address."""
+    with contextlib.suppress(PackageNotFoundError):
+        for entry in metadata("franka-wm").get_all("Project-URL") or []:
+            label, _, address = entry.partition(", ")
+            if label == "Source":
+                return f"[franka_wm]({address})"
+    return "franka_wm"
 
 
 def dataset_card(root: Path, *, repo_id: str, license: str) -> str:
@@ -56,7 +78,7 @@ def dataset_card(root: Path, *, repo_id: str, license: str) -> str:
     tags = ["LeRobot"]
     if provenance is not None:
         robot = f"of a simulated {info['robot_type']} arm"
-        own += ", gathered with franka_wm in NVIDIA Newton"
+        own += f", gathered with {_project()} in NVIDIA Newton"
         settings = f"\n\nSettings in full: [{PROVENANCE}]({PROVENANCE})."
         cite = f"\n## Citation\n\n{_CITATION}\n"
         tags += ["franka", "simulation", "world-model"]
@@ -66,18 +88,19 @@ def dataset_card(root: Path, *, repo_id: str, license: str) -> str:
             " The observation after the last action of each episode is in\n"
             f"`{TERMINAL_FOLDER}`, found by `episode_key`."
         )
-    head = front_matter(
+    head = DatasetCardData(
         license=license,
         task_categories=["robotics"],
         tags=tags,
         configs=[{"config_name": "default", "data_files": "data/*/*.parquet"}],
     )
+    units = {name: UNITS.get(name, "") for name in info["features"]} if provenance is not None else {}
     picture = f"\n![Frames of one episode]({PICTURE})\n" if (root / PICTURE).is_file() else ""
     table = "\n".join(
-        f"| `{name}` | {feature['dtype']} | {tuple(feature['shape'])} | {_names(feature.get('names'))} |"
-        for name, feature in info["features"].items()
+        f"| `{name}` | {one['dtype']} | {tuple(one['shape'])} | {units.get(name, '')} | {_names(one.get('names'))} |"
+        for name, one in info["features"].items()
     )
-    return f"""{head}
+    text = f"""
 # {repo_id.split("/")[-1]}
 
 {info["total_episodes"]} episodes, {info["total_frames"]} steps at {info["fps"]} Hz {robot}.
@@ -88,6 +111,8 @@ def dataset_card(root: Path, *, repo_id: str, license: str) -> str:
 {gathered or "Not recorded."}{settings}
 
 ## Use it
+
+Watch the episodes, once the dataset is public: [visualizer]({VISUALIZER}{repo_id}).
 
 ```python
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
@@ -103,14 +128,15 @@ python train.py dataset=lerobot dataset.repo_id={repo_id}   # a world model, wit
 
 {rows}
 
-| feature | dtype | shape | names |
-|---|---|---|---|
+| feature | dtype | shape | unit | names |
+|---|---|---|---|---|
 {table}
 
 ## License
 
 {license}
 {cite}"""
+    return str(DatasetCard(f"---\n{head}\n---\n{text}"))
 
 
 def _gathered(provenance: Mapping[str, Any]) -> str:
@@ -194,7 +220,7 @@ def model_card(folder: Path, *, repo_id: str, license: str) -> str:
     counters = json.loads((folder / "counters.json").read_text(encoding="utf-8"))
     evaluation = folder / "evaluation.md"
     table = evaluation.read_text(encoding="utf-8") if evaluation.is_file() else "Not evaluated."
-    head = front_matter(
+    head = ModelCardData(
         license=license,
         library_name="franka_wm",
         tags=[
@@ -203,10 +229,10 @@ def model_card(folder: Path, *, repo_id: str, license: str) -> str:
             str(cfg.model.name),
         ],
     )
-    return f"""{head}
+    text = f"""
 # {repo_id.split("/")[-1]}
 
-A latent world model ({cfg.model.name}) of {_world(cfg.env)}, trained with franka_wm:
+A latent world model ({cfg.model.name}) of {_world(cfg.env)}, trained with {_project()}:
 {counters.get("updates", 0):,} updates, {counters.get("env_steps", 0):,} environment steps, seed {cfg.seed}.
 
 ## Evaluation
@@ -230,6 +256,7 @@ Weights are safetensors, everything else is JSON and YAML; nothing is unpickled 
 
 {_CITATION}
 """
+    return str(ModelCard(f"---\n{head}\n---\n{text}"))
 
 
 def _world(env: Any) -> str:

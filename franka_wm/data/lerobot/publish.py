@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import json
+import shutil
 import tempfile
 from collections.abc import Sequence
 from pathlib import Path
@@ -43,7 +44,7 @@ def publish_dataset(
         private: Whether only you can see it.
         license: Of the data.
         update: Allow a repository that exists; files in it that the dataset has not are removed.
-        dry_run: Only say what would go.
+        dry_run: Only say what would go, and write the card.
 
     Raises:
         UserError: One line: not a dataset, no token, the name is taken, no network.
@@ -61,7 +62,7 @@ def publish_dataset(
         if (root / README).is_file():
             say(f"the card above goes in the place of {root / README}, which stays as it is on this machine")
         if api is None:
-            say("dry run: nothing was sent")
+            write_card(staged, repo_id)
             return
         with explained(repo_id):
             check_name(api, repo_id, "dataset", update)
@@ -175,6 +176,18 @@ def show_files(files: Sequence[str], root: Path, repo_id: str, private: bool, ki
     say(f"{kind} {repo_id} ({'private' if private else 'public'}): {len(files)} files, {count(size)}B")
     for name in files:
         say(f"  {name}   {count((root / name).stat().st_size)}B")
+
+
+def write_card(staged: Path, repo_id: str) -> None:
+    """The end of a dry run: the card and its picture, to look at, in a folder of their own."""
+    from franka_wm.console import say
+
+    place = Path("outputs") / "publish" / repo_id.replace("/", "--")
+    for name in (README, PICTURE):
+        if (staged / name).is_file():
+            (place / name).parent.mkdir(parents=True, exist_ok=True)
+            shutil.copyfile(staged / name, place / name)
+    say(f"dry run: nothing was sent; the card: {place / README}")
 
 
 def hub_client(repo_id: str) -> Any:

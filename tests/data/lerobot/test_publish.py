@@ -8,12 +8,16 @@ import os
 import shutil
 import subprocess
 import sys
+from email.message import Message
 from pathlib import Path
 
 import pytest
 import torch
+from huggingface_hub import DatasetCard
 from omegaconf import OmegaConf
 
+from franka_wm.data.lerobot import card as cards
+from franka_wm.data.lerobot.card import PICTURE
 from franka_wm.data.lerobot.hub import check_repo_id, explained
 from franka_wm.data.lerobot.paths import shortened, without_paths
 from franka_wm.data.lerobot.publish import stage_dataset
@@ -57,6 +61,7 @@ def publish(hub, tmp_path):
             [sys.executable, "-m", "franka_wm.commands.main", "publish", *arguments],
             capture_output=True,
             text=True,
+            cwd=tmp_path,
             env=env,
             check=False,
         )
@@ -119,12 +124,33 @@ def test_a_dataset_goes_with_our_card_and_tag(hub, publish, dataset) -> None:
     assert repo["tags"] == {"v3.0": f"{repo['commits']:040x}"}
 
 
-def test_a_dry_run_sends_nothing(hub, publish, dataset) -> None:
+def test_a_dry_run_sends_nothing_and_writes_the_card(hub, publish, dataset, tmp_path) -> None:
     done = publish(f"root={dataset}", "repo_id=user/arm", "--dry-run", token=None)
     assert done.returncode == 0, done.stderr
     assert hub.requests == []
     for text in ("user/arm (private)", "data/chunk-000/file-000.parquet", "README.md", "nothing was sent"):
         assert text in done.stdout
+    place = tmp_path / "outputs" / "publish" / "user--arm"
+    assert set(contents(place)) == {"README.md", PICTURE}
+    card = (place / "README.md").read_text()
+    loaded = DatasetCard(card)
+    assert (loaded.data.license, loaded.data.task_categories) == ("apache-2.0", ["robotics"])
+    for text in (
+        "https://huggingface.co/spaces/lerobot/visualize_dataset?path=user/arm",
+        "| `observation.environment_state` | float32 | (3,) | m |",
+        "| `joint_target` | float32 | (7,) | rad |",
+    ):
+        assert text in card
+    assert publish(f"root={dataset}", "repo_id=user/arm").returncode == 0
+    assert hub.repos["datasets/user/arm"]["files"]["README.md"].decode() == card
+
+
+def test_a_card_links_the_project_where_its_address_is_known(monkeypatch) -> None:
+    known = Message()
+    assert cards._project() == "franka_wm"
+    known["Project-URL"] = "Source, https://example.org/franka_wm"
+    monkeypatch.setattr(cards, "metadata", lambda name: known)
+    assert cards._project() == "[franka_wm](https://example.org/franka_wm)"
 
 
 @pytest.fixture
