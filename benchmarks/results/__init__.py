@@ -3,6 +3,7 @@
 python -m benchmarks.results                               which rows are fresh, stale, missing
 python -m benchmarks.results run reach-cpu                 every seed of a row, then its files in docs/results/
 python -m benchmarks.results collect reach-cpu RUN RUN … --jobs 1     the same from runs that were started otherwise
+python -m benchmarks.results confirm reach-cpu             that changed code does the same as the measured one
 python -m benchmarks.results render                        docs/results.md and README's table from these files
 
 rows.yaml declares the rows. A run's numbers, command, seed, commit, machine and date come from its own folder.

@@ -8,7 +8,7 @@ from collections.abc import Mapping
 from pathlib import Path
 
 import benchmarks.results
-from benchmarks.results import records, render, running
+from benchmarks.results import confirm, records, render, running
 from benchmarks.results.rows import Row, choose, load_rows
 from benchmarks.results.state import state
 from franka_wm.errors import FrankaError
@@ -24,11 +24,13 @@ def overview(rows: Mapping[str, Row], place: Path) -> str:
         kind, reasons = state(row, found)
         have = f"{len(found)}/{len(row.seeds)}" if row.seeds else f"{len(found)}/1"
         judged = [] if kind in ("missing", "mixed") else render.verdicts(row, found)
+        if kind == "stale" and (same := confirm.confirmed(row, found, place)):
+            kind, reasons = "confirmed", [f"{len(reasons)} files changed, nothing else: {same['date']}"]
         more = [
             *reasons,
             *(f"missed: {wanted}, is {reached}" for wanted, reached, enough in judged if not enough),
         ]
-        lines.append(f"{name:24}{kind:9}{have:7}{'; '.join(more)}".rstrip())
+        lines.append(f"{name:24}{kind:10}{have:7}{'; '.join(more)}".rstrip())
     return "\n".join(lines)
 
 
@@ -63,6 +65,10 @@ def parse(arguments: list[str] | None) -> argparse.Namespace:
     two.add_argument("row")
     two.add_argument("runs", type=Path, nargs="+", help="folders; of a benchmark, the file of its --out")
     two.add_argument("--jobs", type=int, required=True, help="how many runs shared the GPU or the cores")
+    three = verbs.add_parser(
+        "confirm", help="whether today's code does the same as the measured one, bit for bit"
+    )
+    three.add_argument("rows", nargs="+")
     for verb in (one, two):
         verb.add_argument("--commit", help="of the code, where there is no repository")
     for verb in verbs.choices.values():
@@ -91,6 +97,12 @@ def main(arguments: list[str] | None = None) -> int:
                 else:
                     record = records.record_run(row, path, jobs=chosen.jobs, commit=chosen.commit)
                 print(records.write(record, chosen.results))
+        elif chosen.verb == "confirm":
+            for name in chosen.rows:
+                try:
+                    print(confirm.confirm(choose(rows, name), chosen.results), flush=True)
+                except FrankaError as error:
+                    failed.append(str(error))
         elif chosen.verb == "render":
             records.prune(chosen.results)
             write_pages(rows, chosen.results)

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from benchmarks.results.confirm import confirmed
 from benchmarks.results.records import FREE, PLACE, read
 from benchmarks.results.rows import Row
 from benchmarks.results.state import Record, numbers, state
@@ -154,10 +155,10 @@ def page(rows: Mapping[str, Row], place: Path = PLACE) -> str:
         here = [n for n, row in rows.items() if row.section is section and measured[n] and n not in single]
         if here:
             parts += [f"## {section.title}\n", *([section.text + "\n"] if section.text else [])]
-            parts += [part(rows[name], measured[name], states[name]) for name in here]
+            parts += [part(rows[name], measured[name], states[name], place) for name in here]
     if single:
         parts.append("## Single seeds\n\nOne run each: another seed may end elsewhere.\n")
-        parts += [part(rows[name], measured[name], states[name]) for name in single]
+        parts += [part(rows[name], measured[name], states[name], place) for name in single]
     missing = [row for name, row in rows.items() if not measured[name]]
     if missing:
         parts.append("## Not measured yet\n")
@@ -166,7 +167,7 @@ def page(rows: Mapping[str, Row], place: Path = PLACE) -> str:
     return "\n".join(parts)
 
 
-def part(row: Row, records: Sequence[Record], judged: tuple[str, list[str]]) -> str:
+def part(row: Row, records: Sequence[Record], judged: tuple[str, list[str]], place: Path = PLACE) -> str:
     """One row of the page."""
     kind, reasons = judged
     lines = [f"### {row.title}" + (f": {row.model}" if row.model else ""), ""]
@@ -179,7 +180,16 @@ def part(row: Row, records: Sequence[Record], judged: tuple[str, list[str]]) -> 
         )
     lines += [_provenance(row, records), ""]
     if kind == "stale":
-        lines += [f"**Measured before changes of** {', '.join(f'`{reason}`' for reason in reasons)}.", ""]
+        files = ", ".join(f"`{reason}`" for reason in reasons)
+        if same := confirmed(row, records, place):
+            lines += [
+                f"Measured before changes of {len(reasons)} files that change nothing a short run shows: on "
+                f"{same['date']} `{same['command']}` gave the same weights and episodes with that code and with "
+                f"today's, bit for bit. <details><summary>Files</summary>{files}</details>",
+                "",
+            ]
+        else:
+            lines += [f"**Measured before changes of** {files}.", ""]
     if kind == "part":
         lines += [f"{'; '.join(reasons).capitalize()}.", ""]
     if row.script is not None:
@@ -339,14 +349,15 @@ def readme_tables(rows: Mapping[str, Row], place: Path = PLACE) -> str:
     """README's part: the arm, other environments, speed; rows of several seeds that belong together."""
     arm, others, speed = [], [], []
     episodes: set[int] = set()
-    aged = False
+    aged = alike = False
     for row in rows.values():
         records = read(row, place) if row.readme else []
         kind, _ = state(row, records)
         if kind in ("missing", "mixed") or (row.script is None and len(records) < 2):
             continue
-        mark = "¹" if kind == "stale" else ""
-        aged = aged or kind == "stale"
+        same = kind == "stale" and confirmed(row, records, place) is not None
+        mark = "" if kind != "stale" else "²" if same else "¹"
+        aged, alike = aged or mark == "¹", alike or mark == "²"
         if isinstance(row.readme, list):
             titles = ["machine", *row.readme]
             cells = [[machine(records[0]) + mark, *line] for line in _cells(records[0]["rows"], row.readme)]
@@ -384,6 +395,9 @@ def readme_tables(rows: Mapping[str, Row], place: Path = PLACE) -> str:
         parts += ["Environment steps per second, resets included, through TorchRL's `Collector`:", "", *speed]
     if aged:
         parts += ["¹ Measured before changes of the code; docs/results.md names them.", ""]
+    if alike:
+        text = "gave the same weights and episodes, bit for bit, with that code and with today's"
+        parts += [f"² Measured with an earlier commit; a short run on a CPU {text}.", ""]
     return "\n".join(parts or ["Not measured yet.", ""])
 
 
