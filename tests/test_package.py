@@ -139,3 +139,10 @@ def test_user_error_is_one_line_and_a_value_error() -> None:
     assert str(error) == "num_envs is 0; at least 1 is needed"
     assert isinstance(error, ValueError)
     assert isinstance(error, FrankaError)
+
+
+def test_the_wheel_takes_every_file_of_the_package() -> None:
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())
+    patterns = [*project["tool"]["setuptools"]["package-data"]["*"], "*.py"]
+    files = [path for path in (ROOT / "franka_wm").rglob("*") if path.is_file() and path.suffix != ".pyc"]
+    assert not [str(path) for path in files if not any(path.match(one) for one in patterns)]

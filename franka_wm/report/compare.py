@@ -3,9 +3,10 @@
 import json
 import shlex
 from collections.abc import Mapping, Sequence
-from html import escape
 from pathlib import Path
 from typing import Any
+
+from markupsafe import Markup
 
 from franka_wm.errors import UserError
 from franka_wm.report import style
@@ -18,13 +19,15 @@ from franka_wm.report.document import (
     commands,
     document,
     folded,
-    scrolling,
+    headed,
+    paragraph,
+    table,
 )
 from franka_wm.report.horizon import horizon_figure
 from franka_wm.report.outcome import SHOWN
 from franka_wm.report.run import RunFiles, but_for_the_seed, malformed
 from franka_wm.report.spectra import spectrum_figure
-from franka_wm.report.table import Table, evaluation_tables, html, is_interval
+from franka_wm.report.table import Table, evaluation_tables, is_interval
 
 FILE = "compare.html"
 
@@ -122,13 +125,15 @@ def repetitions(runs: Mapping[str, RunFiles]) -> dict[str, dict[str, RunFiles]]:
 
 def _results(runs: Mapping[str, RunFiles]) -> str:
     policies = list(dict.fromkeys(policy for run in runs.values() for policy in run.policies))
-    body, rest = "", ""
+    body, rest = Markup(), Markup()
     for policy in sorted(policies, key=lambda name: SHOWN.index(name) if name in SHOWN else len(SHOWN)):
         having = {name: run.policies[policy] for name, run in runs.items() if policy in run.policies}
         tables = [
-            Table(["run", *table.header[1:]], table.rows) for table in evaluation_tables(having) if table.rows
+            table(Table(["run", *found.header[1:]], found.rows))
+            for found in evaluation_tables(having)
+            if found.rows
         ]
-        text = f"<h3>{style.policy_name(policy)}</h3>" + "".join(scrolling(html(table)) for table in tables)
+        text = headed(style.policy_name(policy), Markup().join(tables))
         if policy not in SHOWN:
             rest += text
             continue
@@ -137,7 +142,7 @@ def _results(runs: Mapping[str, RunFiles]) -> str:
             for name, values in having.items()
             if is_interval(values.get("final_distance"))
         }
-        drawn = ""
+        drawn = Markup()
         if distances:
             colours = dict.fromkeys(distances, style.policy_colour(policy))
             drawn = chart(
@@ -146,7 +151,7 @@ def _results(runs: Mapping[str, RunFiles]) -> str:
                 "Shorter is better; whiskers are 95 % intervals over episodes.",
             )
         body += text + cards(drawn)
-    return body + (folded("Baselines", rest) if rest else "") + _measured(runs)
+    return body + folded("Baselines", rest) + _measured(runs)
 
 
 def _measured(runs: Mapping[str, RunFiles]) -> str:
@@ -158,16 +163,14 @@ def _measured(runs: Mapping[str, RunFiles]) -> str:
         for name, run in runs.items()
         if run.results
     ]
-    return scrolling(html(Table(["run", "measured by", "also measured by"], rows), kind="texts"))
+    return table(Table(["run", "measured by", "also measured by"], rows), kind="texts")
 
 
 def _curves(groups: Mapping[str, Mapping[str, RunFiles]]) -> str:
     rows = {name: [run.rows for run in group.values()] for name, group in groups.items()}
     logged = [row for runs in rows.values() for one in runs for row in one]
     without = [name for group in groups.values() for name, run in group.items() if not run.rows]
-    note = (
-        f"<p>Without curves, since nothing was logged: {escape(', '.join(without))}.</p>" if without else ""
-    )
+    note = paragraph(f"Without curves, since nothing was logged: {', '.join(without)}." if without else "")
     axes = [key for key in ("env_steps", "updates") if all(key in row for row in logged)]
     x = next((key for key in axes if any(row[key] for row in logged)), None)  # recorded data makes no steps
     if x is None:
@@ -234,12 +237,12 @@ def _spectra(runs: Mapping[str, RunFiles]) -> str:
 
 def _differences(different: Mapping[str, Mapping[str, Any]], names: Sequence[str]) -> str:
     if not different:
-        return "<p>Nothing: the configurations are the same.</p>"
+        return paragraph("Nothing: the configurations are the same.")
     rows = [
         [entry, *(_text(values[name]) if name in values else MISSING for name in names)]
         for entry, values in different.items()
     ]
-    return scrolling(html(Table(["entry", *names], rows), kind="texts"))
+    return table(Table(["entry", *names], rows), kind="texts")
 
 
 def _text(value: Any) -> str:

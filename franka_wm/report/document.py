@@ -7,14 +7,18 @@ import base64
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from html import escape
+from functools import cache
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
+
+from jinja2 import Environment, PackageLoader, StrictUndefined
+from markupsafe import Markup
 
 from franka_wm.errors import UserError
 from franka_wm.files import atomic_write
 from franka_wm.report.figure import inline_svg
 from franka_wm.report.style import DARK, LIGHT, NAMES, Theme
+from franka_wm.report.table import Table
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -40,18 +44,20 @@ class Section:
 def document(
     title: str, *, subtitle: str, sections: Iterable[Section], above: str = "", below: str = ""
 ) -> str:
-    """The whole page. `title` and `subtitle` are texts; `above` (under the headline), `below` and bodies are HTML."""
-    parts = [section for section in sections if section.body]
-    links = "".join(f'<a href="#{s.key}">{escape(s.title)}</a>' for s in parts)
-    body = "".join(f'<section id="{s.key}"><h2>{escape(s.title)}</h2>{s.body}</section>\n' for s in parts)
+    """The whole page. Titles and `below` are texts; `above` (under the headline) and bodies are HTML."""
     return (
-        '<!doctype html>\n<html lang="en"><head><meta charset="utf-8">'
-        f'<meta http-equiv="Content-Security-Policy" content="{POLICY}">'
-        '<meta name="viewport" content="width=device-width, initial-scale=1">'
-        '<meta name="color-scheme" content="light dark">'
-        f"<title>{escape(title)}</title><style>{stylesheet()}</style></head>\n<body>"
-        f'<header><h1>{escape(title)}</h1><p class="sub">{escape(subtitle)}</p>{above}</header>\n'
-        f"<nav>{links}</nav>\n<main>{body}</main>\n<footer>{below}</footer></body></html>\n"
+        _templates()
+        .get_template("page.html")
+        .render(
+            title=title,
+            subtitle=subtitle,
+            sections=[section for section in sections if section.body],
+            above=above,
+            below=below,
+            policy=POLICY,
+            light=_colours(LIGHT),
+            dark=_colours(DARK),
+        )
     )
 
 
@@ -69,97 +75,92 @@ def write_document(text: str, path: str | Path) -> Path:
     return path
 
 
-# -- parts -----------------------------------------------------------------------------------------------
+# -- parts: `templates/parts.html` -----------------------------------------------------------------------
 
 
-def chart(figure: "Figure | None", label: str, note: str = "") -> str:
+def chart(figure: "Figure | None", label: str, note: str = "") -> Markup:
     """A figure drawn in `LIGHT` as a card that follows the page's theme; nothing for None."""
-    if figure is None:
-        return ""
-    return card(inline_svg(figure, label), note)
+    return Markup() if figure is None else card(inline_svg(figure, label), note)
 
 
-def card(content: str, note: str = "", *, kind: str = "") -> str:
+def card(content: str, note: str = "", *, kind: str = "") -> Markup:
     """HTML on a card of its own, with a line of text below.
 
     Args:
         kind: `wide` (the whole width), `single` (no wider than a picture should be), `strip` (scrolls sideways).
     """
-    caption = f"<figcaption>{escape(note)}</figcaption>" if note else ""
-    return f'<figure class="{f"card {kind}".strip()}">{content}{caption}</figure>' if content else ""
+    return _part("card", content, note, kind) if content else Markup()
 
 
-def cards(*content: str) -> str:
+def cards(*content: str) -> Markup:
     """Cards beside each other, as many as the width has room for."""
-    filled = [one for one in content if one]
-    return f'<div class="cards">{"".join(filled)}</div>' if filled else ""
+    return _part("cards", content) if any(content) else Markup()
 
 
-def tiles(values: Iterable[tuple[str, str, str]]) -> str:
+def tiles(values: Iterable[tuple[str, str, str]]) -> Markup:
     """Large numbers: name, value, and a small remark."""
-    return (
-        '<dl class="tiles">'
-        + "".join(
-            f"<div><dt>{escape(name)}</dt><dd>{escape(value)}"
-            f"{f'<small>{escape(note)}</small>' if note else ''}</dd></div>"
-            for name, value, note in values
-        )
-        + "</dl>"
-    )
+    return _part("tiles", values)
 
 
-def scrolling(table: str) -> str:
-    """A table that scrolls sideways by itself where the page is too narrow for it."""
-    return f'<div class="scroll" tabindex="0">{table}</div>'
+def table(values: Table, *, kind: str = "") -> Markup:
+    """A table on the page; scrolls sideways by itself where it is too wide. Cells are texts, or parts of a page.
+
+    An interval in brackets goes on a line of its own, so that a phone has room for it.
+    """
+    return _part("table", values.header, values.rows, kind)
 
 
-def facts(values: Iterable[tuple[str, str]]) -> str:
+def facts(values: Iterable[tuple[str, str]]) -> Markup:
     """Names and texts in two columns."""
-    rows = "".join(f"<dt>{escape(name)}</dt><dd>{escape(value)}</dd>" for name, value in values)
-    return f'<dl class="facts">{rows}</dl>' if rows else ""
+    values = list(values)
+    return _part("facts", values) if values else Markup()
 
 
-def warning(text: str) -> str:
+def warning(text: str) -> Markup:
     """A line that must not be overlooked."""
-    return f'<p class="warning" role="alert">{escape(text)}</p>'
+    return _part("warning", text)
 
 
-def commands(lines: Sequence[str]) -> str:
+def paragraph(text: str, kind: str = "") -> Markup:
+    """A text; with `kind="note"` a small one. Nothing for an empty one."""
+    return _part("paragraph", text, kind) if text else Markup()
+
+
+def headed(title: str, content: str) -> Markup:
+    """HTML below a headline of its own; nothing without content."""
+    return _part("headed", title, content) if content else Markup()
+
+
+def commands(lines: Sequence[str]) -> Markup:
     """Lines for a shell."""
-    return f"<pre><code>{escape(chr(10).join(lines))}</code></pre>"
+    return _part("commands", lines)
 
 
-def folded(title: str, content: str) -> str:
-    """HTML that opens on a click."""
-    return f"<details><summary>{escape(title)}</summary>{content}</details>"
+def folded(title: str, content: str) -> Markup:
+    """HTML that opens on a click; nothing without content."""
+    return _part("folded", title, content) if content else Markup()
 
 
-def picture(path: Path, label: str) -> str:
+def picture(path: Path, label: str) -> Markup:
     """A picture inside the page."""
     source = data_url(path)
-    if source is None:
-        return left_out(path)
-    return f'<img alt="{escape(label, quote=True)}" src="{source}">'
+    return left_out(path) if source is None else _part("picture", source, label)
 
 
-def video(path: Path, label: str, *, poster: Path | None = None) -> str:
+def video(path: Path, label: str, *, poster: Path | None = None) -> Markup:
     """A video inside the page; it waits to be started."""
     source = data_url(path)
     if source is None:
         return left_out(path)
-    still = data_url(poster) if poster is not None else None
-    shown = f' poster="{still}"' if still else ""
-    return (
-        f'<video controls loop muted playsinline preload="metadata" aria-label="{escape(label, quote=True)}"{shown} '
-        f'src="{source}"></video>'
-    )
+    return _part("video", source, label, data_url(poster) if poster is not None else None)
 
 
-def left_out(path: Path) -> str:
+def left_out(path: Path) -> Markup:
     """What stands in a large file's place."""
     size = path.stat().st_size / 2**20
-    name = escape(path.name)
-    return f'<p class="note">{name} ({size:.0f} MiB) lies beside this page; it is too large to be in it.</p>'
+    return paragraph(
+        f"{path.name} ({size:.0f} MiB) lies beside this page; it is too large to be in it.", "note"
+    )
 
 
 def data_url(path: Path) -> str | None:
@@ -176,125 +177,42 @@ def data_url(path: Path) -> str | None:
         raise UserError(f"cannot read {path}: {error}; make the report again.") from error
 
 
-def sparkline(values: Sequence[float], label: str) -> str:
+def sparkline(values: Sequence[float], label: str) -> Markup:
     """A curve as small as a word; values that are not finite leave a gap."""
-    width, height = 120.0, 26.0
+    width, height = 120, 26
     finite = [v for v in values if math.isfinite(v)]
     if not finite:
-        return ""
+        return Markup()
     low, span = min(finite), max(finite) - min(finite)
-    pieces: list[list[str]] = [[]]
+    pieces: list[list[tuple[float, float]]] = [[]]
     for k, value in enumerate(values):
         if not math.isfinite(value):
             pieces.append([])
             continue
         x = width / 2 if len(values) == 1 else 2 + (width - 4) * k / (len(values) - 1)
         y = height / 2 if span == 0 else height - 3 - (height - 6) * (value - low) / span
-        pieces[-1].append(f"{x:.1f},{y:.1f}")
-    lines = "".join(f'<polyline points="{" ".join(piece)}"/>' for piece in pieces if len(piece) > 1)
-    dots = "".join(
-        f'<circle cx="{piece[0].split(",")[0]}" cy="{piece[0].split(",")[1]}" r="2.5"/>'
-        for piece in pieces
-        if len(piece) == 1
+        pieces[-1].append((x, y))
+    lines = [piece for piece in pieces if len(piece) > 1]
+    dots = [piece[0] for piece in pieces if len(piece) == 1]
+    return _part("sparkline", lines, dots, label, width, height)
+
+
+@cache
+def _templates() -> Environment:
+    templates = Environment(
+        loader=PackageLoader("franka_wm.report"),
+        autoescape=True,
+        trim_blocks=True,
+        keep_trailing_newline=True,
+        undefined=StrictUndefined,
     )
-    return (
-        f'<svg class="spark" role="img" aria-label="{escape(label, quote=True)}" viewBox="0 0 {width:.0f} '
-        f'{height:.0f}">{lines}{dots}</svg>'
-    )
+    templates.tests["html"] = lambda value: isinstance(value, Markup)
+    return templates
 
 
-# -- style -----------------------------------------------------------------------------------------------
+def _part(name: str, *values: Any) -> Markup:
+    return getattr(_templates().get_template("parts.html").module, name)(*values)
 
 
-def stylesheet() -> str:
-    """The page's CSS; its colours are those of the figures."""
-    dark = f":root{{{_variables(DARK)}--page:#0d1117;--shade:#21262d;--alert:#3b2300}}"
-    light = f":root{{{_variables(LIGHT)}--page:#f6f8fa;--shade:#eef1f4;--alert:#fff1e5;--font:{_FONT}}}"
-    return f"{light}@media (prefers-color-scheme:dark){{{dark}}}{_RULES}"
-
-
-def _variables(theme: Theme) -> str:
-    return "".join(f"--{name}:{theme.colour(light)};" for light, name in NAMES.items())
-
-
-_FONT = "system-ui,-apple-system,'Segoe UI',Roboto,'Helvetica Neue','DejaVu Sans',sans-serif"
-
-_RULES = """
-*{box-sizing:border-box}
-html{-webkit-text-size-adjust:100%;scroll-behavior:smooth}
-@media (prefers-reduced-motion:reduce){html{scroll-behavior:auto}}
-body{margin:0;background:var(--page);color:var(--ink);font:16px/1.5 var(--font)}
-header,main,footer{max-width:1120px;margin:0 auto;padding:0 20px}
-header{padding-top:36px}
-h1{margin:0;font-size:30px;line-height:1.2;letter-spacing:-.01em;overflow-wrap:anywhere}
-h2{margin:0 0 12px;font-size:20px}
-h3{margin:20px 0 8px;font-size:16px}
-.sub{margin:6px 0 0;opacity:.75;overflow-wrap:anywhere}
-nav{position:sticky;top:0;z-index:2;background:var(--page);border-bottom:1px solid var(--faint);margin:24px 0 0;
-padding:0 max(20px,calc((100% - 1080px)/2));display:flex;gap:18px;overflow-x:auto;white-space:nowrap;
-scrollbar-width:none}
-nav a{color:var(--ink);text-decoration:none;padding:10px 0;font-size:14px;opacity:.8}
-nav a:hover,nav a:focus{opacity:1;box-shadow:inset 0 -2px var(--blue)}
-section{padding:28px 0 4px;scroll-margin-top:40px}
-.cards{display:grid;gap:16px;grid-template-columns:repeat(auto-fit,minmax(min(100%,340px),1fr));align-items:start;
-margin:12px 0}
-.cards>.card{margin:0}
-.cards>.card:only-child:not(.wide){max-width:620px}
-.card{background:var(--paper);border:1px solid var(--faint);border-radius:10px;padding:12px;margin:12px 0;min-width:0}
-.card.wide{grid-column:1/-1}
-.card img,.card video{display:block;width:100%;height:auto;border-radius:6px}
-.card.single{max-width:620px}
-.card.strip{overflow-x:auto}
-.card.strip img{min-width:620px}
-/* matplotlib leaves black fills out: they inherit */
-.chart{fill:var(--black);display:block;width:100%;height:auto;max-width:560px;margin:0 auto}
-figcaption,.note{font-size:14px;opacity:.8;margin:8px 2px 0}
-section>p{margin:0 0 12px;max-width:70ch}
-.tiles{display:grid;gap:12px;grid-template-columns:repeat(auto-fit,minmax(142px,1fr));margin:22px 0 0}
-.tiles div{background:var(--paper);border:1px solid var(--faint);border-radius:10px;padding:10px 14px}
-.tiles dt{font-size:13px;opacity:.75}
-.tiles dd{margin:0;font-size:24px;font-weight:600;font-variant-numeric:tabular-nums;line-height:1.3}
-.tiles small{display:block;font-size:12px;font-weight:400;opacity:.7}
-/* a shadow at the side where there is more to scroll to; it moves off at the end */
-.scroll{overflow-x:auto;scrollbar-width:thin;background:
-linear-gradient(to right,var(--paper) 40%,transparent) left/48px 100% no-repeat local,
-linear-gradient(to left,var(--paper) 40%,transparent) right/48px 100% no-repeat local,
-linear-gradient(to right,var(--grey),transparent) left/16px 100% no-repeat,
-linear-gradient(to left,var(--grey),transparent) right/16px 100% no-repeat,var(--paper);
-border:1px solid var(--faint);border-radius:10px;margin:12px 0}
-table{border-collapse:collapse;width:100%;font-size:14px;font-variant-numeric:tabular-nums}
-th,td{padding:8px 12px;text-align:right;border-bottom:1px solid var(--faint);vertical-align:top}
-tbody tr:last-child>*{border-bottom:0}
-th:first-child{text-align:left;position:sticky;left:0;background:var(--paper);z-index:1}
-thead th{font-weight:600;vertical-align:bottom;font-size:13px}
-tbody th{font-weight:500;overflow-wrap:anywhere;min-width:100px}
-td{white-space:nowrap}
-td small{display:block;opacity:.65;font-size:12px}
-table.texts td{text-align:left;white-space:normal;overflow-wrap:anywhere}
-table.texts th{text-align:left}
-.facts{display:grid;grid-template-columns:fit-content(58%) minmax(0,1fr);gap:4px 20px;margin:0 0 12px;font-size:15px}
-.facts dt{opacity:.7}
-.facts dd{margin:0;overflow-wrap:anywhere}
-.warning{background:var(--alert);border-left:4px solid var(--vermilion);border-radius:6px;padding:10px 14px;
-margin:16px 0 0;max-width:none}
-pre{background:var(--shade);border-radius:8px;padding:12px 14px;overflow-x:auto;font-size:13px;line-height:1.5;
-margin:8px 0}
-details{margin:10px 0}
-summary{cursor:pointer;font-size:15px}
-.spark{width:120px;height:26px;vertical-align:middle}
-.spark polyline{fill:none;stroke:var(--blue);stroke-width:1.6;stroke-linejoin:round}
-.spark circle{fill:var(--blue)}
-footer{padding-top:20px;padding-bottom:48px;font-size:13px;opacity:.7}
-@media (max-width:600px){
-header,main,footer{padding-left:14px;padding-right:14px}
-header{padding-top:22px}
-nav{padding-left:14px;padding-right:14px}
-h1{font-size:24px}
-.tiles{grid-template-columns:1fr 1fr;gap:8px}
-.tiles dd{font-size:20px}
-th,td{padding:7px 9px}
-.facts{gap:4px 14px;font-size:14px}
-.card{padding:8px}
-}
-@media print{nav{display:none}.card,.scroll{break-inside:avoid}}
-"""
+def _colours(theme: Theme) -> list[tuple[str, str]]:
+    return [(name, theme.colour(light)) for light, name in NAMES.items()]

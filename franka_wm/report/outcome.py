@@ -4,12 +4,14 @@ import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+from markupsafe import Markup
+
 from franka_wm.evaluation.results import Result
 from franka_wm.report import style
 from franka_wm.report.bars import bars_figure
-from franka_wm.report.document import cards, chart, facts, folded, scrolling, tiles, warning
+from franka_wm.report.document import cards, chart, facts, folded, headed, paragraph, table, tiles, warning
 from franka_wm.report.run import RunFiles
-from franka_wm.report.table import Table, evaluation_tables, html, is_interval
+from franka_wm.report.table import Table, evaluation_tables, is_interval
 
 SHOWN = ("planner", "policy")
 """Whose results stand at the top of the page, the first that there is."""
@@ -28,7 +30,7 @@ def headline(run: RunFiles, warned: Sequence[str]) -> str:
     ):
         if key in run.counters:
             values.append((name, write(float(run.counters[key])), ""))
-    return "".join(map(warning, warned)) + (tiles(values) if values else "")
+    return Markup().join(map(warning, warned)) + (tiles(values) if values else Markup())
 
 
 def result(run: RunFiles) -> str:
@@ -36,7 +38,7 @@ def result(run: RunFiles) -> str:
     if not run.results:
         return ""
     shown, *others = run.results
-    tables = f"<p>Measured by {shown.told}.</p>" if others else ""
+    tables = paragraph(f"Measured by {shown.told}." if others else "")
     tables += _tables(shown, cards(_success_bars(shown.policies), _bars(shown.policies)))
     if run.timing:
         rows = [
@@ -44,23 +46,22 @@ def result(run: RunFiles) -> str:
             for name, one in run.timing.items()
         ]
         header = ["policy", "one decision for all worlds [ms]", "worlds"]
-        tables += folded("Time per decision", scrolling(html(Table(header, rows))))
+        tables += folded("Time per decision", table(Table(header, rows)))
     tables += _protocol(shown)
     for other in others:
         tables += folded(f"Also measured, by {other.told}", _tables(other) + _protocol(other))
     return tables
 
 
-def _tables(found: Result, below: str = "") -> str:
+def _tables(found: Result, below: str = "") -> Markup:
     outcome, motion = evaluation_tables(found.policies)
-    legend = style.policy_legend(found.policies)
-    text = scrolling(html(outcome)) + (f'<p class="note">{legend}</p>' if legend else "") + below
-    return text + ("<h3>On the way</h3>" + scrolling(html(motion)) if motion.rows else "")
+    text = table(outcome) + paragraph(style.policy_legend(found.policies), "note") + below
+    return text + headed("On the way", table(motion) if motion.rows else "")
 
 
 def _protocol(found: Result) -> str:
     described = facts((name.replace("_", " "), plain(value)) for name, value in found.protocol.items())
-    return folded("How it was evaluated", described) if described else ""
+    return folded("How it was evaluated", described)
 
 
 def _success_bars(policies: Mapping[str, Mapping[str, Any]]) -> str:

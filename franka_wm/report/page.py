@@ -4,7 +4,6 @@ What it shows is what lies in the run's folder: :mod:`franka_wm.report.run` says
 ``evaluation.json`` are read. A section is there only if there is something for it.
 """
 
-from html import escape
 from pathlib import Path
 
 from franka_wm.report.document import document, write_document
@@ -26,7 +25,7 @@ def page(run: RunFiles) -> str:
             subtitle=" · ".join(known) or "an evaluation",
             above=headline(run, warnings(run)),
             sections=sections(run),
-            below=f"Written by franka_wm {escape(__version__)}.",
+            below=f"Written by franka_wm {__version__}.",
         )
 
 

@@ -3,10 +3,10 @@
 import math
 import shlex
 from collections.abc import Callable, Mapping
-from html import escape
 from pathlib import Path
 from typing import Any
 
+from markupsafe import Markup
 from omegaconf import OmegaConf
 
 from franka_wm.evaluation.results import COMMAND, END
@@ -22,16 +22,18 @@ from franka_wm.report.document import (
     commands,
     facts,
     folded,
+    headed,
+    paragraph,
     picture,
-    scrolling,
     sparkline,
+    table,
     video,
 )
 from franka_wm.report.horizon import horizon_figure
 from franka_wm.report.outcome import number, plain, result
 from franka_wm.report.run import RunFiles
 from franka_wm.report.spectra import latent_figure, spectrum_figure
-from franka_wm.report.table import html, is_interval, nested_table
+from franka_wm.report.table import Table, is_interval, nested_table
 
 
 def sections(run: RunFiles) -> list[Section]:
@@ -73,12 +75,14 @@ def curves(run: RunFiles) -> str:
         for panel in panels(run.rows)
     )
     end = next((one for one in run.results if one.protocol.get("by") == END), None)
-    last = ""
+    last = Markup()
     if end is not None:
         fewer = (run.config.get("evaluation") or {}).get("during_episodes") or end.episodes
         fewer = min(int(fewer), end.episodes)
         before = f"; those before are over {fewer} of these" if fewer < end.episodes else ""
-        last = f"<p>The last points are what the end of training measured over {end.episodes} episodes{before}.</p>"
+        last = paragraph(
+            f"The last points are what the end of training measured over {end.episodes} episodes{before}."
+        )
     return last + cards(*drawn)
 
 
@@ -115,8 +119,8 @@ def imagined(run: RunFiles) -> str:
     parts.append(
         card(picture(masks, "what the masks hide"), "What the masks hide.", kind="single") if masks else ""
     )
-    text = "<p>A decoder, trained on the side and used by nothing else, turns latents into pictures.</p>"
-    return (text if film or strip else "") + cards(*parts) if any(parts) else ""
+    text = "A decoder, trained on the side and used by nothing else, turns latents into pictures."
+    return paragraph(text if film or strip else "") + cards(*parts)
 
 
 def open_loop(run: RunFiles) -> str:
@@ -155,7 +159,7 @@ def probes(run: RunFiles) -> str:
             "how well physical quantities can be read off the latents",
             "1: read off exactly. 0: no better than the mean.",
         )
-    return cards(drawn, card(scrolling(html(nested_table(found, first="quantity", skip=("alpha",))))))
+    return cards(drawn, card(table(nested_table(found, first="quantity", skip=("alpha",)))))
 
 
 def latents(run: RunFiles) -> str:
@@ -220,7 +224,7 @@ def robustness(run: RunFiles) -> str:
             "final distance under each change",
             "How far from the goal episodes end when the world is not that of training.",
         )
-    return cards(drawn) + scrolling(html(nested_table(rows, first="change, policy")))
+    return cards(drawn) + table(nested_table(rows, first="change, policy"))
 
 
 def health(run: RunFiles) -> str:
@@ -230,24 +234,18 @@ def health(run: RunFiles) -> str:
             if isinstance(value, (int, float)) and key not in ("env_steps", "updates", "time_s"):
                 logged.setdefault(key, []).append(float(value))
     found = {k: v for k, v in (run.extras.get("health") or {}).items() if k != "warnings"}
-    table = ""
+    shown = Markup()
     if logged:
-        rows = ""
+        rows = []
         for key, values in sorted(logged.items()):
             name, scale = logged_name(key)
             scaled = [scale * value for value in values]
-            rows += (
-                f'<tr><th scope="row">{escape(name)}</th><td>{sparkline(scaled, name + " while training")}</td>'
-                f"<td>{number(scaled[-1])}</td><td>{_range(scaled)}</td></tr>"
-            )
-        head = (
-            '<th scope="col">logged</th><th scope="col">over time</th><th scope="col">last</th>'
-            '<th scope="col">lowest – highest</th>'
-        )
-        table = scrolling(f"<table><thead><tr>{head}</tr></thead><tbody>{rows}</tbody></table>")
+            drawn = sparkline(scaled, name + " while training")
+            rows.append([name, drawn, number(scaled[-1]), _range(scaled)])
+        shown = table(Table(["logged", "over time", "last", "lowest – highest"], rows))
         if found:
-            table = folded("Everything that was logged", table)
-    return cards(_numbers(found)) + table
+            shown = folded("Everything that was logged", shown)
+    return cards(_numbers(found)) + shown
 
 
 def logged_name(key: str) -> tuple[str, float]:
@@ -272,7 +270,7 @@ def what(run: RunFiles) -> str:
     ]
     told = facts((name, plain(value)) for name, value in rows if value is not None)
     used = facts((name.replace("_", " "), plain(value)) for name, value in run.versions.items())
-    text = told + (f"<h3>Made with</h3>{used}" if used else "")
+    text = told + headed("Made with", used)
     if config:
         text += folded(
             "The whole configuration", commands(OmegaConf.to_yaml(OmegaConf.create(dict(config))).split("\n"))

@@ -1,10 +1,9 @@
 """Tables of an evaluation, from the dict that `evaluation.json` holds.
 
-`evaluation_tables` and `nested_table` make a `Table` of texts; `markdown` and `html` write any of them.
+`evaluation_tables` and `nested_table` make a `Table` of texts; `markdown` writes any of them.
 `data_frame` gives the numbers themselves to pandas, which writes LaTeX, JSON, CSV and more.
 """
 
-import html as escaping
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
@@ -101,17 +100,6 @@ def markdown(table: Table) -> str:
     ]
     text.insert(1, "|---|" + "---:|" * (len(table.header) - 1))
     return "\n".join(text) + "\n"
-
-
-def html(table: Table, *, kind: str = "") -> str:
-    """As an HTML `<table>`; an interval in brackets goes on a line of its own, so that a phone has room for it."""
-    head = "".join(f'<th scope="col">{escaping.escape(cell)}</th>' for cell in table.header)
-    body = "".join(
-        f'<tr><th scope="row">{escaping.escape(name)}</th>{"".join(map(_html_cell, cells))}</tr>'
-        for name, *cells in table.rows
-    )
-    attribute = f' class="{kind}"' if kind else ""
-    return f"<table{attribute}><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table>"
 
 
 # -- numbers ---------------------------------------------------------------------------------------------
@@ -219,9 +207,3 @@ def _is_number(text: str) -> bool:
     except ValueError:
         return False
     return True
-
-
-def _html_cell(text: str) -> str:
-    mean, bracket, interval = text.partition(" (")
-    small = f"<small>{escaping.escape(bracket.strip() + interval)}</small>" if bracket else ""
-    return f"<td>{escaping.escape(mean)}{small}</td>"

@@ -6,11 +6,11 @@ import json
 
 import pytest
 
+from franka_wm.report.document import table
 from franka_wm.report.table import (
     Table,
     data_frame,
     evaluation_tables,
-    html,
     markdown,
     nested_table,
 )
@@ -26,7 +26,7 @@ def test_markdown_cells_cannot_break_the_table() -> None:
 
 
 def test_html_escapes_and_puts_intervals_below() -> None:
-    text = html(Table(["policy", "x"], [["<b>", "2.0 (1.0 – 3.0)"]]), kind="texts")
+    text = table(Table(["policy", "x"], [["<b>", "2.0 (1.0 – 3.0)"]]), kind="texts")
     assert "&lt;b&gt;" in text and "<b>" not in text
     assert "<td>2.0<small>(1.0 – 3.0)</small></td>" in text and 'class="texts"' in text
 
