@@ -145,7 +145,7 @@ class FrankaConfig:
             around the base's vertical axis: it sees the depth that the front camera cannot.
         frame_stack: Pictures in ``pixels`` and ``pixels_…``, oldest first along the channels: the present one
             and those of the steps before it. An episode begins with copies of its first.
-        show_goal: Draw the goal as a small red ball in every picture.
+        show_goal: Draw the goal in every picture: a small red ball, blue where there are objects; a disc for push.
         randomization: Ranges that each episode of each world draws from; :class:`Randomization`.
         finger_opening: Each finger's distance from the closed position [m]; without a gripper it is held there.
         observations: Which of ``("pixels", "depth", "segmentation", "goal_pixels", "state", "joint_target",

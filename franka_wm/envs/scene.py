@@ -32,9 +32,6 @@ SIZES = {
 REACH = (0.25, 0.80)
 """Horizontal distance from the base at which objects may start [m]: nearer is the arm itself, farther no reach."""
 
-MARGIN = 0.01
-"""Space between objects at the start [m], around circles that hold them."""
-
 ATTEMPTS = 64
 """How often an object's place is drawn anew because something stands there already."""
 
@@ -197,11 +194,13 @@ class Scene:
         objects: That move freely, in the order in which they are observed.
         obstacles: That stand still.
         table: That everything stands on.
+        space: Between circles around objects at the start, at least, and between them and obstacles [m].
     """
 
     objects: tuple[Body, ...] = ()
     obstacles: tuple[Obstacle, ...] = ()
     table: Table = Table()
+    space: float = 0.01
 
     def __post_init__(self) -> None:
         for field, kind in (("objects", Body), ("obstacles", Obstacle)):
@@ -210,6 +209,8 @@ class Scene:
                 raise UserError(f"scene.{field}={given!r}: must be a list")
             object.__setattr__(self, field, tuple(kind.of(one) for one in given))
         object.__setattr__(self, "table", Table.of(self.table))
+        if not is_real(self.space) or not 0 <= self.space <= 1:
+            raise UserError(f"scene.space={self.space!r}: must be from 0 to 1 m")
         names = [one.name for one in (self.table, *self.objects, *self.obstacles)]
         for name in names:
             if names.count(name) > 1:
@@ -232,6 +233,8 @@ class Scene:
         Raises:
             UserError: There is none.
         """
+        if not is_real(self.space) or not 0 <= self.space <= 1:
+            raise UserError(f"scene.space={self.space!r}: must be from 0 to 1 m")
         names = [one.name for one in self.objects]
         if name not in names:
             raise UserError(f"scene: no object {name!r}; there are {', '.join(names) or 'none'}")
@@ -264,7 +267,7 @@ class Scene:
             for body in self.objects:
                 for _ in range(ATTEMPTS):
                     x, y = (body.at[k] + generator.uniform(-1, 1) * body.spread[k] for k in range(2))
-                    least = body.radius + MARGIN
+                    least = body.radius + self.space
                     if all(_distance(x, y, one) > least for one in fixed) and all(
                         math.hypot(x - a, y - b) > least + r for a, b, r in taken
                     ):

@@ -22,6 +22,8 @@ from franka_wm.seeding import restore_generator
 FAST, SLOW = 0.5, 0.15
 """Of the hand [m/s]: on its way, and within :data:`NEAR` of where it shall be."""
 NEAR = 0.04
+QUIET = 0.25
+"""Nearer than this to where the hand shall be its noise fades [m]: on the way it strays, but grasps with care."""
 TURN = 2.0
 """Of the hand around the vertical axis [rad/s]."""
 
@@ -36,7 +38,7 @@ class ExpertPolicy(TensorDictModuleBase):
         task: The environment's.
         kinematics: The arm's.
         config: The environment's: what an action means.
-        noise: Standard deviation of noise on the joints' part of the action.
+        noise: Standard deviation of noise on the joints' part of the action while the hand is on its way.
         generator: Source of the noise.
 
     Raises:
@@ -80,9 +82,9 @@ class ExpertPolicy(TensorDictModuleBase):
         else:
             action = (joints - target) / c.action_scale
         if self.noise:
-            action = action + self.noise * torch.randn(
-                action.shape, device=action.device, generator=self.generator
-            )
+            drawn = torch.randn(action.shape, device=action.device, generator=self.generator)
+            way = (aim.tool - sight.tool).norm(dim=-1, keepdim=True)
+            action = action + self.noise * (way / QUIET).clamp_max(1.0).square() * drawn
         grip = 2 * aim.opening / MOST_OPEN - 1
         return tensordict.set("action", torch.cat([action, grip.unsqueeze(-1)], -1).clamp(-1.0, 1.0))
 

@@ -120,8 +120,14 @@ def scale_brightness(views: wp.array[int], brightness: wp.array[float], image: w
 
 
 @wp.kernel(enable_backward=False)
-def move_goal_marker(goal: wp.array2d[float], shapes: wp.array[int], transforms: wp.array[wp.transformf]):
-    """Puts each world's marker on its goal."""
+def move_goal_marker(
+    goal: wp.array2d[float],
+    flat: bool,
+    ground: float,
+    shapes: wp.array[int],
+    transforms: wp.array[wp.transformf],
+):
+    """Puts each world's marker on its goal, or, a ``flat`` one, on the ground below it."""
     world = wp.tid()
-    at = wp.vec3f(goal[world, 0], goal[world, 1], goal[world, 2])
+    at = wp.vec3f(goal[world, 0], goal[world, 1], wp.where(flat, ground, goal[world, 2]))
     transforms[shapes[world]] = wp.transformf(at, wp.quat_identity(dtype=float))

@@ -12,7 +12,7 @@ import warp as wp
 from franka_wm.envs.config import FrankaConfig
 from franka_wm.envs.kernels import bodies as kernels
 from franka_wm.envs.robots.gripper import add_colliders
-from franka_wm.envs.scene import MARGIN, Scene, Solid
+from franka_wm.envs.scene import Scene, Solid
 from franka_wm.envs.simulation.arrays import STATISTICS
 from franka_wm.errors import UserError
 
@@ -149,7 +149,7 @@ class Bodies:
             numbers([scene.top + one.half_height for one in objects] if scene else [], count),
             numbers([one.radius for one in objects], count),
             numbers(blocked, len(blocked), 7),
-            MARGIN,
+            scene.space if scene else 0.0,
         ]
         self._per_step = sim.robot.finger_speed / config.fps
         self._articulations = sim.model.articulation_count // sim.num_envs

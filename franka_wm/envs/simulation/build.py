@@ -6,6 +6,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import newton
 import torch
@@ -35,7 +36,13 @@ def build_model(
         ghost = newton.ModelBuilder.ShapeConfig(
             has_shape_collision=False, has_particle_collision=False, density=0.0
         )
-        arm.add_shape_sphere(body=-1, radius=0.025, cfg=ghost, color=(0.90, 0.22, 0.12), label=GOAL_MARKER)
+        color = (0.16, 0.58, 0.62) if config.surroundings else (0.90, 0.22, 0.12)  # unlike the cube's
+        look: dict[str, Any] = {"cfg": ghost, "color": color, "label": GOAL_MARKER}
+        disc = config.task_class.marker
+        if disc is None:
+            arm.add_shape_sphere(body=-1, radius=0.025, **look)
+        else:
+            arm.add_shape_cylinder(body=-1, radius=disc, half_height=0.001, **look)
     if torch.device(device).type == "cuda":
         # Warp's default there builds trees fast and traces them slowly; a robot's are built once.
         scene.default_bvh_cfg.mesh_constructor = "cubql"

@@ -10,7 +10,10 @@ from typing import TYPE_CHECKING
 
 from franka_wm.envs.tasks.base import Task
 from franka_wm.envs.tasks.lift import Lift
+from franka_wm.envs.tasks.pick import Pick
+from franka_wm.envs.tasks.push import Push
 from franka_wm.envs.tasks.reach import Reach, goal_distance, reach_reward
+from franka_wm.envs.tasks.stack import Stack
 from franka_wm.envs.tasks.torch_task import TorchTask
 from franka_wm.envs.tasks.track import Track
 
@@ -19,7 +22,10 @@ if TYPE_CHECKING:
 
 __all__ = [
     "Lift",
+    "Pick",
+    "Push",
     "Reach",
+    "Stack",
     "Task",
     "TorchTask",
     "Track",
@@ -30,7 +36,14 @@ __all__ = [
     "task_class",
 ]
 
-_BUILT_IN: dict[str, type[Task]] = {"reach": Reach, "track": Track, "lift": Lift}
+_BUILT_IN: dict[str, type[Task]] = {
+    "reach": Reach,
+    "track": Track,
+    "lift": Lift,
+    "push": Push,
+    "pick": Pick,
+    "stack": Stack,
+}
 
 _REGISTERED: dict[str, type[Task]] = {}
 

@@ -32,6 +32,7 @@ class Task:
         gripper: Whether the task needs driven fingers.
         scene: What stands around the arm, where the config does not say.
         home: Joint angles at the start [rad], where the config does not say; ``None``: the arm's.
+        marker: What ``show_goal`` draws: a disc of this radius on the table [m]; ``None``: a ball at the goal.
         words: The task in words, for datasets.
     """
 
@@ -39,6 +40,7 @@ class Task:
     gripper = False
     scene: Scene | None = None
     home: tuple[float, ...] | None = None
+    marker: float | None = None
     words = "Do what the reward asks for."
 
     def __init__(self, config: FrankaConfig):

@@ -10,10 +10,9 @@ import torch
 import warp as wp
 
 from franka_wm.envs.scene import Body, Scene
-from franka_wm.envs.tasks.base import Task
 from franka_wm.envs.tasks.manipulation import (
-    READY,
     Aim,
+    GripperTask,
     Sight,
     effort,
     fetch,
@@ -65,7 +64,7 @@ def lift_reward_and_success(
     success[world, 0] = solved
 
 
-class Lift(Task):
+class Lift(GripperTask):
     """Raise a cube by 20 cm.
 
     **Scene**: a table and a cube of 4 cm and 50 g. **Randomization**: the cube stands within 10 cm in x and 15 cm in y
@@ -75,30 +74,15 @@ class Lift(Task):
     where it succeeds. Both minus ``action_penalty`` · mean(action²).
     """
 
-    gripper = True
     scene = Scene(objects=(Body(name="cube", at=(0.5, 0.0), spread=(0.10, 0.15), turn=math.pi / 4),))
-    home = READY
     words = "Lift the cube."
-
-    @property
-    def reward_bounds(self) -> tuple[float, float]:
-        return -self.config.action_penalty, 1.0
 
     def reset(self, sim: "Simulation", mask: wp.array) -> None:
         w = sim.warp
         wp.launch(goal_above, sim.num_envs, [mask, w.rest_q, HEIGHT, w.task_goal], device=sim.device)
 
     def reward_and_success(self, sim: "Simulation") -> None:
-        w, c = sim.warp, self.config
-        wp.launch(
-            lift_reward_and_success,
-            sim.num_envs,
-            [
-                w.next_true_state, w.next_joint_target, w.next_objects, w.task_goal, w.action, c.reward == "sparse",
-                c.action_penalty, HEIGHT, w.reward, w.success,
-            ],
-            device=sim.device,
-        )  # fmt: skip
+        self.launch_reward(sim, lift_reward_and_success, HEIGHT)
 
     def measures(self, sim: "Simulation") -> dict[str, torch.Tensor]:
         return {"cube's height [m]": sim.tensors.next_objects[:, 2]}

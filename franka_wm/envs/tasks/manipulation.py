@@ -5,16 +5,18 @@
 # Warp reads annotations as types: no `from __future__ import annotations` here.
 import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Self
+from typing import TYPE_CHECKING, Any, Self
 
 import torch
 import warp as wp
 from tensordict import TensorDictBase
 
 from franka_wm.envs.constants import MOST_OPEN, NUM_JOINTS, OBJECT_DIM
+from franka_wm.envs.tasks.base import Task
 
 if TYPE_CHECKING:
     from franka_wm.envs.kinematics import Kinematics
+    from franka_wm.envs.simulation import Simulation
 
 READY = (0.0, 0.1, 0.0, -2.3, 0.0, 2.4, 0.785)
 """Joint angles with the hand upright, 0.3 m above the middle of the table [rad]."""
@@ -77,7 +79,33 @@ def effort(action: wp.array2d[float], world: int) -> float:
     return total / float(action.shape[1])
 
 
-# -- experts --------------------------------------------------------------------------------------------------
+# -- tasks and their experts ----------------------------------------------------------------------------------
+
+
+class GripperTask(Task):
+    """A task with a hand that starts upright over the table; rewards are in [0, 1], minus the action penalty."""
+
+    gripper = True
+    home = READY
+
+    @property
+    def reward_bounds(self) -> tuple[float, float]:
+        return -self.config.action_penalty, 1.0
+
+    def launch_reward(self, sim: "Simulation", kernel: wp.Kernel, *further: Any) -> None:
+        """Launches a kernel that takes state, joint target and objects after the step, goal, action, whether the reward
+        is sparse, the action penalty, ``further``, and writes reward and success; one thread for each world."""
+        w, c = sim.warp, self.config
+        inputs = [
+            w.next_true_state,
+            w.next_joint_target,
+            w.next_objects,
+            w.task_goal,
+            w.action,
+            c.reward == "sparse",
+        ]
+        inputs += [c.action_penalty, *further, w.reward, w.success]
+        wp.launch(kernel, sim.num_envs, inputs, device=sim.device)
 
 
 @dataclass(frozen=True)
@@ -142,6 +170,10 @@ class Aim:
     opening: torch.Tensor
 
 
+GAIN, CLOSE = 0.4, 0.04
+"""Of what a held object is off by, such a share in a step, where that is less [m]: more would make the arm swing."""
+
+
 def quarter_turn(angle: torch.Tensor, near: torch.Tensor) -> torch.Tensor:
     """The angle nearest to ``near`` that is ``angle`` up to quarter turns: how to grasp a box."""
     quarter = 0.5 * math.pi
@@ -179,6 +211,8 @@ def fetch(sight: Sight, number: int, to: torch.Tensor, *, above: float = 0.08) -
     )
     tool = torch.where((over | there)[..., None], place, hover)
     tool = torch.where((there & closing)[..., None], sight.target, tool)
-    tool = torch.where(held[..., None], sight.target + (to - place), tool)
+    missing = to - place
+    gain = torch.where(missing.norm(dim=-1, keepdim=True) < CLOSE, GAIN, 1.0)
+    tool = torch.where(held[..., None], sight.target + gain * missing, tool)
     opening = torch.where(there, 0.0, MOST_OPEN)
     return Aim(tool, torch.where(there, sight.target_yaw, yaw), opening), held

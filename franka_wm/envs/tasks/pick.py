@@ -1,0 +1,117 @@
+# pyright: reportAttributeAccessIssue=false, reportIndexIssue=false, reportArgumentType=false, reportOperatorIssue=false, reportCallIssue=false
+# (Kernels are Warp's language: pyright knows neither its arrays nor its vectors.)
+"""Pick: bring a cube to a point in the air."""
+
+# Warp reads annotations as types: no `from __future__ import annotations` here.
+import math
+from typing import TYPE_CHECKING
+
+import torch
+import warp as wp
+
+from franka_wm.envs.scene import Body, Scene
+from franka_wm.envs.tasks.manipulation import (
+    Aim,
+    GripperTask,
+    Sight,
+    effort,
+    fastest_joint,
+    fetch,
+    holds,
+    nearness,
+    place_of,
+    tool_of,
+)
+
+if TYPE_CHECKING:
+    from franka_wm.envs.simulation import Simulation
+
+NEAR = 0.025
+"""From the goal, at most [m]."""
+REST = 0.2
+"""The arm is at rest where no joint is faster [rad/s]."""
+MIDDLE, HALF, HIGHEST = 0.5, 0.10, 0.30
+"""The goal's x in the middle of its range, half of the range of x and y, and its largest height over the cube's [m]."""
+
+
+@wp.kernel(enable_backward=False)
+def goal_in_the_air(
+    mask: wp.array[wp.bool],
+    draws: wp.array2d[float],
+    rest_q: wp.array2d[float],
+    middle: float,
+    half: float,
+    highest: float,
+    goal: wp.array2d[float],
+):
+    world = wp.tid()
+    if mask[world]:
+        goal[world, 0] = middle + half * (2.0 * draws[world, 0] - 1.0)
+        goal[world, 1] = half * (2.0 * draws[world, 1] - 1.0)
+        goal[world, 2] = (
+            rest_q[world, 4] + highest * draws[world, 2]
+        )  # behind two fingers, x and y: the cube's z
+
+
+@wp.kernel(enable_backward=False)
+def pick_reward_and_success(
+    state: wp.array2d[float],
+    joint_target: wp.array2d[float],
+    objects: wp.array2d[float],
+    goal: wp.array2d[float],
+    action: wp.array2d[float],
+    sparse: bool,
+    penalty: float,
+    near: float,
+    rest: float,
+    reward: wp.array2d[float],
+    success: wp.array2d[wp.bool],
+):
+    world = wp.tid()
+    cube = place_of(objects, world, 0)
+    missing = wp.length(wp.vec3f(goal[world, 0], goal[world, 1], goal[world, 2]) - cube)
+    speed = fastest_joint(state, world)
+    solved = missing <= near and speed < rest
+    value = 0.2 * nearness(wp.length(tool_of(state, world) - cube))
+    if holds(state, joint_target, cube, world):
+        value += 0.2 + 0.4 * nearness(missing)
+        if missing <= near:
+            value += 0.2 * nearness(speed)
+    if solved:
+        value = 1.0
+    if sparse:
+        value = wp.where(solved, 1.0, 0.0)
+    reward[world, 0] = value - penalty * effort(action, world)
+    success[world, 0] = solved
+
+
+class Pick(GripperTask):
+    """Bring a cube to a point in the air and keep it there.
+
+    **Scene**: a table and a cube of 4 cm and 50 g. **Randomization**: the cube stands within 10 cm in x and y of
+    (0.5, 0) m, turned by up to 45°; the goal lies within 10 cm of it in x and y and up to 30 cm over the resting cube.
+    **Success**: the cube's centre is at most 2.5 cm from the goal, and no joint of the arm is faster than 0.2 rad/s
+    (ManiSkill3's PickCube: Tao et al. 2024; 50 steps at 20 Hz, joints within 0.02 rad of the same pose). **Reward**,
+    dense, in [0, 1]: 1 where it succeeds; else 0.2 for the tool's nearness to the cube, 1 − tanh(5 · distance), 0.2 for
+    holding it, and while it is held 0.4 for its nearness to the goal, and there 0.2 for slow joints; sparse: 1 where it
+    succeeds. Both minus ``action_penalty`` · mean(action²).
+    """
+
+    scene = Scene(objects=(Body(name="cube", at=(0.5, 0.0), spread=(0.10, 0.10), turn=math.pi / 4),))
+    num_draws = 3
+    words = "Bring the cube to the goal."
+
+    def reset(self, sim: "Simulation", mask: wp.array) -> None:
+        w = sim.warp
+        inputs = [mask, w.draws, w.rest_q, MIDDLE, HALF, HIGHEST, w.task_goal]
+        wp.launch(goal_in_the_air, sim.num_envs, inputs, device=sim.device)
+
+    def reward_and_success(self, sim: "Simulation") -> None:
+        self.launch_reward(sim, pick_reward_and_success, NEAR, REST)
+
+    def measures(self, sim: "Simulation") -> dict[str, torch.Tensor]:
+        return {"cube to goal [m]": (sim.tensors.next_objects[:, :3] - sim.tensors.next_goal).norm(dim=-1)}
+
+    def expert(self, sight: Sight) -> Aim:
+        """Grasp the cube from above and bring it to the goal."""
+        return fetch(sight, 0, sight.goal)[0]

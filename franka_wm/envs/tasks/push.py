@@ -1,0 +1,109 @@
+# pyright: reportAttributeAccessIssue=false, reportIndexIssue=false, reportArgumentType=false, reportOperatorIssue=false, reportCallIssue=false
+# (Kernels are Warp's language: pyright knows neither its arrays nor its vectors.)
+"""Push: slide a cube onto a disc."""
+
+# Warp reads annotations as types: no `from __future__ import annotations` here.
+from typing import TYPE_CHECKING
+
+import torch
+import warp as wp
+
+from franka_wm.envs.scene import Body, Scene
+from franka_wm.envs.tasks.manipulation import (
+    Aim,
+    GripperTask,
+    Sight,
+    effort,
+    nearness,
+    place_of,
+    tool_of,
+)
+
+if TYPE_CHECKING:
+    from franka_wm.envs.simulation import Simulation
+
+AHEAD, RADIUS = 0.20, 0.10
+"""The disc's middle is so far in front of the cube; its radius [m]."""
+BEHIND = 0.035
+"""Where the fingers push: so far behind the cube's centre [m]."""
+
+
+@wp.kernel(enable_backward=False)
+def goal_ahead(mask: wp.array[wp.bool], rest_q: wp.array2d[float], ahead: float, goal: wp.array2d[float]):
+    world = wp.tid()
+    if mask[world]:
+        for i in range(3):
+            goal[world, i] = rest_q[world, 2 + i]  # behind the two fingers: the first object
+        goal[world, 0] += ahead
+
+
+@wp.kernel(enable_backward=False)
+def push_reward_and_success(
+    state: wp.array2d[float],
+    joint_target: wp.array2d[float],
+    objects: wp.array2d[float],
+    goal: wp.array2d[float],
+    action: wp.array2d[float],
+    sparse: bool,
+    penalty: float,
+    radius: float,
+    behind: float,
+    reward: wp.array2d[float],
+    success: wp.array2d[wp.bool],
+):
+    world = wp.tid()
+    cube = place_of(objects, world, 0)
+    missing = wp.length(wp.vec2f(goal[world, 0] - cube[0], goal[world, 1] - cube[1]))
+    flat = wp.abs(cube[2] - goal[world, 2]) < 0.005
+    solved = missing < radius and flat
+    ready = nearness(wp.length(tool_of(state, world) - (cube - wp.vec3f(behind, 0.0, 0.0))))
+    value = 0.3 * ready + 0.5 * nearness(missing) * wp.where(flat, 1.0, 0.0)
+    if solved:
+        value = 0.8 + 0.2 * nearness(missing)
+    if sparse:
+        value = wp.where(solved, 1.0, 0.0)
+    reward[world, 0] = value - penalty * effort(action, world)
+    success[world, 0] = solved
+
+
+class Push(GripperTask):
+    """Push a cube onto a disc.
+
+    **Scene**: a table and a cube of 4 cm and 50 g. **Randomization**: the cube stands within 7 cm in x and 15 cm in y
+    of (0.42, 0) m. **Goal**: the middle of a disc of 10 cm radius, 20 cm in front of where the cube stood.
+    **Success**: the cube lies on the table with its centre on the disc (ManiSkill3's PushCube: Tao et al. 2024).
+    **Reward**, dense, in [0, 1]: on the disc 0.8 to 1, by the distance to its middle; else 0.3 for the tool's nearness
+    to where it can push, 1 − tanh(5 · distance), and half for the cube's to the goal; sparse: 1 where it succeeds.
+    Both minus ``action_penalty`` · mean(action²).
+    """
+
+    scene = Scene(objects=(Body(name="cube", at=(0.42, 0.0), spread=(0.07, 0.15)),))
+    marker = RADIUS
+    words = "Push the cube onto the disc."
+
+    def reset(self, sim: "Simulation", mask: wp.array) -> None:
+        w = sim.warp
+        wp.launch(goal_ahead, sim.num_envs, [mask, w.rest_q, AHEAD, w.task_goal], device=sim.device)
+
+    def reward_and_success(self, sim: "Simulation") -> None:
+        self.launch_reward(sim, push_reward_and_success, RADIUS, BEHIND)
+
+    def measures(self, sim: "Simulation") -> dict[str, torch.Tensor]:
+        way = sim.tensors.next_objects[:, :2] - sim.tensors.next_goal[:, :2]
+        return {"cube to the disc's middle [m]": way.norm(dim=-1)}
+
+    def expert(self, sight: Sight) -> Aim:
+        """Closed fingers down behind the cube, then forward with it."""
+        cube, _ = sight.body(0)
+        away = cube - sight.tool
+        behind = (away[:, 0] > BEHIND - 0.015) & (away[:, 0] < BEHIND + 0.04) & (away[:, 1].abs() < 0.015)
+        low = away[:, 2].abs() < 0.015
+        back = cube.new_tensor([BEHIND + 0.02, 0.0, 0.0])
+        over = (cube - back - sight.tool)[:, :2].norm(dim=-1) < 0.015
+        start = cube - back
+        start[:, 2] += torch.where(over | (behind & low), 0.0, 0.08)
+        onward = torch.stack([sight.goal[:, 0] - BEHIND, cube[:, 1], cube[:, 2]], -1)
+        done = cube[:, 0] > sight.goal[:, 0] - 0.02
+        tool = torch.where((behind & low)[:, None], onward, start)
+        tool = torch.where(done[:, None], sight.target, tool)
+        return Aim(tool, torch.zeros_like(sight.yaw), torch.zeros_like(sight.yaw))

@@ -1,0 +1,132 @@
+# pyright: reportAttributeAccessIssue=false, reportIndexIssue=false, reportArgumentType=false, reportOperatorIssue=false, reportCallIssue=false
+# (Kernels are Warp's language: pyright knows neither its arrays nor its vectors.)
+"""Stack: put a cube on another."""
+
+# Warp reads annotations as types: no `from __future__ import annotations` here.
+import math
+from typing import TYPE_CHECKING
+
+import torch
+import warp as wp
+
+from franka_wm.envs.constants import MOST_OPEN
+from franka_wm.envs.scene import Body, Scene
+from franka_wm.envs.tasks.manipulation import (
+    Aim,
+    GripperTask,
+    Sight,
+    effort,
+    fetch,
+    holds,
+    nearness,
+    place_of,
+    speed_of,
+    tool_of,
+)
+
+if TYPE_CHECKING:
+    from franka_wm.envs.simulation import Simulation
+
+EDGE = 0.04
+"""Of both cubes [m]."""
+ASIDE, OFF = 0.5 * EDGE + 0.005, 0.005
+"""How far the upper cube may be off, sideways and in height [m]."""
+STILL = 0.01
+"""It stands still where it is slower [m/s]."""
+
+
+@wp.kernel(enable_backward=False)
+def goal_on_top(mask: wp.array[wp.bool], rest_q: wp.array2d[float], edge: float, goal: wp.array2d[float]):
+    world = wp.tid()
+    if mask[world]:
+        for i in range(3):
+            goal[world, i] = rest_q[world, 9 + i]  # behind the two fingers and the first cube: the second one
+        goal[world, 2] += edge
+
+
+@wp.kernel(enable_backward=False)
+def stack_reward_and_success(
+    state: wp.array2d[float],
+    joint_target: wp.array2d[float],
+    objects: wp.array2d[float],
+    goal: wp.array2d[float],
+    action: wp.array2d[float],
+    sparse: bool,
+    penalty: float,
+    edge: float,
+    aside: float,
+    off: float,
+    still: float,
+    reward: wp.array2d[float],
+    success: wp.array2d[wp.bool],
+):
+    world = wp.tid()
+    cube = place_of(objects, world, 0)
+    missing = place_of(objects, world, 1) + wp.vec3f(0.0, 0.0, edge) - cube
+    placed = wp.length(wp.vec2f(missing[0], missing[1])) <= aside and wp.abs(missing[2]) <= off
+    away = wp.length(tool_of(state, world) - cube)
+    released = away > edge or state[world, 20] + state[world, 21] > edge + 0.004
+    solved = placed and released and speed_of(objects, world, 0) < still
+    value = 0.2 * nearness(away)
+    if holds(state, joint_target, cube, world):
+        value += 0.2 + 0.3 * nearness(wp.length(missing))
+    if placed:
+        value = wp.where(released, 0.9, 0.8)
+    if solved:
+        value = 1.0
+    if sparse:
+        value = wp.where(solved, 1.0, 0.0)
+    reward[world, 0] = value - penalty * effort(action, world)
+    success[world, 0] = solved
+
+
+class Stack(GripperTask):
+    """Put a cube on another and let go.
+
+    **Scene**: a table and two cubes of 4 cm and 50 g. **Randomization**: both stand within 10 cm in x and 15 cm in y
+    of (0.5, 0) m, turned by up to 45°, with 6 cm between circles around them. **Goal**: the place on top of the second
+    cube at the start. **Success**: the first cube lies on the second one, off by at most half an edge and 5 mm to the
+    side and 5 mm in height, slower than 1 cm/s, and the fingers have let go (ManiSkill3's StackCube: Tao et al. 2024).
+    **Reward**, dense, in [0, 1]: 1 where it succeeds, 0.9 released on top, 0.8 held there; else 0.2 for the tool's
+    nearness to the first cube, 1 − tanh(5 · distance), 0.2 for holding it, and then 0.3 for its nearness to its place;
+    sparse: 1 where it succeeds. Both minus ``action_penalty`` · mean(action²).
+    """
+
+    scene = Scene(
+        objects=(
+            Body(name="cube", at=(0.5, 0.0), spread=(0.10, 0.15), turn=math.pi / 4),
+            Body(name="base", at=(0.5, 0.0), spread=(0.10, 0.15), turn=math.pi / 4, color=(0.20, 0.55, 0.30)),
+        ),
+        space=0.06,
+    )
+    words = "Put the red cube on the green one."
+
+    def reset(self, sim: "Simulation", mask: wp.array) -> None:
+        w = sim.warp
+        wp.launch(goal_on_top, sim.num_envs, [mask, w.rest_q, EDGE, w.task_goal], device=sim.device)
+
+    def reward_and_success(self, sim: "Simulation") -> None:
+        self.launch_reward(sim, stack_reward_and_success, EDGE, ASIDE, OFF, STILL)
+
+    def measures(self, sim: "Simulation") -> dict[str, torch.Tensor]:
+        return {"height of the cube [m]": sim.tensors.next_objects[:, 2]}
+
+    def expert(self, sight: Sight) -> Aim:
+        """Grasp the first cube from above, bring it over the second, down, let go, and up."""
+        cube, _ = sight.body(0)
+        spot = sight.body(1)[0] + cube.new_tensor([0.0, 0.0, EDGE])
+        aside = (cube - spot)[:, :2].norm(dim=-1)
+        high = cube[:, 2] > spot[:, 2] + 0.025
+        to = torch.where((aside < 0.008)[:, None], spot, spot + cube.new_tensor([0.0, 0.0, 0.05]))
+        to[:, :2] = torch.where((high | (aside < 0.008))[:, None], spot[:, :2], cube[:, :2])
+        aim, _ = fetch(sight, 0, to)
+        placed = (aside < 0.012) & ((cube - spot)[:, 2].abs() < 0.004)
+        up = sight.target.clone()
+        free = (sight.opening > 0.03) & (sight.tool[:, 2] < cube[:, 2] + 0.10)
+        up[:, 2] += torch.where(free, 0.08, 0.0)
+        tool = torch.where(placed[:, None], up, aim.tool)
+        return Aim(
+            tool,
+            torch.where(placed, sight.target_yaw, aim.yaw),
+            torch.where(placed, MOST_OPEN, aim.opening),
+        )
