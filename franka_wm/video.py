@@ -149,7 +149,7 @@ def _check_frames(frames: Tensor, path: Path, ending: str, fps: int) -> None:
     if frames.ndim != 4 or frames.shape[-1] != 3 or frames.dtype != torch.uint8 or 0 in frames.shape:
         raise UserError(
             f"cannot write {path.name}: frames are {tuple(frames.shape)} {frames.dtype}; "
-            "RGB pictures (height, width, 3) of uint8 are needed, at least one."
+            "RGB images (height, width, 3) of uint8 are needed, at least one."
         )
     if fps < 1:
         raise UserError(f"cannot write {path.name}: fps is {fps}; at least 1 is needed.")

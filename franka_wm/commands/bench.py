@@ -19,9 +19,7 @@ def bench(arguments: list[str]) -> int:
     folder = CHECKOUT / "benchmarks"
     names = sorted(file.stem for file in folder.glob("*.py") if file.stem != "common" and file.stem[0] != "_")
     if not names or not (CHECKOUT / "pyproject.toml").is_file():  # site-packages may have a "benchmarks", too
-        raise UserError(
-            "bench: the benchmarks are in a checkout of the repository, which this installation is not"
-        )
+        raise UserError("bench: benchmarks need a checkout of the repository; this is an installed package")
     if not arguments:
         raise UserError(f"bench: give NAME, one of {', '.join(names)}")
     name, *rest = arguments

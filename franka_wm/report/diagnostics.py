@@ -129,7 +129,7 @@ def findings(results: Mapping[str, Any]) -> dict[str, str]:
     if "decoder" in ahead:
         errors = ahead["decoder"]
         share = errors["error"] / max(errors["mean_picture"], 1e-12)
-        out["decoder's error / that of the mean picture"] = number(share)
+        out["decoder's error / that of the mean image"] = number(share)
     if value:
         line = f"return = {number(value['slope'])} · value + {number(value['intercept'])}"
         out["value calibration (exact: 1, 0)"] = line

@@ -119,7 +119,7 @@ def imagined(run: RunFiles) -> str:
     parts.append(
         card(picture(masks, "what the masks hide"), "What the masks hide.", kind="single") if masks else ""
     )
-    text = "A decoder, trained on the side and used by nothing else, turns latents into pictures."
+    text = "A decoder, trained on the side and used by nothing else, turns latents into images."
     return paragraph(text if film or strip else "") + cards(*parts)
 
 

@@ -109,13 +109,13 @@ class TableJob:
         data = cell.get("bytes") if isinstance(cell, dict) else cell
         if not isinstance(data, bytes):
             raise UserError(
-                f"{self.path}: {feature} holds no picture but a path; embed the pictures (LeRobot's own writer does)"
+                f"{self.path}: {feature} holds no image but a path; embed the images (LeRobot's own writer does)"
             )
         try:
             with Image.open(io.BytesIO(data)) as picture:
                 return np.asarray(picture.convert("RGB"))
         except (OSError, SyntaxError, ValueError) as error:
-            raise UserError(f"{self.path}: a picture of {feature} cannot be decoded: {error}") from error
+            raise UserError(f"{self.path}: an image of {feature} cannot be decoded: {error}") from error
 
 
 @dataclass(frozen=True)
@@ -173,7 +173,7 @@ class VideoJob:
         if frames != total:
             raise UserError(
                 f"{self.path} has {frames} frames, its episodes have {total} rows: the encoder dropped or added "
-                "frames, so pictures and rows no longer belong together; record it again"
+                "frames, so images and rows no longer belong together; record it again"
             )
         if len(set(seen)) != total:
             raise UserError(

@@ -138,7 +138,7 @@ def map_features(
         if any(is_image(there[name]) for name in names):
             if len(names) != 1:
                 raise UserError(
-                    f"dataset.features.{key}: one picture, or a list of vectors; got {_list(names)}"
+                    f"dataset.features.{key}: one image, or a list of vectors; got {_list(names)}"
                 )
             height, width = image_shape(source, names[0])
             images[key] = (names[0], (*(size or (height, width)), 3))
@@ -191,7 +191,7 @@ def image_shape(source: Source, name: str) -> tuple[int, int]:
     spec = source.features[name]
     shape = tuple(spec["shape"])
     if is_depth(spec) or len(shape) != 3 or 3 not in (shape[0], shape[-1]):
-        raise UserError(f"{source.root}: {name} {shape} is not a colour picture; leave it out")
+        raise UserError(f"{source.root}: {name} {shape} is not a colour image; leave it out")
     names = spec.get("names") or []
     first = names[0] if len(names) == 3 else None
     if shape[0] == 3 and (shape[-1] != 3 or first in ("channel", "channels")):

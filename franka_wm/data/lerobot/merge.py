@@ -192,7 +192,7 @@ def check_merged(out: Path, roots: Sequence[Path]) -> None:
         if feature["dtype"] == "video":
             frames = sum(_frames(file) for _, file in _files(out / "videos" / name, ".mp4"))
             if frames != len(rows):
-                raise UserError(f"merging gave {frames} pictures of {name} for {len(rows)} rows")
+                raise UserError(f"merging gave {frames} images of {name} for {len(rows)} rows")
 
 
 def _column(root: Path, name: str) -> np.ndarray:

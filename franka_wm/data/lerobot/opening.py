@@ -147,7 +147,7 @@ def _check_alike(a: FeatureMap, b: FeatureMap, name_a: str, name_b: str) -> None
         if x != y:
             raise UserError(
                 f"{name_a} gives {x or 'no ' + what}, {name_b} {y or 'no ' + what}; several datasets must be alike: "
-                "choose entries with dataset.features, sizes of pictures with dataset.image_size"
+                "choose entries with dataset.features, sizes of images with dataset.image_size"
             )
     if a.action[1] != b.action[1]:
         raise UserError(f"actions have {a.action[1]} numbers in {name_a} and {b.action[1]} in {name_b}")

@@ -46,7 +46,7 @@ if TYPE_CHECKING:  # writing processes need this module, and neither torch nor t
     from franka_wm.envs import FrankaConfig
 
 FORMATS = {
-    "exact": "PNG inside parquet: every picture comes back bit for bit; for training",
+    "exact": "PNG inside parquet: every image comes back bit for bit; for training",
     "video": "LeRobot's default codec (AV1): small, for sharing and viewers; blurs small motion",
     "video_near_lossless": "h264, 4:4:4, crf 0: each channel off by 2 of 255 at most; plays in most viewers",
 }
@@ -172,7 +172,7 @@ def schema_for(
         raise UserError(f"format={format!r}: must be one of {', '.join(FORMATS)}")
     if config.frame_stack > 1 and config.images:
         raise UserError(
-            f"env.frame_stack={config.frame_stack}: a dataset holds single pictures; record with env.frame_stack=1"
+            f"env.frame_stack={config.frame_stack}: a dataset holds single images; record with env.frame_stack=1"
         )
     if config.fps != round(config.fps):
         raise UserError(

@@ -88,9 +88,7 @@ def test_an_error_in_a_worker_is_one_line(
     monkeypatch.setattr(decode_workers, "ROWS_WORTH_A_PROCESS", 0)
     monkeypatch.setattr(build_cache, "ROWS_PER_JOB", 5)
     root = damaged_picture(pictures, tmp_path / "data")
-    with pytest.raises(
-        UserError, match=r"file-000\.parquet: a picture of observation\.images\.\w+ cannot be"
-    ):
+    with pytest.raises(UserError, match=r"file-000\.parquet: an image of observation\.images\.\w+ cannot be"):
         opened(root, workers=2)
     assert folders(tmp_path / "cache") == []
 
@@ -330,7 +328,7 @@ def test_damaged_rows(pictures: Path, opened: Callable, tmp_path: Path) -> None:
     import pyarrow as pa
     import pyarrow.parquet as pq
 
-    with pytest.raises(UserError, match=r"a picture of .* cannot be decoded"):
+    with pytest.raises(UserError, match=r"an image of .* cannot be decoded"):
         opened(damaged_picture(pictures, tmp_path / "picture"))
 
     def rewritten(name: str, change: Callable[[pa.Table], pa.Table]) -> Path:
