@@ -96,7 +96,7 @@ POLICY_COLOURS = {
     "random": ORANGE,
     "noop": BLACK,
     "ik": GREEN,
-    "expert": GREEN,
+    "expert": PURPLE,
 }
 
 POLICY_LEGEND = {
