@@ -1,6 +1,7 @@
 """Frames into files: video, animated picture, still. Frames are uint8 RGB, as the camera gives them."""
 
 import math
+from collections.abc import Sequence
 from pathlib import Path
 
 import torch
@@ -117,6 +118,32 @@ def tile_frames(frames: Tensor, columns: int | None = None) -> Tensor:
     grid = frames.new_zeros((t, rows * columns, h, w, 3))
     grid[:, :n] = frames
     return grid.view(t, rows, columns, h, w, 3).transpose(2, 3).reshape(t, rows * h, columns * w, 3)
+
+
+def draw_labels(frames: Tensor, texts: Sequence[str]) -> Tensor:
+    """Write one line on a dark band at the top of every world's pictures; lines shrink until the longest fits.
+
+    Args:
+        frames: (T, N, H, W, 3) uint8.
+        texts: N lines.
+
+    Returns:
+        New frames of the same shape.
+    """
+    from PIL import Image, ImageDraw, ImageFont
+
+    labelled = frames.clone()
+    height, width = frames.shape[2:4]
+    size = max(8.0, height / 14)
+    while size > 6 and max(map(ImageFont.load_default(size).getlength, texts)) > width - 6:
+        size -= 0.5
+    font, band = ImageFont.load_default(size), min(height, round(1.6 * size))
+    for world, text in enumerate(texts):
+        strip = Image.new("RGB", (width, band), (31, 35, 40))
+        ImageDraw.Draw(strip).text((3, band / 2), text, font=font, anchor="lm", fill=(255, 255, 255))
+        pixels = torch.frombuffer(bytearray(strip.tobytes()), dtype=torch.uint8)
+        labelled[:, world, :band] = pixels.view(band, width, 3).to(frames.device)
+    return labelled
 
 
 def draw_marker(

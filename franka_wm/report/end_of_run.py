@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from tensordict import TensorDictBase
 
 from franka_wm.envs.camera import project
 from franka_wm.evaluation.closed_loop import arm_of, play_episodes, reaches
@@ -15,11 +16,12 @@ from franka_wm.evaluation.results import FILE, Result, last_row
 from franka_wm.files import atomic_write
 from franka_wm.report.curves import axis, plot_learning_curves
 from franka_wm.report.diagnostics import evaluation_markdown, terminal
+from franka_wm.report.style import policy_name
 from franka_wm.report.table import evaluation_tables
 from franka_wm.seeding import seeded
 from franka_wm.training.build import make_evaluation_env
 from franka_wm.training.settings import RunSettings
-from franka_wm.video import draw_marker, tile_frames, write_png, write_video
+from franka_wm.video import draw_labels, draw_marker, tile_frames, write_png, write_video
 
 
 def report_run(
@@ -61,9 +63,9 @@ def report_run(
         plot_learning_curves(drawn, folder / "curves.png", x=x, success_distance=mark)
     if settings.evaluation.video_episodes and arm is not None:
         name = acting(policies)
-        frames = film(settings, folder, policies[name])
+        frames = film(settings, folder, policies[name], name)
         if log_video is not None:
-            log_video(f"eval/{name}", frames, round(arm.config.fps))
+            log_video(f"eval/{name}", frames, _slow(arm.config.fps))
     Console(width=120).print(terminal(evaluation_tables(found.policies)[0]))
 
 
@@ -72,8 +74,11 @@ def acting(policies: Mapping[str, Any]) -> str:
     return next((name for name in ("planner", "policy") if name in policies), next(iter(policies)))
 
 
-def film(settings: RunSettings, folder: Path, policy: Any) -> torch.Tensor:
-    """``video.mp4`` and ``last_frame.png``: episodes of one policy, the goal drawn as a ring."""
+def film(settings: RunSettings, folder: Path, policy: Any, name: str) -> torch.Tensor:
+    """``video.mp4`` and ``last_frame.png``: episodes of one policy at half speed, the goal drawn as a ring.
+
+    Each picture says whose episode it is and how it ended; the worst of several is marked.
+    """
     env = make_evaluation_env(settings, num_envs=settings.evaluation.video_episodes)
     arm = arm_of(env)
     assert arm is not None
@@ -87,8 +92,38 @@ def film(settings: RunSettings, folder: Path, policy: Any) -> torch.Tensor:
 
     seed = held_out_seeds(1)[0]  # the first of the episodes that the table is about
     with seeded(seed, policy):
-        play_episodes(env, policy, seed=seed, video=picture)
-    film = tile_frames(torch.stack(frames))
-    write_video(film, folder / "video.mp4", fps=round(arm.config.fps))
+        played = play_episodes(env, policy, seed=seed, video=picture)
+    fps = _slow(arm.config.fps)
+    frames += frames[-1:] * fps  # a second to look at the end
+    film = tile_frames(draw_labels(torch.stack(frames), endings(played, policy_name(name), arm)))
+    write_video(film, folder / "video.mp4", fps=fps)
     write_png(film[-1], folder / "last_frame.png")
     return film
+
+
+def endings(played: TensorDictBase, who: str, arm: Any) -> list[str]:
+    """One line for each episode: policy, final distance where there is a goal, success; and which was the worst.
+
+    Args:
+        played: As :func:`~franka_wm.evaluation.closed_loop.play_episodes` gives it.
+    """
+    distances = played.get("final_distance", None)
+    worst = int(played.get("return").argmin() if distances is None else distances.argmax())
+    lines = []
+    for episode in range(played.numel()):
+        parts = [who]
+        if distances is None:
+            success = bool(played["success"][episode])
+        else:
+            distance = float(distances[episode])
+            success = distance < arm.config.success_distance
+            parts.append(f"{100 * distance:.1f} cm")
+        parts.append("success" if success else "no success")
+        parts += ["worst"] if episode == worst and played.numel() > 1 else []
+        lines.append(", ".join(parts))
+    return lines
+
+
+def _slow(fps: float) -> int:
+    """Half the frames per second of the arm's."""
+    return max(1, round(fps / 2))

@@ -91,7 +91,7 @@ def videos(run: RunFiles) -> str:
     if film is not None:
         return card(
             video(film, "episodes of the planner", poster=still),
-            "Episodes that training never saw; the ring marks the goal.",
+            "Held-out episodes; the ring marks the goal.",
             kind="single",
         )
     if still is not None:

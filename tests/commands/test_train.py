@@ -121,10 +121,12 @@ def test_what_it_leaves(run) -> None:
 
 
 def test_video(run) -> None:
-    """As many frames as an episode has steps, and the arm moves in it."""
+    """As many frames as an episode has steps, at half speed, and a second to look at its end; the arm moves in it."""
     with av.open(str(run[0] / "video.mp4")) as film:
+        rate = film.streams.video[0].average_rate
         frames = [frame.to_ndarray(format="rgb24").astype(int) for frame in film.decode(video=0)]
-    assert len(frames) == LENGTH
+    assert rate == round(OmegaConf.load(run[0] / "config.yaml").env.fps / 2)
+    assert len(frames) == LENGTH + rate
     assert all(frame.std() > 10 for frame in frames)
     assert (abs(frames[0] - frames[-1]).max(-1) > 40).mean() > 0.005
 

@@ -6,12 +6,15 @@ import json
 from pathlib import Path
 
 import pytest
+import torch
 from matplotlib.axes import Axes
+from tensordict import TensorDict
 
 from franka_wm.evaluation.protocol import evaluate_run
 from franka_wm.evaluation.results import END, read_result
 from franka_wm.policies.scripted import NoopPolicy
-from franka_wm.report.end_of_run import report_run
+from franka_wm.report.end_of_run import endings, report_run
+from franka_wm.video import draw_labels
 
 
 @pytest.mark.parametrize("during", [["policy"], []])
@@ -48,3 +51,28 @@ def test_the_table_is_the_curves_last_point(
         assert logged == [{f"eval/policy/{name}": value for name, value in numbers.items()}]
     else:  # no curve was asked for
         assert drawn[0, "policy"][0] == [50] and logged == []
+
+
+def test_the_video_says_whose_episodes_it_shows_and_how_they_ended(small_env) -> None:
+    arm = small_env(1, success_distance=0.05)
+    near = TensorDict(
+        {"final_distance": torch.tensor([0.021, 0.3]), "return": torch.tensor([-1.0, -9.0])}, [2]
+    )
+    assert endings(near, "planner", arm) == [
+        "planner, 2.1 cm, success",
+        "planner, 30.0 cm, no success, worst",
+    ]
+    other = TensorDict({"success": torch.tensor([0.0, 1.0]), "return": torch.tensor([-1.0, 3.0])}, [2])
+    assert endings(other, "policy", arm) == ["policy, no success, worst", "policy, success"]
+    assert endings(near[:1], "ik", arm) == ["ik, 2.1 cm, success"]
+
+
+@pytest.mark.parametrize("size", [96, 256])
+def test_labels_fit_their_pictures(size: int) -> None:
+    frames = torch.full((3, 2, size, size, 3), 20, dtype=torch.uint8)
+    labelled = draw_labels(frames, ["planner, 30.0 cm, no success, worst", "ik"])
+    assert (frames == 20).all() and labelled.shape == frames.shape
+    assert (labelled[0] == labelled[2]).all() and (labelled[:, :, size // 2 :] == 20).all()
+    bright = labelled[0].float().mean(-1) > 80
+    assert bright[0].any(0).sum() > bright[1].any(0).sum() > 0  # more columns are written on by a longer line
+    assert not bright[0, :, -2:].any()  # and it ends before its picture does
