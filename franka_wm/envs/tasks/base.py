@@ -130,7 +130,7 @@ def with_goal(transitions: TensorDictBase, goal: torch.Tensor) -> TensorDict:
     """What another goal changes in the observations of recorded transitions; exact where they have no noise.
 
     Args:
-        transitions: (B, H) with ``state`` (20), also in ``next``.
+        transitions: (B, H) with ``state`` (20 or 28), also in ``next``.
         goal: (B, 3) [m].
 
     Returns:
@@ -140,7 +140,8 @@ def with_goal(transitions: TensorDictBase, goal: torch.Tensor) -> TensorDict:
     out = TensorDict({}, batch_size=transitions.batch_size)
     for root in ((), ("next",)):
         state = transitions.get((*root, "state"))
-        out.set((*root, "state"), torch.cat([state[..., :17], state[..., 14:17] - goal], -1))
+        moved = [state[..., :17], state[..., 14:17] - goal, state[..., 20:]]
+        out.set((*root, "state"), torch.cat(moved, -1))
         if transitions.get((*root, "goal"), None) is not None:
             out.set((*root, "goal"), goal)
     return out

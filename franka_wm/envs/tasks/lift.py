@@ -17,6 +17,7 @@ from franka_wm.envs.tasks.manipulation import (
     effort,
     fetch,
     holds,
+    moved,
     nearness,
     place_of,
     tool_of,
@@ -89,4 +90,4 @@ class Lift(GripperTask):
 
     def expert(self, sight: Sight) -> Aim:
         """Grasp the cube from above and bring it a little higher than the goal."""
-        return fetch(sight, 0, sight.goal + sight.goal.new_tensor([0.0, 0.0, 0.03]))[0]
+        return fetch(sight, 0, moved(sight.goal, z=0.03))[0]

@@ -14,6 +14,7 @@ from franka_wm.envs.tasks.manipulation import (
     GripperTask,
     Sight,
     effort,
+    moved,
     nearness,
     place_of,
     tool_of,
@@ -98,9 +99,8 @@ class Push(GripperTask):
         away = cube - sight.tool
         behind = (away[:, 0] > BEHIND - 0.015) & (away[:, 0] < BEHIND + 0.04) & (away[:, 1].abs() < 0.015)
         low = away[:, 2].abs() < 0.015
-        back = cube.new_tensor([BEHIND + 0.02, 0.0, 0.0])
-        over = (cube - back - sight.tool)[:, :2].norm(dim=-1) < 0.015
-        start = cube - back
+        start = moved(cube, x=-BEHIND - 0.02)
+        over = (start - sight.tool)[:, :2].norm(dim=-1) < 0.015
         start[:, 2] += torch.where(over | (behind & low), 0.0, 0.08)
         onward = torch.stack([sight.goal[:, 0] - BEHIND, cube[:, 1], cube[:, 2]], -1)
         done = cube[:, 0] > sight.goal[:, 0] - 0.02

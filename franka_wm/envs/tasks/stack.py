@@ -18,6 +18,7 @@ from franka_wm.envs.tasks.manipulation import (
     effort,
     fetch,
     holds,
+    moved,
     nearness,
     place_of,
     speed_of,
@@ -114,10 +115,10 @@ class Stack(GripperTask):
     def expert(self, sight: Sight) -> Aim:
         """Grasp the first cube from above, bring it over the second, down, let go, and up."""
         cube, _ = sight.body(0)
-        spot = sight.body(1)[0] + cube.new_tensor([0.0, 0.0, EDGE])
+        spot = moved(sight.body(1)[0], z=EDGE)
         aside = (cube - spot)[:, :2].norm(dim=-1)
         high = cube[:, 2] > spot[:, 2] + 0.025
-        to = torch.where((aside < 0.008)[:, None], spot, spot + cube.new_tensor([0.0, 0.0, 0.05]))
+        to = torch.where((aside < 0.008)[:, None], spot, moved(spot, z=0.05))
         to[:, :2] = torch.where((high | (aside < 0.008))[:, None], spot[:, :2], cube[:, :2])
         aim, _ = fetch(sight, 0, to)
         placed = (aside < 0.012) & ((cube - spot)[:, 2].abs() < 0.004)

@@ -23,8 +23,8 @@ class TorchTask(Task):
     beside it. So they work on whole batches (``torch.where`` instead of ``if``), never wait for the device (no
     ``.item()``), copy nothing from the host (no ``torch.tensor``), and draw nothing: random numbers are given.
 
-    The 20 numbers of a state are joints 7 [rad], velocities 7 [rad/s], tool 3 [m], tool − goal 3 [m]; it has no
-    observation noise.
+    The 20 numbers of a state are joints 7 [rad], velocities 7 [rad/s], tool 3 [m], tool − goal 3 [m]; with a gripper 8
+    of the hand follow, and then the 13 of each object (``docs/tasks.md``). It has no observation noise.
     """
 
     num_draws = 8
@@ -48,12 +48,13 @@ class TorchTask(Task):
         sim.recorder.run(partial(self._write_reward_and_success, sim))
 
     def present_reward(self, sim: Simulation, action: torch.Tensor) -> torch.Tensor:
-        return self.reward(sim.tensors.true_state, _applied(action)).unsqueeze(-1)
+        t = sim.tensors
+        return self.reward(_seen(t.true_state, t.objects), _applied(action)).unsqueeze(-1)
 
     def relabel(self, transitions: TensorDictBase, goal: torch.Tensor) -> TensorDict:
         """As :meth:`Reach.relabel`: observations, reward and end of recorded transitions had the goal been another."""
         out = with_goal(transitions, goal)
-        after = out.get(("next", "state"))
+        after = _seen(out.get(("next", "state")), transitions.get(("next", "objects"), None))
         out.set(("next", "reward"), self.reward(after, _applied(transitions.get("action"))).unsqueeze(-1))
         ended = self.success(after).unsqueeze(-1) & self.config.terminate_on_success
         out.set(("next", "terminated"), ended)
@@ -75,8 +76,9 @@ class TorchTask(Task):
 
     def _write_reward_and_success(self, sim: Simulation) -> None:
         t, shape = sim.tensors, (sim.num_envs,)
-        reward = self._checked("reward", self.reward(t.next_true_state, _applied(t.action)), shape)
-        success = self._checked("success", self.success(t.next_true_state), shape, boolean=True)
+        state = _seen(t.next_true_state, t.next_objects)
+        reward = self._checked("reward", self.reward(state, _applied(t.action)), shape)
+        success = self._checked("success", self.success(state), shape, boolean=True)
         t.reward.copy_(reward.unsqueeze(-1))
         t.success.copy_(success.unsqueeze(-1))
 
@@ -90,6 +92,11 @@ class TorchTask(Task):
                 f"give {shape} {'bool' if boolean else 'float'}"
             )
         return value
+
+
+def _seen(state: torch.Tensor, objects: torch.Tensor | None) -> torch.Tensor:
+    """The state, and the objects where there are any: what reward and success are functions of."""
+    return state if objects is None or not objects.shape[-1] else torch.cat([state, objects], -1)
 
 
 def _applied(action: torch.Tensor) -> torch.Tensor:

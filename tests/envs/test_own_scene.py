@@ -1,0 +1,54 @@
+"""A scene and a task with objects of one's own, as docs/tasks.md prints them: no file of the package is touched."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import pytest
+import torch
+
+from franka_wm.envs import FrankaConfig, FrankaEnv
+from franka_wm.evaluation.closed_loop import play_episodes
+from franka_wm.policies.expert import ExpertPolicy
+from franka_wm.training.settings import RunSettings
+
+
+def test_the_printed_scene(root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    page = (root / "docs" / "tasks.md").read_text()
+    scene = next(b for b in re.findall(r"```yaml\n(.*?)```", page, re.DOTALL) if "name: ball" in b)
+    code = next(b for b in re.findall(r"```python\n(.*?)```", page, re.DOTALL) if "kitchen.yaml" in b)
+    (tmp_path / "kitchen.yaml").write_text(scene)
+    monkeypatch.chdir(tmp_path)
+    names: dict = {}
+    exec(code, names)
+    env, observation = names["env"], names["observation"]
+    assert observation["objects"].shape == (16, 39)
+    assert [body.name for body in env.config.surroundings.objects] == ["cube", "can", "ball"]
+    action = torch.zeros(16, 8)
+    for _ in range(20):
+        observation = env.step(observation.set("action", action))["next"]
+    heights = observation["objects"].view(16, 3, 13)[..., 2]
+    assert torch.allclose(heights, torch.tensor([0.02, 0.055, 0.03]).expand(16, 3), atol=1e-3)
+    assert not observation["done"].any()
+
+
+def test_the_printed_task_and_its_expert(printed_class, composed) -> None:
+    topple = printed_class("Topple(TorchTask)", lines=40)
+    config = RunSettings.of(composed("env=lift", "env.task=topple")).env.arm  # it has registered itself
+    assert config.num_objects == 1 and config.surroundings is topple.scene
+    env = FrankaEnv(config, num_envs=32, device="cpu", seed=0)
+    played = play_episodes(env, ExpertPolicy(env.simulation.task, env.kinematics, config), seed=2)
+    assert played["success_once"].mean() > 0.95
+    observation = env.reset(seed=3)
+    assert not observation["success"].any()
+    for _ in range(10):
+        observation = env.step(observation.set("action", torch.zeros(32, 8)))["next"]
+    assert not observation["success"].any()  # nothing falls by itself
+    assert env.reward(torch.zeros(32, 8)).shape == (32, 1)
+
+
+def test_an_own_config_is_not_the_tasks_scene() -> None:
+    scene = {"objects": [{"name": "brick", "size": [0.06, 0.03, 0.02], "at": [0.45, 0.1]}]}
+    config = FrankaConfig(task="lift", scene=scene)
+    assert [body.name for body in config.surroundings.objects] == ["brick"]
