@@ -135,7 +135,7 @@ def draw_labels(frames: Tensor, texts: Sequence[str]) -> Tensor:
     labelled = frames.clone()
     height, width = frames.shape[2:4]
     size = max(8.0, height / 14)
-    while size > 6 and max(map(ImageFont.load_default(size).getlength, texts)) > width - 6:
+    while size > 4 and max(map(ImageFont.load_default(size).getlength, texts)) > width - 6:
         size -= 0.5
     font, band = ImageFont.load_default(size), min(height, round(1.6 * size))
     for world, text in enumerate(texts):
