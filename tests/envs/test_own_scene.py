@@ -50,5 +50,6 @@ def test_the_printed_task_and_its_expert(printed_class, composed) -> None:
 
 def test_an_own_config_is_not_the_tasks_scene() -> None:
     scene = {"objects": [{"name": "brick", "size": [0.06, 0.03, 0.02], "at": [0.45, 0.1]}]}
-    config = FrankaConfig(task="lift", scene=scene)
+    config = FrankaConfig.from_mapping({"task": "lift", "scene": scene})
+    assert config.surroundings is not None
     assert [body.name for body in config.surroundings.objects] == ["brick"]
