@@ -47,9 +47,8 @@ def wanted(kind: click.ParamType) -> str:
     if isinstance(kind, click.Choice):
         return f"one of {', '.join(kind.choices)}"
     if isinstance(kind, click.IntRange):
-        return f"a whole number of at least {kind.min}" + (
-            "" if kind.max is None else f", at most {kind.max}"
-        )
+        most = "" if kind.max is None else f", at most {kind.max}"
+        return f"a whole number of at least {kind.min}{most}"
     return f"a finite number above {kind.min:g}" if isinstance(kind, click.FloatRange) else "true or false"
 
 
@@ -182,10 +181,8 @@ def word(
 
 def verb(name: str, **settings: Any) -> Callable[[Any], Verb]:
     """Make a function a verb; the first paragraphs of its docstring, up to a form feed, are its help."""
-    width = {"max_content_width": 110, "help_option_names": ["--help", "-h"]}
-    return click.command(
-        name, cls=Verb, context_settings=width | settings.pop("context_settings", {}), **settings
-    )
+    context = {"max_content_width": 110, "help_option_names": ["--help", "-h"]}
+    return click.command(name, cls=Verb, context_settings=context, **settings)
 
 
 def did_you_mean(word: str, known: Sequence[str]) -> str:

@@ -145,8 +145,11 @@ def test_ctrl_c_leaves_a_dataset(tmp_path, load) -> None:
         (["out=x", "format=gif"], "must be one of exact, video"),
         (["out=x", "policy=planner"], "give checkpoint="),
         (["out=x", "policy=smooth"], "collect: policy=smooth: this policy is called random now"),
-        (["out=x", "policy=nonsense"], "random, noop, ik, or the folder of a run"),
-        (["out=x", "env=nonsense"], "env=nonsense: must be one of dm_control, franka, gym, none, reach"),
+        (["out=x", "policy=nonsense"], "random, noop, ik, expert, or the folder of a run"),
+        (
+            ["out=x", "env=nonsense"],
+            "env=nonsense: must be one of dm_control, franka, gym, lift, none, reach",
+        ),
         (["out=x", "fmt=exact"], "fmt: no such option; there are out, episodes, policy, checkpoint, format"),
         (
             ["out=x", "env.imag_size=3"],
