@@ -148,7 +148,7 @@ def test_ctrl_c_leaves_a_dataset(tmp_path, load) -> None:
         (["out=x", "policy=nonsense"], "random, noop, ik, expert, or the folder of a run"),
         (
             ["out=x", "env=nonsense"],
-            "env=nonsense: must be one of dm_control, franka, gym, lift, none, reach",
+            "env=nonsense: must be one of dm_control, franka, gym, ",
         ),
         (["out=x", "fmt=exact"], "fmt: no such option; there are out, episodes, policy, checkpoint, format"),
         (
