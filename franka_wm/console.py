@@ -90,7 +90,7 @@ def announced(what: str, *, every: float = 10.0) -> Iterator[None]:
 
     def talk() -> None:
         while not finished.wait(every):
-            say(f"  still at it, {duration(time.perf_counter() - started)}")
+            say(f"  still running, {duration(time.perf_counter() - started)}")
 
     thread = threading.Thread(target=talk, daemon=True)
     thread.start()

@@ -21,7 +21,7 @@ from franka_wm.errors import UserError
     FLAG,
     True,
 )
-@word("probes", "what can be read off the latents; their spectrum", FLAG, True)
+@word("probes", "joints, tool and goal predicted from the latents by probes; spectrum", FLAG, True)
 @word("robustness", "the same in shifted worlds: looks, camera, dynamics, delay, noise", FLAG, False)
 def evaluate(checkpoint: str, out: str | None, **options: Any) -> None:
     """Evaluate a checkpoint on held-out episodes. Success, predictions, latents, robustness.

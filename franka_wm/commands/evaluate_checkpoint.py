@@ -93,7 +93,7 @@ def run(options: Options) -> dict[str, Any]:
 def _look_ahead(
     agent: Any, held: diagnose.Held, evaluation: Evaluation, results: dict[str, Any], say: Say
 ) -> tuple[Imagined, Any, Any] | None:
-    say("predictions without looking …")
+    say("open-loop predictions …")
     ahead: dict[str, Any]
     try:
         ahead = diagnose.open_loop(agent, held)
@@ -101,7 +101,7 @@ def _look_ahead(
         ahead = {"not_measured": str(error)}
         say(f"warning: open loop not measured: {error}")
     results["open_loop"] = ahead
-    say("values against true returns …")
+    say("value calibration …")
     results["calibration"] = diagnose.calibration(agent)
     results["health"] = diagnose.health(agent, evaluation)
     imagined = diagnose.imagine(agent, held, say=say)
@@ -111,7 +111,7 @@ def _look_ahead(
 
 
 def _look_inside(agent: Any, held: diagnose.Held, results: dict[str, Any], say: Say) -> None:
-    say("what can be read off the latents …")
+    say("probes and spectrum of the latents …")
     results["probes"] = diagnose.probes(held, agent.model)
     results["spectrum"], results["latents"] = diagnose.representation(held, agent.model)
     warning = results["spectrum"]["warning"]
@@ -121,7 +121,7 @@ def _look_inside(agent: Any, held: diagnose.Held, results: dict[str, Any], say: 
 
 
 def _shift(agent: Any, options: Options, results: dict[str, Any], say: Say) -> None:
-    say("the same in shifted worlds …")
+    say("robustness: the same episodes in shifted worlds …")
 
     def told(case: str, found: Mapping[str, Any]) -> None:
         parts = (f"{describe(p, r).strip()} {r['verdict']}" for p, r in found.items())

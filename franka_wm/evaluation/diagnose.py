@@ -228,7 +228,7 @@ def imagine(
     known[fit:], unknown[:fit] = False, False
     latents, drawn = _starts(agent, decoder_size=pictures.shape[2])
     latents, drawn = torch.cat([seen[known.to(device)], latents]), torch.cat([pictures[known], drawn])
-    say(f"training a decoder on {len(drawn)} pictures, for looking only …")
+    say(f"training a decoder on {len(drawn)} images; it is used for display only …")
     decoder = train_decoder(latents, drawn)
     errors = decoder_error(decoder, seen[unknown.to(device)], pictures[unknown])
     world = (

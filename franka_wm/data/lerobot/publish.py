@@ -60,7 +60,7 @@ def publish_dataset(
         files = files_of(staged)
         show_files(files, staged, repo_id, private, "dataset")
         if (root / README).is_file():
-            say(f"the card above goes in the place of {root / README}, which stays as it is on this machine")
+            say(f"the card replaces {README} in what is sent; {root / README} stays as it is")
         if api is None:
             write_card(staged, repo_id)
             return
