@@ -118,6 +118,7 @@ def test_a_verb_is_one_line_in_the_table(
         "@verb('try')\n"
         "@word('x', 'what')\n"
         "def run(x):\n"
+        "    if x == 'stop': raise KeyboardInterrupt\n"
         "    if x: raise UserError('bad:\\n  ' + x)\n"
         "    return 7\n"
     )
@@ -126,6 +127,8 @@ def test_a_verb_is_one_line_in_the_table(
     assert cli.main(["try"]) == 7
     assert cli.main(["try", "x=y"]) == 1
     assert capsys.readouterr().err == "error: bad: y\n"
+    assert cli.main(["try", "x=stop"]) == 130
+    assert not capsys.readouterr().err.strip()
 
 
 HEAVY = {"torch", "tensordict", "torchrl", "newton", "warp", "pandas", "scipy", "matplotlib", "lerobot"}
