@@ -21,7 +21,8 @@ if TYPE_CHECKING:
     ),
 )
 @word("checkpoint", "a run's folder, a checkpoint in it, or hf:user/name", metavar="FOLDER")
-@word("policy", "who acts first: planner, policy, ik, random, noop", metavar="NAME")
+@word("env", "without a checkpoint: an arm and its task, as train.py names them", metavar="lift")
+@word("policy", "who acts first: planner, policy, ik, expert, random, noop", metavar="NAME")
 @word("port", "of http://127.0.0.1; 0 takes a free one", whole(0, 65535), 8080)
 @word("out", "where recordings go: videos and LeRobot datasets", default=".")
 @word("seconds", "ends after so long; without it, Ctrl-C ends it", real(above=0), metavar="S")
@@ -33,8 +34,8 @@ def view(**options: Any) -> None:
 
     The page is served to this machine only.
 
-    Without a checkpoint the arm is moved by a planner that knows its geometry, by inverse kinematics, by random
-    actions, or not at all.
+    Without a checkpoint the arm is moved by a planner that knows its geometry, by inverse kinematics, with a gripper
+    by the task's expert, by random actions, or not at all.
     """
     show(**options)
 
@@ -56,12 +57,20 @@ def show(**given: Any) -> None:
     serve(build(options), options)
 
 
-def options_of(overrides: Sequence[str], rerun: str | None, **given: Any) -> Options:
+def options_of(
+    overrides: Sequence[str],
+    rerun: str | None,
+    env: str | None = None,
+    checkpoint: str | None = None,
+    **given: Any,
+) -> Options:
     """The words of the verb as options.
 
     Args:
         overrides: ``env.KEY=VALUE`` …
         rerun: File for the Rerun viewer.
+        env: Name of an environment of train.py.
+        checkpoint: Where an agent is, which has an environment of its own.
         given: The other fields of the options.
 
     Raises:
@@ -74,9 +83,32 @@ def options_of(overrides: Sequence[str], rerun: str | None, **given: Any) -> Opt
     if rerun is not None and not rerun.endswith(".rrd"):
         raise UserError(f"view: rerun={rerun}: must end in .rrd")
     try:
-        env: Any = OmegaConf.to_container(OmegaConf.from_dotlist(list(overrides)))
+        changes: Any = OmegaConf.to_container(OmegaConf.from_dotlist(list(overrides)))
     except (YAMLError, OmegaConfBaseException) as error:
         raise UserError(f"view: {' '.join(overrides)}: not a value as in YAML ({error})") from error
     from franka_wm.live.view import Options
 
-    return Options(rerun=rerun, env=env.get("env", {}), **given)
+    return Options(
+        rerun=rerun, checkpoint=checkpoint, env=_named(env, checkpoint) | changes.get("env", {}), **given
+    )
+
+
+def _named(env: str | None, checkpoint: str | None) -> dict[str, Any]:
+    """Fields of the environment that a name of train.py stands for; none without a name."""
+    if env is None:
+        return {}
+    if checkpoint is not None:
+        raise UserError(
+            f"view: env={env}: the checkpoint has its own environment; change it by env.KEY=VALUE"
+        )
+    from omegaconf import OmegaConf
+
+    from franka_wm.commands.overrides import compose
+
+    values: Any = OmegaConf.to_container(compose([f"env={env}"]).env, resolve=True)
+    if values.pop("kind") != "franka":
+        raise UserError(f"view: env={env}: the page shows the arm only")
+    values.pop("urdf_path")
+    del values["episode_length"]  # while somebody watches, an episode has no end
+    pictures = [key for key in values["observations"] if "pixels" in key]
+    return values | {"observations": [key for key in values["observations"] if key not in pictures]}

@@ -32,6 +32,9 @@ SIZES = {
 REACH = (0.25, 0.80)
 """Horizontal distance from the base at which objects may start [m]: nearer is the arm itself, farther no reach."""
 
+FLOOR = -0.75
+"""Height of the ground, which the table stands on [m]."""
+
 ATTEMPTS = 64
 """How often an object's place is drawn anew because something stands there already."""
 

@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from franka_wm.envs.scene import FLOOR
 from franka_wm.errors import UserError
 from franka_wm.live.frame import Frame
 from franka_wm.live.gate import Gate, is_number
@@ -86,6 +87,7 @@ class Page:
             arm_shapes(arm.model),
             bodies=len(first.bodies),
             success_distance=arm.config.success_distance,
+            floor=FLOOR if arm.config.surroundings else 0.0,
             on_goal=session.ask_goal,
         )
         self._times: deque[float] = deque(maxlen=30)

@@ -34,6 +34,7 @@ class Scene:
         shapes: The arm's, by :func:`~franka_wm.live.shapes.arm_shapes`.
         bodies: Number of moving links.
         success_distance: Radius of the goal's outer sphere [m].
+        floor: Height of the ground [m].
         on_goal: Called with (x, y, z) [m] while the goal is dragged in a browser; must return at once.
     """
 
@@ -44,6 +45,7 @@ class Scene:
         *,
         bodies: int,
         success_distance: float,
+        floor: float = 0.0,
         on_goal: Callable[[tuple[float, float, float]], None],
     ):
         self._server, self._on_goal = server, on_goal
@@ -51,7 +53,7 @@ class Scene:
         self._trail: deque[np.ndarray] = deque(maxlen=TRAIL_STEPS)
         self._lines: dict[str, Any] = {}
         self._reached: bool | None = None
-        self._stage()
+        self._stage(floor)
         self.links = [server.scene.add_frame(f"/arm/link{i + 1}", show_axes=False) for i in range(bodies)]
         for shape in shapes:
             parent = "/arm/base" if shape.body < 0 else f"/arm/link{shape.body + 1}"
@@ -78,7 +80,7 @@ class Scene:
         )
         self.goal.on_update(self._drag)
 
-    def _stage(self) -> None:
+    def _stage(self, floor: float) -> None:
         scene = self._server.scene
         scene.set_up_direction("+z")
         scene.world_axes.visible = False
@@ -96,6 +98,7 @@ class Scene:
         )
         scene.add_grid(
             "/ground",
+            position=(0.0, 0.0, floor),
             width=4.0,
             height=4.0,
             cell_size=0.1,

@@ -32,7 +32,7 @@ FARTHEST = 5.0
 BUDGET = 1.0
 """Longest decision that a planner's settings may lead to [s]: while it plans, nothing else is heard."""
 
-PREFERRED = ("planner", "ik", "noop")
+PREFERRED = ("planner", "expert", "ik", "noop")
 """Which policy starts, the first one that there is."""
 
 

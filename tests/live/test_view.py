@@ -39,9 +39,9 @@ def test_arguments() -> None:
 @pytest.mark.parametrize(
     ("argument", "said"),
     [
-        ("page=3", "page: no such option; there are checkpoint, policy"),
+        ("page=3", "page: no such option; there are checkpoint, env, policy"),
         ("--fast", "fast: no such option"),
-        ("env=reach", "env: no such option"),
+        ("env=dm_control", "the page shows the arm only"),
         ("sed=3", "sed: no such option; did you mean seed?"),
         ("port", "'port' is not name=value; franka-wm view --help"),
         ("port=http", "port=http: must be a whole number"),
@@ -287,3 +287,16 @@ def test_rerun_writes_an_episode(tmp_path: Path, capsys: pytest.CaptureFixture[s
     out = capsys.readouterr().out
     assert "recording 4 steps" in out
     assert f"rerun {path}" in out
+
+
+def test_a_task_with_a_gripper_is_shown_by_its_expert() -> None:
+    """By name, without a checkpoint; the page and the recording have the same stage."""
+    options = options_of([], None, env="stack", seed=0, device="cpu")
+    stage = view.build(options)
+    assert list(stage.policies) == ["expert", "random", "noop"] and stage.env.config.num_objects == 2
+    observation = stage.env.reset()
+    for _ in range(120):
+        observation = stage.env.step(stage.policies["expert"](observation))["next"]
+    assert observation["success"].all()
+    with pytest.raises(UserError, match="the checkpoint has its own environment"):
+        options_of([], None, env="stack", checkpoint="somewhere")

@@ -16,10 +16,8 @@ from franka_wm.envs.camera import GOAL_MARKER, GROUND, wrist_mount
 from franka_wm.envs.config import FrankaConfig
 from franka_wm.envs.constants import NUM_JOINTS
 from franka_wm.envs.robots import Robot, add_robot, arm_builder
+from franka_wm.envs.scene import FLOOR
 from franka_wm.envs.simulation.bodies import add_scene, contact_options
-
-FLOOR = -0.75
-"""Height of the ground below a table [m]."""
 
 
 def build_model(
