@@ -45,7 +45,9 @@ class StackStorage(LazyTensorStorage):
         self.stacked = tuple(stacked)
         self._checked = False
 
-    def set(self, cursor: Any, data: Any, *, set_cursor: bool = True) -> None:
+    def set(  # pyright: ignore[reportIncompatibleVariableOverride]  # TorchRL declares an attribute
+        self, cursor: Any, data: Any, *, set_cursor: bool = True
+    ) -> None:
         """Keeps the newest picture of each stack.
 
         Raises:
@@ -58,7 +60,7 @@ class StackStorage(LazyTensorStorage):
             self._checked = check_stacks(data[:64], self.stacked, self.frame_stack)
         super().set(cursor, kept, set_cursor=set_cursor)
 
-    def get(self, index: Any) -> Any:
+    def get(self, index: Any) -> Any:  # pyright: ignore[reportIncompatibleMethodOverride]  # two overloads
         match index:
             case torch.Tensor() as time, torch.Tensor() as world:
                 return self.windows(time, world)

@@ -58,10 +58,9 @@ class ImageEncoder(nn.Module):
             if freeze:
                 self.backbone.requires_grad_(False).eval()
         else:
-            self.convolutions = nn.ModuleList(
-                ConvEncoder(size, channels=channels) for size in image_sizes.values()
-            )
-            features = sum(conv.features for conv in self.convolutions)  # type: ignore[misc]
+            convolutions = [ConvEncoder(size, channels=channels) for size in image_sizes.values()]
+            self.convolutions = nn.ModuleList(convolutions)
+            features = sum(conv.features for conv in convolutions)
         layers = []
         for width in hidden if observation_dim else ():
             layers.append(NormedLinear(observation_dim, width))

@@ -159,7 +159,7 @@ class CausalTransformer(nn.Module):
             raise ValueError(f"head_dim must be even (rotary codes turn pairs of features), got {head_dim}")
         if not 0.0 <= dropout < 1.0:
             raise ValueError(f"dropout must be in [0, 1), got {dropout}")
-        self.blocks = nn.ModuleList(
+        blocks = [
             CausalBlock(
                 width=width,
                 heads=heads,
@@ -169,15 +169,16 @@ class CausalTransformer(nn.Module):
                 dropout=dropout,
             )
             for _ in range(depth)
-        )
+        ]
+        self.blocks = nn.ModuleList(blocks)
         self.norm = nn.LayerNorm(width, eps=1e-6)
         # Unit gain, as in DiT: with the usual 0.02, narrow transformers pass on next to nothing of an action.
         for layer in self.modules():
             if isinstance(layer, nn.Linear):
                 nn.init.xavier_uniform_(layer.weight)
                 nn.init.zeros_(layer.bias)
-        for block in self.blocks:
-            block.zero()  # type: ignore[operator]
+        for block in blocks:
+            block.zero()
 
     def forward(
         self,

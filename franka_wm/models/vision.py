@@ -61,8 +61,8 @@ class ConvEncoder(nn.Module):
 
     def maps(self, images: Tensor) -> Tensor:
         """(N, height, width, C) uint8 -> feature maps (N, channels, rows, columns)."""
-        weight = self.network[0].weight
-        x = check_images(images).permute(0, 3, 1, 2).to(weight.dtype).div(255.0).sub(0.5)  # type: ignore[arg-type]
+        dtype = next(self.network.parameters()).dtype
+        x = check_images(images).permute(0, 3, 1, 2).to(dtype).div(255.0).sub(0.5)
         return self.network(x)
 
     def forward(self, images: Tensor) -> Tensor:

@@ -1,15 +1,11 @@
 """Experts: what a task says of where the hand shall be, turned into actions of all worlds by inverse kinematics."""
 
-# TorchRL declares in_keys and out_keys as properties, and lets classes set them as plain lists.
-# pyright: reportIncompatibleMethodOverride=false
-
 from __future__ import annotations
 
 from collections.abc import Mapping
 
 import torch
 from tensordict import TensorDictBase
-from tensordict.nn import TensorDictModuleBase
 
 from franka_wm.envs.config import FrankaConfig
 from franka_wm.envs.constants import MOST_OPEN, NUM_JOINTS
@@ -17,6 +13,7 @@ from franka_wm.envs.kinematics import Kinematics
 from franka_wm.envs.tasks import Task
 from franka_wm.envs.tasks.manipulation import Aim, Sight
 from franka_wm.errors import UserError
+from franka_wm.policies.scripted import ScriptedPolicy
 from franka_wm.seeding import restore_generator
 
 FAST, SLOW = 0.5, 0.15
@@ -28,7 +25,7 @@ TURN = 2.0
 """Of the hand around the vertical axis [rad/s]."""
 
 
-class ExpertPolicy(TensorDictModuleBase):
+class ExpertPolicy(ScriptedPolicy):
     """What a task can show: its own plan (``Task.expert``) from the true positions of all objects.
 
     The hand points down and moves straight, at up to 0.5 m/s; joint targets follow by inverse kinematics from those
@@ -45,8 +42,7 @@ class ExpertPolicy(TensorDictModuleBase):
         UserError: The task has no expert, or actions are tool displacements.
     """
 
-    in_keys = ["state", "joint_target", "objects", "goal"]  # pyright: ignore[reportAssignmentType]
-    out_keys = ["action"]  # pyright: ignore[reportAssignmentType]
+    in_keys = ["state", "joint_target", "objects", "goal"]
 
     def __init__(
         self,

@@ -40,8 +40,8 @@ class ExploringPolicy(TensorDictModuleBase):
         self.policy, self.noise, self.planner, self.planner_worlds = policy, noise, planner, planner_worlds
         # in_keys and out_keys are what a collector carries from step to step.
         more = [] if planner is None else [planner]
-        self.in_keys = list(dict.fromkeys(key for one in (policy, *more) for key in one.in_keys))  # pyright: ignore
-        self.out_keys = list(dict.fromkeys(key for one in (policy, *more) for key in one.out_keys))  # pyright: ignore
+        self.in_keys = list(dict.fromkeys(key for one in (policy, *more) for key in one.in_keys))  # pyright: ignore[reportAttributeAccessIssue]
+        self.out_keys = list(dict.fromkeys(key for one in (policy, *more) for key in one.out_keys))  # pyright: ignore[reportAttributeAccessIssue]
 
     @torch.no_grad()
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:

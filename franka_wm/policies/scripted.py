@@ -1,12 +1,10 @@
 """Policies that need no learning, as TensorDict modules that a TorchRL collector can run."""
 
-# TorchRL declares in_keys and out_keys as properties, and lets classes set them as plain lists.
-# pyright: reportIncompatibleMethodOverride=false
-
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from typing import Any
 
 import torch
 from tensordict import TensorDictBase
@@ -18,11 +16,18 @@ from franka_wm.errors import UserError
 from franka_wm.seeding import restore_generator
 
 
-class NoopPolicy(TensorDictModuleBase):
+class ScriptedPolicy(TensorDictModuleBase):
+    """A policy that learned nothing; its class names what it reads."""
+
+    # TensorDict declares properties and accepts lists.
+    in_keys: Any = []  # pyright: ignore[reportIncompatibleVariableOverride]
+    out_keys: Any = ["action"]  # pyright: ignore[reportIncompatibleVariableOverride]
+
+
+class NoopPolicy(ScriptedPolicy):
     """Does nothing: action 0. What every agent must beat."""
 
-    in_keys = ["is_init"]  # pyright: ignore[reportAssignmentType]
-    out_keys = ["action"]  # pyright: ignore[reportAssignmentType]
+    in_keys = ["is_init"]
 
     def __init__(self, action_dim: int = 7):
         super().__init__()
@@ -35,7 +40,7 @@ class NoopPolicy(TensorDictModuleBase):
         )
 
 
-class SmoothRandomPolicy(TensorDictModuleBase):
+class SmoothRandomPolicy(ScriptedPolicy):
     """First-order autoregressive random actions in [−1, 1], started anew where an episode starts.
 
     Args:
@@ -44,8 +49,7 @@ class SmoothRandomPolicy(TensorDictModuleBase):
         generator: Source of randomness.
     """
 
-    in_keys = ["is_init"]  # pyright: ignore[reportAssignmentType]
-    out_keys = ["action"]  # pyright: ignore[reportAssignmentType]
+    in_keys = ["is_init"]
 
     def __init__(
         self,
@@ -85,7 +89,7 @@ class SmoothRandomPolicy(TensorDictModuleBase):
         return _go_on(self.generator, state["generator"])
 
 
-class OraclePolicy(TensorDictModuleBase):
+class OraclePolicy(ScriptedPolicy):
     """Inverse kinematics with the true geometry and the true goal: what the environment allows at best.
 
     Solves for joint angles that put the tool on the goal, starting from the servo's present targets, and
@@ -96,8 +100,7 @@ class OraclePolicy(TensorDictModuleBase):
         config: The environment's: what an action means.
     """
 
-    in_keys = ["joint_target", "goal"]  # pyright: ignore[reportAssignmentType]
-    out_keys = ["action"]  # pyright: ignore[reportAssignmentType]
+    in_keys = ["joint_target", "goal"]
 
     def __init__(self, kinematics: Kinematics, config: FrankaConfig):
         super().__init__()
@@ -123,7 +126,7 @@ def _joint_target(tensordict: TensorDictBase) -> torch.Tensor:
     return target
 
 
-class DiscreteOraclePolicy(TensorDictModuleBase):
+class DiscreteOraclePolicy(ScriptedPolicy):
     """The oracle for numbered moves: the first of the two moves after which the tool is nearest to the goal.
 
     All pairs of moves are tried with the true geometry, on the tool's position where the servo's targets put it. A
@@ -136,8 +139,7 @@ class DiscreteOraclePolicy(TensorDictModuleBase):
         table: The moves, (M, A).
     """
 
-    in_keys = ["joint_target", "goal"]  # pyright: ignore[reportAssignmentType]
-    out_keys = ["action"]  # pyright: ignore[reportAssignmentType]
+    in_keys = ["joint_target", "goal"]
 
     def __init__(self, kinematics: Kinematics, config: FrankaConfig, table: torch.Tensor):
         super().__init__()
@@ -170,7 +172,7 @@ class DiscreteOraclePolicy(TensorDictModuleBase):
         return target if self.config.action_mode == "ee_delta" else self.kinematics.forward(target)
 
 
-class DiscretePolicy(TensorDictModuleBase):
+class DiscretePolicy(ScriptedPolicy):
     """A policy for continuous actions, played with numbered moves: the row of the table nearest to its action.
 
     Args:
@@ -182,7 +184,7 @@ class DiscretePolicy(TensorDictModuleBase):
         super().__init__()
         self.policy = policy
         self.table = table
-        self.in_keys = list(policy.in_keys)  # pyright: ignore[reportAttributeAccessIssue]
+        self.in_keys = list(policy.in_keys)
         self.out_keys = ["action"]
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
@@ -191,7 +193,7 @@ class DiscretePolicy(TensorDictModuleBase):
         return tensordict.set("action", distance.argmin(-1))
 
 
-class RandomMovesPolicy(TensorDictModuleBase):
+class RandomMovesPolicy(ScriptedPolicy):
     """A move drawn uniformly, in every step: int64 (N,).
 
     Args:
@@ -199,8 +201,7 @@ class RandomMovesPolicy(TensorDictModuleBase):
         generator: Source of randomness.
     """
 
-    in_keys = ["is_init"]  # pyright: ignore[reportAssignmentType]
-    out_keys = ["action"]  # pyright: ignore[reportAssignmentType]
+    in_keys = ["is_init"]
 
     def __init__(self, num_actions: int, *, generator: torch.Generator | None = None):
         super().__init__()

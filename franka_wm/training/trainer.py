@@ -143,6 +143,7 @@ class Trainer:
         saved = time.perf_counter()
         every = self.settings.evaluation_period
         ahead = sorted(steps for steps in self.settings.evaluation.at_steps if steps > self.env_steps)
+        anew = False
         with interruptible() as stop:
             if self.env is None:
                 self.standardize(self.replay.statistics())
@@ -443,8 +444,8 @@ class Trainer:
         if self.env is None or not len(self.replay):
             return None
         data = self.replay[:]
-        cursor = self.replay.writer._cursor  # type: ignore[union-attr]
-        full = self.replay.storage._len_along_dim0 == self.replay.storage._storage.shape[0]  # type: ignore[union-attr]
+        cursor = self.replay.writer._cursor
+        full = self.replay.storage._len_along_dim0 == self.replay.storage._storage.shape[0]
         if full and cursor:
             return torch.cat([data[:, cursor:], data[:, :cursor]], 1)  # pyright: ignore[reportReturnType]
         return data

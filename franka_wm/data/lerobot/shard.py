@@ -281,9 +281,10 @@ def _video_info(path: Path, schema: Schema) -> dict[str, Any]:
     """What LeRobot keeps about a video in ``info.json``."""
     import av
 
+    info: dict[str, Any] = {}
     with av.open(str(path)) as container:
         stream = container.streams.video[0]
-        info = {
+        info |= {
             "video.height": stream.height,
             "video.width": stream.width,
             "video.codec": stream.codec.canonical_name,
@@ -331,8 +332,9 @@ def check_video(path: Path, frames: int, fps: int) -> None:
     """
     import av
 
+    times: list[float | None] = []
     with av.open(str(path)) as container:
-        times = [frame.time for frame in container.decode(video=0)]
+        times += [frame.time for frame in container.decode(video=0)]
     if len(times) != frames:
         raise UserError(f"{path.name}: {frames} frames were written, {len(times)} can be read back")
     late = [i for i, time in enumerate(times) if time is None or abs(time - i / fps) > 0.1 / fps]
