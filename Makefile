@@ -13,12 +13,13 @@ ARGS ?=
 PYTHON ?=
 ROW ?=
 REPOSITORY ?=
+MINUTES ?= 60
 VENV := .venv
 STAMP := $(VENV)/.installed
 DEV := $(VENV)/.installed-dev
 BIN := $(VENV)/bin
 
-.PHONY: help setup train demo demo-agent test test-slow results mutation lint format lock docs wheel audit clean
+.PHONY: help setup train demo demo-agent test test-slow results mutation fuzz lint format lock docs wheel audit clean
 
 help: ## show the targets
 	@grep -hE '^[a-z-]+:.*## ' $(firstword $(MAKEFILE_LIST)) | sed -E 's/:[^#]*## /\t/' | \
@@ -66,6 +67,10 @@ mutation: $(DEV) ## which small mistakes in the code no test notices (hours; ARG
 	@$(BIN)/python -c 'import cosmic_ray' 2>/dev/null || \
 	  $(BIN)/python -m pip install --quiet --disable-pip-version-check cosmic-ray==8.7.0
 	@$(BIN)/python scripts/mutation.py $(ARGS)
+
+# What it finds becomes files in tests/fuzz/cases, which the tests run from then on.
+fuzz: $(DEV) ## damaged checkpoints, runs, datasets, robots and options for MINUTES=60; ARGS="config --seed 3"
+	@OMP_NUM_THREADS=1 HF_HUB_OFFLINE=1 $(BIN)/python tests/fuzz --minutes $(MINUTES) $(ARGS)
 
 lint: $(DEV) ## ruff check, ruff format --check, pyright
 	@$(BIN)/ruff check .

@@ -1,14 +1,19 @@
 """Errors that a user can mend. Entry points print them as one line, without a traceback."""
 
+LONGEST, LONGEST_LINE = 1000, 2500
+"""Characters of a word and of a message: what a user, or a stranger's file, holds may be of any length."""
+
 
 class FrankaError(Exception):
     """Any error that this package raises on purpose.
 
-    The message is kept on one line, whatever was put into it.
+    The message is kept on one line that can be read, whatever was put into it.
     """
 
     def __init__(self, message: str) -> None:
-        super().__init__(" ".join(message.split()))
+        words = (word if len(word) <= LONGEST else f"{word[:LONGEST]}…" for word in message.split())
+        line = " ".join(words)
+        super().__init__(line if len(line) <= LONGEST_LINE else f"{line[:LONGEST_LINE]}…")
 
 
 class CaptureError(FrankaError, RuntimeError):

@@ -68,26 +68,36 @@ class Bounds(NamedTuple):
         return " " + " and ".join(said) if said else ""
 
 
-POSITIVE = Bounds(least=1)
+POSITIVE = Bounds(least=1, most=10**6)
 """Sizes and counts."""
+DEPTH = Bounds(least=1, most=1000)
+"""Layers of a network."""
 FRACTION = Bounds(least=0, most=1)
 COEFFICIENT = Bounds(least=0)
 
 
+LARGEST = 3e38
+"""Of all finite numbers: what float32 holds."""
+
+
 def is_whole(value: Any) -> TypeGuard[int]:
-    """Whether it is an int; true and false are none."""
-    return isinstance(value, Integral) and not isinstance(value, bool)
+    """Whether it is an int that 64 bits hold; true and false are none."""
+    return isinstance(value, Integral) and not isinstance(value, bool) and -(2**63) <= int(value) < 2**63
 
 
 def is_real(value: Any) -> TypeGuard[float]:
     """Whether it is a finite number; true and false are none."""
-    return isinstance(value, Real) and not isinstance(value, bool) and math.isfinite(value)
+    return isinstance(value, Real) and not isinstance(value, bool) and -LARGEST <= value <= LARGEST  # type: ignore[operator]
 
 
-def whole_rule(*, least: int, even: bool = False, unit: str = "", null: str | None = None) -> Rule:
-    """A whole number of at least ``least``; even, if asked for."""
+def whole_rule(
+    *, least: int, most: int | None = None, even: bool = False, unit: str = "", null: str | None = None
+) -> Rule:
+    """A whole number of at least ``least``, and of at most ``most``; even, if asked for."""
     wanted = f"{'an even' if even else 'a whole'} number{unit and f' of {unit}'} of at least {least}"
-    return Rule(lambda x: is_whole(x) and x >= least and not (even and x % 2), wanted, null)
+    wanted += "" if most is None else f" and of at most {most}"
+    end = 2**63 - 1 if most is None else most
+    return Rule(lambda x: is_whole(x) and least <= x <= end and not (even and x % 2), wanted, null)
 
 
 def whole(default: Any = MISSING, **rule: Any) -> Any:

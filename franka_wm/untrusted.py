@@ -7,13 +7,14 @@ whatever is no ordinary file. Sizes are checked before anything is allocated.
 import json
 import math
 from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import yaml
 
-from franka_wm.errors import UserError
+from franka_wm.errors import FrankaError, UserError
 
 MOST_JSON = 32 * 2**20
 MOST_YAML = 2**20
@@ -149,6 +150,38 @@ class UntrustedFolder:
         """
         for path in sorted(self.root.rglob("*")):
             self._inside(path.relative_to(self.root))
+
+
+@contextmanager
+def values_of(what: str, then: str) -> Iterator[None]:
+    """Around the use of what a file holds: values of a form that nothing writes end in one line.
+
+    Args:
+        what: Which file or folder, for the message.
+        then: What to do.
+
+    Raises:
+        UserError: In place of what such values lead to.
+    """
+    try:
+        yield
+    except FrankaError:
+        raise
+    except (
+        ArithmeticError,
+        AssertionError,
+        AttributeError,
+        LookupError,
+        OSError,
+        RecursionError,
+        RuntimeError,
+        TypeError,
+        ValueError,
+    ) as error:
+        reason = (str(error).strip() or "no value").splitlines()[0]
+        raise UserError(
+            f"{what} holds values of another form than was written ({type(error).__name__}: {reason}); {then}"
+        ) from error
 
 
 def check_image(path: Path) -> None:

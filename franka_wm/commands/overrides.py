@@ -22,7 +22,13 @@ def compose(overrides: Sequence[str], options: Sequence[str] = ()) -> Any:
 
     try:
         return conf.compose(*overrides)
-    except (HydraException, OmegaConfBaseException) as error:
+    except UserError:
+        raise
+    except (
+        HydraException,
+        OmegaConfBaseException,
+        ValueError,
+    ) as error:  # the last for a group that is no name
         raise UserError(explain(str(error), allowed=_allowed(str(error), overrides, options))) from error
 
 

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 from franka_wm.envs.constants import HAND_DIM, HOME, NUM_JOINTS, STATE_DIM
 from franka_wm.envs.scene import Scene
 from franka_wm.errors import UserError
+from franka_wm.options import is_real
 
 if TYPE_CHECKING:
     from franka_wm.envs.tasks import Task
@@ -412,4 +413,4 @@ class FrankaConfig:
 
 
 def _is_number(value: object) -> bool:
-    return isinstance(value, (int, float)) and not isinstance(value, bool) and math.isfinite(value)
+    return is_real(value)

@@ -27,7 +27,7 @@ from franka_wm.models.regularizers import (
 )
 from franka_wm.models.transformer import MLPDynamics, TokenDynamics
 from franka_wm.models.windows import check_windows, window_of
-from franka_wm.options import COEFFICIENT, FRACTION, POSITIVE, Bounds
+from franka_wm.options import COEFFICIENT, DEPTH, FRACTION, POSITIVE, Bounds
 
 
 class ActionWorldModel(HistoryWorldModel):
@@ -93,6 +93,7 @@ class ActionWorldModel(HistoryWorldModel):
         **dict.fromkeys(("guard_coef", "weight_decay", "encoder_lr_scale"), COEFFICIENT),
         "ema": FRACTION,
         "dropout": Bounds(least=0, below=1),
+        **dict.fromkeys(("encoder_depth", "predictor_depth"), DEPTH),
     }
 
     def __init__(

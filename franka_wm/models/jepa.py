@@ -37,7 +37,7 @@ from franka_wm.models.vision import (
     vit_size,
 )
 from franka_wm.models.windows import check_windows
-from franka_wm.options import COEFFICIENT, FRACTION, POSITIVE, Bounds
+from franka_wm.options import COEFFICIENT, DEPTH, FRACTION, POSITIVE, Bounds
 
 # recipe -> (guard, masks, clips, tubelet): what it takes where nothing else is asked for
 RECIPES: dict[str, tuple[CollapseName, str | None, bool, int]] = {
@@ -109,6 +109,7 @@ class JEPA(WorldModel):
         **dict.fromkeys(("ema_start", "ema_end"), FRACTION),
         "local_views": Bounds(least=0),
         "mask_ratio": Bounds(above=0, below=1),
+        **dict.fromkeys(("encoder_depth", "predictor_depth"), DEPTH),
     }
 
     def __init__(

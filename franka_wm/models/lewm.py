@@ -26,7 +26,7 @@ from franka_wm.models.regularizers import (
 from franka_wm.models.transformer import CausalTransformer, block_causal_mask, hide_invalid
 from franka_wm.models.vision import ViT, vit_size
 from franka_wm.models.windows import check_windows, window_of
-from franka_wm.options import COEFFICIENT, FRACTION, POSITIVE, Bounds, with_defaults
+from franka_wm.options import COEFFICIENT, DEPTH, FRACTION, POSITIVE, Bounds, with_defaults
 
 
 class LeWorldModel(HistoryWorldModel):
@@ -93,6 +93,7 @@ class LeWorldModel(HistoryWorldModel):
         **dict.fromkeys(("sigreg_coef", "infonce_coef", "inverse_coef", "weight_decay"), COEFFICIENT),
         "discount": FRACTION,
         "dropout": Bounds(least=0, below=1),
+        **dict.fromkeys(("encoder_depth", "predictor_depth"), DEPTH),
     }
 
     def __init__(

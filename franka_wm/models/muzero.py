@@ -17,7 +17,7 @@ from franka_wm.models.layers import NormedLinear, SimNorm, TwoHotSymlog, initial
 from franka_wm.models.returns import discount_per_step, n_step_returns, value_range
 from franka_wm.models.simplicial import SimplicialWorldModel
 from franka_wm.models.windows import check_windows
-from franka_wm.options import COEFFICIENT, FRACTION, POSITIVE, Bounds, with_defaults
+from franka_wm.options import COEFFICIENT, DEPTH, FRACTION, POSITIVE, Bounds, with_defaults
 
 
 class MuZero(SimplicialWorldModel):
@@ -88,6 +88,7 @@ class MuZero(SimplicialWorldModel):
         "discount": FRACTION,
         "random_shift": Bounds(least=0),
         "weight_decay": COEFFICIENT,
+        "encoder_layers": DEPTH,
     }
     actions: Tensor
 

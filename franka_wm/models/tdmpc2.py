@@ -29,7 +29,7 @@ from franka_wm.models.returns import discount_per_step, value_range
 from franka_wm.models.simplicial import SimplicialWorldModel
 from franka_wm.models.streams import side_stream
 from franka_wm.models.windows import check_windows, window_of
-from franka_wm.options import COEFFICIENT, POSITIVE, Bounds, with_defaults
+from franka_wm.options import COEFFICIENT, DEPTH, POSITIVE, Bounds, with_defaults
 
 
 class TDMPC2(SimplicialWorldModel):
@@ -103,6 +103,7 @@ class TDMPC2(SimplicialWorldModel):
         **dict.fromkeys(("discount", "dropout"), Bounds(least=0, below=1)),
         "tau": Bounds(above=0, most=1),
         "random_shift": Bounds(least=0),
+        "encoder_layers": DEPTH,
     }
 
     def __init__(

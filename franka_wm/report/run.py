@@ -16,15 +16,15 @@ All of them are optional; `franka_wm.report.page` shows what there is.
 
 import json
 import math
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Mapping, Sequence
+from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 from franka_wm.errors import UserError
 from franka_wm.evaluation.results import Result, last_row, results
-from franka_wm.untrusted import UntrustedFolder, check_image, check_video
+from franka_wm.untrusted import UntrustedFolder, check_image, check_video, values_of
 
 SAME_BUT = ("seed", "device", "resume")
 """Runs whose configurations differ in these alone are repetitions of one another."""
@@ -153,20 +153,9 @@ def but_for_the_seed(config: Mapping[str, Any]) -> str:
     return json.dumps(kept, sort_keys=True, default=str) if kept else ""
 
 
-@contextmanager
-def malformed(folder: Path) -> Iterator[None]:
-    """Turn what values of another type or form than documented lead to into one line.
-
-    Raises:
-        UserError: in their place.
-    """
-    try:
-        yield
-    except (ArithmeticError, AttributeError, IndexError, KeyError, TypeError, ValueError) as error:
-        raise UserError(
-            f"{folder} holds values of another form than a run writes ({type(error).__name__}: {error}); "
-            "measure the run again."
-        ) from error
+def malformed(folder: Path) -> AbstractContextManager[None]:
+    """Around the use of a run's values: those of another form than documented end in one line."""
+    return values_of(str(folder), "measure the run again.")
 
 
 # -- files -----------------------------------------------------------------------------------------------

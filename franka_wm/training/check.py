@@ -10,8 +10,10 @@ from franka_wm.envs.external import ExternalConfig, check_external
 from franka_wm.envs.franka import check_robot
 from franka_wm.errors import UserError
 from franka_wm.models import WorldModel
+from franka_wm.planning import registry
 from franka_wm.training import build
 from franka_wm.training.loggers import check_loggers
+from franka_wm.training.room import check_memory
 from franka_wm.training.settings import RunSettings
 from franka_wm.training.spaces import Spaces
 
@@ -44,6 +46,7 @@ def check(run: RunSettings) -> None:
         raise UserError(
             f"pretrain: model={run.model.name} takes no pretrained encoder; use action_world_model or tdmpc2_pixels"
         )
+    _check_planner(run)
     _check_parts(run)
 
 
@@ -93,6 +96,15 @@ def _check_evaluation(run: RunSettings) -> None:
         )
 
 
+def _check_planner(run: RunSettings) -> None:
+    """Its options, also where the sizes of actions are not known yet."""
+    if run.planner.name not in registry.available():
+        raise UserError(
+            f"planner.name={run.planner.name!r}: must be one of {', '.join(registry.available())}"
+        )
+    registry.validate(run.planner.name, run.planner.options)
+
+
 def _check_parts(run: RunSettings) -> None:
     """Builds what costs little, where the environment's sizes are known before it is."""
     if isinstance(run.env.config, ExternalConfig):
@@ -103,7 +115,9 @@ def _check_parts(run: RunSettings) -> None:
     if run.is_offline:
         return
     spaces = Spaces.of_config(run.env.arm, discrete=run.is_discrete)
-    model = _sketch(run, spaces)
+    model = sketch(run, spaces)
+    if model is None:
+        model = build.make_model(run, spaces)
     if run.objective_name == "goal_image":
         goals = build.goal_pictures(model.image_sizes).values()
         if not goals or any(goal not in spaces.image_sizes for goal in goals):
@@ -115,16 +129,18 @@ def _check_parts(run: RunSettings) -> None:
     build.make_objective(run, model)
     if model.has_next:
         build.make_planner(run, spaces.num_actions or spaces.action_dim)
+    check_memory(run, model, spaces)
 
 
-def _sketch(run: RunSettings, spaces: Spaces) -> WorldModel:
+def sketch(run: RunSettings, spaces: Spaces) -> WorldModel | None:
     """The model's shapes: its constructor refuses what it would, but no weight is allocated or drawn.
 
-    A family of one's own, whose constructor may look at values, and one that reads weights are built whole.
+    `None` for a family of one's own, whose constructor may look at values, and for one that reads weights.
     """
     reads = any(run.model.options.get(name) is not None for name in ("encoder_from", "huggingface"))
-    ours = run.model.family.__module__.startswith(f"{models.__name__}.")
-    with torch.device("meta" if ours and not reads else "cpu"):
+    if reads or not run.model.family.__module__.startswith(f"{models.__name__}."):
+        return None
+    with torch.device("meta"):
         return build.make_model(run, spaces)
 
 

@@ -30,15 +30,24 @@ import torch
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 from safetensors import SafetensorError
-from safetensors.torch import load_file
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor, nn
 
 from franka_wm.conf import use_present_names
 from franka_wm.errors import UserError
+from franka_wm.options import is_real
 from franka_wm.training.manifest import MANIFEST, Manifest, read_manifest, saved_at, sync, write_manifest
 from franka_wm.training.optimizer_state import Optimizers, load_optimizer_state, optimizer_state
-from franka_wm.training.tree import read_tree, save_tensors, tree_files, write_json, write_tree
+from franka_wm.training.tree import (
+    damaged,
+    read_tensors,
+    read_tree,
+    save_tensors,
+    tree_files,
+    write_json,
+    write_tree,
+)
+from franka_wm.untrusted import UntrustedFolder
 
 FIRST_STAGE = "pretrained"
 """Folder of the first stage, in that of its run."""
@@ -174,17 +183,30 @@ class Checkpoint:
             UserError: the model is another one. Its weights are then untouched.
         """
         model = _unwrap(model)
-        saved = load_file(self.folder / "model.safetensors")
-        here = _tensor_state(model)
-        difference = _first_difference(saved, here)
+        saved = self.check_model(model)
+        broken = next((name for name, x in saved.items() if not bool(x.isfinite().all())), None)
+        if broken is not None:
+            raise UserError(
+                f"checkpoint {self.folder}: its weights {broken} are not finite; use another checkpoint."
+            )
+        # Entries that are no tensors (TensorDictParams keeps its batch size there) are the model's own.
+        model.load_state_dict({**model.state_dict(), **saved})
+
+    def check_model(self, model: nn.Module) -> dict[str, Tensor]:
+        """The saved weights, if they fit into `model`, of which only shapes matter.
+
+        Raises:
+            UserError: the model is another one.
+        """
+        saved = read_tensors(self.folder, "model")
+        difference = _first_difference(saved, _tensor_state(model))
         if difference is not None:
             raise UserError(
                 f"checkpoint {self.folder} holds a {self.model_name} that does not fit this "
                 f"{type(model).__name__}: {difference}; build the model from the checkpoint's config.yaml, "
                 "or leave out the options that change it."
             )
-        # Entries that are no tensors (TensorDictParams keeps its batch size there) are the model's own.
-        model.load_state_dict({**model.state_dict(), **saved})
+        return saved
 
     def load_optimizer(self, optimizer: Optimizers) -> None:
         """Give `optimizer` the saved state; it goes on exactly where the saved one stopped.
@@ -203,7 +225,8 @@ class Checkpoint:
             raise UserError(
                 f"checkpoint {self.folder} was saved without an optimizer; start a new run from its weights."
             )
-        load_optimizer_state(saved, optimizer, f"checkpoint {self.folder}")
+        with damaged(self.folder, "optimizer.json"):
+            load_optimizer_state(saved, optimizer, f"checkpoint {self.folder}")
 
     def restore_rng(self) -> None:
         """Set torch's (CPU and CUDA), NumPy's and Python's global generators to their saved states.
@@ -211,13 +234,13 @@ class Checkpoint:
         CUDA states are restored for the devices that are there.
         """
         state = self._tree("rng")
-        assert state is not None  # always saved, and the manifest was checked
-        random.setstate(state["python"])
-        np.random.set_state(state["numpy"])
-        torch.set_rng_state(state["torch"])
-        if torch.cuda.is_available():
-            for device, one in enumerate(state["cuda"][: torch.cuda.device_count()]):
-                torch.cuda.set_rng_state(one, device)
+        with damaged(self.folder, "rng.json"):
+            random.setstate(state["python"])
+            np.random.set_state(state["numpy"])
+            torch.set_rng_state(state["torch"])
+            if torch.cuda.is_available():
+                for device, one in enumerate(state["cuda"][: torch.cuda.device_count()]):
+                    torch.cuda.set_rng_state(one, device)
 
     def replay(self, device: torch.device | str | None = None) -> TensorDict | None:
         """The saved replay, with its batch dimensions, on `device` (the CPU if None); None if none was saved.
@@ -231,7 +254,8 @@ class Checkpoint:
         saved = self._tree("replay")
         if saved is None:
             return None
-        return TensorDict(saved["entries"], batch_size=saved["batch_size"], device=device or "cpu")
+        with damaged(self.folder, "replay.json"):
+            return TensorDict(saved["entries"], batch_size=saved["batch_size"], device=device or "cpu")
 
     def extra(self) -> dict[str, Any] | None:
         """What was saved as `extra`, tensors on the CPU; None if nothing was."""
@@ -261,20 +285,37 @@ def load_checkpoint(folder: str | Path) -> Checkpoint:
     for name in manifest.files:
         if name not in tree_files("replay"):
             manifest.check_sum(path, name)
-    config = OmegaConf.load(path / "config.yaml")
-    if not isinstance(config, DictConfig):
+    return Checkpoint(path, _read_config(path), _read_counters(path), manifest)
+
+
+def _read_config(path: Path) -> DictConfig:
+    written = UntrustedFolder(path).yaml("config.yaml")  # of a size that can be, and without aliases
+    if not isinstance(written, dict):
         raise UserError(
             f"checkpoint {path} is damaged: config.yaml holds no configuration; use another checkpoint."
         )
     # Saved configurations are resolved; reading one `${oc.env:…}` would take secrets from this machine.
-    if "${" in json.dumps(OmegaConf.to_container(config, resolve=False), default=str):
+    if "${" in json.dumps(written, default=str):
         raise UserError(
             f"checkpoint {path}: its config.yaml holds an interpolation (${{…}}), which no run writes; "
             "use another checkpoint."
         )
-    use_present_names(config)
-    counters = json.loads((path / "counters.json").read_bytes())
-    return Checkpoint(path, config, counters, manifest)
+    with damaged(path, "config.yaml"):
+        config = OmegaConf.load(path / "config.yaml")
+        assert isinstance(config, DictConfig)
+        use_present_names(config)
+        OmegaConf.to_container(config, throw_on_missing=True)
+    return config
+
+
+def _read_counters(path: Path) -> dict[str, int | float]:
+    found = UntrustedFolder(path).json("counters.json") or {}
+    for name, number in found.items():
+        if not is_real(number) or not 0 <= number < 2**63:
+            raise UserError(
+                f"checkpoint {path} is damaged: {name}={number!r} in counters.json; use another checkpoint."
+            )
+    return found
 
 
 def latest_checkpoint(folder: str | Path) -> Path:

@@ -12,9 +12,11 @@ import torch
 from franka_wm.device import resolve_device
 from franka_wm.errors import UserError
 from franka_wm.training import build
+from franka_wm.training.check import sketch
 from franka_wm.training.checkpoint import Checkpoint, latest_checkpoint, load_checkpoint
 from franka_wm.training.settings import RunSettings
 from franka_wm.training.spaces import Spaces
+from franka_wm.training.tree import damaged
 
 HUB = "hf:"
 
@@ -97,11 +99,17 @@ def find_checkpoint(folder: str | Path) -> Checkpoint:
 
 
 def _model(checkpoint: Checkpoint, settings: RunSettings, device: torch.device) -> Any:
-    saved = (checkpoint.extra() or {}).get("spaces")
+    extra = checkpoint.extra()
+    saved = extra.get("spaces") if isinstance(extra, dict) else None
     if saved is None:
         raise UserError(
             f"{checkpoint.folder}: does not say what sizes its model has; it was written by an older version"
         )
-    model = build.make_model(settings, Spaces.from_dict(saved), device)
+    with damaged(checkpoint.folder, "extra.json"):
+        spaces = Spaces.from_dict(saved)
+        shapes = sketch(settings, spaces)
+        if shapes is not None:  # before anything of the sizes that config.yaml names is allocated
+            checkpoint.check_model(shapes)
+        model = build.make_model(settings, spaces, device)
     checkpoint.load_model(model)
     return model.eval()

@@ -1,7 +1,6 @@
 """The checkpoint's manifest: what was written, by name, size and SHA-256, so that damage is found before it is read."""
 
 import hashlib
-import json
 import os
 import time
 from collections.abc import Mapping
@@ -10,10 +9,13 @@ from typing import Any, NamedTuple
 
 from franka_wm.errors import UserError
 from franka_wm.training.tree import write_json
+from franka_wm.untrusted import UntrustedFolder
 from franka_wm.version import __version__
 
 FORMAT_VERSION = 1
 MANIFEST = "manifest.json"
+ALWAYS = {"config.yaml", "counters.json", "model.safetensors"}
+"""Files of every checkpoint; the trees of published ones are fewer."""
 
 
 class Manifest(NamedTuple):
@@ -30,8 +32,8 @@ class Manifest(NamedTuple):
     def check_size(self, folder: Path, name: str) -> None:
         """Raise a `UserError` unless the file is there and as long as it was written."""
         expected = self.files[name]["bytes"]
-        path = folder / name
-        if not path.is_file():
+        path = UntrustedFolder(folder).path(name)
+        if path is None:
             raise UserError(f"checkpoint {folder} is damaged: {name} is missing; use another checkpoint.")
         actual = path.stat().st_size
         if actual != expected:
@@ -73,11 +75,14 @@ def read_manifest(folder: Path) -> Manifest:
         UserError: it cannot be read, or has another format.
     """
     try:
-        manifest = json.loads((folder / MANIFEST).read_bytes())
+        manifest = UntrustedFolder(folder).json(MANIFEST) or {}
         version, model, files = manifest["format_version"], manifest["model"], dict(manifest["files"])
         if not all(
-            isinstance(one["bytes"], int) and isinstance(one["sha256"], str) for one in files.values()
+            isinstance(one["bytes"], int) and isinstance(one["sha256"], str) and Path(name).name == name
+            for name, one in files.items()
         ):
+            raise ValueError("files")
+        if not files.keys() >= ALWAYS or not isinstance(model, str):
             raise ValueError("files")
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise UserError(
@@ -95,8 +100,8 @@ def read_manifest(folder: Path) -> Manifest:
 def saved_at(folder: Path) -> int:
     """Time of saving [ns]; a damaged manifest counts as the oldest."""
     try:
-        return int(json.loads((folder / MANIFEST).read_bytes())["saved_at_ns"])
-    except (OSError, ValueError, KeyError, TypeError):
+        return int((UntrustedFolder(folder).json(MANIFEST) or {})["saved_at_ns"])
+    except (ValueError, KeyError, TypeError, OverflowError):
         return -1
 
 

@@ -8,6 +8,7 @@ from torch import Tensor
 from torch.optim import Optimizer
 
 from franka_wm.errors import UserError
+from franka_wm.options import is_real
 
 type Optimizers = Optimizer | Mapping[str, Optimizer]
 """One optimizer, or several by name."""
@@ -15,6 +16,9 @@ type Optimizers = Optimizer | Mapping[str, Optimizer]
 # How an optimizer runs, not what it has learned: kept from the optimizer that is loaded into, so that a
 # checkpoint from a GPU (fused, capturable) goes on on a CPU and the other way round.
 _EXECUTION_FLAGS = ("capturable", "differentiable", "foreach", "fused")
+
+_MOMENTS = {name: {"step", "exp_avg", "exp_avg_sq"} for name in ("Adam", "AdamW")}
+"""What an optimizer that has made a step holds for each parameter."""
 
 
 def optimizer_state(optimizer: Optimizers) -> dict[str, Any]:
@@ -71,14 +75,34 @@ def _optimizer_difference(saved: Mapping[str, Any], optimizer: Optimizer) -> str
     if [len(g["params"]) for g in groups] != [len(g["params"]) for g in optimizer.param_groups]:
         return "its groups hold other numbers of parameters"
     for group, group_here in zip(groups, optimizer.param_groups, strict=True):
+        for name, here in group_here.items():
+            if name not in ("params", *_EXECUTION_FLAGS) and not _alike(group.get(name), here):
+                return f"{name} is {group.get(name)!r}, here {here!r}"
         for index, parameter in zip(group["params"], group_here["params"], strict=True):
-            for name, value in saved["state_dict"]["state"].get(index, {}).items():
+            state = saved["state_dict"]["state"].get(index, {})
+            if state and saved["type"] in _MOMENTS and not state.keys() >= _MOMENTS[saved["type"]]:
+                return f"of parameter {index} it holds {sorted(state)}"
+            for name, value in state.items():
+                if not isinstance(value, Tensor) or not bool(value.isfinite().all()):
+                    return f"{name} of parameter {index} holds no finite numbers"
+                if name == "step" and value.ndim:
+                    return f"step of parameter {index} has shape {tuple(value.shape)}"
                 if isinstance(value, Tensor) and value.ndim > 0 and value.shape != parameter.shape:
                     return (
                         f"{name} of parameter {index} has shape {tuple(value.shape)}, "
                         f"the parameter {tuple(parameter.shape)}"
                     )
     return None
+
+
+def _alike(saved: Any, here: Any) -> bool:
+    """Whether a saved option of a group is of the kind that it has here."""
+    if isinstance(here, tuple):
+        return isinstance(saved, tuple) and len(saved) == len(here) and all(map(_alike, saved, here))
+    if isinstance(here, Tensor) or is_real(here):
+        number = saved.item() if isinstance(saved, Tensor) and saved.numel() == 1 else saved
+        return is_real(number) and number >= 0
+    return type(saved) is type(here)
 
 
 def _as_it_runs_here(state: Mapping[str, Any], optimizer: Optimizer) -> dict[str, Any]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import shutil
 from pathlib import Path
 from typing import Any
@@ -11,8 +12,10 @@ from tensordict import TensorDictBase
 
 from franka_wm.data.memory import free_memory
 from franka_wm.data.stacks import StackStorage, newest
+from franka_wm.device import resolve_device
 from franka_wm.errors import UserError
 from franka_wm.training.settings import RunSettings
+from franka_wm.training.spaces import Spaces
 
 BETWEEN = 2e9
 """Up to so much experience [bytes] goes into checkpoints while a run goes on: writing tens of GB takes minutes."""
@@ -22,6 +25,49 @@ KEPT = 8e9
 
 SPARE = 5e8
 """What must stay free on the disk [bytes], for the weights and for what else a run writes."""
+
+
+PER_WORLD = 1e4
+"""Of a simulated world at the very least [bytes]."""
+
+
+def check_memory(run: RunSettings, model: torch.nn.Module, spaces: Spaces) -> None:
+    """Refuse what cannot fit into the memory that is free, before anything of it is built.
+
+    Only what is known beforehand is counted, and little of that: a run that passes may still not fit.
+
+    Args:
+        model: Only its shapes matter.
+        spaces: Sizes of observations and actions.
+
+    Raises:
+        UserError: It names the options of the largest part.
+    """
+    device = resolve_device(run.device)
+    free = free_memory(device)
+    if free is None:
+        return
+    c, e, r = run.collector, run.evaluation, run.replay
+    step = 4 * sum(spaces.observation_sizes.values()) + sum(map(math.prod, spaces.image_sizes.values()))
+    planned = math.prod(run.planner.options.get(name, 1) for name in ("num_samples", "horizon"))
+    steps = c.num_envs * run.planned_steps() if device.type != "cuda" else r.capacity
+    film = min(e.video_episodes, e.episodes) * run.env.episode_length * 3 * e.video_size**2
+    parts = {
+        "the model and its optimiser (model, size)": 16 * sum(x.numel() for x in model.parameters()),
+        f"experience (replay.capacity={r.capacity})": step * min(r.capacity, steps),
+        f"a batch (replay.batch_size={r.batch_size})": step * r.batch_size * run.window,
+        f"worlds (collector.num_envs={c.num_envs})": c.num_envs * (PER_WORLD + step * c.steps_per_batch),
+        f"worlds (evaluation.episodes={e.episodes})": e.episodes * (PER_WORLD + step),
+        "plans (planner.num_samples, planner.horizon)": 4 * e.episodes * planned * max(spaces.action_dim, 1),
+        f"a video (evaluation.video_size={e.video_size})": film,
+    }
+    needed = sum(parts.values())
+    if needed > free:
+        name, most = max(parts.items(), key=lambda part: part[1])
+        raise UserError(
+            f"{name}: at least {most / 1e9:.1f} GB, of {needed / 1e9:.1f} GB in all, do not fit into the "
+            f"{free / 1e9:.1f} GB that are free on {device}; lower it"
+        )
 
 
 def fill(

@@ -26,6 +26,7 @@ from franka_wm.training.moment import draws, go_on_drawing, put_back, restorable
 from franka_wm.training.room import fill, held, left_out
 from franka_wm.training.settings import RunSettings, plain
 from franka_wm.training.spaces import Spaces
+from franka_wm.training.tree import damaged
 
 OTHER_DEVICE = (
     "the checkpoint is of another kind of device: random numbers start anew; this run will not be the same"
@@ -399,6 +400,10 @@ class Trainer:
         numbers are put back. What cannot be is said in a line: experience that the checkpoint was too large for, and
         worlds of other libraries or of a changed configuration, which start new episodes.
         """
+        with damaged(checkpoint.folder):
+            self._restore(checkpoint)
+
+    def _restore(self, checkpoint: Checkpoint) -> None:
         checkpoint.load_model(self.model)
         checkpoint.load_optimizer(self.learner.optimizer)
         self.learner.use_rates()

@@ -2,12 +2,17 @@
 
 import json
 from collections.abc import Mapping
+from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from safetensors import SafetensorError
 from safetensors.torch import load_file, save_file
 from torch import Tensor
+
+from franka_wm.errors import UserError
+from franka_wm.untrusted import values_of
 
 
 def write_tree(folder: Path, name: str, tree: Any) -> None:
@@ -28,9 +33,33 @@ def write_tree(folder: Path, name: str, tree: Any) -> None:
 
 
 def read_tree(folder: Path, name: str) -> Any:
-    """What `write_tree` wrote; tensors on the CPU, arrays as lists."""
-    structure = json.loads((folder / f"{name}.json").read_bytes())
-    return _decode(structure, load_file(folder / f"{name}.safetensors"))
+    """What `write_tree` wrote; tensors on the CPU, arrays as lists.
+
+    Raises:
+        UserError: another program wrote these files.
+    """
+    with damaged(folder, f"{name}.json"):
+        structure = json.loads((folder / f"{name}.json").read_bytes())
+        return _decode(structure, read_tensors(folder, name))
+
+
+def read_tensors(folder: Path, name: str) -> dict[str, Tensor]:
+    """The tensors of `name.safetensors`, on the CPU.
+
+    Raises:
+        UserError: it is no such file.
+    """
+    try:
+        return load_file(folder / f"{name}.safetensors")
+    except (SafetensorError, OSError, ValueError, RuntimeError, KeyError) as error:
+        raise UserError(
+            f"checkpoint {folder} is damaged: {name}.safetensors cannot be read ({error}); use another checkpoint."
+        ) from error
+
+
+def damaged(folder: Path, name: str = "one of its files") -> AbstractContextManager[None]:
+    """Around the use of a checkpoint's values, which somebody else may have written."""
+    return values_of(f"checkpoint {folder} is damaged: {name}", "use another checkpoint.")
 
 
 def tree_files(name: str) -> tuple[str, str]:

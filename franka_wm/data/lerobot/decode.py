@@ -21,6 +21,7 @@ from typing import Any
 import numpy as np
 
 from franka_wm.errors import UserError
+from franka_wm.untrusted import MOST_PIXELS
 
 ROWS_AT_A_TIME = 64
 
@@ -72,14 +73,17 @@ class TableJob:
                                 arrays[name][row] = resized(picture, height, width)
                     arrays.mark("table", rows)
                     done += len(rows)
-        except (pa.ArrowException, OSError) as error:
+        except (pa.ArrowException, OSError, KeyError) as error:
             raise UserError(f"{self.path} cannot be read: {error}") from error
         arrays.flush()
         return done
 
     def _rows(self, batch: Any, starts: np.ndarray, lengths: np.ndarray) -> np.ndarray:
-        episode = batch.column("episode_index").to_numpy(zero_copy_only=False)
-        frame = batch.column("frame_index").to_numpy(zero_copy_only=False)
+        episode, frame = (
+            batch.column(name).to_numpy(zero_copy_only=False) for name in ("episode_index", "frame_index")
+        )
+        if episode.dtype.kind not in "iu" or frame.dtype.kind not in "iu":
+            raise UserError(f"{self.path}: episode_index or frame_index are no whole numbers in every row")
         inside = (episode >= 0) & (episode < len(starts))
         inside[inside] &= (frame[inside] >= 0) & (frame[inside] < lengths[episode[inside]])
         if not inside.all():
@@ -94,10 +98,12 @@ class TableJob:
         while hasattr(flat, "flatten") and hasattr(flat.type, "value_type"):
             flat = flat.flatten()
         values = flat.to_numpy(zero_copy_only=False)
-        if column.null_count or values.size != len(column) * size:
+        if column.null_count or values.dtype.kind not in "fiub" or values.size != len(column) * size:
             raise UserError(f"{self.path}: {feature} should have {size} numbers in every row and has not")
         values = values.reshape(len(column), size)
-        if values.dtype.kind == "f" and not np.isfinite(values).all():
+        with np.errstate(over="ignore"):  # a number that float32 cannot hold is none either
+            finite = np.isfinite(values.astype(np.float32)).all()
+        if values.dtype.kind == "f" and not finite:
             raise UserError(
                 f"{self.path}: {feature} holds a number that is not finite; delete the episode (lerobot-edit-dataset)"
             )
@@ -113,8 +119,10 @@ class TableJob:
             )
         try:
             with Image.open(io.BytesIO(data)) as picture:
+                if picture.width * picture.height > MOST_PIXELS:
+                    raise ValueError(f"{picture.width} × {picture.height} pixels")
                 return np.asarray(picture.convert("RGB"))
-        except (OSError, SyntaxError, ValueError) as error:
+        except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:
             raise UserError(f"{self.path}: an image of {feature} cannot be decoded: {error}") from error
 
 

@@ -8,6 +8,8 @@ import zlib
 
 import numpy as np
 
+from franka_wm.untrusted import MOST_PIXELS
+
 
 def encode_png(picture: np.ndarray) -> bytes:
     """(H, W, 3) uint8 as PNG, without filters.
@@ -32,8 +34,14 @@ def _chunk(kind: bytes, data: bytes) -> bytes:
 
 
 def decode_png(data: bytes) -> np.ndarray:
-    """PNG as (H, W, 3) uint8."""
+    """PNG as (H, W, 3) uint8.
+
+    Raises:
+        ValueError: It has too many pixels.
+    """
     from PIL import Image
 
     with Image.open(io.BytesIO(data)) as picture:
+        if picture.width * picture.height > MOST_PIXELS:
+            raise ValueError(f"a picture of {picture.width} × {picture.height} pixels")
         return np.asarray(picture.convert("RGB"))

@@ -3,19 +3,28 @@
 from __future__ import annotations
 
 import hashlib
-import json
+import math
 import os
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
+from string import Formatter
 from typing import Any
 
 import numpy as np
 
 from franka_wm.errors import UserError
+from franka_wm.options import is_real, is_whole
+from franka_wm.untrusted import UntrustedFolder
 
 DEFAULT_DATA_PATH = "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
 DEFAULT_VIDEO_PATH = "videos/{video_key}/chunk-{chunk_index:03d}/file-{file_index:03d}.mp4"
+
+LONGEST_PATH = 255
+"""Of the templates of paths [characters]."""
+MOST_EPISODES, MOST_ROWS, MOST_NUMBERS = 10**8, 10**10, 10**8
+"""Of a dataset; of numbers, in one cell: whatever says more is no dataset, and sizes are taken from it."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,13 +92,31 @@ class Source:
 
     def _path(self, name: str, default: str, **numbers: int | str) -> Path:
         template = self.info.get(name) or default
-        try:
-            relative = PurePosixPath(template.format(**numbers))
-        except (KeyError, IndexError, ValueError, AttributeError) as error:
-            raise UserError(f"{self.root}: {name}={template!r} in meta/info.json makes no path") from error
+        if not isinstance(template, str) or not _is_template(template):
+            raise UserError(f"{self.root}: {name}={template!r} in meta/info.json makes no path")
+        relative = PurePosixPath(template.format(**numbers))
         if relative.is_absolute() or ".." in relative.parts:
             raise UserError(f"{self.root}: {name}={template!r} in meta/info.json leaves the dataset")
         return self.root / relative
+
+
+def _is_template(text: str) -> bool:
+    """Whether it only asks for the numbers that there are, of a width that a path may have."""
+    try:
+        fields = [
+            (name, spec, change) for _, name, spec, change in Formatter().parse(text) if name is not None
+        ]
+    except ValueError:
+        return False
+    known = all(
+        change is None
+        and (
+            (name in ("chunk_index", "file_index") and re.fullmatch(r"(0?\d{1,2}d)?", spec or "") is not None)
+            or (name == "video_key" and not spec)
+        )
+        for name, spec, change in fields
+    )
+    return known and "\0" not in text and len(text) <= LONGEST_PATH
 
 
 def unique_files(numbers: np.ndarray) -> list[tuple[int, int]]:
@@ -111,30 +138,37 @@ def read_source(root: str | Path) -> Source:
         raise UserError(
             f"dataset.root={root}: no LeRobot dataset, meta/info.json is missing; give the folder that holds meta/"
         )
-    try:
-        info = json.loads(info_path.read_text())
-        version, features, fps = str(info["codebase_version"]), info["features"], float(info["fps"])
-    except (OSError, ValueError, KeyError, TypeError) as error:
-        raise UserError(f"{info_path} cannot be read ({type(error).__name__}: {error})") from error
+    real = info_path.resolve()  # the Hub's local copies are links
+    info = UntrustedFolder(real.parent).json(real.name) or {}
+    for name in ("codebase_version", "features", "fps"):
+        if name not in info:
+            raise UserError(f"{info_path} cannot be read: {name} is missing")
+    version, features, fps = str(info["codebase_version"]), info["features"], info["fps"]
     if not version.startswith("v3"):
         raise UserError(
             f"{root} is in LeRobot's format {version}; v3 is read. Convert it with "
             "python -m lerobot.scripts.convert_dataset_v21_to_v30 --repo-id=…"
         )
-    if not isinstance(features, dict) or not fps > 0:
-        raise UserError(f"{info_path}: features or fps={fps} make no sense")
-    if not info.get("total_episodes"):
+    if not isinstance(features, dict) or not is_real(fps) or not 0 < fps <= 1e6:
+        raise UserError(f"{info_path}: features or fps={fps!r} make no sense")
+    for name, feature in features.items():
+        if not _is_feature(name, feature):
+            raise UserError(f"{info_path}: the feature {name!r} makes no sense: {feature!r}")
+    total = info.get("total_episodes")
+    if not is_whole(total) or not 0 <= total <= MOST_EPISODES:
+        raise UserError(f"{info_path}: total_episodes={total!r} makes no sense")
+    if not total:
         raise UserError(f"{root} holds 0 episodes; record some first")
     videos = [name for name, feature in features.items() if feature.get("dtype") == "video"]
     table = _episodes(root, videos)
     order = np.argsort(table["episode_index"], kind="stable")
-    if not np.array_equal(table["episode_index"][order], np.arange(info["total_episodes"])):
+    if len(order) != total or not np.array_equal(table["episode_index"][order], np.arange(total)):
         raise UserError(
             f"{root}: meta/info.json tells of {info['total_episodes']} episodes, meta/episodes of {len(order)}; "
             "the program that wrote it was probably killed"
         )
     lengths = table["length"][order].astype(np.int64)
-    if (lengths < 1).any() or int(lengths.sum()) != info.get("total_frames"):
+    if (lengths < 1).any() or (lengths > MOST_ROWS).any() or int(lengths.sum()) != info.get("total_frames"):
         raise UserError(
             f"{root}: meta/info.json tells of {info.get('total_frames')} frames, its episodes of {lengths.sum()}"
         )
@@ -154,6 +188,15 @@ def read_source(root: str | Path) -> Source:
     )
 
 
+def _is_feature(name: str, feature: Any) -> bool:
+    if not isinstance(feature, dict) or not isinstance(feature.get("dtype"), str) or "\0" in name:
+        return False
+    shape = feature.get("shape")
+    if not isinstance(shape, list) or not all(is_whole(n) and 1 <= n <= MOST_NUMBERS for n in shape):
+        return False
+    return math.prod(shape) <= MOST_NUMBERS
+
+
 def _episodes(root: Path, videos: Sequence[str]) -> dict[str, np.ndarray]:
     """The columns of ``meta/episodes`` that say where rows and frames are."""
     import pyarrow as pa
@@ -167,11 +210,16 @@ def _episodes(root: Path, videos: Sequence[str]) -> dict[str, np.ndarray]:
         raise UserError(f"{root}: meta/episodes is empty; the program that wrote it was probably killed")
     try:
         tables = [pq.ParquetFile(path).read(columns=columns) for path in paths]
-        return {c: np.concatenate([t[c].to_numpy() for t in tables]) for c in columns}
+        found = {c: np.concatenate([t[c].to_numpy() for t in tables]) for c in columns}
     except (pa.ArrowException, OSError, KeyError) as error:
         raise UserError(
             f"{root}: meta/episodes cannot be read ({error}); the program that wrote it was probably killed"
         ) from error
+    for name, column in found.items():
+        wanted = "f" if name.endswith("from_timestamp") else "iu"
+        if column.dtype.kind not in wanted or not np.isfinite(column).all() or (column < 0).any():
+            raise UserError(f"{root}: meta/episodes holds {name} that are no numbers of at least 0")
+    return found
 
 
 def find_dataset(repo_id: str, revision: str | None = None) -> Path:

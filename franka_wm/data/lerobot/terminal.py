@@ -23,6 +23,7 @@ import numpy as np
 from franka_wm.data.lerobot.pictures import decode_png, encode_png
 from franka_wm.data.lerobot.schema import OWN_FOLDER
 from franka_wm.errors import UserError
+from franka_wm.untrusted import values_of
 
 TERMINAL_FOLDER = f"{OWN_FOLDER}/terminal"
 
@@ -88,8 +89,6 @@ def read_terminals(
     Returns:
         What was found, and in ``problem`` one line about what was not.
     """
-    import pyarrow.parquet as pq
-
     files = sorted((Path(root) / TERMINAL_FOLDER).glob("*.parquet"))
     wanted = {int(key): [] for key in keys}
     for place, key in enumerate(keys):
@@ -101,29 +100,8 @@ def read_terminals(
         values[feature] = np.zeros((len(keys), *spec["shape"]), "uint8" if picture else spec["dtype"])
     changed = 0
     for file in files:
-        names = pq.read_schema(file).names
-        lacking = [feature for feature in features if feature not in names]
-        if lacking:
-            raise UserError(f"{file}: has no {lacking[0]!r}; it belongs to another dataset")
-        table = pq.read_table(file, columns=["episode_key", "length", *features])
-        for row, (key, length) in enumerate(
-            zip(table["episode_key"].to_pylist(), table["length"].to_pylist(), strict=True)
-        ):
-            for place in wanted.get(key, ()):
-                if found[place]:
-                    continue
-                if length != lengths[place]:
-                    changed += 1
-                    continue
-                found[place] = True
-                for feature in features:
-                    cell = table[feature][row].as_py()
-                    array = values[feature]
-                    array[place] = (
-                        decode_png(cell)
-                        if isinstance(cell, bytes)
-                        else np.asarray(cell, array.dtype).reshape(array.shape[1:])
-                    )
+        with values_of(str(file), "delete it, and the last step of every episode is left out."):
+            changed += _read_file(file, wanted, lengths, found, values)
     missing = int((~found).sum())
     problem = None
     if missing:
@@ -139,3 +117,47 @@ def read_terminals(
             "not used where the observation after it is needed"
         )
     return Terminals(found, values, problem)
+
+
+def _read_file(
+    file: Path,
+    wanted: Mapping[int, Sequence[int]],
+    lengths: Sequence[int],
+    found: np.ndarray,
+    values: Mapping[str, np.ndarray],
+) -> int:
+    """Fills in what a file has of the episodes that are wanted; returns how many of them changed their length."""
+    import pyarrow.parquet as pq
+
+    names = pq.read_schema(file).names
+    lacking = [feature for feature in values if feature not in names]
+    if lacking:
+        raise UserError(f"{file}: has no {lacking[0]!r}; it belongs to another dataset")
+    table = pq.read_table(file, columns=["episode_key", "length", *values])
+    changed = 0
+    for row, (key, length) in enumerate(
+        zip(table["episode_key"].to_pylist(), table["length"].to_pylist(), strict=True)
+    ):
+        for place in wanted.get(key, ()):
+            if found[place]:
+                continue
+            if length != lengths[place]:
+                changed += 1
+                continue
+            found[place] = True
+            for feature, array in values.items():
+                cell = table[feature][row].as_py()
+                value = (
+                    decode_png(cell)
+                    if isinstance(cell, bytes)
+                    else np.asarray(cell, array.dtype).reshape(array.shape[1:])
+                )
+                if value.shape != array.shape[1:]:
+                    raise ValueError(f"{feature} of shape {value.shape}")
+                if value.dtype.kind == "f" and not np.isfinite(value).all():
+                    raise UserError(
+                        f"{file}: {feature} holds a number that is not finite, in row {row}; delete the file, and the "
+                        "last step of every episode is left out."
+                    )
+                array[place] = value
+    return changed

@@ -21,6 +21,7 @@ from franka_wm.envs.config import FrankaConfig
 from franka_wm.envs.constants import NUM_FINGERS, NUM_JOINTS
 from franka_wm.envs.quiet import start_warp
 from franka_wm.envs.robots import gripper, meshes
+from franka_wm.envs.robots.description import read_description
 from franka_wm.envs.robots.sources import SOURCES, Source, detail, urdf_source
 from franka_wm.errors import UserError
 
@@ -98,18 +99,21 @@ def add_robot(
             mesh that it names cannot be read.
     """
     path = urdf_source(config, urdf_path)
-    root = _parse(path)
+    root = read_description(path)
     if config.has_gripper:
         gripper.free_fingers(root)
     else:
         _hold_fingers(root, config.finger_opening)
     drawn = _prepare_shapes(root, path, visuals)
-    builder.add_urdf(
-        ET.tostring(root, encoding="unicode"),
-        floating=False,
-        enable_self_collisions=False,
-        parse_visuals_as_colliders=False,
-    )
+    try:
+        builder.add_urdf(
+            ET.tostring(root, encoding="unicode"),
+            floating=False,
+            enable_self_collisions=False,
+            parse_visuals_as_colliders=False,
+        )
+    except Exception as error:  # Newton's reader fails in ways of its own
+        raise UserError(f"{path.name}: Newton cannot read it ({type(error).__name__}: {error})") from error
     for body, label in enumerate(builder.body_label):
         meshes.draw(
             builder, body, drawn.get(label.rsplit("/", 1)[-1], []), detail(SOURCES[config.robot], config)
@@ -126,7 +130,7 @@ def add_robot(
     tool_link, tool_frame = _find_tool(builder, path)
     merged = _merged_inertia(builder)
     builder.collapse_fixed_joints()
-    _set_inertia(builder, merged)
+    _set_inertia(builder, merged, path)
     carrier = builder.body_label.index(tool_link)
 
     joints = range(NUM_JOINTS)
@@ -157,13 +161,6 @@ def load_robot(config: FrankaConfig, urdf_path: str | Path | None = None) -> Rob
     """The robot's description alone, without a simulation."""
     builder = arm_builder()
     return add_robot(builder, config, urdf_path, visuals=False)
-
-
-def _parse(path: Path) -> ET.Element:
-    try:
-        return ET.parse(path).getroot()
-    except (ET.ParseError, UnicodeDecodeError) as error:
-        raise UserError(f"{path}: not a readable URDF ({error})") from error
 
 
 def _prepare_shapes(root: ET.Element, path: Path, visuals: bool) -> dict[str, list[meshes.Piece]]:
@@ -273,8 +270,16 @@ def _merged_inertia(builder: newton.ModelBuilder) -> dict[str, tuple[float, np.n
 
 
 def _set_inertia(
-    builder: newton.ModelBuilder, merged: dict[str, tuple[float, np.ndarray, np.ndarray]]
+    builder: newton.ModelBuilder, merged: dict[str, tuple[float, np.ndarray, np.ndarray]], path: Path
 ) -> None:
+    for label in builder.body_label:
+        mass, _, inertia = merged.get(label, (0.0, None, np.zeros((3, 3))))
+        if mass <= 0 or not np.linalg.eigvalsh(inertia)[0] > 0:
+            link = label.rsplit("/", 1)[-1]
+            raise UserError(
+                f"{path.name}: link {link!r} moves and has a mass of {mass:g} kg, or an inertia that no body has; "
+                "give it an <inertial>"
+            )
     for label, (mass, centre, inertia) in merged.items():
         body = builder.body_label.index(label)
         builder.body_mass[body], builder.body_inv_mass[body] = mass, 1.0 / mass

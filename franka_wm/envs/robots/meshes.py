@@ -7,6 +7,7 @@ A picture of thousands of worlds pays for every shape and triangle, and CAD mesh
 
 from __future__ import annotations
 
+import os
 import warnings
 import xml.etree.ElementTree as ET
 from collections.abc import Iterator
@@ -64,7 +65,7 @@ def resolve(name: str, urdf: Path) -> Path:
             f"{urdf.name}: mesh {name!r}: only local files are read; download it and name the file"
         )
     for path in candidates:
-        if path.is_file():
+        if os.path.isfile(path):  # unlike Path.is_file, it takes names that no file can have
             return path.resolve()
     hint = (
         f"; put the URDF inside its package {rest.partition('/')[0]!r}"

@@ -6,6 +6,7 @@ To add a robot, write such a function and give it a line in :data:`SOURCES`; ``d
 from __future__ import annotations
 
 import math
+import os
 from collections.abc import Callable
 from dataclasses import dataclass
 from importlib.metadata import PackageNotFoundError, distribution
@@ -106,8 +107,10 @@ def urdf_source(config: FrankaConfig, urdf_path: str | Path | None) -> Path:
     """
     if urdf_path is None:
         return SOURCES[config.robot].find(config)
+    if not isinstance(urdf_path, str | Path) or not urdf_path:
+        raise UserError(f"urdf_path={urdf_path!r}: must be the path of a URDF, or null")
     path = Path(urdf_path).expanduser()
-    if not path.is_file():
+    if not os.path.isfile(path):  # unlike Path.is_file, it takes names that no file can have
         raise UserError(
             f"urdf_path={path}: no such file; give a URDF with seven arm joints, or use robot=embedded"
         )

@@ -19,6 +19,8 @@ from franka_wm.policies.planner import PRECISIONS
 from franka_wm.training.learner import SCHEDULES
 
 MODELS_OWN = "the model's own"
+MOST_UPDATES = 10**12
+"""Of a run: a thousand updates a second for thirty years."""
 
 
 @dataclass(frozen=True)
@@ -26,8 +28,8 @@ class CollectorSettings:
     """Who gathers experience, in how many worlds."""
 
     acts: str = choice("auto", of=("auto", *POLICIES))
-    num_envs: int = whole(least=1)
-    steps_per_batch: int = whole(least=1)
+    num_envs: int = whole(least=1, most=10**6)
+    steps_per_batch: int = whole(least=1, most=10**6)
     seed_steps: int = whole(least=1)
     smoothness: float = real(0.7, least=0, below=1)
     noise: float = real(0.0, least=0, most=2, unit="units of the action")
@@ -48,7 +50,7 @@ class ReplaySettings:
 class TrainerSettings:
     """How much and how fast is learned."""
 
-    updates: int = whole(least=0)
+    updates: int = whole(least=0, most=MOST_UPDATES)
     updates_per_batch: int = whole(least=1)
     lr: float | None = real(None, above=0, null=MODELS_OWN)
     grad_clip: float = real(20.0, above=0)
@@ -67,13 +69,13 @@ class TrainerSettings:
 class EvaluationSettings:
     """How the result is judged."""
 
-    episodes: int = whole(least=2)
+    episodes: int = whole(least=2, most=10**6)
     during: tuple[str, ...] = several((), each=choice(of=POLICIES), example="[planner,policy]")
     during_episodes: int | None = whole(None, least=2, null="all")
     every: int | None = whole(None, least=1, unit="updates", null="an eighth of trainer.updates")
     at_steps: tuple[int, ...] = several((), each=whole(least=1), example="[50000,100000]")
     video_episodes: int = whole(0, least=0)
-    video_size: int = whole(256, least=16, even=True, unit="pixels")
+    video_size: int = whole(256, least=16, most=4096, even=True, unit="pixels")
 
 
 @dataclass(frozen=True)
@@ -225,7 +227,7 @@ class EnvSettings:
     @classmethod
     def of(cls, values: Mapping[str, Any]) -> EnvSettings:
         """Reads one; what is wrong is said by the config that it makes."""
-        kind = values["kind"]
+        kind = values.get("kind")
         if kind == "franka":
             own = {k: v for k, v in values.items() if k not in ("kind", "urdf_path")}
             whole_rule(least=1).check("env.frame_stack", own.get("frame_stack", 1))
@@ -235,7 +237,7 @@ class EnvSettings:
             frames = values.get("frame_stack", 1)
             whole_rule(least=1).check("env.frame_stack", frames)
             return cls(kind, None, None, frames, values)
-        return cls(kind, external_config(values), values=values)
+        return cls(str(kind), external_config(values), values=values)
 
     def changed(self, **changes: Any) -> EnvSettings:
         """The same with other values of its fields."""

@@ -90,6 +90,9 @@ class RunSettings:
         missing = [name for name in ("seed", "device", "env", "model", "planner") if name not in values]
         if missing:
             raise UserError(f"the configuration has no {missing[0]}; it is not one of a run of this package")
+        for name in (*GROUPS, "env", "model", "planner", "logger"):
+            if not isinstance(values.get(name, {}), Mapping):
+                raise UserError(f"{name}={values[name]!r}: must be a group of options")
         refuse_old_name("collector.acts", values.get("collector", {}).get("acts"))
         for name in _listed(values.get("evaluation", {}).get("during")):
             refuse_old_name("evaluation.during", name)
