@@ -138,19 +138,17 @@ class Trainer:
         trainer = self.settings.trainer
         total = trainer.updates
         started = time.perf_counter() - self.seconds
-        progress = Progress(
-            total, done=self.learner.updates, env_steps=self.env_steps, every=trainer.log_every
-        )
+        updates = self.learner.updates
+        progress = Progress(total, done=updates, env_steps=self.env_steps, every=trainer.log_every)
         saved = time.perf_counter()
         every = self.settings.evaluation_period
         ahead = sorted(steps for steps in self.settings.evaluation.at_steps if steps > self.env_steps)
-        anew = False
+        anew = self.env is not None and not len(self.replay) and (updates < total or not updates)
         with interruptible() as stop:
             if self.env is None:
                 self.standardize(self.replay.statistics())
             else:
                 assert self._acting is not None
-                anew = len(self.replay) == 0 and (self.learner.updates < total or not self.learner.updates)
                 if anew:
                     self.seed()
                 self._acting.use(self.actor)
