@@ -388,6 +388,10 @@ class FrankaConfig:
             raise UserError(f"gripper=false: task={self.task} needs the gripper; leave it at null")
         if self.surroundings and not self.has_gripper:
             raise UserError("scene: contacts need the fingers as bodies of their own; set gripper=true")
+        if self.has_gripper and "goal_pixels" in self.observations:
+            raise UserError(
+                f"goal_pixels: task={self.task} has no image of its goal; leave it out (show_goal draws it)"
+            )
         if self.has_gripper and self.solver == "featherstone":
             raise UserError("gripper and scene need solver=mujoco")
         if "objects" in self.observations and not self.num_objects:

@@ -97,7 +97,7 @@ def test_a_scene_as_yaml_has_it() -> None:
     env = make(2, task="reach", gripper=True, scene=scene)
     observation = env.reset()
     heights = observation["objects"].view(2, 3, 13)[:, :, 2]
-    assert torch.allclose(heights, torch.tensor([0.05, 0.025, 0.04]).expand(2, 3), atol=1e-6)
+    assert torch.allclose(heights, torch.tensor([0.05, 0.025, 0.04]).expand(2, 3), atol=1e-4)
     for _ in range(15):
         observation = env.step(observation.set("action", grips(env, 1.0)))["next"]
     can, ball, _pill = observation["objects"].view(2, 3, 13).unbind(1)
@@ -191,6 +191,7 @@ def test_a_cube_rests_on_the_table_without_sinking_or_creeping() -> None:
     start = observation["objects"].clone()
     for _ in range(30):
         observation = env.step(observation.set("action", grips(env, 1.0)))["next"]
+        assert (observation["objects"][:, 2] - start[:, 2]).abs().max() < 2e-5  # not even at first
     assert (observation["objects"][:, :2] - start[:, :2]).abs().max() < 1e-5
     assert (observation["objects"][:, 2] - 0.02).abs().max() < 1e-3
     assert observation["objects"][:, 7:].abs().max() < 1e-3
@@ -310,6 +311,7 @@ def test_objects_start_apart_everywhere_anew() -> None:
         ({"task": "reach", "scene": Scene(objects=(CUBE,)), "observations": ("state",)}, "set gripper=true"),
         ({"solver": "featherstone"}, "solver=mujoco"),
         ({"task": "reach"}, "has no objects"),
+        ({"observations": ("goal_pixels", "state")}, "has no image of its goal"),
         ({"gripper_force": 100.0}, "gripper_force=100.0: must be from 1 to 70"),
         ({"home": (0.0, 1.0)}, "7 joint angles"),
         ({"scene": {"objects": [{"name": "cube", "mass": 0}]}}, "scene.cube.mass=0: must be from 0.001"),

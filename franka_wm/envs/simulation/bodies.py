@@ -25,6 +25,9 @@ SOLREF, SOLIMP = (0.02, 1.0), (0.95, 0.99, 0.001, 0.5, 2.0)
 CAPACITY = 1 | 2 | 4 | 8 | 16 | 1 << 16 | 1 << 17
 """Bits of MuJoCo's overflow that mean lost contacts; the others say that iterations were used up."""
 
+RESTING = 5e-5
+"""How deep an object presses into the table under its own weight [m]: it starts at rest, not in a small fall."""
+
 SUNK = 0.02
 """An object that is this far below the table's top has left it [m]."""
 
@@ -146,7 +149,7 @@ class Bodies:
             numbers([one.at for one in objects], count, 2),
             numbers([one.spread for one in objects], count, 2),
             numbers([one.turn for one in objects], count),
-            numbers([scene.top + one.half_height for one in objects] if scene else [], count),
+            numbers([scene.top + one.half_height - RESTING for one in objects] if scene else [], count),
             numbers([one.radius for one in objects], count),
             numbers(blocked, len(blocked), 7),
             scene.space if scene else 0.0,
