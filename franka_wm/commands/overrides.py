@@ -24,11 +24,8 @@ def compose(overrides: Sequence[str], options: Sequence[str] = ()) -> Any:
         return conf.compose(*overrides)
     except UserError:
         raise
-    except (
-        HydraException,
-        OmegaConfBaseException,
-        ValueError,
-    ) as error:  # the last for a group that is no name
+    # The last two for a group that is no name.
+    except (HydraException, OmegaConfBaseException, ValueError, TypeError) as error:
         raise UserError(explain(str(error), allowed=_allowed(str(error), overrides, options))) from error
 
 

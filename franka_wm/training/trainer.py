@@ -399,24 +399,20 @@ class Trainer:
         worlds of other libraries or of a changed configuration, which start new episodes.
         """
         with damaged(checkpoint.folder):
-            self._restore(checkpoint)
-
-    def _restore(self, checkpoint: Checkpoint) -> None:
-        checkpoint.load_model(self.model)
-        checkpoint.load_optimizer(self.learner.optimizer)
-        self.learner.use_rates()
-        self.learner.updates = int(checkpoint.counters["updates"])
-        self.env_steps = int(checkpoint.counters["env_steps"])
-        self.seconds = float(checkpoint.counters["seconds"])
-        extra = checkpoint.extra() or {}
-        self.rows = list(extra.get("rows", []))
-        experience = None if self.env is None else checkpoint.replay(self.env.device)
-        if experience is not None:
-            fill(self.replay, experience, self.settings, updates=self.learner.updates, restored=True)
-        elif self.env is not None and self.learner.updates < self.settings.trainer.updates:
-            say("  the checkpoint holds no experience: this run gathers anew and will not be the same")
-        self._restore_moment(checkpoint, extra.get("moment", {}))
-        checkpoint.restore_rng()  # the last: whatever is built draws
+            checkpoint.load_model(self.model)
+            checkpoint.load_optimizer(self.learner.optimizer)
+            self.learner.use_rates()
+            self.learner.updates = int(checkpoint.counters["updates"])
+            self.env_steps, self.seconds = (checkpoint.counters[name] for name in ("env_steps", "seconds"))
+            extra = checkpoint.extra() or {}
+            self.rows = list(extra.get("rows", []))
+            experience = None if self.env is None else checkpoint.replay(self.env.device)
+            if experience is not None:
+                fill(self.replay, experience, self.settings, updates=self.learner.updates, restored=True)
+            elif self.env is not None and self.learner.updates < self.settings.trainer.updates:
+                say("  the checkpoint holds no experience: this run gathers anew and will not be the same")
+            self._restore_moment(checkpoint, extra.get("moment", {}))
+            checkpoint.restore_rng()  # the last: whatever is built draws
 
     def _restore_moment(self, checkpoint: Checkpoint, moment: Mapping[str, Any]) -> None:
         """Undoes :meth:`_moment`."""
@@ -433,9 +429,7 @@ class Trainer:
             if restorable(self.env) is None:
                 why = "the simulators of other libraries cannot be put back"
             else:
-                why = (
-                    "of another configuration" if worlds is not None else "the checkpoint does not hold them"
-                )
+                why = "of another configuration" if worlds is not None else "the checkpoint holds none"
             say(f"  worlds: {why}; they start new episodes, and this run will not be the same")
             # Not those that the first run has seen already.
             self.env.set_seed(derive_seed("training", self.settings.seed, "resumed", self.env_steps))
