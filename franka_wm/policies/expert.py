@@ -39,7 +39,7 @@ class ExpertPolicy(ScriptedPolicy):
         generator: Source of the noise.
 
     Raises:
-        UserError: The task has no expert, or actions are tool displacements.
+        UserError: The task has no expert, the arm hangs under its own weight, or actions are tool displacements.
     """
 
     in_keys = ["state", "joint_target", "objects", "goal"]
@@ -57,6 +57,11 @@ class ExpertPolicy(ScriptedPolicy):
         if task.expert is None:
             raise UserError(
                 f"policy=expert: task={config.task} has none; a task says it with a method expert"
+            )
+        if not config.gravity_compensation:
+            raise UserError(
+                "policy=expert: needs gravity_compensation=true; without it the tool hangs 2 cm below where it is told "
+                "to be, and grasps nothing"
             )
         if config.action_mode == "ee_delta":
             raise UserError("policy=expert: drives joints; use env.action_mode=joint_delta or joint_position")

@@ -231,7 +231,8 @@ def make_scripted_policies(env: Any, *, seed: int = 0, smoothness: float = 0.7) 
             scripted["ik"] = DiscreteOraclePolicy(env.kinematics, env.config, moves.table)
     elif arm and env.config.has_gripper:
         task = env.simulation.task
-        if task.expert is not None and env.config.action_mode != "ee_delta":
+        fits = env.config.gravity_compensation and env.config.action_mode != "ee_delta"
+        if task.expert is not None and fits:
             scripted["expert"] = ExpertPolicy(task, env.kinematics, env.config)
     elif arm:
         scripted["ik"] = OraclePolicy(env.kinematics, env.config)

@@ -341,6 +341,8 @@ def test_the_expert_says_what_it_needs() -> None:
         expert(reach)
     with pytest.raises(UserError, match="joint_delta or joint_position"):
         expert(make(1, action_mode="ee_delta"))
+    with pytest.raises(UserError, match="needs gravity_compensation=true"):
+        expert(make(1, gravity_compensation=False))
 
 
 def test_own_tasks_bring_their_scene_as_well() -> None:
