@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from typing import TYPE_CHECKING
 
-from franka_wm.envs.constants import HAND_DIM, HOME, NUM_JOINTS, STATE_DIM
+from franka_wm.envs.constants import HAND_DIM, HOME, NUM_FINGERS, NUM_JOINTS, STATE_DIM
 from franka_wm.envs.scene import Scene
 from franka_wm.errors import UserError
 from franka_wm.options import is_real
@@ -15,7 +15,10 @@ from franka_wm.options import is_real
 if TYPE_CHECKING:
     from franka_wm.envs.tasks import Task
 
-OBSERVATIONS = ("pixels", "depth", "segmentation", "goal_pixels", "state", "joint_target", "objects")
+OBSERVATIONS = (
+    *("pixels", "depth", "segmentation", "goal_pixels"),
+    *("state", "joint_target", "objects", "contacts"),
+)
 """Observation groups that can be asked for; ``goal`` is always emitted."""
 
 IMAGES = ("pixels", "depth", "segmentation", "goal_pixels")
@@ -150,7 +153,7 @@ class FrankaConfig:
         randomization: Ranges that each episode of each world draws from; :class:`Randomization`.
         finger_opening: Each finger's distance from the closed position [m]; without a gripper it is held there.
         observations: Which of ``("pixels", "depth", "segmentation", "goal_pixels", "state", "joint_target",
-            "objects")`` are emitted. ``goal`` always is.
+            "objects", "contacts")`` are emitted. ``goal`` always is.
         episode_length: Control steps after which an episode is truncated.
         goal_sampling: ``"fixed"`` (``goal``) or ``"reachable"`` (the tool position of a random pose, drawn
             per world and episode).
@@ -373,6 +376,11 @@ class FrankaConfig:
             raise UserError(f"unknown environment option {unknown[0]!r}; known: {', '.join(sorted(known))}")
         return cls(**dict(values))
 
+    @property
+    def contact_dim(self) -> int:
+        """Size of ``contacts``: a force of each finger; 0 where it is not asked for."""
+        return NUM_FINGERS * ("contacts" in self.observations)
+
     def _check_scene(self) -> None:
         """Scene, gripper and what they need of the rest."""
         if self.scene is not None:
@@ -394,6 +402,10 @@ class FrankaConfig:
             )
         if self.has_gripper and self.solver == "featherstone":
             raise UserError("gripper and scene need solver=mujoco")
+        if self.contact_dim and not self.surroundings:
+            raise UserError(
+                f"observations: task={self.task} touches nothing; leave contacts out, or give a scene"
+            )
         if "objects" in self.observations and not self.num_objects:
             raise UserError(
                 f"observations: task={self.task} has no objects; leave objects out, or give a scene"

@@ -46,6 +46,8 @@ def observation_spec(
         entries["joint_target"] = Bounded(low, high, device=device)
     if "objects" in config.observations:
         entries["objects"] = Unbounded(shape=(n, OBJECT_DIM * config.num_objects), device=device)
+    if config.contact_dim:
+        entries["contacts"] = Unbounded(shape=(n, config.contact_dim), device=device)
     entries["goal"] = Unbounded(shape=(n, 3), device=device)
     entries["success"] = Binary(shape=(n, 1), dtype=torch.bool, device=device)
     entries["is_init"] = Binary(shape=(n, 1), dtype=torch.bool, device=device)

@@ -61,7 +61,9 @@ def make_evaluation_env(run: RunSettings, *, num_envs: int | None = None, **chan
     if run.is_arm:
         read = run.model.observations or ()
         goal = ("goal_pixels",) if run.objective_name == "goal_image" else ()
-        vectors = ["state", "joint_target"] + ["objects"] * (run.env.arm.num_objects > 0)
+        arm = run.env.arm
+        vectors = ["state", "joint_target"] + ["objects"] * (arm.num_objects > 0)
+        vectors += ["contacts"] * (arm.contact_dim > 0)
         pictures = [o for o in run.env.arm.observations if o not in vectors]
         used = [o for o in pictures if any(key == o or key.startswith(f"{o}_") for key in (*read, *goal))]
         changes = {"observations": [*used, *vectors]} | changes

@@ -96,6 +96,7 @@ class Spaces:
             "state": config.state_dim,
             "joint_target": config.target_dim,
             "objects": OBJECT_DIM * config.num_objects,
+            "contacts": config.contact_dim,
         }
         moves = discrete_action_table(config.action_dim).shape[0]
         return cls(

@@ -1,3 +1,5 @@
+# pyright: reportAttributeAccessIssue=false
+# (MuJoCo is compiled: pyright sees none of its names.)
 """Free bodies move as in MuJoCo's own C library: falling, landing, sliding, pushing one another."""
 
 from __future__ import annotations

@@ -17,7 +17,7 @@ from franka_wm.evaluation.closed_loop import play_episodes
 from franka_wm.policies.expert import ExpertPolicy
 from franka_wm.training.settings import RunSettings
 
-OBSERVED = ("state", "joint_target", "objects")
+OBSERVED = ("state", "joint_target", "objects", "contacts")
 PRESET = {
     "task": "lift",
     "observations": OBSERVED,
@@ -185,6 +185,14 @@ def test_what_is_held_stays(lifted) -> None:
     assert observation["success"].all()
 
 
+def test_the_fingers_feel_what_they_hold(lifted) -> None:
+    """Each pushes with its servo's stiffness times what it is stopped short of: 18.3 mm of 1000 N/m."""
+    _env, observation = lifted
+    expected = 1000.0 * observation["state"][:, 20:22]
+    assert (observation["contacts"] - expected).abs().max() < 1.0
+    assert (make(2).reset()["contacts"] == 0).all()
+
+
 def test_a_cube_rests_on_the_table_without_sinking_or_creeping() -> None:
     env = make(4)
     observation = env.reset()
@@ -310,7 +318,8 @@ def test_objects_start_apart_everywhere_anew() -> None:
         ({"gripper": False}, "task=lift needs the gripper"),
         ({"task": "reach", "scene": Scene(objects=(CUBE,)), "observations": ("state",)}, "set gripper=true"),
         ({"solver": "featherstone"}, "solver=mujoco"),
-        ({"task": "reach"}, "has no objects"),
+        ({"task": "reach", "observations": ("objects",)}, "has no objects"),
+        ({"task": "reach"}, "touches nothing"),
         ({"observations": ("goal_pixels", "state")}, "has no image of its goal"),
         ({"gripper_force": 100.0}, "gripper_force=100.0: must be from 1 to 70"),
         ({"home": (0.0, 1.0)}, "7 joint angles"),

@@ -22,6 +22,7 @@ feature                            shape, dtype        meaning
 ``joint_positions``                (7,) float32        [rad]; the first seven of the state
 ``tool_position``                  (3,) float32        [m]
 ``joint_target``                   (7,) float32        the servo's commanded angles [rad]
+``observation.contacts``           (2,) float32        force at each finger [N], if it was observed
 ``objects``                        (13 · K,) float32   of each object: position, quaternion, two velocities
 ``seed``                           (3,) int64          seed of the run, world, episode: what the episode's draws
                                                        depend on; the episode is −1 where it is not known
@@ -57,6 +58,7 @@ STATE, GOAL, ACTION = "observation.state", "observation.environment_state", "act
 REWARD, DONE, TERMINATED = "next.reward", "next.done", "next.terminated"
 TRUNCATED, SUCCESS = "next.truncated", "next.success"
 JOINTS, TOOL, TARGET, OBJECTS = "joint_positions", "tool_position", "joint_target", "objects"
+CONTACTS = "observation.contacts"
 SEED, EPISODE_KEY = "seed", "episode_key"
 
 AUTOMATIC = ("timestamp", "frame_index", "episode_index", "index", "task_index")
@@ -181,7 +183,7 @@ def schema_for(
     if keys is None:
         keys = [
             *(_image_keys(config)),
-            *(o for o in ("state", "joint_target", "objects") if o in config.observations),
+            *(o for o in ("state", "joint_target", "objects", "contacts") if o in config.observations),
             "goal",
         ]
     features: dict[str, dict[str, Any]] = {}
@@ -226,6 +228,8 @@ def schema_for(
     if "objects" in keys and config.surroundings:
         bodies = [body.name for body in config.surroundings.objects]
         observed(OBJECTS, "objects", [f"{body}.{name}" for body in bodies for name in _OBJECT_NAMES])
+    if "contacts" in keys:
+        observed(CONTACTS, "contacts", ["finger_1.force", "finger_2.force"])
     features[SEED] = {"dtype": "int64", "shape": (3,), "names": ["run", "world", "episode"]}
     features[EPISODE_KEY] = {"dtype": "int64", "shape": (1,), "names": ["episode_key"]}
     return Schema(

@@ -69,6 +69,7 @@ def place(
     rest_qd: wp.array2d[float],
     rest_control: wp.array2d[float],
     grip: wp.array[float],
+    contacts: wp.array2d[float],
     history: wp.array3d[float],
 ):
     """New episodes of the masked worlds: fingers open, objects at rest where nothing else stands.
@@ -82,6 +83,8 @@ def place(
         rest_q[world, f] = OPEN
         rest_control[world, f] = OPEN
     grip[world] = OPEN
+    for f in range(contacts.shape[1]):
+        contacts[world, f] = 0.0
     for j in range(rest_qd.shape[1]):
         rest_qd[world, j] = 0.0
     for k in range(history.shape[1]):
@@ -188,6 +191,7 @@ def restore(
     rest_qd: wp.array2d[float],
     rest_control: wp.array2d[float],
     grip: wp.array[float],
+    contacts: wp.array2d[float],
 ):
     """Puts fingers and objects of broken worlds back to their last finite observation, at rest."""
     world = wp.tid()
@@ -195,6 +199,8 @@ def restore(
         return
     for i in range(HAND, HAND_END):
         state[world, i] = last_state[world, i]
+    for f in range(contacts.shape[1]):
+        contacts[world, f] = 0.0
     joint_target[world, ARM] = last_target[world, ARM]
     grip[world] = last_target[world, ARM]
     for f in range(FINGERS):
@@ -207,6 +213,31 @@ def restore(
             rest_q[world, FINGERS + 7 * b + i] = last_objects[world, EACH * b + i]
     for j in range(rest_qd.shape[1]):
         rest_qd[world, j] = 0.0
+
+
+@wp.kernel(enable_backward=False)
+def add_forces(
+    count: wp.array[int],
+    worlds: wp.array[int],
+    geoms: wp.array[wp.vec2i],
+    rows: wp.array2d[int],
+    force: wp.array2d[float],
+    finger: wp.array[int],
+    contacts: wp.array2d[float],
+):
+    """Adds the normal force of each of MuJoCo's contacts to the finger that it is at. dim = contacts, at most."""
+    contact = wp.tid()
+    if contact >= count[0]:
+        return
+    row = rows[contact, 0]  # of elliptic cones the first row is the normal's
+    if row < 0 or row >= force.shape[1]:
+        return
+    for side in range(2):
+        geom = geoms[contact][side]
+        if geom >= 0:
+            f = finger[geom]
+            if f >= 0:
+                wp.atomic_add(contacts, worlds[contact], f, force[worlds[contact], row])
 
 
 @wp.kernel(enable_backward=False)

@@ -34,7 +34,9 @@ class Arrays[T]:
         state, joint_target, goal: The present observation, (N, S), (N, 7) [rad] with the fingers' set point [m]
             behind it where there is a gripper, (N, 3) [m].
         objects: (N, 13 · K) the same of the objects.
-        next_state, next_joint_target, next_goal, next_objects: What the last step led to, before any reset.
+        contacts: (N, 2) force of what each finger touches [N], along the contacts' normals; (N, 0) if not asked for.
+        next_state, next_joint_target, next_goal, next_objects, next_contacts: What the last step led to, before any
+            reset.
         true_state, next_true_state: (N, S) without observation noise; the same memory where there is none.
         reward, success: Of the last step, (N, 1) float and bool: what a task writes.
         terminated, truncated, done: Of the last step, (N, 1) bool.
@@ -73,10 +75,12 @@ class Arrays[T]:
     joint_target: T
     goal: T
     objects: T
+    contacts: T
     next_state: T
     next_joint_target: T
     next_goal: T
     next_objects: T
+    next_contacts: T
     true_state: T
     next_true_state: T
     reward: T
@@ -157,10 +161,12 @@ def allocate(
         joint_target=zeros(n, config.target_dim),
         goal=zeros(n, 3),
         objects=zeros(n, OBJECT_DIM * config.num_objects),
+        contacts=zeros(n, config.contact_dim),
         next_state=next_observed,
         next_joint_target=zeros(n, config.target_dim),
         next_goal=zeros(n, 3),
         next_objects=zeros(n, OBJECT_DIM * config.num_objects),
+        next_contacts=zeros(n, config.contact_dim),
         # Without noise what is seen is what is true: the same memory, and no launch between them.
         true_state=zeros(n, size) if noisy else observed,
         next_true_state=zeros(n, size) if noisy else next_observed,

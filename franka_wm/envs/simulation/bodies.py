@@ -158,6 +158,11 @@ class Bodies:
         self._articulations = sim.model.articulation_count // sim.num_envs
         self._mask = wp.zeros(sim.model.articulation_count, dtype=wp.bool, device=device)
         self._scene = scene
+        if config.contact_dim:
+            geoms = sim.solver.mjc_geom_to_newton_shape.numpy()[0]  # pyright: ignore[reportAttributeAccessIssue]
+            names = [sim.model.shape_label[shape] if shape >= 0 else "" for shape in geoms]
+            pads = [int(name[-1]) if name in ("pad0", "pad1") else -1 for name in names]
+            self._finger = wp.array(pads, dtype=int, device=device)
 
     def articulation_mask(self, mask: wp.array) -> wp.array:
         """A mask of worlds as Newton's forward kinematics takes it, which counts every object as well."""
@@ -180,10 +185,26 @@ class Bodies:
             data = self.sim.solver.mjw_data  # pyright: ignore[reportAttributeAccessIssue]
             self._launch(kernels.note_overflow, data.overflow, CAPACITY, self.sim.warp.overflow)
 
+    def launch_contacts(self) -> None:
+        """Forces at the fingers, of the last substep."""
+        w = self.sim.warp
+        if not self.sim.config.contact_dim:
+            return
+        data = self.sim.solver.mjw_data  # pyright: ignore[reportAttributeAccessIssue]
+        w.next_contacts.zero_()
+        c = data.contact
+        inputs = [data.nacon, c.worldid, c.geom, c.efc_address, data.efc.force, self._finger, w.next_contacts]
+        wp.launch(kernels.add_forces, data.naconmax, inputs, device=self.sim.device)
+
+    def launch_show_contacts(self) -> None:
+        """What was felt in the step is the present observation, until a reset."""
+        if self.sim.config.contact_dim:
+            wp.copy(self.sim.warp.contacts, self.sim.warp.next_contacts)
+
     def launch_place(self, mask: wp.array) -> None:
         """New places of the masked worlds' objects; their fingers are open."""
         w = self.sim.warp
-        outputs = [w.rest_q, w.rest_qd, w.rest_control, w.grip, w.history]
+        outputs = [w.rest_q, w.rest_qd, w.rest_control, w.grip, w.contacts, w.history]
         self._launch(kernels.place, mask, w.seed, w.episode, *self._places, *outputs)
 
     def launch_observe(self, state: wp.array, joint_target: wp.array, objects: wp.array) -> None:
@@ -202,7 +223,17 @@ class Bodies:
         w = self.sim.warp
         last = [w.true_state, w.joint_target, w.objects]
         after = [w.next_true_state, w.next_joint_target, w.next_objects]
-        self._launch(kernels.restore, w.broken, *last, *after, w.rest_q, w.rest_qd, w.rest_control, w.grip)
+        self._launch(
+            kernels.restore,
+            w.broken,
+            *last,
+            *after,
+            w.rest_q,
+            w.rest_qd,
+            w.rest_control,
+            w.grip,
+            w.next_contacts,
+        )
 
     def launch_cut_short(self) -> None:
         """Which worlds end before their time."""

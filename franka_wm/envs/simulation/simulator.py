@@ -206,6 +206,7 @@ class Simulation:
         self.task.advance(self)
         self._launch_observe(w.next_true_state, w.next_joint_target, w.next_goal, w.next_objects)
         if self.bodies:
+            self.bodies.launch_contacts()
             self.bodies.launch_mark_nonfinite()
         self._launch(
             observation.catch_nonfinite,
@@ -214,6 +215,7 @@ class Simulation:
         )  # fmt: skip
         if self.bodies:
             self.bodies.launch_restore()
+            self.bodies.launch_show_contacts()
             self.bodies.launch_cut_short()
         self.task.reward_and_success(self)
         self._launch(

@@ -34,7 +34,10 @@ def memory(sim: Simulation) -> dict[str, torch.Tensor]:
     """Everything that the future depends on but the seed, by name, each (N, …): not copies."""
     out = {name: getattr(sim.tensors, name) for name in MEMORY}
     if sim.bodies:
-        out |= {name: getattr(sim.tensors, name) for name in ("rest_q", "rest_qd", "rest_control", "grip")}
+        out |= {
+            name: getattr(sim.tensors, name)
+            for name in ("rest_q", "rest_qd", "rest_control", "grip", "contacts")
+        }
     out["body_qd"] = wp.to_torch(sim.newton_state.body_qd).view(sim.num_envs, -1, 6)
     out |= {f"solver_{name}": wp.to_torch(array) for name, array in solver_memory(sim).items() if array.size}
     if sim.task.num_draws:
