@@ -291,7 +291,7 @@ class FrankaConfig:
         self._check_choice("goal_sampling", ("fixed", "reachable"))
         self._check_choice("action_mode", tuple(ACTION_MODES))
         self._check_choice("task", TASKS)
-        self._check_choice("reward", ("dense", "sparse", "normalized"))
+        self._check_choice("reward", self.task_class.rewards)
         self._check_choice("auto_reset", ("native", "standard"))
         for name in (f.name for f in fields(self) if isinstance(f.default, bool) or f.name == "gripper"):
             if not isinstance(getattr(self, name), bool) and (name != "gripper" or self.gripper is not None):

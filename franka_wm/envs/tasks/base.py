@@ -33,6 +33,7 @@ class Task:
         scene: What stands around the arm, where the config does not say.
         home: Joint angles at the start [rad], where the config does not say; ``None``: the arm's.
         marker: What ``show_goal`` draws: a disc of this radius on the table [m]; ``None``: a ball at the goal.
+        rewards: What ``reward`` may be.
         words: The task in words, for datasets.
     """
 
@@ -41,6 +42,7 @@ class Task:
     scene: Scene | None = None
     home: tuple[float, ...] | None = None
     marker: float | None = None
+    rewards: tuple[str, ...] = ("dense", "sparse", "normalized")
     words = "Do what the reward asks for."
 
     def __init__(self, config: FrankaConfig):

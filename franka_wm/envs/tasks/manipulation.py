@@ -87,6 +87,7 @@ class GripperTask(Task):
 
     gripper = True
     home = READY
+    rewards = ("dense", "sparse")
 
     @property
     def reward_bounds(self) -> tuple[float, float]:
