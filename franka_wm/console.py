@@ -24,8 +24,13 @@ class _Copied:
         self._stream = stream
 
     def write(self, text: str) -> int:
-        if _log is not None:
-            _log.write(text)
+        global _log
+        try:
+            if _log is not None:
+                _log.write(text)
+        except OSError as error:  # a full disk: what a run says must not end it
+            _log = None
+            self._stream.write(f"warning: nothing more is copied into train.log: {error}\n")
         return self._stream.write(text)
 
     def __getattr__(self, name: str) -> Any:
@@ -47,7 +52,8 @@ def terminal_log() -> Iterator[None]:
         yield
     finally:
         sys.stdout, sys.stderr = streams
-        _log.close()
+        if _log is not None:
+            _log.close()
         _log = None
 
 

@@ -1,5 +1,7 @@
 """Errors that a user can mend. Entry points print them as one line, without a traceback."""
 
+import errno
+
 LONGEST, LONGEST_LINE = 1000, 2500
 """Characters of a word and of a message: what a user, or a stranger's file, holds may be of any length."""
 
@@ -26,3 +28,33 @@ class UserError(FrankaError, ValueError):
     The message says what is wrong, what is allowed, and what to do. Also a `ValueError`, so that code
     which uses the package as a library can catch it without knowing it.
     """
+
+
+_REFUSED = {
+    errno.ENOSPC: "the disk is full",
+    errno.EDQUOT: "the disk quota is used up",
+    errno.EFBIG: "a file may not become so large here",
+    errno.EROFS: "the disk is read-only",
+    errno.EACCES: "a file may not be written",
+    errno.EMFILE: "too many open files (ulimit -n)",
+    errno.ENFILE: "too many open files on this machine",
+    errno.ENOMEM: "out of memory",
+}
+_NO_MEMORY = ("can't allocate memory", "out of memory", "Failed to allocate")
+
+
+def machine_refused(error: BaseException) -> str | None:
+    """In one line, what the machine had no more of; `None` for any other error."""
+    reason = _REFUSED.get(error.errno or 0) if isinstance(error, OSError) else None
+    if isinstance(error, MemoryError) or (
+        isinstance(error, RuntimeError) and any(words in str(error) for words in _NO_MEMORY)
+    ):
+        reason = (
+            "out of memory; use fewer worlds (collector.num_envs, evaluation.episodes) or a smaller batch"
+        )
+    if reason is None:
+        return None
+    said = str(error).strip().splitlines()
+    return str(
+        FrankaError(f"{reason} ({said[0] if said else type(error).__name__}); what was saved before is whole")
+    )

@@ -5,6 +5,7 @@ from __future__ import annotations
 import functools
 import sys
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, NoReturn, TextIO
 
@@ -16,7 +17,7 @@ from omegaconf.errors import OmegaConfBaseException
 from franka_wm import conf
 from franka_wm.commands.overrides import compose, explain
 from franka_wm.console import say, terminal_log
-from franka_wm.errors import FrankaError
+from franka_wm.errors import FrankaError, machine_refused
 
 INTERRUPTED = 130
 """Exit status after Ctrl-C, as shells expect."""
@@ -29,8 +30,20 @@ def run_command(main: Callable[[], Any], arguments: list[str] | None = None) -> 
         main: Reads ``sys.argv``, as Hydra's are.
         arguments: After the program's name; the command line's if not given.
     """
-    with terminal_log():
+    with terminal_log(), one_line_refusals():
         _run(main, sys.argv[1:] if arguments is None else arguments)
+
+
+@contextmanager
+def one_line_refusals() -> Iterator[None]:
+    """What the machine has no more of (room on the disk, descriptors, memory) is one line, too."""
+    try:
+        yield
+    except (OSError, MemoryError, RuntimeError) as error:
+        refused = machine_refused(error)
+        if refused is None:
+            raise
+        fail(refused)
 
 
 def _run(main: Callable[[], Any], arguments: list[str]) -> None:
@@ -90,7 +103,8 @@ def one_line_errors(main: Callable[[DictConfig], Any]) -> Callable[[DictConfig],
     @functools.wraps(main)
     def wrapped(cfg: DictConfig) -> Any:
         try:
-            return main(cfg)
+            with one_line_refusals():
+                return main(cfg)
         except FrankaError as error:
             fail(str(error))
         except KeyboardInterrupt:

@@ -17,6 +17,7 @@ from typing import Any
 
 from torch import Tensor
 
+from franka_wm.console import say
 from franka_wm.errors import UserError
 
 FILES = ("csv", "tensorboard")
@@ -85,17 +86,26 @@ def make_loggers(names: Sequence[str], folder: str | Path, **options: Mapping[st
 def log_numbers(loggers: Iterable[Any], numbers: Mapping[str, float], *, step: int) -> None:
     """Log a row of numbers: one entry of a service's history, not one for each number.
 
+    Where a file cannot be written (a full disk), it says so and goes on: the weights are saved after the last row.
+
     Args:
         numbers: by name; a service shows ``a/b`` as b in the group a.
         step: updates made.
     """
     for logger in loggers:
-        if kind(logger) == "trackio":  # TorchRL would send one message for each number
-            logger.experiment.log(dict(numbers), step=step)
-        elif kind(logger) == "wandb":  # the run's own step: charts of all groups share it
-            logger.log_metrics(dict(numbers), step=step, override_global_step=True)
-        else:
-            logger.log_metrics(dict(numbers), step=step)
+        try:
+            _log_row(logger, dict(numbers), step)
+        except OSError as error:
+            say(f"  warning: {kind(logger)} cannot log the numbers of update {step}: {error}")
+
+
+def _log_row(logger: Any, numbers: dict[str, float], step: int) -> None:
+    if kind(logger) == "trackio":  # TorchRL would send one message for each number
+        logger.experiment.log(numbers, step=step)
+    elif kind(logger) == "wandb":  # the run's own step: charts of all groups share it
+        logger.log_metrics(numbers, step=step, override_global_step=True)
+    else:
+        logger.log_metrics(numbers, step=step)
 
 
 def log_config(loggers: Iterable[Any], config: Mapping[str, Any]) -> None:

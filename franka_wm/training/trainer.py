@@ -403,7 +403,10 @@ class Trainer:
             checkpoint.load_optimizer(self.learner.optimizer)
             self.learner.use_rates()
             self.learner.updates = int(checkpoint.counters["updates"])
-            self.env_steps, self.seconds = (checkpoint.counters[name] for name in ("env_steps", "seconds"))
+            self.env_steps, self.seconds = (
+                int(checkpoint.counters["env_steps"]),
+                checkpoint.counters["seconds"],
+            )
             extra = checkpoint.extra() or {}
             self.rows = list(extra.get("rows", []))
             experience = None if self.env is None else checkpoint.replay(self.env.device)
@@ -415,7 +418,6 @@ class Trainer:
             checkpoint.restore_rng()  # the last: whatever is built draws
 
     def _restore_moment(self, checkpoint: Checkpoint, moment: Mapping[str, Any]) -> None:
-        """Undoes :meth:`_moment`."""
         if self.env is None:
             for name, part in {"windows": self.replay, "validation": self.validation}.items():
                 if part is not None and name in moment and not part.set_state(moment[name]):

@@ -123,7 +123,7 @@ def export_replay(
             "ones; gather more first"
         )
     provenance = describe(policy=policy, seed=seed, config=settings)
-    with DatasetWriter(out, schema, provenance=provenance, workers=workers) as writer:
+    with DatasetWriter(out, schema, provenance=provenance, workers=workers, resumable=False) as writer:
         writer.add(episodes)
         return Exported(writer.finish(), len(episodes), sum(e.length for e in episodes), partial)
 

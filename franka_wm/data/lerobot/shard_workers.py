@@ -106,7 +106,7 @@ class Worker:
         self._process.wait()
         return UserError(
             f"a writing process ended (exit code {self._process.returncode}; {self.log} may say why); what is "
-            "finished is kept, go on with resume=true"
+            "finished is kept: collect goes on with resume=true"
         )
 
     def stop(self) -> None:
@@ -131,7 +131,9 @@ class InProcess:
 
 def _raise(problem: str | None) -> None:
     if problem is not None:
-        raise UserError(f"writing failed: {problem}; what is finished is kept, go on with resume=true")
+        raise UserError(
+            f"writing failed: {problem}; what is finished is kept: collect goes on with resume=true"
+        )
 
 
 def _do(kind: str, *job: Any) -> str | None:

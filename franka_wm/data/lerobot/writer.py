@@ -54,6 +54,7 @@ class DatasetWriter:
         workers: Writing processes; 0 writes in this one, which needs no time to start and gathers nothing meanwhile.
         shard_frames: Steps in a shard; by their size if not given. A kill loses the shards that are not finished.
         resume: Go on with what is in ``OUT.writing``, and add to ``OUT`` if it is there.
+        resumable: Whether whoever gathers it has ``resume``; an export does not, and is made again instead.
 
     Attributes:
         episodes, frames: Written or waiting to be, with those of earlier sessions.
@@ -72,6 +73,7 @@ class DatasetWriter:
         workers: int = 2,
         shard_frames: int | None = None,
         resume: bool = False,
+        resumable: bool = True,
     ):
         whole_rule(least=0).check("workers", workers)
         whole_rule(least=1, null="by their size").check("shard_frames", shard_frames)
@@ -84,6 +86,7 @@ class DatasetWriter:
         self._workers: list[Worker | InProcess] = []
         self._session = dict(provenance)
         self._number_of_workers = workers
+        self._resumable = resumable
         self._lock = None
         self._open(resume)
 
@@ -91,13 +94,13 @@ class DatasetWriter:
 
     def _open(self, resume: bool) -> None:
         if self.out.exists() and not resume:
-            raise UserError(f"out={self.out} exists; choose another folder, or add to it with resume=true")
+            more = ", or add to it with resume=true" if self._resumable else ""
+            raise UserError(f"out={self.out} exists; choose another folder{more}")
         if self.out.exists() and not (self.out / "meta" / "info.json").is_file():
             raise UserError(f"out={self.out} is not a LeRobot dataset; choose another folder")
         if self._shards() and not resume:
-            raise UserError(
-                f"{self.working} holds an unfinished dataset; go on with resume=true, or remove that folder"
-            )
+            more = "go on with resume=true, or " if self._resumable else ""
+            raise UserError(f"{self.working} holds an unfinished dataset; {more}remove {self.working}")
         try:
             (self.working / "shards").mkdir(parents=True, exist_ok=True)
             self._lock = lock_folder(self.working / "lock")

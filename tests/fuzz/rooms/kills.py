@@ -1,0 +1,143 @@
+"""A command in a fork that is killed at a chosen file operation, or runs where the machine refuses something.
+
+File operations are counted by Python's audit events: the product needs no hook for it.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import resource
+import signal
+import sys
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+CHANGES = (
+    "os.rename",
+    "os.mkdir",
+    "os.remove",
+    "os.rmdir",
+    "shutil.rmtree",
+    "os.link",
+    "os.symlink",
+    "os.truncate",
+)
+
+
+@dataclass(frozen=True)
+class Ended:
+    """How a command ended: exit status (negative: by a signal), what it printed, how many operations it made."""
+
+    status: int
+    said: str
+    operations: int
+
+
+def command(
+    work: Callable[[], Any],
+    folder: Path,
+    *,
+    kill_at: int | None = None,
+    limits: dict[int, int] | None = None,
+    seconds: float = 150.0,
+) -> Ended:
+    """Run a command line in a fork.
+
+    Args:
+        work: It; what it returns, or exits with, is the status.
+        folder: Operations below it count.
+        kill_at: Number of the operation at which it gets SIGKILL; `None`: none.
+        limits: Of resources (`resource.RLIMIT_…`).
+    """
+    said, counted = folder.parent / f"{folder.name}.said", folder.parent / f"{folder.name}.counted"
+    sys.stdout.flush()
+    child = os.fork()
+    if child == 0:
+        os.setpgid(0, 0)
+        status = 99
+        with contextlib.suppress(BaseException):
+            _redirect(said)
+            with counted.open("wb", buffering=0) as file:
+                sys.addaudithook(_counter(str(folder), kill_at, file.fileno()))
+                for which, most in (limits or {}).items():
+                    resource.setrlimit(which, (most, most))
+                status = _status(work)
+        os._exit(status)
+    with contextlib.suppress(OSError):
+        os.setpgid(child, child)
+    ends, ended = time.monotonic() + seconds, 0
+    while not ended and time.monotonic() < ends:
+        ended, status = os.waitpid(child, os.WNOHANG)
+        time.sleep(0.02)
+    with contextlib.suppress(ProcessLookupError):
+        os.killpg(child, signal.SIGKILL)
+    assert ended, f"more than {seconds:g} s\n{said.read_text()}"
+    return Ended(os.waitstatus_to_exitcode(status), said.read_text(), counted.stat().st_size)
+
+
+def _redirect(said: Path) -> None:
+    place = os.open(said, os.O_WRONLY | os.O_CREAT | os.O_TRUNC)
+    for stream in (1, 2):
+        os.dup2(place, stream)
+    sys.stdout, sys.stderr = (os.fdopen(k, "w", buffering=1, closefd=False) for k in (1, 2))
+
+
+def _counter(folder: str, kill_at: int | None, file: int) -> Callable[[str, tuple[Any, ...]], None]:
+    made = 0
+
+    def hook(event: str, given: tuple[Any, ...]) -> None:
+        nonlocal made
+        if event == "open":
+            _, mode, flags = given
+            if not ((isinstance(mode, str) and set(mode) & set("wax+")) or flags & (os.O_WRONLY | os.O_RDWR)):
+                return
+        elif event not in CHANGES:
+            return
+        if not str(given[0]).startswith(folder):
+            return
+        made += 1
+        os.write(file, b".")
+        if made == kill_at:
+            os.kill(os.getpid(), signal.SIGKILL)
+
+    return hook
+
+
+def _status(work: Callable[[], Any]) -> int:
+    import traceback
+
+    try:
+        found = work()
+    except SystemExit as error:
+        found = error.code
+    except BaseException:
+        traceback.print_exc()
+        return 98
+    sys.stdout.flush()
+    return found if isinstance(found, int) else 0
+
+
+def train(*words: str) -> Callable[[], Any]:
+    """`python train.py WORDS`."""
+
+    def run() -> None:
+        from franka_wm.commands.train import command as program
+
+        program(list(words))
+
+    return run
+
+
+def verb(*words: str) -> Callable[[], Any]:
+    """`franka-wm WORDS`."""
+
+    def run() -> int:
+        from franka_wm.commands.main import main
+
+        return main(list(words))
+
+    return run

@@ -1,0 +1,178 @@
+"""Kills at file operations, a full disk, no descriptors, no memory: nothing is lost, and the printed advice works.
+
+`FAULTS=all` kills at every operation instead of at some.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+import resource
+from pathlib import Path
+
+import pytest
+
+from rooms.checkpoint import RUN
+from rooms.kills import Ended, command, train, verb
+
+pytestmark = pytest.mark.slow
+
+KILLS = 3
+UPDATES = 8
+WORDS = [
+    *RUN,
+    f"trainer.updates={UPDATES}",
+    "trainer.checkpoint_every=0.001",
+    "trainer.updates_per_batch=4",
+    "evaluation.during=[]",
+    "evaluation.video_episodes=0",
+    "planner.num_samples=8",
+    "planner.num_policy_samples=2",
+    "planner.num_elites=2",
+    "planner.iterations=1",
+    "logger=files",
+]
+COLLECT = [
+    "env=reach",
+    "env.episode_length=6",
+    "env.substeps=2",
+    "env.image_size=16",
+    "device=cpu",
+    "scale=smoke",
+]
+
+
+@pytest.fixture(scope="module", autouse=True)
+def imported() -> None:
+    """Once, before the forks."""
+    import franka_wm.commands.collect
+    import franka_wm.commands.export
+    import franka_wm.commands.main
+    import franka_wm.commands.report
+    import franka_wm.commands.train
+    import franka_wm.data.lerobot.writer
+    import franka_wm.evaluation.protocol
+    import franka_wm.report.end_of_run
+    import franka_wm.report.page
+    import franka_wm.training.trainer  # noqa: F401
+
+
+def places(operations: int) -> list[int]:
+    """At which of them to kill."""
+    every = range(1, operations + 1)
+    if os.environ.get("FAULTS") == "all":
+        return list(every)
+    return sorted({*every[operations // (2 * KILLS) :: max(1, operations // KILLS)]})
+
+
+def in_one_line(ended: Ended) -> str:
+    """What it said was wrong; no traceback."""
+    assert "Traceback" not in ended.said, ended.said
+    assert ended.status == 1, ended
+    (line,) = [line for line in ended.said.splitlines() if line.startswith("error: ")]
+    return line
+
+
+def whole(ended: Ended) -> Ended:
+    assert ended.status == 0, ended.said
+    assert "Traceback" not in ended.said
+    return ended
+
+
+def test_a_killed_run_goes_on_from_its_last_checkpoint(tmp_path: Path) -> None:
+    from franka_wm.errors import UserError
+    from franka_wm.training.checkpoint import latest_checkpoint, load_checkpoint
+
+    once = whole(command(train(*WORDS, f"hydra.run.dir={tmp_path}/once"), tmp_path / "once"))
+    went_on = 0
+    for at in places(once.operations):
+        run = tmp_path / f"killed{at}"
+        words = [*WORDS, f"hydra.run.dir={run}"]
+        assert command(train(*words), run, kill_at=at).status in (-9, 0), at
+        try:
+            saved = load_checkpoint(latest_checkpoint(run))
+        except UserError:
+            saved = None
+        if saved is None:
+            whole(command(train(*words), run))
+        else:
+            went_on += 1
+            again = whole(command(train(f"resume={run}", f"hydra.run.dir={run}"), run))
+            assert "results:" in again.said
+        assert load_checkpoint(latest_checkpoint(run)).counters["updates"] == UPDATES
+    assert went_on
+
+
+def test_a_killed_collection_goes_on_as_it_says(tmp_path: Path) -> None:
+    from franka_wm.data.lerobot.source import read_source
+
+    def words(out: Path) -> list[str]:
+        return ["collect", f"out={out}", "episodes=6", "num_envs=2", "workers=1", "shard_frames=12", *COLLECT]
+
+    once = whole(command(verb(*words(tmp_path / "once")), tmp_path / "once"))
+    for at in places(once.operations):
+        out = tmp_path / f"killed{at}"
+        ended = command(verb(*words(out)), out, kill_at=at)
+        assert ended.status in (-9, 0), ended
+        again = command(verb(*words(out)), out)
+        if again.status:
+            assert "resume=true" in in_one_line(again)
+            whole(command(verb(*words(out), "resume=true"), out))
+        assert len(read_source(out).lengths) == 6
+
+
+def test_a_killed_export_and_report_are_repeated_as_they_say(tmp_path: Path) -> None:
+    from franka_wm.data.lerobot.source import read_source
+
+    run = tmp_path / "run"
+    whole(command(train(*WORDS, f"hydra.run.dir={run}"), run))
+
+    def words(out: Path) -> list[str]:
+        return ["export", f"source={run}", f"out={out}", "workers=1"]
+
+    once = whole(command(verb(*words(tmp_path / "once")), tmp_path / "once"))
+    for at in places(once.operations):
+        out = tmp_path / f"killed{at}"
+        command(verb(*words(out)), out, kill_at=at)
+        again = command(verb(*words(out)), out)
+        if again.status:
+            line = in_one_line(again)
+            assert "resume=true" not in line, f"an export has no such option: {line}"
+            (named,) = re.findall(r"remove (\S+?)[;,.]?(?:\s|$)", line)
+            assert Path(named).is_relative_to(tmp_path)
+            __import__("shutil").rmtree(named)
+            whole(command(verb(*words(out)), out))
+        assert len(read_source(out).lengths) == len(read_source(tmp_path / "once").lengths)
+    page = command(verb("report", str(run)), run)
+    for at in places(page.operations):
+        (run / "report.html").unlink(missing_ok=True)
+        command(verb("report", str(run)), run, kill_at=at)
+        whole(command(verb("report", str(run)), run))
+        assert (run / "report.html").read_text().rstrip().endswith("</html>")
+
+
+@pytest.mark.parametrize(
+    ("limits", "words"),
+    [
+        ({resource.RLIMIT_FSIZE: 200_000}, "so large|No space|too large"),
+        ({resource.RLIMIT_NOFILE: 12}, "open files"),
+    ],
+    ids=["files of 200 kB", "12 descriptors"],
+)
+def test_what_the_machine_refuses_is_one_line(limits: dict[int, int], words: str, tmp_path: Path) -> None:
+    run = tmp_path / "run"
+    ended = command(train(*WORDS, f"hydra.run.dir={run}"), run, limits=limits)
+    line = in_one_line(ended)
+    assert re.search(words, line), line
+
+
+def test_a_disk_that_fills_up_keeps_the_last_checkpoint(tmp_path: Path) -> None:
+    from franka_wm.training.checkpoint import latest_checkpoint, load_checkpoint
+
+    run = tmp_path / "run"
+    whole(command(train(*WORDS, f"hydra.run.dir={run}"), run))
+    size = max(path.stat().st_size for path in (run / "checkpoints" / "latest").iterdir())
+    more = [f"resume={run}", f"hydra.run.dir={run}", f"trainer.updates={2 * UPDATES}"]
+    in_one_line(command(train(*more), run, limits={resource.RLIMIT_FSIZE: size // 2}))
+    assert load_checkpoint(latest_checkpoint(run)).counters["updates"] == UPDATES
+    whole(command(train(*more), run))
