@@ -145,14 +145,18 @@ def _simple(
             f"collect: env.kind={cfg.env.kind!r}: datasets are gathered from the arm (env=reach, …)"
         )
     values: Any = OmegaConf.to_container(cfg.env, resolve=True)
+    del values["kind"]
+    urdf_path = values.pop("urdf_path")
+    if name == "expert" and FrankaConfig.from_mapping(values).task_class.expert is None:
+        raise UserError(
+            f"collect: policy=expert: task={values['task']} has none; env=lift has one, for example"
+        )
     needed = ("state", "joint_target", *(["objects"] if name == "expert" else []))
     added = [key for key in needed if key not in values["observations"]]
     if added:
         what = "a dataset always has" if "objects" not in added else "the expert and a dataset need"
         say(f"env.observations: adding {' and '.join(added)}, which {what}")
     values["observations"] = [*values["observations"], *added]
-    del values["kind"]
-    urdf_path = values.pop("urdf_path")
     config = FrankaConfig.from_mapping(values)
     schema_for(config, format=format)  # refuses what cannot be stored before anything is built
     with announced(f"building {worlds} worlds; a machine's first start compiles kernels for a minute or two"):

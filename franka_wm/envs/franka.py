@@ -48,7 +48,7 @@ def own_seed() -> int:
 
 
 class FrankaEnv(EnvBase):
-    """N simulated Franka arms that reach, as a TorchRL environment; everything stays on ``device``.
+    """N simulated Franka arms and their task, as a TorchRL environment; everything stays on ``device``.
 
     The leading dimension is always N, also for N = 1:
 
@@ -59,13 +59,13 @@ class FrankaEnv(EnvBase):
     ``state``           (N, 20) float32         joints 7 [rad], velocities 7 [rad/s], tool 3 [m], tool − goal 3 [m];
                                                 with a gripper 28: fingers 2 [m], their speeds 2, tool's x y z w
     ``objects``         (N, 13 · K) float32     of each: position, x y z w, velocity, angular velocity; if asked for
-    ``joint_target``    (N, 7) float32          the servo's commanded angles [rad]; present when asked for
-    ``goal``            (N, 3) float32          reach target in the world [m]
-    ``success``         (N, 1) bool             tool within ``success_distance`` of the goal
+    ``joint_target``    (N, 7) float32          the servo's commanded angles [rad]; with a gripper 8: its opening [m]
+    ``goal``            (N, 3) float32          where the tool, or the task's object, shall be [m]
+    ``success``         (N, 1) bool             as the task says: of reach, tool within ``success_distance``
     ``is_init``         (N, 1) bool             first observation of an episode
     ``action``          (N, 7) float32          in [−1, 1]: change of the joint targets, × ``action_scale``; an eighth
                                                 is the gripper's: −1 closed, 1 open
-    ``reward``          (N, 1) float32          −tanh(distance) − penalty · mean(action²)
+    ``reward``          (N, 1) float32          the task's: of reach, −tanh(distance) − penalty · mean(action²)
     ``done``, …         (N, 1) bool             ``terminated`` by success (if asked), ``truncated`` by time
     ==================  ======================  ==================================================================
 
@@ -367,7 +367,7 @@ class FrankaEnv(EnvBase):
         return self.simulation.tensors.body_q[..., :3].clone()
 
     def state_observation(self) -> torch.Tensor:
-        """(N, 20), as under the key ``state``."""
+        """(N, 20), with a gripper (N, 28), as under the key ``state``."""
         return self.simulation.tensors.state.clone()
 
     def goal_distance(self) -> torch.Tensor:
@@ -375,7 +375,7 @@ class FrankaEnv(EnvBase):
         return goal_distance(self.simulation.tensors.state)
 
     def reward(self, action: torch.Tensor) -> torch.Tensor:
-        """Reward of having applied ``action`` (N, 7) and being in the present state, (N, 1).
+        """Reward of having applied ``action`` (N, `action_dim`) and being in the present state, (N, 1).
 
         Raises:
             UserError: A task of one's own has its reward in a kernel: read it from a step.

@@ -104,6 +104,11 @@ class OraclePolicy(ScriptedPolicy):
 
     def __init__(self, kinematics: Kinematics, config: FrankaConfig):
         super().__init__()
+        if config.has_gripper:
+            raise UserError(
+                f"policy=ik: brings the tool to the goal and knows no gripper, which task={config.task} has; use "
+                "policy=expert"
+            )
         self.kinematics = kinematics
         self.config = config
 

@@ -9,7 +9,7 @@ import pytest
 import torch
 from tensordict import TensorDict
 
-from franka_wm.envs import FrankaEnv
+from franka_wm.envs import FrankaConfig, FrankaEnv
 from franka_wm.errors import UserError
 from franka_wm.policies.scripted import DiscretePolicy, NoopPolicy, OraclePolicy, SmoothRandomPolicy
 from franka_wm.training import build
@@ -116,4 +116,9 @@ def test_the_oracle_with_moves_to_poses_takes_the_best(moving) -> None:
 
 def test_oracle_needs_the_targets() -> None:
     with pytest.raises(UserError, match="joint_target"):
-        OraclePolicy(None, 0.25)(TensorDict({"goal": torch.zeros(1, 3)}, batch_size=[1]))  # type: ignore[arg-type]
+        OraclePolicy(None, FrankaConfig())(TensorDict({"goal": torch.zeros(1, 3)}, batch_size=[1]))  # type: ignore[arg-type]
+
+
+def test_inverse_kinematics_of_the_tool_alone_refuses_a_gripper() -> None:
+    with pytest.raises(UserError, match="task=lift has; use policy=expert"):
+        OraclePolicy(None, FrankaConfig(task="lift"))  # type: ignore[arg-type]

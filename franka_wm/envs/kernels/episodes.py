@@ -31,8 +31,8 @@ def end_step(
 ):
     """Ends episodes and keeps their statistics.
 
-    A broken world is truncated, not terminated: all rewards are negative, so an end worth 0 would pay an
-    agent for breaking the simulation. So is a world that is ``cut`` short: what comes then has no reward of its own,
+    A broken world is truncated, not terminated: where rewards are negative, as reach's are, an end worth 0 would
+    pay an agent for breaking the simulation. So is a world that is ``cut`` short: what comes then has no reward of its own,
     but is not worth 0 either. A world that is stepped on after its end, without a reset, stays done by
     time or success, and is not counted again.
     """

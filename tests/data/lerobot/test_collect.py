@@ -164,6 +164,7 @@ def test_ctrl_c_leaves_a_dataset(tmp_path, load) -> None:
         (["out=x", "policy=.", "env.goal=[1"], "is not a value as in YAML"),
         (["out=x", "env.fps=29.97"], "whole frames"),
         (["out=x", "env.observations=[depth]"], "depth has no place"),
+        (["out=x", "policy=expert"], "policy=expert: task=reach has none; env=lift has one"),
         (["out=x", "rubbish"], "'rubbish' is not name=value"),
     ],
 )
