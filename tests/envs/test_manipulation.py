@@ -234,6 +234,8 @@ def test_a_masked_reset_leaves_other_worlds_alone() -> None:
     for key in OBSERVED:
         assert torch.equal(again[key][[0, 2]], observation[key][[0, 2]]), key
     assert not torch.equal(again["objects"][1], observation["objects"][1])
+    tool = env.kinematics.forward(again["state"][:, :7])  # its links moved with its joints
+    assert torch.allclose(tool, again["state"][:, 14:17], atol=1e-4)
     assert again["state"][1, 20] == pytest.approx(MOST_OPEN)
 
 
