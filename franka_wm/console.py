@@ -33,6 +33,12 @@ class _Copied:
             self._stream.write(f"warning: nothing more is copied into train.log: {error}\n")
         return self._stream.write(text)
 
+    def __eq__(self, other: object) -> bool:
+        """Equal to the stream itself: libraries ask whether theirs is ``sys.stderr`` before they close it."""
+        return other is self or other is self._stream
+
+    __hash__ = object.__hash__
+
     def __getattr__(self, name: str) -> Any:
         return getattr(self._stream, name)
 

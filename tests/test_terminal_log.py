@@ -1,0 +1,30 @@
+"""What Python prints, copied into a run's log."""
+
+from __future__ import annotations
+
+import io
+import sys
+from pathlib import Path
+
+import pytest
+
+from franka_wm.console import log_to, terminal_log
+
+
+def test_what_is_printed_before_and_after_there_is_a_file(tmp_path: Path, capsys) -> None:
+    with terminal_log():
+        print("before")
+        log_to(tmp_path / "train.log")
+        print("after", file=sys.stderr)
+    print("outside")
+    assert (tmp_path / "train.log").read_text() == "before\nafter\n"
+    assert capsys.readouterr() == ("before\noutside\n", "after\n")
+
+
+def test_a_library_that_asks_first_does_not_close_the_terminal(monkeypatch: pytest.MonkeyPatch) -> None:
+    """absl's log handler, when Hydra configures logging: it closes its stream unless that is ``sys.stderr``."""
+    stream = io.StringIO()
+    monkeypatch.setattr(sys, "stderr", stream)
+    with terminal_log():
+        assert sys.stderr is not stream and stream in (sys.stderr, sys.stdout)
+        assert io.StringIO() not in (sys.stderr, sys.stdout)
