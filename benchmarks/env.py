@@ -4,13 +4,15 @@
     python benchmarks/env.py --worlds 4096 16384 --cases state pixels --out env.json
 
 *raw Newton* is physics (and rendering) alone in one graph, without task, reset or TorchRL: the ceiling.
-Worlds are diverged: each is at another point of its episode, so that resets happen in every step.
+Worlds are diverged in all three: each is at another point of its episode, so that resets happen in every step. Where
+there is something to touch they play an episode of the expert's, over and over.
 """
 
 from __future__ import annotations
 
 import argparse
 import time
+from collections.abc import Callable
 from dataclasses import replace
 
 import torch
@@ -22,6 +24,8 @@ from torchrl.collectors import Collector
 from franka_wm.device import resolve_device
 from franka_wm.envs import FrankaConfig, FrankaEnv
 from franka_wm.envs.simulation import Simulation
+from franka_wm.envs.tasks import task_class
+from franka_wm.policies.expert import ExpertPolicy
 
 PRESET = FrankaConfig(
     observations=("state", "joint_target"),
@@ -31,32 +35,92 @@ PRESET = FrankaConfig(
     action_scale=0.085,
     substeps=4,
 )
+
+
+def manipulation(task: str, *more: str, steps: int = 60) -> FrankaConfig:
+    """A task with contacts, in which every episode begins alike: so one episode of the expert fits all of them."""
+    scene = task_class(task).scene
+    assert scene is not None
+    still = {"spread": (0.0, 0.0), "turn": 0.0}
+    apart = len({one.at for one in scene.objects}) == len(scene.objects)
+    objects = [
+        replace(one, at=one.at if apart else (0.5, 0.15 * k), **still) for k, one in enumerate(scene.objects)
+    ]
+    articulated = tuple(replace(one, **still) for one in scene.articulated)
+    return replace(
+        PRESET,
+        task=task,
+        scene=replace(scene, objects=tuple(objects), articulated=articulated),
+        observations=(*more, "state", "joint_target", "objects"),
+        episode_length=steps,
+        pose_noise=0.0,
+        solver_ls_iterations=20,
+    )
+
+
 CASES = {
     "state": PRESET,
     "pixels": replace(PRESET, observations=("pixels", "state", "joint_target")),
     "meshes": replace(PRESET, observations=("pixels", "state", "joint_target"), robot="panda_meshes"),
+    "lift": manipulation("lift"),
+    "lift pixels": manipulation("lift", "pixels"),
+    "stack": manipulation("stack", steps=120),
+    "drawer": manipulation("drawer", steps=90),
+    "peg": manipulation("peg", steps=150),
     "pixels 128": replace(PRESET, observations=("pixels", "state", "joint_target"), image_size=128),
 }
 
 
-class RandomPolicy(TensorDictModuleBase):
-    """Uniform actions, drawn on the device."""
+Actions = Callable[[Simulation], torch.Tensor]
+"""What all worlds do next, (N, A), drawn or looked up on the device."""
+
+
+def uniform(sim: Simulation) -> torch.Tensor:
+    # A repeated action would drive the arms into their limits, a rare and slow case.
+    return torch.rand_like(sim.tensors.action) * 2 - 1
+
+
+def experts(config: FrankaConfig, device: str) -> Actions:
+    """An episode of the expert's, looked up by the step at which each world is."""
+    env = FrankaEnv(config, num_envs=2, device=device)
+    policy, now, actions = ExpertPolicy(env.simulation.task, env.kinematics, config), env.reset(), []
+    for _ in range(config.episode_length):
+        now = policy(now)
+        actions.append(now["action"][0].clone())
+        step, now = env.step_and_maybe_reset(now)
+    if not step["next", "success"].all():
+        raise RuntimeError(f"the expert did not succeed at {config.task}")
+    table = torch.stack(actions)
+    return lambda sim: table[sim.tensors.step_count.view(-1).long()]
+
+
+class Playing(TensorDictModuleBase):
+    """Actions as a policy."""
 
     in_keys = ["is_init"]
     out_keys = ["action"]
 
+    def __init__(self, sim: Simulation, actions: Actions):
+        super().__init__()
+        self.sim, self.actions = sim, actions
+
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        is_init = tensordict.get("is_init")
-        return tensordict.set("action", torch.rand(is_init.shape[0], 7, device=is_init.device) * 2 - 1)
+        return tensordict.set("action", self.actions(self.sim))
 
 
-def raw_newton(config: FrankaConfig, worlds: int, device: str, seconds: float) -> float:
-    """Physics, and refit and rendering where there are pictures, from diverged poses."""
+def diverge(sim: Simulation, actions: Actions) -> None:
+    """Brings each world to another point of its episode."""
+    sim.tensors.step_count.random_(0, sim.config.episode_length)
+    for _ in range(sim.config.episode_length):
+        sim.tensors.action.copy_(actions(sim))
+        sim.step()
+
+
+def raw_newton(config: FrankaConfig, worlds: int, device: str, seconds: float, actions: Actions) -> float:
+    """Physics, and refit and rendering where there are images, from diverged poses."""
     sim = Simulation(config, worlds, device)
     sim.reset()
-    for _ in range(25):
-        sim.tensors.action.uniform_(-1, 1)
-        sim.step()
+    diverge(sim, actions)
 
     def launches() -> None:
         sim.launch_physics()
@@ -68,22 +132,20 @@ def raw_newton(config: FrankaConfig, worlds: int, device: str, seconds: float) -
     return worlds * rate(lambda: sim.recorder.replay(graph), seconds=seconds)
 
 
-def captured_step(env: FrankaEnv, seconds: float) -> float:
+def captured_step(env: FrankaEnv, seconds: float, actions: Actions) -> float:
     sim = env.simulation
 
     def step() -> None:
-        sim.tensors.action.uniform_(
-            -1, 1
-        )  # a repeated action would drive the arms into their limits, a rare and slow case
+        sim.tensors.action.copy_(actions(sim))
         sim.step()
 
     return env.num_envs * rate(step, seconds=seconds)
 
 
-def collector(env: FrankaEnv, steps: int, seconds: float) -> float:
+def collector(env: FrankaEnv, steps: int, seconds: float, actions: Actions) -> float:
     gather = Collector(
         env,
-        RandomPolicy(),
+        Playing(env.simulation, actions),
         frames_per_batch=env.num_envs * steps,
         total_frames=-1,
         track_traj_ids=False,
@@ -91,6 +153,9 @@ def collector(env: FrankaEnv, steps: int, seconds: float) -> float:
         trust_policy=True,
     )
     experience = iter(gather)
+    next(experience)  # it begins with a reset of all worlds
+    diverge(env.simulation, actions)
+    env.statistics()
     result = env.num_envs * steps * rate(lambda: next(experience), seconds=seconds, warmup=2)
     gather.shutdown()
     return result
@@ -107,12 +172,13 @@ def measure(name: str, worlds: int, device: str, seconds: float) -> dict:
     env.step_and_maybe_reset(env.rand_action(env.reset()))
     startup = time.perf_counter() - started
     memory = (free - torch.cuda.mem_get_info()[0]) / worlds / 2**10 if on_gpu else float("nan")
-    env.simulation.tensors.step_count.random_(0, config.episode_length)
-    step = captured_step(env, seconds)
-    through = collector(env, 16 if on_gpu else 8, seconds)
-    broken = env.statistics()["nonfinite"]
+    actions = experts(config, device) if config.has_gripper else uniform
+    diverge(env.simulation, actions)
+    step = captured_step(env, seconds, actions)
+    through = collector(env, 16 if on_gpu else 8, seconds, actions)
+    seen = env.statistics()
     del env
-    raw = raw_newton(config, worlds, device, seconds)
+    raw = raw_newton(config, worlds, device, seconds, actions)
     return {
         "case": name,
         "worlds": worlds,
@@ -122,7 +188,8 @@ def measure(name: str, worlds: int, device: str, seconds: float) -> dict:
         "Collector / raw": through / raw,
         "start [s]": startup,
         "memory [KiB/world]": memory,
-        "broken worlds": int(broken),
+        "broken worlds": int(seen["nonfinite"]),
+        "success [%]": 100 * seen["success"] if config.has_gripper else float("nan"),
     }
 
 

@@ -4,7 +4,7 @@
     python benchmarks/lerobot.py --part reading …         see lerobot_reading.py
     python benchmarks/lerobot.py --episodes 100 --length 60 --formats exact
 
-Pictures are rendered by the environment: noise or a constant would compress like nothing that is recorded. Writing
+Images are rendered by the environment: noise or a constant would compress like nothing that is recorded. Writing
 counts from the first episode to the finished dataset, the merge and the check of decoded frames included; the start
 of the writing processes, which a collection hides, is in a column of its own.
 """
@@ -162,7 +162,7 @@ def main() -> None:
     parser.add_argument("--part", choices=["writing", "reading"], default="writing")
     parser.add_argument("--episodes", type=int, default=64)
     parser.add_argument("--length", type=int, default=60)
-    parser.add_argument("--size", type=int, default=64, help="side of the pictures [px]")
+    parser.add_argument("--size", type=int, default=64, help="side of the images [px]")
     parser.add_argument("--formats", nargs="+", choices=list(FORMATS), default=list(FORMATS))
     parser.add_argument("--out", help="write the numbers as JSON")
     arguments, rest = parser.parse_known_args()

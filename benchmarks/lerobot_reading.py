@@ -2,8 +2,8 @@
 
 python benchmarks/lerobot_reading.py [--episodes 40] [--window 8] [--batch-size 64] [--out results.json]
 
-The dataset is recorded with the arm: 64 × 64 pictures (exact), state, action. All readers give windows of H
-transitions, H + 1 pictures each; LeRobot's ``__getitem__`` with ``delta_timestamps``, one by one in random order.
+The dataset is recorded with the arm: 64 × 64 images (exact), state, action. All readers give windows of H
+transitions, H + 1 images each; LeRobot's ``__getitem__`` with ``delta_timestamps``, one by one in random order.
 """
 
 from __future__ import annotations

@@ -30,7 +30,7 @@ def main() -> None:
     )
     parser.add_argument("--steps", type=int, default=100_000)
     parser.add_argument("--worlds", type=int, default=64)
-    parser.add_argument("--pixels", action="store_true", help="with 64×64 pictures")
+    parser.add_argument("--pixels", action="store_true", help="with 64×64 images")
     parser.add_argument("--device", default="auto")
     parser.add_argument("--out", help="JSON file")
     args = parser.parse_args()

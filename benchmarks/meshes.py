@@ -1,4 +1,4 @@
-"""What thinning out a robot's meshes costs in pictures: triangles, and the difference from drawing them all.
+"""What thinning out a robot's meshes costs in images: triangles, and the difference from drawing them all.
 
 python benchmarks/meshes.py                  64 x 64, 16 worlds in diverged poses; needs the extra [meshes]
 """
@@ -17,7 +17,7 @@ DETAILS = [0.004, 0.008, 0.012, 0.016, 0.02, 0.03]
 
 
 def seen(detail: float, size: int) -> tuple[int, torch.Tensor]:
-    """Triangles of one robot, and its pictures (worlds, size, size, 3)."""
+    """Triangles of one robot, and its images (worlds, size, size, 3)."""
     config = FrankaConfig(robot="panda_meshes", mesh_detail=detail, image_size=size, observations=("pixels",))
     env = FrankaEnv(config, num_envs=16, device="cpu")
     meshes = {id(mesh): mesh for mesh in env.model.shape_source if hasattr(mesh, "indices")}

@@ -2,7 +2,7 @@
 
     python benchmarks/planners.py                          each with its numbers at scale=gpu
     python benchmarks/planners.py --planners mppi cem --sizes laptop --envs 1 16
-    python benchmarks/planners.py --sizes lewm --planners cem           to a goal picture
+    python benchmarks/planners.py --sizes lewm --planners cem           to a goal image
 
 The control rate is how many decisions per second each arm gets, if all are planned for in one call. On CUDA every
 decision is timed twice: with each operation launched from Python, and as one captured graph, which is what runs do.

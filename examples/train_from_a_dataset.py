@@ -24,7 +24,7 @@ source = {"root": where} if Path(where).is_dir() else {"repo_id": where}
 windows = open_dataset(**source, window=3, batch_size=64, device=device)
 validation = windows.validation()
 print(
-    f"vectors {dict(windows.observation_sizes)}, pictures {dict(windows.image_sizes)}, actions {windows.action_dim}"
+    f"vectors {dict(windows.observation_sizes)}, images {dict(windows.image_sizes)}, actions {windows.action_dim}"
 )
 
 model = models.make(

@@ -9,7 +9,7 @@ from torchrl.data import LazyTensorStorage, ReplayBuffer
 from torchrl.envs.utils import check_env_specs
 
 from franka_wm.envs import FrankaConfig, FrankaEnv
-from franka_wm.policies.scripted import OraclePolicy
+from franka_wm.policies.scripted import IKPolicy
 
 config = FrankaConfig(
     observations=("pixels", "state", "joint_target"),
@@ -23,8 +23,8 @@ env = FrankaEnv(config, num_envs=16, seed=0)  # on the GPU if there is one
 check_env_specs(env)
 
 # One episode of every world, by inverse kinematics.
-oracle = OraclePolicy(env.kinematics, config)
-episode = env.rollout(config.episode_length, oracle, break_when_any_done=False)
+policy = IKPolicy(env.kinematics, config)
+episode = env.rollout(config.episode_length, policy, break_when_any_done=False)
 final = episode["next", "state"][:, -1, 17:20].norm(dim=-1)
 print(f"distance to the goal after {config.episode_length} steps: {100 * final.mean():.2f} cm")
 

@@ -17,7 +17,7 @@ def resolve_device(device: torch.device | str | None) -> torch.device:
         device = "cuda" if torch.cuda.is_available() else "cpu"
     try:
         device = torch.device(device)
-    except (RuntimeError, TypeError) as error:
+    except (RuntimeError, TypeError, ValueError) as error:
         raise UserError(f"device={device!r}: must be auto, cpu, cuda or cuda:K") from error
     if device.type == "cuda":
         index = 0 if device.index is None else device.index

@@ -73,7 +73,8 @@ POSITIVE = Bounds(least=1, most=10**6)
 DEPTH = Bounds(least=1, most=1000)
 """Layers of a network."""
 FRACTION = Bounds(least=0, most=1)
-COEFFICIENT = Bounds(least=0)
+COEFFICIENT = Bounds(least=0, most=1e6)
+"""Weights of losses, temperatures and the like."""
 
 
 LARGEST = 3e38
@@ -86,8 +87,10 @@ def is_whole(value: Any) -> TypeGuard[int]:
 
 
 def is_real(value: Any) -> TypeGuard[float]:
-    """Whether it is a finite number; true and false are none."""
-    return isinstance(value, Real) and not isinstance(value, bool) and -LARGEST <= value <= LARGEST  # type: ignore[operator]
+    """Whether it is a finite number; true and false are none. torch takes no whole number beyond 64 bits."""
+    if isinstance(value, Integral):
+        return is_whole(value)
+    return isinstance(value, Real) and -LARGEST <= value <= LARGEST  # type: ignore[operator]
 
 
 def whole_rule(
@@ -98,6 +101,11 @@ def whole_rule(
     wanted += "" if most is None else f" and of at most {most}"
     end = 2**63 - 1 if most is None else most
     return Rule(lambda x: is_whole(x) and least <= x <= end and not (even and x % 2), wanted, null)
+
+
+def check_whole(option: str, value: Any, *, least: int = 1, **rule: Any) -> None:
+    """Raises a ``UserError`` unless the value fits :func:`whole_rule`."""
+    whole_rule(least=least, **rule).check(option, value)
 
 
 def whole(default: Any = MISSING, **rule: Any) -> Any:

@@ -1,4 +1,4 @@
-"""Frames into files: video, animated picture, still. Frames are uint8 RGB, as the camera gives them."""
+"""Frames into files: video, animated image, still. Frames are uint8 RGB, as the camera gives them."""
 
 import math
 from collections.abc import Sequence
@@ -42,8 +42,8 @@ def write_video(frames: Tensor, path: str | Path, fps: int) -> Path:
         stream = container.add_stream("libx264", rate=fps, options={"crf": "18"})
         stream.width, stream.height, stream.pix_fmt = width, height, "yuv420p"
         for frame in frames:  # one at a time: a long video need not fit into host memory twice
-            picture = av.VideoFrame.from_ndarray(frame.contiguous().cpu().numpy(), format="rgb24")
-            container.mux(stream.encode(picture))
+            image = av.VideoFrame.from_ndarray(frame.contiguous().cpu().numpy(), format="rgb24")
+            container.mux(stream.encode(image))
         container.mux(stream.encode())
     return path
 
@@ -73,7 +73,7 @@ def write_gif(frames: Tensor, path: str | Path, fps: int) -> Path:
 
 
 def write_png(frame: Tensor, path: str | Path) -> Path:
-    """Write one picture.
+    """Write one image.
 
     Args:
         frame: (H, W, 3) uint8.
@@ -121,7 +121,7 @@ def tile_frames(frames: Tensor, columns: int | None = None) -> Tensor:
 
 
 def draw_labels(frames: Tensor, texts: Sequence[str]) -> Tensor:
-    """Write one line on a dark band at the top of every world's pictures; lines shrink until the longest fits.
+    """Write one line on a dark band at the top of every world's images; lines shrink until the longest fits.
 
     Args:
         frames: (T, N, H, W, 3) uint8.
@@ -149,7 +149,7 @@ def draw_labels(frames: Tensor, texts: Sequence[str]) -> Tensor:
 def draw_marker(
     frames: Tensor, centres: Tensor, *, radius: float, colour: tuple[int, int, int] = (230, 75, 40)
 ) -> Tensor:
-    """Draw a ring around one point of every picture.
+    """Draw a ring around one point of every image.
 
     Args:
         frames: (N, H, W, 3) uint8.

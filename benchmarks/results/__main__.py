@@ -15,6 +15,9 @@ from franka_wm.errors import FrankaError
 from franka_wm.files import atomic_write
 from franka_wm.source import ROOT
 
+SHOWN = 3
+"""Of the files that changed since a row was measured."""
+
 
 def overview(rows: Mapping[str, Row], place: Path) -> str:
     """A line for each row: its state, how many seeds it has, and why it is not fresh."""
@@ -26,6 +29,8 @@ def overview(rows: Mapping[str, Row], place: Path) -> str:
         judged = [] if kind in ("missing", "mixed") else render.verdicts(row, found)
         if kind == "stale" and (same := confirm.confirmed(row, found, place)):
             kind, reasons = "confirmed", [f"{len(reasons)} files changed, nothing else: {same['date']}"]
+        if len(reasons) > SHOWN:
+            reasons = [*reasons[:SHOWN], f"{len(reasons) - SHOWN} more, see docs/results.md"]
         more = [
             *reasons,
             *(f"missed: {wanted}, is {reached}" for wanted, reached, enough in judged if not enough),

@@ -42,7 +42,8 @@ class Machine:
         Raises:
             UserError: There are too few cores for so many runs.
         """
-        environment = {"PYTHONPATH": str(ROOT)}
+        further = os.environ.get("PYTHONPATH")
+        environment = {"PYTHONPATH": os.pathsep.join([str(ROOT), further] if further else [str(ROOT)])}
         if self.commit:
             environment["FRANKA_WM_COMMIT"] = self.commit
         if row.section.threads is None:

@@ -103,13 +103,17 @@ class Verb(click.Command):
             rest = super().parse_args(ctx, list(self._as_options(args)))
         except click.MissingParameter as error:
             one = error.param
-            name = f"{one.name}=…" if isinstance(one, Word) else one and one.make_metavar(ctx)
-            raise UserError(f"{self.name}: give {name}; franka-wm {self.name} --help") from error
+            what = one and one.make_metavar(ctx)
+            if isinstance(one, Word):
+                what = f"{one.name}={one.metavar or '…'} ({one.help})"
+            raise UserError(f"{self.name}: give {what}; all options: franka-wm {self.name} --help") from error
         except click.UsageError as error:
             raise UserError(f"{self.name}: {error.format_message()}") from error
         for word in ctx.params.get("overrides", ()):
             if "=" not in word:
-                raise UserError(f"{self.name}: {word!r} is not name=value; franka-wm {self.name} --help")
+                raise UserError(
+                    f"{self.name}: {word!r}: write options as name=value; all of them: franka-wm {self.name} --help"
+                )
         return rest
 
     def _as_options(self, args: Sequence[str]) -> Iterator[str]:

@@ -138,7 +138,7 @@ def _simple(
     from franka_wm.commands.entry import with_scale
     from franka_wm.envs import FrankaConfig, FrankaEnv
 
-    cfg = compose(with_scale(list(overrides)))
+    cfg = compose(with_scale(list(overrides), quiet=True))
     worlds = num_envs or min(number(cfg, "collector.num_envs"), episodes)
     if cfg.env.kind != "franka":
         raise UserError(
@@ -166,13 +166,13 @@ def _simple(
 
     from franka_wm.data.lerobot.collect import Source
     from franka_wm.policies.expert import ExpertPolicy
-    from franka_wm.policies.scripted import NoopPolicy, OraclePolicy, SmoothRandomPolicy
+    from franka_wm.policies.scripted import IKPolicy, NoopPolicy, SmoothRandomPolicy
     from franka_wm.seeding import derive_seed
 
     generator = torch.Generator(device=env.device).manual_seed(derive_seed("policies", seed, "collection"))
     makers: dict[str, Callable[[], Any]] = {
         "noop": lambda: NoopPolicy(env.action_dim),
-        "ik": lambda: OraclePolicy(env.kinematics, config),
+        "ik": lambda: IKPolicy(env.kinematics, config),
         "random": lambda: SmoothRandomPolicy(
             env.action_dim,
             smoothness=smoothness,

@@ -134,8 +134,13 @@ def fail(message: str) -> NoReturn:
     sys.exit(1)
 
 
-def with_scale(arguments: list[str], stream: TextIO | None = None) -> list[str]:
-    """Adds ``scale=gpu`` or ``scale=laptop`` where none, or ``scale=auto``, is given; says so on ``stream``."""
+def with_scale(arguments: list[str], stream: TextIO | None = None, *, quiet: bool = False) -> list[str]:
+    """Adds ``scale=gpu`` or ``scale=laptop`` where none, or ``scale=auto``, is given.
+
+    Args:
+        stream: Where that is said.
+        quiet: Say nothing, since nothing is trained.
+    """
     given = next((a for a in arguments if a.startswith("scale=")), None)
     if given not in (None, "scale=auto"):
         return arguments
@@ -144,7 +149,7 @@ def with_scale(arguments: list[str], stream: TextIO | None = None) -> list[str]:
     device = next((a.split("=", 1)[1] for a in arguments if a.startswith("device=")), "auto")
     on_gpu = device.startswith("cuda") or (device == "auto" and torch.cuda.is_available())
     scale = "gpu" if on_gpu else "laptop"
-    if not any(a.startswith("resume=") for a in arguments):
+    if not quiet and not any(a.startswith("resume=") for a in arguments):
         say(f"scale={scale}, by the device; choose with scale=laptop, gpu or smoke", stream)
     return [a for a in arguments if a != given] + [f"scale={scale}"]
 

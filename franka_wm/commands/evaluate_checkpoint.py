@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from franka_wm.console import announced, say
 from franka_wm.evaluation import diagnose
@@ -23,6 +23,9 @@ from franka_wm.report.diagnostics import (
 )
 from franka_wm.report.table import evaluation_tables, markdown
 from franka_wm.training.load import load_agent
+
+if TYPE_CHECKING:
+    from franka_wm.training.load import Agent
 
 WORLDS = 256
 """Simulated at once, at most; more episodes are played in rounds."""
@@ -72,7 +75,7 @@ def run(options: Options) -> dict[str, Any]:
     imagined = None
     if options.open_loop or options.probes:
         say("held-out episodes for the diagnostics …")
-        held = diagnose.hold_out(agent, pictures=options.open_loop)
+        held = diagnose.hold_out(agent, images=options.open_loop)
         if options.open_loop:
             imagined = _look_ahead(agent, held, evaluation, results, say)
         if options.probes:
@@ -91,7 +94,7 @@ def run(options: Options) -> dict[str, Any]:
 
 
 def _look_ahead(
-    agent: Any, held: diagnose.Held, evaluation: Evaluation, results: dict[str, Any], say: Say
+    agent: Agent, held: diagnose.Held, evaluation: Evaluation, results: dict[str, Any], say: Say
 ) -> tuple[Imagined, Any, Any] | None:
     say("open-loop predictions …")
     ahead: dict[str, Any]
@@ -110,7 +113,7 @@ def _look_ahead(
     return imagined
 
 
-def _look_inside(agent: Any, held: diagnose.Held, results: dict[str, Any], say: Say) -> None:
+def _look_inside(agent: Agent, held: diagnose.Held, results: dict[str, Any], say: Say) -> None:
     say("probes and spectrum of the latents …")
     results["probes"] = diagnose.probes(held, agent.model)
     results["spectrum"], results["latents"] = diagnose.representation(held, agent.model)
@@ -120,7 +123,7 @@ def _look_inside(agent: Any, held: diagnose.Held, results: dict[str, Any], say: 
         say(f"warning: {warning}")
 
 
-def _shift(agent: Any, options: Options, results: dict[str, Any], say: Say) -> None:
+def _shift(agent: Agent, options: Options, results: dict[str, Any], say: Say) -> None:
     say("robustness: the same episodes in shifted worlds …")
 
     def told(case: str, found: Mapping[str, Any]) -> None:

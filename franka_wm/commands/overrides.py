@@ -24,8 +24,8 @@ def compose(overrides: Sequence[str], options: Sequence[str] = ()) -> Any:
         return conf.compose(*overrides)
     except UserError:
         raise
-    # The last two for a group that is no name.
-    except (HydraException, OmegaConfBaseException, ValueError, TypeError) as error:
+    # The last three for a group that is no name, or too long for one.
+    except (HydraException, OmegaConfBaseException, ValueError, TypeError, OSError) as error:
         raise UserError(explain(str(error), allowed=_allowed(str(error), overrides, options))) from error
 
 

@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import click
 
 from franka_wm.commands.arguments import verb
+
+if TYPE_CHECKING:
+    from franka_wm.evaluation.results import Result
 
 
 @verb("summary")
@@ -16,24 +21,34 @@ def summary(folders: tuple[str, ...]) -> None:
 
     Runs that differ in more than their seed get a table for each configuration.
     """
-    from franka_wm.evaluation.results import Result
-    from franka_wm.report.run import but_for_the_seed, read_config
-    from franka_wm.report.seeds import read_evaluation, runs_of, seeds_table
+    from franka_wm.report.run import but_for_the_seed, malformed, read_config
+    from franka_wm.report.seeds import read_evaluation, runs_of
+    from franka_wm.untrusted import values_of
 
     groups: dict[str, dict[Path, Result]] = {}
     for folder in folders:
         for run in runs_of(folder):
-            groups.setdefault(but_for_the_seed(read_config(run)), {})[run] = read_evaluation(run)
+            with malformed(run):
+                groups.setdefault(but_for_the_seed(read_config(run)), {})[run] = read_evaluation(run)
     for group in groups.values():
-        found = list(group.values())
-        counts = sorted({one.episodes for one in found})
-        runs = f"{len(found)} run{'s' * (len(found) > 1)}"
-        if len(groups) > 1:
-            runs += f" ({', '.join(run.name for run in group)})"
-        episodes = f"{counts[0]}" if len(counts) == 1 else f"{counts[0]} to {counts[-1]}"
-        print(f"{runs} of {episodes} episodes each: mean over runs (lowest – highest run)")
-        by = sorted({str(one.protocol.get("by", one.path)) for one in found})
-        print(f"measured by {' and '.join(by)}; of a run measured twice, what rests on more episodes\n")
-        print(seeds_table([one.policies for one in found]))
-        if len(groups) > 1:
-            print()
+        with values_of(" or ".join(map(str, group)), "measure the run again."):
+            show(group, several=len(groups) > 1)
+
+
+def show(group: Mapping[Path, Result], *, several: bool) -> None:
+    """Print the table of runs that differ in their seed alone; with their names where there are several tables."""
+    from franka_wm.report.seeds import seeds_table
+
+    found = list(group.values())
+    counts = sorted({one.episodes for one in found})
+    runs = f"{len(found)} run{'s' * (len(found) > 1)}"
+    if several:
+        runs += f" ({', '.join(run.name for run in group)})"
+    episodes = f"{counts[0]}" if len(counts) == 1 else f"{counts[0]} to {counts[-1]}"
+    by = sorted({str(one.protocol.get("by", one.path)) for one in found})
+    table = seeds_table([one.policies for one in found])
+    print(f"{runs} of {episodes} episodes each: mean over runs (lowest – highest run)")
+    print(f"measured by {' and '.join(by)}; of a run measured twice, what rests on more episodes\n")
+    print(table)
+    if several:
+        print()

@@ -9,7 +9,7 @@ from franka_wm.commands.arguments import real, verb, whole, word
 from franka_wm.errors import UserError
 
 if TYPE_CHECKING:
-    from franka_wm.live.view import Options
+    from franka_wm.live.stage import Options
 
 
 @verb(
@@ -48,7 +48,7 @@ def show(**given: Any) -> None:
     """
     options = options_of(**given)
     from franka_wm.live.page import import_viser
-    from franka_wm.live.view import build, record, serve
+    from franka_wm.live.stage import build, record, serve
 
     if options.rerun is not None:
         record(options)
@@ -86,7 +86,7 @@ def options_of(
         changes: Any = OmegaConf.to_container(OmegaConf.from_dotlist(list(overrides)))
     except (YAMLError, OmegaConfBaseException) as error:
         raise UserError(f"view: {' '.join(overrides)}: not a value as in YAML ({error})") from error
-    from franka_wm.live.view import Options
+    from franka_wm.live.stage import Options
 
     return Options(
         rerun=rerun, checkpoint=checkpoint, env=_named(env, checkpoint) | changes.get("env", {}), **given
@@ -110,5 +110,5 @@ def _named(env: str | None, checkpoint: str | None) -> dict[str, Any]:
         raise UserError(f"view: env={env}: the page shows the arm only")
     values.pop("urdf_path")
     del values["episode_length"]  # while somebody watches, an episode has no end
-    pictures = [key for key in values["observations"] if "pixels" in key]
-    return values | {"observations": [key for key in values["observations"] if key not in pictures]}
+    images = [key for key in values["observations"] if "pixels" in key]
+    return values | {"observations": [key for key in values["observations"] if key not in images]}

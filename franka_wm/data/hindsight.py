@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import torch
@@ -18,11 +18,13 @@ class Hindsight:
     """Relabels a share of each batch of windows with goals reached later (HER, arXiv:1707.01495, strategy `future`).
 
     The reward is a known function of state and goal, so relabeled windows are exact, not approximate. The new goal is
-    where the tool was after a step drawn uniformly from those between the window's end and the episode's.
+    where the tool, or the object that the goal is for, was after a step drawn uniformly from those between the window's
+    end and the episode's.
 
     Args:
         relabel: The task's, see `franka_wm.envs.tasks.Task.relabel`.
-        achieved: Place that a state has reached: (…, 20) → (…, 3) [m].
+        achieved: Name and columns of the observation that holds the place reached [m].
+        reads: Observations that `relabel` and `achieved` need.
         share: Of the windows of a batch, in [0, 1].
         episode_length: Steps of an episode, at most: how far to look ahead.
     """
@@ -30,17 +32,15 @@ class Hindsight:
     def __init__(
         self,
         relabel: Relabel,
-        achieved: Callable[[torch.Tensor], torch.Tensor],
         *,
+        achieved: tuple[str, slice],
+        reads: Sequence[str],
         share: float,
         episode_length: int,
     ):
-        self.relabel, self.achieved, self.share, self.episode_length = (
-            relabel,
-            achieved,
-            share,
-            episode_length,
-        )
+        self.relabel, self.reads = relabel, reads
+        self.key, self.columns = achieved
+        self.share, self.episode_length = share, episode_length
 
     def __call__(
         self,
@@ -67,8 +67,8 @@ class Hindsight:
         begins[:, 0] = False
         same = (begins.cumsum(1) == 0) & (ahead <= ((newest - last) % capacity).unsqueeze(1))
         chosen = (torch.rand(last.shape, device=device) * same.sum(1)).long()
-        reached = data.get(("next", "state"))[later.gather(1, chosen.unsqueeze(1)).squeeze(1), world]
-        relabeled = self.relabel(batch, self.achieved(reached))
+        reached = data.get(("next", self.key))[later.gather(1, chosen.unsqueeze(1)).squeeze(1), world]
+        relabeled = self.relabel(batch, reached[..., self.columns])
         mask = torch.rand(last.shape, device=device) < self.share
         for key in relabeled.keys(True, True):
             new, old = relabeled.get(key), batch.get(key)

@@ -34,7 +34,7 @@ class WindowSampler(Sampler):
         cross_episode: Windows may go on past the end of an episode, into the next one: for losses that look at
             ``boundary`` themselves. Then every step starts windows, also the last ones of an episode, and
             episodes shorter than a window are seen.
-        before: So many steps before each window must be kept as well: for stacked pictures.
+        before: So many steps before each window must be kept as well: for stacked images.
     """
 
     def __init__(
@@ -196,7 +196,7 @@ def make_replay(
         batch_size: Windows per sample.
         device: Where everything lives.
         cross_episode: Windows may go on past the end of an episode, see :class:`WindowSampler`.
-        frame_stack: Pictures in each observation under ``stacked``, as ``env.frame_stack``: each is kept once, and
+        frame_stack: Images in each observation under ``stacked``, as ``env.frame_stack``: each is kept once, and
             samples have stacks again.
         stacked: Keys of such observations.
         hindsight: Relabels a share of each batch with goals that were reached later.

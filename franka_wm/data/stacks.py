@@ -1,8 +1,8 @@
-"""Stacked pictures in a replay: each picture is kept once, a stack is put together when it is sampled.
+"""Stacked images in a replay: each image is kept once, a stack is put together when it is sampled.
 
-With ``env.frame_stack`` k every observation holds the present picture and the k - 1 before it, so a replay of
-observations holds each picture k times. Older pictures of a stack are the newest ones of earlier steps, back to
-where the episode began; its first picture stands for those before it.
+With ``env.frame_stack`` k every observation holds the present image and the k - 1 before it, so a replay of
+observations holds each image k times. Older images of a stack are the newest ones of earlier steps, back to
+where the episode began; its first image stands for those before it.
 """
 
 from __future__ import annotations
@@ -17,21 +17,21 @@ from torchrl.data import LazyTensorStorage
 from franka_wm.errors import UserError
 
 CHANNELS = 3
-"""Of one picture; stacks are of colours alone."""
+"""Of one image; stacks are of colours alone."""
 
 BOUNDARY = "is_init"
 """Key of the flag that marks the first step of an episode."""
 
 
 class StackStorage(LazyTensorStorage):
-    """A storage of (time, worlds) that is given stacks and gives them back, and keeps their newest pictures.
+    """A storage of (time, worlds) that is given stacks and gives them back, and keeps their newest images.
 
     What is read by times and worlds has stacks, as a sampler asks for it; everything else (``storage[:]``) is as it is
-    kept. Stacks of the oldest ``frame_stack - 1`` steps need pictures that are gone: a sampler leaves them out.
+    kept. Stacks of the oldest ``frame_stack - 1`` steps need images that are gone: a sampler leaves them out.
 
     Args:
         max_size: Steps of all worlds together.
-        frame_stack: Pictures in a stack, k.
+        frame_stack: Images in a stack, k.
         stacked: Keys of stacks, (…, H, W, 3 k) uint8, oldest first along the channels; under ``next`` as well. Those
             that the first steps do not have are passed over.
         device: Where everything lives.
@@ -48,10 +48,10 @@ class StackStorage(LazyTensorStorage):
     def set(  # pyright: ignore[reportIncompatibleVariableOverride]  # TorchRL declares an attribute
         self, cursor: Any, data: Any, *, set_cursor: bool = True
     ) -> None:
-        """Keeps the newest picture of each stack.
+        """Keeps the newest image of each stack.
 
         Raises:
-            UserError: The first stacks that are given are not made of the pictures before them.
+            UserError: The first stacks that are given are not made of the images before them.
         """
         if not self.initialized:
             self.stacked = tuple(key for key in self.stacked if data.get(key, None) is not None)
@@ -80,33 +80,33 @@ class StackStorage(LazyTensorStorage):
             earlier = torch.where(begins[earlier, world], earlier, (earlier - 1) % data.shape[0])
             times.insert(0, earlier)
         for key in self.stacked:
-            pictures = data.get(key)
-            stack = torch.cat([*(pictures[one, world] for one in times), batch.get(key)], -1)
+            images = data.get(key)
+            stack = torch.cat([*(images[one, world] for one in times), batch.get(key)], -1)
             batch.set(key, stack)
             following = batch.get(("next", key), None)
-            if following is not None:  # the step's own pictures come before it, also at the end of an episode
+            if following is not None:  # the step's own images come before it, also at the end of an episode
                 batch.set(("next", key), torch.cat([stack[..., CHANNELS:], following], -1))
         return batch
 
 
 def newest(data: TensorDictBase, stacked: Sequence[str], frame_stack: int) -> TensorDictBase:
-    """``data`` with the newest picture of each stack in its place; pictures that are single already stay.
+    """``data`` with the newest image of each stack in its place; images that are single already stay.
 
     Raises:
-        UserError: Pictures of other sizes.
+        UserError: Images of other sizes.
     """
-    out = data.copy()  # of the structure, not of the pictures
+    out = data.copy()  # of the structure, not of the images
     for key in stacked:
         for name in (key, ("next", key)):
-            pictures = data.get(name, None)
-            if pictures is None:
+            images = data.get(name, None)
+            if images is None:
                 continue
-            if pictures.shape[-1] not in (CHANNELS, CHANNELS * frame_stack):
+            if images.shape[-1] not in (CHANNELS, CHANNELS * frame_stack):
                 raise UserError(
-                    f"{key} has {pictures.shape[-1]} channels, {frame_stack} stacked pictures have "
+                    f"{key} has {images.shape[-1]} channels, {frame_stack} stacked images have "
                     f"{CHANNELS * frame_stack}; is env.frame_stack the same as when they were gathered?"
                 )
-            out.set(name, pictures[..., -CHANNELS:])
+            out.set(name, images[..., -CHANNELS:])
     return out
 
 
@@ -114,10 +114,10 @@ def check_stacks(data: TensorDictBase, stacked: Sequence[str], frame_stack: int)
     """That stacks (time, worlds) are what :class:`StackStorage` will put together again; waits for the device.
 
     Returns:
-        Whether there are any: a checkpoint has single pictures.
+        Whether there are any: a checkpoint has single images.
 
     Raises:
-        UserError: They are not: older pictures are not those of the steps before.
+        UserError: They are not: older images are not those of the steps before.
     """
     begins = data.get(BOUNDARY).squeeze(-1)
     stacks = [key for key in stacked if data.get(key).shape[-1] != CHANNELS]
@@ -132,7 +132,7 @@ def check_stacks(data: TensorDictBase, stacked: Sequence[str], frame_stack: int)
             right &= (following[..., :-CHANNELS] == stack[..., CHANNELS:]).all()
         if not bool(right):
             raise UserError(
-                f"{key}: its older pictures are not those of the steps before; a replay with frame_stack={frame_stack} "
+                f"{key}: its older images are not those of the steps before; a replay with frame_stack={frame_stack} "
                 "takes stacks as franka_wm.envs gives them (env.frame_stack)"
             )
     return bool(stacks)

@@ -9,12 +9,12 @@ from typing import TYPE_CHECKING, Any
 from franka_wm.envs.config import FrankaConfig, Randomization
 
 if TYPE_CHECKING:
+    from franka_wm.envs.camera_math import look_at_angles, supersample
     from franka_wm.envs.discretize import DiscreteActions, discrete_action_table
     from franka_wm.envs.franka import FrankaEnv
     from franka_wm.envs.high_quality import HighQualityRenderer, which_backends
     from franka_wm.envs.sequences import franka_sequences, smooth_actions
     from franka_wm.envs.transformed import TransformedFrankaEnv
-    from franka_wm.envs.view import look_at_angles, supersample
 
 __all__ = [
     "DiscreteActions",
@@ -38,9 +38,9 @@ _WHERE = {
     "TransformedFrankaEnv": "transformed",
     "discrete_action_table": "discretize",
     "franka_sequences": "sequences",
-    "look_at_angles": "view",
+    "look_at_angles": "camera_math",
     "smooth_actions": "sequences",
-    "supersample": "view",
+    "supersample": "camera_math",
     "which_backends": "high_quality",
 }
 

@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import newton
@@ -15,17 +16,26 @@ import warp as wp
 from newton.sensors import SensorCamera
 
 from franka_wm.envs.config import FrankaConfig
-from franka_wm.envs.kernels import images as kernels
+from franka_wm.envs.kernels import rendering as kernels
 from franka_wm.errors import UserError
 
 if TYPE_CHECKING:
+    from franka_wm.envs.kinematics import Kinematics
+    from franka_wm.envs.scene import Scene
     from franka_wm.envs.simulation.arrays import Arrays
     from franka_wm.envs.simulation.build import Chain
 
 BACKGROUND = (0.62, 0.71, 0.80)
 GROUND = (0.34, 0.37, 0.41)
 WRIST_FOV_DEGREES = 75.0
-GOAL_MARKER = "goal_marker"
+GOAL_MARKER = "goal-marker"
+"""Label of a shape. No name of an object can be or end like it: they have no hyphen."""
+
+MARKER, TABLE = 255, 254
+"""Their numbers in `segmentation`; obstacles follow downwards."""
+
+LINK = 0.06
+"""Half the thickness of a link, or of the hand beside the tool [m]."""
 
 TURNS = {"front": 0.0, "side": -math.pi / 2.0}
 """Where the fixed cameras stand: so far around the vertical axis through what they look at [rad]."""
@@ -35,6 +45,39 @@ def camera_framing(config: FrankaConfig) -> tuple[tuple[float, float, float], tu
     """(eye, target) in world metres."""
     target = (config.camera_target_distance, 0.0, config.camera_target_height)
     return (config.camera_distance, 0.0, config.camera_height), target
+
+
+def whole_arm(config: FrankaConfig, kinematics: Kinematics) -> FrankaConfig:
+    """The configuration with its camera moved so that the arm stays in the image in every pose: for videos.
+
+    The direction is the same, the distance as small as possible, and each world's camera stands alike.
+    """
+    eye, target = (np.array(point) for point in camera_framing(config))
+    back = (eye - target) / np.linalg.norm(eye - target)
+    side = np.array([0.0, 1.0, 0.0])
+    axes = np.stack([side, np.cross(back, side), back], 1)
+    shares = torch.rand(4096, kinematics.lower.numel(), generator=torch.Generator().manual_seed(0))
+    lower, upper = kinematics.lower.cpu(), kinematics.upper.cpu()
+    tools = kinematics.forward((lower + shares * (upper - lower)).to(kinematics.lower.device)).cpu().numpy()
+    tools = tools[tools[:, 2] > 0.0]  # above the ground
+    slope = math.tan(0.5 * math.radians(config.camera_fov_degrees))
+
+    def distance(height: float) -> float:
+        """How far the camera must be if it looks at this height."""
+        seen = (tools - (0.0, 0.0, height)) @ axes
+        needed = (np.abs(seen[:, :2]).max(1) + LINK) / slope + seen[:, 2]
+        return float(np.quantile(needed, 0.97))  # the rest are stretched out to the limit
+
+    height = min(np.linspace(0.0, tools[:, 2].max(), 33).tolist(), key=distance)
+    eye = (0.0, 0.0, height) + distance(height) * back
+    return replace(
+        config,
+        camera_distance=float(eye[0]),
+        camera_height=float(eye[2]),
+        camera_target_distance=0.0,
+        camera_target_height=height,
+        randomization=replace(config.randomization, camera_position=0.0, camera_target=0.0),
+    )
 
 
 def look_at(eye, target) -> wp.transformf:
@@ -71,7 +114,7 @@ class Camera:
         config: Framing, field of view, shadows.
         name: ``"front"`` or ``"side"``, which stand still, or ``"wrist"``, which rides on the hand.
         kinds: What it renders: any of ``"pixels"``, ``"depth"``, ``"segmentation"``.
-        size: Side of the square picture [px]; ``config.image_size`` if not given.
+        size: Side of the square image [px]; ``config.image_size`` if not given.
         num_views: How many worlds are seen at once.
         samples: Anti-aliasing factor: ``samples``² rays per pixel.
 
@@ -132,7 +175,9 @@ class Camera:
         )
         if "segmentation" in kinds:
             self._shape_index = self.sensor.allocate_image_shape_index(views, size, size)
-            self._segments = wp.array(segment_numbers(model), dtype=wp.uint8, device=model.device)
+            self._segments = wp.array(
+                segment_numbers(model, config.surroundings), dtype=wp.uint8, device=model.device
+            )
         self.images = self.allocate(views)
 
     def allocate(self, views: int) -> dict[str, wp.array]:
@@ -193,14 +238,19 @@ def as_torch(kind: str, image: wp.array) -> torch.Tensor:
     return tensor.unsqueeze(-1)
 
 
-def segment_numbers(model: newton.Model) -> np.ndarray:
-    """For each shape: 1 for the ground and whatever else stands still outside the robot, 2 for the robot's base,
-    3 … for its moving links in order, 255 for the goal marker. 0 is left for rays that meet nothing."""
+def segment_numbers(model: newton.Model, scene: Scene | None) -> np.ndarray:
+    """For each shape: 1 for the ground, 2 for the robot's base, 3 … for its moving links in order, then (from 12 on)
+    the scene's objects, then case and moving part of each drawer or door; 255 for the goal marker, 254 for the table,
+    253, 252, … for the scene's obstacles. 0 is left for rays that meet nothing."""
     bodies = model.shape_body.numpy()
     worlds = model.shape_world.numpy()
     per_world = model.body_count // model.world_count
     numbers = np.where(bodies >= 0, 3 + bodies % per_world, np.where(worlds >= 0, 2, 1))
-    numbers[[label.endswith(GOAL_MARKER) for label in model.shape_label]] = 255
+    numbers[[label.endswith(GOAL_MARKER) for label in model.shape_label]] = MARKER
+    still = [one.name for one in (scene.table, *scene.obstacles)] if scene else []
+    for k, name in enumerate(still):
+        there = [label == name for label in model.shape_label]
+        numbers[np.array(there) & (bodies < 0) & (worlds >= 0)] = TABLE - k
     return numbers.astype(np.uint8)
 
 
@@ -219,7 +269,7 @@ SKIP_VIEW = int(SensorCamera.WorldRenderFlag.DISABLE_PRESERVE)
 
 
 def project(points: torch.Tensor, config: FrankaConfig, size: int) -> torch.Tensor:
-    """Where world points are seen: (..., 3) [m] → (..., 2) pixel columns and rows of a ``size``² picture."""
+    """Where world points are seen: (..., 3) [m] → (..., 2) pixel columns and rows of a ``size``² image."""
     pose = look_at(*camera_framing(config))
     rotation = torch.tensor(
         np.array(wp.quat_to_matrix(pose.q)).reshape(3, 3), dtype=points.dtype, device=points.device

@@ -7,10 +7,11 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from typing import TYPE_CHECKING
 
-from franka_wm.envs.constants import HAND_DIM, HOME, NUM_FINGERS, NUM_JOINTS, STATE_DIM
+from franka_wm.envs.constants import HAND_DIM, HOME, JOINT_DIM, NUM_FINGERS, NUM_JOINTS, OBJECT_DIM, STATE_DIM
+from franka_wm.envs.ranges import Randomization
 from franka_wm.envs.scene import Scene
 from franka_wm.errors import UserError
-from franka_wm.options import is_real
+from franka_wm.options import check_whole, is_real
 
 if TYPE_CHECKING:
     from franka_wm.envs.tasks import Task
@@ -27,69 +28,6 @@ ACTION_MODES = {"joint_delta": 7, "joint_position": 7, "ee_delta": 3}
 """Meaning of an action, and its size."""
 
 MAX_IMAGE_SIZE = 2048
-
-
-@dataclass(frozen=True, kw_only=True)
-class Randomization:
-    """What each episode of each world draws anew; all off by default. Reproducible from seed × world × episode.
-
-    A factor of ``x`` means a uniform draw from [1 − x, 1 + x]; an offset of ``x`` one from [−x, x].
-
-    Attributes:
-        color: Offset of the red, green and blue of every shape but the ground, which all worlds share.
-        brightness: Factor of the whole picture.
-        camera_position: Offset of the front camera's eye [m] in x, y and z; the side camera moves alike.
-        camera_target: Offset of the point it looks at [m].
-        gains: Factor of the servo's stiffness and damping.
-        armature: Factor of the joints' armature.
-        friction: Largest dry friction of a joint [N·m]; drawn from [0, friction].
-        mass: Factor of every link's mass and inertia.
-        action_noise: Standard deviation of noise added to actions, in every step.
-        action_latency: Largest delay of actions [control steps]; drawn from 0 … action_latency.
-        observation_noise: Standard deviation of noise on observed joint angles [rad] and, times 10, velocities
-            [rad/s], in every step. Tool, goal and rewards stay true.
-    """
-
-    color: float = 0.0
-    brightness: float = 0.0
-    camera_position: float = 0.0
-    camera_target: float = 0.0
-    gains: float = 0.0
-    armature: float = 0.0
-    friction: float = 0.0
-    mass: float = 0.0
-    action_noise: float = 0.0
-    action_latency: int = 0
-    observation_noise: float = 0.0
-
-    def __post_init__(self) -> None:
-        limits = {"color": 1.0, "brightness": 0.99, "gains": 0.9, "armature": 0.9, "mass": 0.9}
-        for f in fields(self):
-            value, limit = getattr(self, f.name), limits.get(f.name, 100.0)
-            if not _is_number(value) or not 0 <= value <= limit:
-                raise UserError(f"randomization.{f.name}={value!r}: must be from 0 to {limit:g}")
-        if not isinstance(self.action_latency, int):
-            raise UserError(
-                f"randomization.action_latency={self.action_latency!r}: must be a whole number of steps"
-            )
-
-    def any(self) -> bool:
-        """Whether anything is drawn at all."""
-        return any(getattr(self, f.name) for f in fields(self))
-
-    @property
-    def dynamics(self) -> bool:
-        """Whether anything of the physical model is drawn."""
-        return bool(self.gains or self.armature or self.friction or self.mass)
-
-    @classmethod
-    def from_mapping(cls, values: Mapping) -> Randomization:
-        """From a mapping; an unknown name is an error that lists the known ones."""
-        known = {f.name for f in fields(cls)}
-        for name in values:
-            if name not in known:
-                raise UserError(f"unknown randomization {name!r}; known: {', '.join(sorted(known))}")
-        return cls(**dict(values))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -119,7 +57,7 @@ class FrankaConfig:
         enable_textures: Use mesh textures where the robot has them.
         mesh_detail: Details of meshes smaller than this are not drawn [m], nor shapes (middle times longest side) of
             less than half its square; 0 draws every triangle. ``None``: a pixel
-            and a half at the distance that the fixed cameras look at, at most 3 cm; 8 mm where no pictures are
+            and a half at the distance that the fixed cameras look at, at most 3 cm; 8 mm where no images are
             observed, or the wrist camera's are. ``robot="panda_meshes_full"`` always draws every triangle.
         solver: ``"mujoco"``, ``"featherstone"``, or ``"auto"``, which is ``"mujoco"`` on every device.
         asset_name: Newton's downloadable asset, for ``robot="newton_asset"``.
@@ -140,6 +78,7 @@ class FrankaConfig:
             the task's. With objects or obstacles there are contacts; they need the gripper.
         max_contacts: Contacts for which there is room in each world, on average. ``None``: by the scene.
         end_when_lost: End the episode where an object has left the table.
+        drawer_opening: ``task="drawer"`` is solved where the drawer is open so far [m]. ``None``: 90 % of its travel.
         home: Joint angles at the start, before noise [rad]. ``None``: the task's.
         reward: ``"dense"`` (−tanh distance), ``"sparse"`` (1 where solved, else 0) or ``"normalized"`` (the part
             of the episode's initial distance that has been closed, at least −1); all minus the action penalty.
@@ -147,9 +86,9 @@ class FrankaConfig:
         cameras: Which of ``("front", "side", "wrist")`` the image observations come from. The first one's keys
             are ``pixels``, ``depth``, …; another's ``pixels_wrist``, …. ``side`` is ``front`` a quarter turn
             around the base's vertical axis: it sees the depth that the front camera cannot.
-        frame_stack: Pictures in ``pixels`` and ``pixels_…``, oldest first along the channels: the present one
+        frame_stack: Images in ``pixels`` and ``pixels_…``, oldest first along the channels: the present one
             and those of the steps before it. An episode begins with copies of its first.
-        show_goal: Draw the goal in every picture: a small red ball, blue where there are objects; a disc for push.
+        show_goal: Draw the goal in every image: a small red ball, blue where there are objects; a disc for push.
         randomization: Ranges that each episode of each world draws from; :class:`Randomization`.
         finger_opening: Each finger's distance from the closed position [m]; without a gripper it is held there.
         observations: Which of ``("pixels", "depth", "segmentation", "goal_pixels", "state", "joint_target",
@@ -201,6 +140,7 @@ class FrankaConfig:
     scene: Scene | None = None
     max_contacts: int | None = None
     end_when_lost: bool = True
+    drawer_opening: float | None = None
     home: tuple[float, ...] | None = None
     reward: str = "dense"
     track_radius: float = 0.1
@@ -234,7 +174,7 @@ class FrankaConfig:
         elif not isinstance(self.randomization, Randomization):
             raise UserError(f"randomization={self.randomization!r}: must be a mapping of ranges")
         self._check_whole("image_size", 1, MAX_IMAGE_SIZE, "pixels")
-        self._check_whole("frame_stack", 1, 64, "pictures along the channels")
+        self._check_whole("frame_stack", 1, 64, "images along the channels")
         self._check_whole("substeps", 1, 1000, "physics steps per control step")
         self._check_whole("episode_length", 1, 1_000_000, "control steps")
         self._check_whole("solver_iterations", 1, 1000, "iterations")
@@ -358,6 +298,16 @@ class FrankaConfig:
         return len(self.surroundings.objects) if self.surroundings else 0
 
     @property
+    def num_articulated(self) -> int:
+        """How many bodies have a joint."""
+        return len(self.surroundings.articulated) if self.surroundings else 0
+
+    @property
+    def object_dim(self) -> int:
+        """Size of ``objects``: of each body, and of each joint."""
+        return OBJECT_DIM * (self.num_objects + self.num_articulated) + JOINT_DIM * self.num_articulated
+
+    @property
     def images(self) -> tuple[str, ...]:
         """The image observations that were asked for, without cameras' names."""
         return tuple(o for o in self.observations if o in IMAGES)
@@ -397,24 +347,28 @@ class FrankaConfig:
         if self.surroundings and not self.has_gripper:
             raise UserError("scene: contacts need the fingers as bodies of their own; set gripper=true")
         if self.has_gripper and "goal_pixels" in self.observations:
-            raise UserError(
-                f"goal_pixels: task={self.task} has no image of its goal; leave it out (show_goal draws it)"
-            )
+            self.task_class.check_goal_image()
         if self.has_gripper and self.solver == "featherstone":
             raise UserError("gripper and scene need solver=mujoco")
         if self.contact_dim and not self.surroundings:
             raise UserError(
                 f"observations: task={self.task} touches nothing; leave contacts out, or give a scene"
             )
-        if "objects" in self.observations and not self.num_objects:
+        if "objects" in self.observations and not self.object_dim:
             raise UserError(
                 f"observations: task={self.task} has no objects; leave objects out, or give a scene"
             )
+        for name, there, what in (
+            ("contact_friction", self.surroundings, "a scene"),
+            ("grip_force", self.has_gripper, "the gripper"),
+            ("object_noise", self.object_dim, "objects"),
+        ):
+            if getattr(self.randomization, name) and not there:
+                raise UserError(f"randomization.{name}: needs {what}; task={self.task} has none; set it to 0")
+        self.task_class.check(self)
 
     def _check_whole(self, name: str, low: int, high: int, unit: str) -> None:
-        value = getattr(self, name)
-        if isinstance(value, bool) or not isinstance(value, int) or not low <= value <= high:
-            raise UserError(f"{name}={value!r}: must be a whole number from {low} to {high} ({unit})")
+        check_whole(name, getattr(self, name), least=low, most=high, unit=unit)
 
     def _check_real(self, name: str, low: float, high: float, unit: str, *, open_low: bool = False) -> None:
         value = getattr(self, name)

@@ -15,3 +15,6 @@ HOME = (0.0, -0.4, 0.0, -2.0, 0.0, 1.6, 0.8)
 
 OBJECT_DIM = 13
 """Numbers of each object: position 3 [m], quaternion x y z w, velocity 3 [m/s], angular velocity 3 [rad/s]."""
+
+JOINT_DIM = 2
+"""Numbers of each articulated body's joint: how far it is open [m or rad], and its speed [m/s or rad/s]."""

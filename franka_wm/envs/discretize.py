@@ -10,6 +10,7 @@ from torchrl.envs.transforms import Transform
 
 from franka_wm.envs.constants import NUM_JOINTS
 from franka_wm.errors import UserError
+from franka_wm.options import check_whole
 
 
 def discrete_action_table(action_dim: int, magnitude: float = 1.0, include_noop: bool = True) -> torch.Tensor:
@@ -24,8 +25,7 @@ def discrete_action_table(action_dim: int, magnitude: float = 1.0, include_noop:
         (2·A + 1, A) float32, or (2·A, A) without the no-op. Row 2·i is +magnitude on axis i, row 2·i + 1 is
         −magnitude, and the **last** row is the no-op: the indices of moves do not depend on it.
     """
-    if isinstance(action_dim, bool) or not isinstance(action_dim, int) or action_dim < 1:
-        raise UserError(f"action_dim={action_dim!r}: must be a whole number of at least 1")
+    check_whole("action_dim", action_dim)
     if not (math.isfinite(magnitude) and 0.0 < magnitude <= 1.0):
         raise UserError(f"magnitude={magnitude}: must be above 0 and at most 1, where actions are clipped")
     moves = torch.eye(action_dim).repeat_interleave(2, 0)

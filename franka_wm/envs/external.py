@@ -25,6 +25,7 @@ from torchrl.envs.transforms import (
 )
 
 from franka_wm.errors import UserError
+from franka_wm.options import check_whole
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -52,9 +53,7 @@ class ExternalConfig:
         if self.kind not in ("gym", "dm_control"):
             raise UserError(f"env.kind={self.kind!r}: must be franka, gym or dm_control")
         for name in ("episode_length", "frame_skip"):
-            value = getattr(self, name)
-            if isinstance(value, bool) or not isinstance(value, int) or value < 1:
-                raise UserError(f"env.{name}={value!r}: must be a whole number of at least 1")
+            check_whole(f"env.{name}", getattr(self, name))
 
 
 class ExternalEnv(TransformedEnv):

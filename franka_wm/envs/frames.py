@@ -1,4 +1,4 @@
-"""The last few pictures of every world, side by side along the channels."""
+"""The last few images of every world, side by side along the channels."""
 
 from __future__ import annotations
 
@@ -7,10 +7,10 @@ from torch import Tensor
 
 
 class FrameStack:
-    """The last ``count`` pictures of N worlds by observation key, oldest first; nothing waits for the device.
+    """The last ``count`` images of N worlds by observation key, oldest first; nothing waits for the device.
 
     Args:
-        count: Pictures that are kept, the present one included.
+        count: Images that are kept, the present one included.
     """
 
     def __init__(self, count: int):

@@ -28,6 +28,7 @@ from franka_wm.envs.simulation import Simulation
 from franka_wm.envs.specs import observation_spec
 from franka_wm.envs.tasks import Task, goal_distance
 from franka_wm.errors import UserError
+from franka_wm.options import check_whole
 from franka_wm.seeding import derive_seed
 
 log = logging.getLogger(__name__)
@@ -58,7 +59,7 @@ class FrankaEnv(EnvBase):
     ``pixels``          (N, H, W, 3) uint8      the camera; present when asked for; 3 · ``frame_stack`` channels
     ``state``           (N, 20) float32         joints 7 [rad], velocities 7 [rad/s], tool 3 [m], tool − goal 3 [m];
                                                 with a gripper 28: fingers 2 [m], their speeds 2, tool's x y z w
-    ``objects``         (N, 13 · K) float32     of each: position, x y z w, velocity, angular velocity; if asked for
+    ``objects``         (N, 13 · K) float32     of each: place, x y z w, velocity, angular velocity; of drawers more
     ``joint_target``    (N, 7) float32          the servo's commanded angles [rad]; with a gripper 8: its opening [m]
     ``goal``            (N, 3) float32          where the tool, or the task's object, shall be [m]
     ``success``         (N, 1) bool             as the task says: of reach, tool within ``success_distance``
@@ -110,8 +111,7 @@ class FrankaEnv(EnvBase):
         task: Task | None = None,
     ):
         config = FrankaConfig() if config is None else config
-        if isinstance(num_envs, bool) or not isinstance(num_envs, int) or num_envs < 1:
-            raise UserError(f"num_envs={num_envs!r}: must be a whole number of at least 1")
+        check_whole("num_envs", num_envs)
         device = resolve_device(device)
         super().__init__(device=device, batch_size=torch.Size([num_envs]))
         if task is None:
@@ -142,7 +142,7 @@ class FrankaEnv(EnvBase):
         self.reward_spec = Unbounded(shape=(num_envs, 1), device=device)
         flags = {key: Binary(shape=(num_envs, 1), dtype=torch.bool, device=device) for key in FLAGS}
         self.done_spec = Composite(**flags, shape=(num_envs,), device=device)
-        self._renderers: dict[tuple[int, int], Camera] = {}
+        self._renderers: dict[tuple, Camera] = {}
 
     # -- TorchRL ------------------------------------------------------------------------------------------
 
@@ -390,24 +390,26 @@ class FrankaEnv(EnvBase):
         """The camera's image now, (N, 3, H, W) float32 in [0, 1] at ``image_size``."""
         return self.render(self.config.image_size).permute(0, 3, 1, 2).float().div_(255.0)
 
-    def render(self, size: int | None = None, samples: int = 1, num_views: int | None = None) -> torch.Tensor:
+    def render(
+        self, size: int | None = None, samples: int = 1, num_views: int | None = None, *,
+        config: FrankaConfig | None = None,
+    ) -> torch.Tensor:  # fmt: skip
         """The camera's image now, (views, size, size, 3) uint8, for people and videos.
 
         Args:
             size: Side [px]; ``image_size`` if not given.
             samples: Anti-aliasing: ``samples``² rays per pixel.
             num_views: The first so many worlds; all if not given.
+            config: Where the camera stands; the environment's if not given. :func:`~franka_wm.envs.camera.whole_arm`.
         """
         size = self.config.image_size if size is None else size
         views = self.num_envs if num_views is None else min(num_views, self.num_envs)
         if size < 1 or samples < 1 or views < 1:
-            raise UserError(
-                f"render(size={size}, samples={samples}, num_views={num_views}): all must be at least 1"
-            )
-        key = (size, samples)
+            raise UserError(f"render({size=}, {samples=}, {num_views=}): all must be at least 1")
+        key = (size, samples, camera_framing(config := config or self.config))
         camera = self._renderers.get(key)
         if camera is None or camera.num_views != views:
-            camera = Camera(self.model, self.config, size=size, num_views=views, samples=samples)
+            camera = Camera(self.model, config, size=size, num_views=views, samples=samples)
             self._renderers[key] = camera
         sim = self.simulation
         with sim.recorder.on_stream_of_torch():

@@ -20,6 +20,7 @@ import numpy as np
 import torch
 from tensordict import TensorDictBase
 
+from franka_wm.envs.camera import whole_arm
 from franka_wm.envs.config import NUM_JOINTS, FrankaConfig
 from franka_wm.envs.franka import FrankaEnv
 from franka_wm.envs.tasks import TASKS
@@ -203,7 +204,8 @@ class FrankaVectorEnv(gymnasium.vector.VectorEnv):
         """N frames, (256, 256, 3) uint8; ``None`` without ``render_mode="rgb_array"``."""
         if self.render_mode is None:
             return None
-        return tuple(self.env.render(256, samples=2).cpu().numpy())
+        config = whole_arm(self.env.config, self.env.kinematics)
+        return tuple(self.env.render(256, samples=2, config=config).cpu().numpy())
 
     def call(self, name: str, *args: Any, **kwargs: Any) -> tuple[Any, ...]:
         """``name`` of each world, as ``SyncVectorEnv.call`` has it; called if it can be.

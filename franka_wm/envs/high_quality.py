@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any, Literal, Self
 import numpy as np
 import torch
 
-from franka_wm.envs.view import Vector, axes, camera_rotation, look_at_angles, point
+from franka_wm.envs.camera_math import Vector, axes, camera_rotation, look_at_angles, point
 from franka_wm.errors import UserError
 
 if TYPE_CHECKING:

@@ -56,13 +56,21 @@ class Randomizer:
             ]  # fmt: skip
             ke, kd, armature, _, mass, inertia = (wp.clone(a) for a in self._physical)
             self._plain = [ke, kd, armature, mass, inertia]
+            self._limits = per_world(model.joint_effort_limit)
+            self._plain_limits = wp.clone(self._limits)
             self._any = wp.zeros(1, dtype=int, device=sim.device)
+
+        if self.ranges.contact_friction:  # MuJoCo's own, which nothing else writes
+            self._frictions = sim.solver.mjw_model.geom_friction
+            self._plain_frictions = wp.clone(self._frictions)
 
     def arrays(self) -> list[wp.array]:
         """What is drawn, each (N, …), beside what the simulation lists itself."""
-        return ([self._colors] if self.ranges.color else []) + (
-            self._physical if self.ranges.dynamics else []
-        )
+        r = self.ranges
+        out = [self._colors] if r.color else []
+        out += self._physical if r.dynamics else []
+        out += [self._limits] if r.grip_force else []
+        return out + ([self._frictions] if r.contact_friction else [])
 
     def launch(self, mask: wp.array) -> None:
         """Draws for the masked worlds."""
@@ -78,6 +86,20 @@ class Randomizer:
                 ],
                 device=sim.device,
             )  # fmt: skip
+        known = [mask, w.seed, w.episode]
+        if r.contact_friction:
+            inputs = [*known, r.contact_friction, self._plain_frictions, self._frictions]
+            wp.launch(kernels.draw_frictions, sim.num_envs, inputs, device=sim.device)
+        if r.grip_force:
+            inputs = [
+                *known,
+                r.grip_force,
+                self._plain[0],
+                self._plain_limits,
+                self._physical[0],
+                self._limits,
+            ]
+            wp.launch(kernels.draw_grip, sim.num_envs, inputs, device=sim.device)
         if r.dynamics:
             wp.launch(
                 kernels.draw_dynamics,

@@ -9,6 +9,7 @@ import torch
 from tensordict import TensorDict
 
 from franka_wm.errors import UserError
+from franka_wm.options import check_whole, is_whole
 
 if TYPE_CHECKING:
     from franka_wm.envs.franka import FrankaEnv
@@ -87,16 +88,14 @@ def franka_sequences(
     Raises:
         UserError: If a size cannot be had, or too many sequences are discarded; says what to change.
     """
-    if isinstance(n_sequences, bool) or not isinstance(n_sequences, int) or n_sequences < 1:
-        raise UserError(f"n_sequences={n_sequences!r}: must be a whole number of at least 1")
+    check_whole("n_sequences", n_sequences)
     longest = env.config.episode_length + 1
-    if isinstance(length, bool) or not isinstance(length, int) or not 2 <= length <= longest:
+    if not is_whole(length) or not 2 <= length <= longest:
         raise UserError(
             f"length={length!r}: must be from 2 to {longest} frames, one more than episode_length="
             f"{env.config.episode_length}; for longer sequences raise episode_length"
         )
-    if max_attempts < 1:
-        raise UserError(f"max_attempts={max_attempts}: must be at least 1")
+    check_whole("max_attempts", max_attempts)
     from franka_wm.envs.simulation import STATISTICS  # late: this module's other function needs no simulator
 
     # Drawn on the host, so that every device plays the same sequences.

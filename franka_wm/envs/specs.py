@@ -10,7 +10,7 @@ import torch
 from torchrl.data import Binary, Bounded, Composite, Unbounded
 
 from franka_wm.envs.config import FrankaConfig
-from franka_wm.envs.constants import MOST_OPEN, OBJECT_DIM
+from franka_wm.envs.constants import MOST_OPEN
 from franka_wm.envs.kinematics import Kinematics
 
 
@@ -45,7 +45,7 @@ def observation_spec(
             )
         entries["joint_target"] = Bounded(low, high, device=device)
     if "objects" in config.observations:
-        entries["objects"] = Unbounded(shape=(n, OBJECT_DIM * config.num_objects), device=device)
+        entries["objects"] = Unbounded(shape=(n, config.object_dim), device=device)
     if config.contact_dim:
         entries["contacts"] = Unbounded(shape=(n, config.contact_dim), device=device)
     entries["goal"] = Unbounded(shape=(n, 3), device=device)

@@ -14,18 +14,12 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from franka_wm.envs import FrankaEnv
 from franka_wm.evaluation.intervals import bootstrap_mean, wilson
+from franka_wm.training.build import arm_of
 
 THRESHOLDS = (0.05, 0.025, 0.01)
 """Distances to the goal that count as success [m]."""
 
 Policy = Callable[[TensorDictBase], TensorDictBase]
-
-
-def arm_of(env: Any) -> FrankaEnv | None:
-    """The arm inside an environment, under whatever transforms; ``None`` for one of another library."""
-    while env is not None and not isinstance(env, FrankaEnv):
-        env = getattr(env, "base_env", None)
-    return env
 
 
 def reaches(env: Any) -> bool:
@@ -76,7 +70,7 @@ def play_episodes(
         policy: Run without exploration, its model in evaluation mode.
         seed: Of the episodes' poses and goals.
         episodes: Fewer than there are worlds: the first ones. Nothing is decided for the others.
-        video: Called before every step, to take a picture; after the last one the worlds have been reset.
+        video: Called before every step, to take an image; after the last one the worlds have been reset.
 
     Returns:
         Batch size (N,), or (episodes,), all float32, of each world's first episode up to its true last observation.

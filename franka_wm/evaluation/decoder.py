@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import torch
 from torch import Tensor, nn
@@ -10,18 +10,21 @@ from torch.nn import functional as F
 
 from franka_wm.evaluation.rollouts import embedding
 
+if TYPE_CHECKING:
+    from franka_wm.models.base import WorldModel
+
 SIZES = (32, 64)
-"""Sides of the pictures that it can draw [px]."""
+"""Sides of the images that it can draw [px]."""
 
 
 class Decoder(nn.Module):
-    """Latents to pictures: a linear layer to 4 × 4, then doubled in size and convolved until the picture is full.
+    """Latents to images: a linear layer to 4 × 4, then doubled in size and convolved until the image is full.
 
-    It draws the difference from the training pictures' mean, so that a still background costs nothing.
+    It draws the difference from the training images' mean, so that a still background costs nothing.
 
     Args:
         latent_dim: D.
-        size: Side of the picture [px], 32 or 64.
+        size: Side of the image [px], 32 or 64.
         width: Channels at 4 × 4; halved at every doubling, at least 24.
 
     Raises:
@@ -59,26 +62,26 @@ class Decoder(nn.Module):
 
     @torch.no_grad()
     def draw(self, z: Tensor) -> Tensor:
-        """(..., D) → pictures (..., S, S, 3) uint8."""
+        """(..., D) → images (..., S, S, 3) uint8."""
         flat = self(z.reshape(-1, z.shape[-1]))
-        pictures = (flat.clamp(0, 1) * 255).round().to(torch.uint8).permute(0, 2, 3, 1)
-        return pictures.reshape(*z.shape[:-1], self.size, self.size, 3)
+        images = (flat.clamp(0, 1) * 255).round().to(torch.uint8).permute(0, 2, 3, 1)
+        return images.reshape(*z.shape[:-1], self.size, self.size, 3)
 
 
 def train_decoder(
     latents: Tensor,
-    pictures: Tensor,
+    images: Tensor,
     *,
     steps: int = 600,
     batch_size: int = 16,
     lr: float = 6e-3,
     seed: int = 0,
 ) -> Decoder:
-    """Fits a decoder to pairs of latent and picture. The latents are taken as they are: no gradient leaves here.
+    """Fits a decoder to pairs of latent and image. The latents are taken as they are: no gradient leaves here.
 
     Args:
         latents: (n, D).
-        pictures: (n, S, S, 3) uint8, S as in :data:`SIZES`.
+        images: (n, S, S, 3) uint8, S as in :data:`SIZES`.
         steps: Updates; 600 take some 10 to 20 s on two CPU cores at 64 × 64.
         batch_size, lr: Of Adam, with a cosine to 0.
         seed: Of weights and batches.
@@ -89,25 +92,25 @@ def train_decoder(
     Raises:
         ValueError: Shapes that do not fit.
     """
-    if pictures.dim() != 4 or pictures.shape[0] != latents.shape[0] or pictures.dtype != torch.uint8:
+    if images.dim() != 4 or images.shape[0] != latents.shape[0] or images.dtype != torch.uint8:
         raise ValueError(
-            f"latents {tuple(latents.shape)} and pictures {tuple(pictures.shape)} {pictures.dtype} do not fit: "
+            f"latents {tuple(latents.shape)} and images {tuple(images.shape)} {images.dtype} do not fit: "
             "(n, D) and (n, S, S, 3) uint8 are needed"
         )
     device = latents.device
     z = latents.detach().float()
     with torch.random.fork_rng(devices=[device] if device.type == "cuda" else []), torch.enable_grad():
         torch.manual_seed(seed)
-        decoder = Decoder(z.shape[-1], size=pictures.shape[1]).to(device)
+        decoder = Decoder(z.shape[-1], size=images.shape[1]).to(device)
         decoder.mean.copy_(z.mean(0))
         decoder.std.copy_(z.std(0).clamp_min(1e-4))
-        images = pictures.to(device).permute(0, 3, 1, 2)
-        decoder.background.copy_(images.float().mean(0) / 255)
+        pixels = images.to(device).permute(0, 3, 1, 2)
+        decoder.background.copy_(pixels.float().mean(0) / 255)
         optimizer = torch.optim.Adam(decoder.parameters(), lr=lr)
         schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, steps)
         for _ in range(steps):
             index = torch.randint(len(z), (batch_size,), device=device)
-            loss = F.mse_loss(decoder(z[index]), images[index].float() / 255)
+            loss = F.mse_loss(decoder(z[index]), pixels[index].float() / 255)
             optimizer.zero_grad()
             loss.backward()
             optimizer.step()
@@ -115,17 +118,17 @@ def train_decoder(
     return decoder.eval().requires_grad_(False)
 
 
-def decoder_error(decoder: Decoder, latents: Tensor, pictures: Tensor) -> dict[str, float]:
-    """Mean squared error of the decoder's pictures and of the mean picture, of values in [0, 1].
+def decoder_error(decoder: Decoder, latents: Tensor, images: Tensor) -> dict[str, float]:
+    """Mean squared error of the decoder's images and of the mean image, of values in [0, 1].
 
     Args:
         latents: (n, D), not trained on.
-        pictures: (n, S, S, 3) uint8.
+        images: (n, S, S, 3) uint8.
 
     Returns:
-        ``error``, and ``mean_picture``, the error of always drawing the training pictures' mean.
+        ``error``, and ``mean_picture``, the error of always drawing the training images' mean.
     """
-    truth = pictures.to(latents.device).permute(0, 3, 1, 2).float() / 255
+    truth = images.to(latents.device).permute(0, 3, 1, 2).float() / 255
     with torch.no_grad():
         drawn = torch.cat([decoder(part) for part in latents.split(256)])
     return {
@@ -145,29 +148,29 @@ class Imagined(NamedTuple):
 
 @torch.no_grad()
 def imagined_beside_real(
-    model: Any, decoder: Decoder, latent: Tensor, actions: Tensor, pictures: Tensor
+    model: WorldModel, decoder: Decoder, latent: Tensor, actions: Tensor, images: Tensor
 ) -> Imagined:
     """Unrolls a model from one latent and draws what it imagines beside what happened.
 
     Args:
         model: With ``next``, and ``embed`` where the family has it: the decoder reads what it gives.
         decoder: Of :func:`train_decoder`.
-        latent: (Z), at the first picture.
+        latent: (Z), at the first image.
         actions: (H, A), or (H) numbered moves, that were taken.
-        pictures: (H + 1, S, S, 3) uint8, what happened.
+        images: (H + 1, S, S, 3) uint8, what happened.
 
     Raises:
-        ValueError: Another number or size of pictures.
+        ValueError: Another number or size of images.
     """
     steps, size = actions.shape[0], decoder.size
-    if pictures.shape != (steps + 1, size, size, 3):
+    if images.shape != (steps + 1, size, size, 3):
         raise ValueError(
-            f"pictures are {tuple(pictures.shape)}; {steps} actions need ({steps + 1}, {size}, {size}, 3)"
+            f"images are {tuple(images.shape)}; {steps} actions need ({steps + 1}, {size}, {size}, 3)"
         )
     imagined = [latent.unsqueeze(0)]
     for t in range(steps):
         imagined.append(model.next(imagined[-1], actions[t : t + 1]))
     drawn = decoder.draw(embedding(model)(torch.cat(imagined))).cpu()
-    real = pictures.cpu()
+    real = images.cpu()
     strip = torch.cat([row.permute(1, 0, 2, 3).reshape(size, -1, 3) for row in (real, drawn)])
     return Imagined(strip, torch.cat([real, drawn], 2))

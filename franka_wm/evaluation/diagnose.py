@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, cast
+from typing import TYPE_CHECKING, Any, cast
 
 import torch
 from tensordict import TensorDict
 from torch import Tensor
 
-from franka_wm.evaluation.closed_loop import arm_of, begin, reaches
+from franka_wm.evaluation.closed_loop import begin, reaches
 from franka_wm.evaluation.decoder import (
     SIZES,
     Decoder,
@@ -42,12 +42,17 @@ from franka_wm.evaluation.rollouts import (
 from franka_wm.evaluation.spectrum import spectrum
 from franka_wm.policies import PlannerPolicy
 from franka_wm.seeding import derive_seed, seeded
+from franka_wm.training.build import arm_of
+
+if TYPE_CHECKING:
+    from franka_wm.models.base import WorldModel
+    from franka_wm.training.load import Agent
 
 EPISODES = 48
 """Held-out episodes of the diagnostics, at most; half of them random, half the model's own."""
 
-PICTURED = 48
-"""Of how many of them pictures are taken."""
+SHOWN = 48
+"""Of how many of them images are taken."""
 
 HORIZON = 10
 POINTS = 600
@@ -61,29 +66,29 @@ class Held:
         episodes: Batch size (E, T).
         latents: (E, T + 1, Z).
         valid: (E, T + 1) bool.
-        pictures: (P, T, S, S, 3) uint8 of the first P episodes, or ``None``.
+        images: (P, T, S, S, 3) uint8 of the first P episodes, or ``None``.
         reaches: Whether success is a small distance to the goal.
     """
 
     episodes: TensorDict
     latents: Tensor
     valid: Tensor
-    pictures: Tensor | None
+    images: Tensor | None
     reaches: bool = False
 
 
-def hold_out(agent: Any, *, pictures: bool = True, seed: int = ROLLOUT_SEED) -> Held:
+def hold_out(agent: Agent, *, images: bool = True, seed: int = ROLLOUT_SEED) -> Held:
     """Plays the episodes that the diagnostics look at: smooth random and the model's own behaviour, in turns."""
     env, model = agent.env, agent.model
     keys = model.observation_keys
-    shown = min(PICTURED, env.num_envs) if pictures and arm_of(env) is not None else 0
+    shown = min(SHOWN, env.num_envs) if images and arm_of(env) is not None else 0
     episodes, seen = gather_episodes(
         env,
         mixture(agent.policies),
         seed=seed,
         keys=keys,
-        picture_size=picture_size(model),
-        pictures=shown,
+        image_size=image_size(model),
+        images=shown,
     )
     episodes = cast(TensorDict, episodes[:EPISODES])
     with torch.no_grad():
@@ -91,13 +96,13 @@ def hold_out(agent: Any, *, pictures: bool = True, seed: int = ROLLOUT_SEED) -> 
     return Held(episodes, latents, encoded_validly(episodes), seen, reaches(env))
 
 
-def picture_size(model: Any) -> int:
-    """Side of the decoder's pictures [px]: what the model itself reads if that is small, else 64."""
+def image_size(model: WorldModel) -> int:
+    """Side of the decoder's images [px]: what the model itself reads if that is small, else 64."""
     sizes = [shape[0] for shape in model.image_sizes.values()]
     return min(SIZES, key=lambda size: abs(size - (sizes[0] if sizes else 64)))
 
 
-def open_loop(agent: Any, held: Held, *, horizon: int = HORIZON) -> dict[str, Any]:
+def open_loop(agent: Agent, held: Held, *, horizon: int = HORIZON) -> dict[str, Any]:
     """Latent error by horizon and rank correlations; empty for a model without ``next``."""
     model = agent.model
     out: dict[str, Any] = {}
@@ -112,7 +117,7 @@ def open_loop(agent: Any, held: Held, *, horizon: int = HORIZON) -> dict[str, An
     return out
 
 
-def probes(held: Held, model: Any) -> dict[str, Any]:
+def probes(held: Held, model: WorldModel) -> dict[str, Any]:
     """R² of joints, velocities, tool, goal, read off the latents; of other environments, of what the model reads."""
     use = held.valid[:, :-1]
     if held.latents.shape[0] < 3:
@@ -131,8 +136,8 @@ def probes(held: Held, model: Any) -> dict[str, Any]:
     return probe(held.latents[:, :-1], targets, valid=use) if targets else {}
 
 
-def representation(held: Held, model: Any) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Spectrum with collapse warning, and the latents along their two main directions for a picture."""
+def representation(held: Held, model: WorldModel) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Spectrum with collapse warning, and the latents along their two main directions for an image."""
     use = held.valid[:, :-1]
     embedded = embedding(model)(held.latents[:, :-1])[use].float()
     seen = spectrum(embedded)
@@ -154,7 +159,7 @@ def representation(held: Held, model: Any) -> tuple[dict[str, Any], dict[str, An
     return seen, latents
 
 
-def calibration(agent: Any, *, episodes: int = 32) -> dict[str, Any]:
+def calibration(agent: Agent, *, episodes: int = 32) -> dict[str, Any]:
     """The value against true discounted returns of the policy that it is the value of.
 
     Played in episodes that are long enough for what is cut off to weigh less than 2 %, since a value looks
@@ -189,7 +194,7 @@ def calibration(agent: Any, *, episodes: int = 32) -> dict[str, Any]:
     return result | {"tail": tail}
 
 
-def health(agent: Any, evaluation: Evaluation | None) -> dict[str, Any]:
+def health(agent: Agent, evaluation: Evaluation | None) -> dict[str, Any]:
     """How the planner searches on held-out first states, and what it gains over its prior in truth."""
     out: dict[str, Any] = {}
     planner = agent.policies.get("planner")
@@ -204,48 +209,48 @@ def health(agent: Any, evaluation: Evaluation | None) -> dict[str, Any]:
 
 
 def imagine(
-    agent: Any, held: Held, *, steps: int = 8, say: Callable[[str], None] = lambda text: None
+    agent: Agent, held: Held, *, steps: int = 8, say: Callable[[str], None] = lambda text: None
 ) -> tuple[Imagined, Decoder, dict[str, float]] | None:
-    """Trains a decoder on the pictures and draws what the model imagines in an episode that it has not seen.
+    """Trains a decoder on the images and draws what the model imagines in an episode that it has not seen.
 
     Args:
         steps: Imagined, at most.
         say: Called with one line when the training starts.
 
     Returns:
-        ``None`` without pictures or without ``next``; else strip and film, the decoder, and its errors on the
+        ``None`` without images or without ``next``; else strip and film, the decoder, and its errors on the
         episodes left out (:func:`~franka_wm.evaluation.decoder.decoder_error`).
     """
-    if held.pictures is None or not agent.model.has_next or held.pictures.shape[0] < 4:
+    if held.images is None or not agent.model.has_next or held.images.shape[0] < 4:
         return None
-    pictures = held.pictures
-    count, length = pictures.shape[:2]
+    images = held.images
+    count, length = images.shape[:2]
     device = held.latents.device
     seen = embedding(agent.model)(held.latents[:count, :length]).float()
     fit = count - max(2, count // 6)
     valid = held.valid[:count, :length].cpu()
     known, unknown = valid.clone(), valid.clone()
     known[fit:], unknown[:fit] = False, False
-    latents, drawn = _starts(agent, decoder_size=pictures.shape[2])
-    latents, drawn = torch.cat([seen[known.to(device)], latents]), torch.cat([pictures[known], drawn])
+    latents, drawn = _starts(agent, decoder_size=images.shape[2])
+    latents, drawn = torch.cat([seen[known.to(device)], latents]), torch.cat([images[known], drawn])
     say(f"training a decoder on {len(drawn)} images; it is used for display only …")
     decoder = train_decoder(latents, drawn)
-    errors = decoder_error(decoder, seen[unknown.to(device)], pictures[unknown])
+    errors = decoder_error(decoder, seen[unknown.to(device)], images[unknown])
     world = (
         count - 1 if count % 2 == 0 else count - 2
     )  # odd: the model's own behaviour, which moves with a purpose
     steps = min(steps, int(valid[world].sum()) - 1)
     actions = held.episodes.get("action")[world, :steps]
     shown = imagined_beside_real(
-        agent.model, decoder, held.latents[world, 0], actions, pictures[world, : steps + 1]
+        agent.model, decoder, held.latents[world, 0], actions, images[world, : steps + 1]
     )
     return shown, decoder, errors
 
 
-def _starts(agent: Any, *, decoder_size: int, rounds: int = 6, steps: int = 8) -> tuple[Tensor, Tensor]:
-    """Latents (n, D) and pictures of the first steps of many more episodes: more poses than a few long ones show."""
+def _starts(agent: Agent, *, decoder_size: int, rounds: int = 6, steps: int = 8) -> tuple[Tensor, Tensor]:
+    """Latents (n, D) and images of the first steps of many more episodes: more poses than a few long ones show."""
     keys = agent.model.observation_keys
-    latents, pictures = [], []
+    latents, images = [], []
     for k in range(rounds):
         episodes, seen = gather_episodes(
             agent.env,
@@ -253,8 +258,8 @@ def _starts(agent: Any, *, decoder_size: int, rounds: int = 6, steps: int = 8) -
             seed=derive_seed("diagnostics", 0, "starts", k),
             steps=steps,
             keys=keys,
-            picture_size=decoder_size,
-            pictures=min(64, agent.env.num_envs),
+            image_size=decoder_size,
+            images=min(64, agent.env.num_envs),
         )
         assert seen is not None
         episodes = cast(TensorDict, episodes[: len(seen)])
@@ -262,5 +267,5 @@ def _starts(agent: Any, *, decoder_size: int, rounds: int = 6, steps: int = 8) -
             embedded = embedding(agent.model)(encode_episodes(agent.model, episodes)[:, :-1]).float()
         use = episodes.get("valid")
         latents.append(embedded[use])
-        pictures.append(seen[use.cpu()])
-    return torch.cat(latents), torch.cat(pictures)
+        images.append(seen[use.cpu()])
+    return torch.cat(latents), torch.cat(images)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import inspect
 import math
-from typing import Any, cast
+from typing import TYPE_CHECKING, Any, cast
 
 import torch
 from tensordict import TensorDictBase
@@ -16,12 +16,15 @@ from franka_wm.evaluation.open_loop import correlation
 from franka_wm.evaluation.rollouts import embedding
 from franka_wm.evaluation.spectrum import collapse_warning, latent_statistics
 
+if TYPE_CHECKING:
+    from franka_wm.models.base import WorldModel
+
 SAMPLES = 512
 """Latents that :func:`training_diagnostics` looks at, at most."""
 
 
 @torch.no_grad()
-def training_diagnostics(model: Any, batch: TensorDictBase) -> dict[str, float]:
+def training_diagnostics(model: WorldModel, batch: TensorDictBase) -> dict[str, float]:
     """Numbers that show a collapse while it happens; cheap enough for every line of a log.
 
     Changes nothing: neither the model's mode and statistics nor torch's random numbers. Waits for the device.
@@ -57,7 +60,7 @@ def training_diagnostics(model: Any, batch: TensorDictBase) -> dict[str, float]:
 
 
 def _value_consistency(
-    model: Any, first: Tensor, last: Tensor, reward: Tensor, terminated: Tensor
+    model: WorldModel, first: Tensor, last: Tensor, reward: Tensor, terminated: Tensor
 ) -> dict[str, float]:
     value = model.value(first).squeeze(-1).float()
     target = model.value(last).squeeze(-1).float()
@@ -135,7 +138,7 @@ def paired_gain(planner: TensorDictBase, prior: TensorDictBase) -> dict[str, Any
     return {name: bootstrap_mean((planner.get(name) - prior.get(name)).cpu()).as_dict() for name in names}
 
 
-def diagnose_training(model: Any, batch: Any) -> tuple[dict[str, float], str | None]:
+def diagnose_training(model: WorldModel, batch: Any) -> tuple[dict[str, float], str | None]:
     """Whether latents collapse and values drift: numbers to log, and a warning."""
     numbers = training_diagnostics(model, batch)
     if not numbers:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor
@@ -12,6 +12,9 @@ from torch import Tensor
 from franka_wm.evaluation.calibration import calibration_bins
 from franka_wm.evaluation.intervals import Interval, bootstrap_ratio
 from franka_wm.evaluation.rollouts import embedding
+
+if TYPE_CHECKING:
+    from franka_wm.models.base import WorldModel
 
 PAIRS = 2000
 """Random pairs of states that a rank correlation is measured over."""
@@ -28,7 +31,7 @@ class NothingToPredictError(ValueError):
 
 @torch.no_grad()
 def horizon_error(
-    model: Any, latents: Tensor, actions: Tensor, *, horizon: int = 10, valid: Tensor | None = None
+    model: WorldModel, latents: Tensor, actions: Tensor, *, horizon: int = 10, valid: Tensor | None = None
 ) -> dict[str, Any]:
     """Error of predicted latents by horizon, against the encoded truth and against "nothing changes".
 

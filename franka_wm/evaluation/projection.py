@@ -25,7 +25,7 @@ class Projection(NamedTuple):
 def principal_components(latents: ArrayLike) -> Projection:
     """Latents (N, Z), N ≥ 2, along their first two principal directions.
 
-    Signs are fixed (the largest coordinate of each direction is positive), so that a picture does not flip.
+    Signs are fixed (the largest coordinate of each direction is positive), so that an image does not flip.
 
     Raises:
         UserError: another shape, or values that are not finite.

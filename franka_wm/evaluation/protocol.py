@@ -6,7 +6,7 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, cast
+from typing import TYPE_CHECKING, Any, cast
 
 import torch
 from tensordict import TensorDict
@@ -27,6 +27,9 @@ from franka_wm.seeding import derive_seed, seeded
 from franka_wm.training.settings import EvaluationSettings, RunSettings
 from franka_wm.version import __version__
 from franka_wm.versions import hardware
+
+if TYPE_CHECKING:
+    from franka_wm.training.load import Agent
 
 EPISODES = 100
 """Episodes per policy, if not said otherwise."""
@@ -64,7 +67,7 @@ class Evaluation:
 
 
 def evaluate_agent(
-    agent: Any,
+    agent: Agent,
     *,
     episodes: int = EPISODES,
     policies: Mapping[str, Any] | None = None,

@@ -4,16 +4,20 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from tensordict import TensorDictBase
 from torch import Tensor
 
 from franka_wm.errors import UserError
-from franka_wm.evaluation.closed_loop import arm_of, play_episodes
+from franka_wm.evaluation.closed_loop import play_episodes
 from franka_wm.evaluation.intervals import bootstrap_mean, wilson
 from franka_wm.evaluation.protocol import held_out_seeds
 from franka_wm.seeding import seeded
+from franka_wm.training.build import arm_of
+
+if TYPE_CHECKING:
+    from franka_wm.training.load import Agent
 
 UNSHIFTED = "as trained"
 
@@ -39,7 +43,7 @@ class Shift:
 
     Attributes:
         randomization: Fields of :class:`~franka_wm.envs.config.Randomization`.
-        looks: Whether it changes pictures alone: without pictures nothing of it is seen.
+        looks: Whether it changes images alone: without images nothing of it is seen.
         env: Other fields of the environment's configuration.
     """
 
@@ -67,7 +71,7 @@ SHIFTS: dict[str, Shift] = {
 
 
 def robustness(
-    agent: Any,
+    agent: Agent,
     *,
     episodes: int = 100,
     shifts: Mapping[str, Shift] = SHIFTS,
@@ -81,7 +85,7 @@ def robustness(
     Args:
         agent: Of :func:`franka_wm.training.load.load_agent`; of the arm.
         episodes: Worlds, at least 2.
-        shifts: By name; those that change pictures alone are left out for models that read none.
+        shifts: By name; those that change images alone are left out for models that read none.
         policies: Names; the planner (or the policy where there is none) and ``ik``, which shows what the shift
             leaves possible, if not given.
         report: Called with each shift's name and results as they come.
@@ -126,7 +130,7 @@ def robustness(
     return results
 
 
-def check_shiftable(agent: Any) -> None:
+def check_shiftable(agent: Agent) -> None:
     """Whether the agent's worlds can be shifted.
 
     Raises:

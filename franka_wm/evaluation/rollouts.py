@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import Any, cast
+from typing import TYPE_CHECKING, Any, cast
 
 import torch
 from tensordict import TensorDict, TensorDictBase
@@ -11,8 +11,12 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
-from franka_wm.evaluation.closed_loop import arm_of, begin, evaluating
+from franka_wm.evaluation.closed_loop import begin, evaluating
 from franka_wm.seeding import derive_seed, seeded
+from franka_wm.training.build import arm_of
+
+if TYPE_CHECKING:
+    from franka_wm.models.base import WorldModel
 
 ROLLOUT_SEED = derive_seed("diagnostics", 0)
 """Episodes of the diagnostics: neither those of training nor those of the closed loop."""
@@ -60,8 +64,8 @@ def gather_episodes(
     seed: int = ROLLOUT_SEED,
     steps: int | None = None,
     keys: Sequence[str] = (),
-    picture_size: int | None = None,
-    pictures: int = 0,
+    image_size: int | None = None,
+    images: int = 0,
 ) -> tuple[TensorDict, Tensor | None]:
     """Plays the first episode of every world and keeps what the diagnostics need.
 
@@ -71,14 +75,14 @@ def gather_episodes(
         seed: Of the episodes and of all random numbers: the same call gives the same numbers on a CPU.
         steps: T, at most an episode's length; that if not given.
         keys: Observations to keep.
-        picture_size: Side of the pictures to render [px].
-        pictures: Of how many worlds, the first ones; the arm only.
+        image_size: Side of the images to render [px].
+        images: Of how many worlds, the first ones; the arm only.
 
     Returns:
         Batch size (E, T). Root: ``keys``, ``action``, ``is_init``, ``valid`` (E, T) bool (step of the first
         episode), for the arm ``physical`` (E, T, 20): the true state without noise, as under the key ``state``;
-        under ``next``: ``keys``, ``reward``, ``terminated``, ``done``, ``physical``. And pictures of the roots,
-        (pictures, T, S, S, 3) uint8 on the CPU, or ``None``.
+        under ``next``: ``keys``, ``reward``, ``terminated``, ``done``, ``physical``. And images of the roots,
+        (images, T, S, S, 3) uint8 on the CPU, or ``None``.
     """
     arm = arm_of(env)
     longest = int(env.config.episode_length)
@@ -91,8 +95,8 @@ def gather_episodes(
             row: dict[Any, Tensor] = {"valid": running.clone()}
             if arm is not None:
                 row["physical"] = arm.simulation.tensors.true_state.clone()
-                if picture_size and pictures:
-                    seen.append(arm.render(picture_size, num_views=pictures).cpu())
+                if image_size and images:
+                    seen.append(arm.render(image_size, num_views=images).cpu())
             tensordict, following = env.step_and_maybe_reset(policy(tensordict))
             row |= {key: tensordict.get(key) for key in (*keys, "action", "is_init")}
             row |= {
@@ -108,14 +112,14 @@ def gather_episodes(
 
 
 @torch.no_grad()
-def encode_episodes(model: Any, episodes: TensorDictBase, *, chunk: int = 1024) -> Tensor:
+def encode_episodes(model: WorldModel, episodes: TensorDictBase, *, chunk: int = 1024) -> Tensor:
     """Latents of all observations of the episodes, what ended them included.
 
     A model with memory (``observe``) sees each episode from its beginning, as when it acts.
 
     Args:
         episodes: Batch size (E, T), of :func:`gather_episodes`.
-        chunk: Observations encoded at a time: bounds the memory that pictures take.
+        chunk: Observations encoded at a time: bounds the memory that images take.
 
     Returns:
         (E, T + 1, Z).
@@ -141,7 +145,7 @@ def encoded_validly(episodes: TensorDictBase) -> Tensor:
     return torch.cat([valid, valid[:, -1:]], 1)
 
 
-def embedding(model: Any) -> Callable[[Tensor], Tensor]:
+def embedding(model: WorldModel) -> Callable[[Tensor], Tensor]:
     """What distances between latents are measured on: ``model.embed``, or the latent itself."""
     return model.embed
 

@@ -24,7 +24,7 @@ NEARBY = ("127.0.0.1", "localhost", "::1")
 LARGEST = 16 * 1024
 """Largest message of a client [bytes]."""
 RATE, BURST = 300.0, 600.0
-"""Messages per second of one client, and how many at once: a dragged goal sends one for each picture of the screen."""
+"""Messages per second of one client, and how many at once: a dragged goal sends one for each image of the screen."""
 
 type Check = Callable[[Any], bool]
 

@@ -16,10 +16,10 @@ from franka_wm.envs.scene import FLOOR
 from franka_wm.errors import UserError
 from franka_wm.live.frame import Frame
 from franka_wm.live.gate import Gate, is_number
-from franka_wm.live.scene import Scene
 from franka_wm.live.session import SPEEDS, Session
-from franka_wm.live.settings import Setting
 from franka_wm.live.shapes import arm_shapes
+from franka_wm.live.sliders import Setting
+from franka_wm.live.viser_scene import ViserScene
 from franka_wm.report.style import BLUE, VERMILION, policy_name
 
 HOST = "127.0.0.1"
@@ -30,9 +30,9 @@ HISTORY = 10.0
 PENDING = 8
 """Requests of browsers that may wait for the session at once; further ones are ignored."""
 REDRAW = 0.2
-"""Least time between two pictures of the plots and the status [s]; the arm moves in every step."""
+"""Least time between two images of the plots and the status [s]; the arm moves in every step."""
 
-KINDS = "video: an .mp4 of the environment's camera; dataset: a LeRobot dataset of what is observed and done"
+KINDS = "video: an .mp4 of the arm; dataset: a LeRobot dataset of what is observed and done"
 
 LABELS = {
     "horizon": "horizon [steps]",
@@ -82,7 +82,7 @@ class Page:
         self._pending = threading.BoundedSemaphore(PENDING)
         arm = session.arm
         first = session.frame()
-        self.scene = Scene(
+        self.scene = ViserScene(
             self.server,
             arm_shapes(arm.model),
             bodies=len(first.bodies),

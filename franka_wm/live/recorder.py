@@ -11,7 +11,7 @@ import torch
 from tensordict import TensorDictBase
 
 from franka_wm.envs import FrankaEnv
-from franka_wm.envs.camera import project
+from franka_wm.envs.camera import project, whole_arm
 from franka_wm.errors import UserError
 from franka_wm.video import draw_marker, write_video
 
@@ -37,16 +37,17 @@ class Recorder:
 
 
 class VideoRecorder(Recorder):
-    """Collects one picture a step, from the environment's own camera, the goal drawn as a ring.
+    """Collects one image a step, from a camera that has the whole arm in view, the goal drawn as a ring.
 
     Args:
         env: Whose first world is filmed.
-        size: Side of the picture [px], even.
-        most: Pictures after which it is full: they are kept in memory (480² px: 0.7 MB each).
+        size: Side of the image [px], even.
+        most: Images after which it is full: they are kept in memory (480² px: 0.7 MB each).
     """
 
     def __init__(self, env: FrankaEnv, *, size: int = 480, most: int = 1800):
         self.env, self.size, self.most = env, size, most
+        self.whole = whole_arm(env.config, env.kinematics)
         self.frames: list[torch.Tensor] = []
 
     def __len__(self) -> int:
@@ -54,18 +55,18 @@ class VideoRecorder(Recorder):
         return len(self.frames)
 
     def take(self, step: TensorDictBase) -> None:
-        """One picture of the present; nothing where it is full or closed. ``step`` is not looked at."""
+        """One image of the present; nothing where it is full or closed. ``step`` is not looked at."""
         if self.closed or self.full:
             return
-        picture = self.env.render(self.size, num_views=1).cpu()
-        centre = project(self.env.goal[:1], self.env.config, self.size).cpu()
+        picture = self.env.render(self.size, num_views=1, config=self.whole).cpu()
+        centre = project(self.env.goal[:1], self.whole, self.size).cpu()
         self.frames.append(draw_marker(picture, centre, radius=self.size / 32)[0])
 
     def write(self, path: str | Path) -> Path:
         """Writes the .mp4 at the environment's own rate, however fast it was simulated.
 
         Raises:
-            UserError: No picture was taken, or the file cannot be written.
+            UserError: No image was taken, or the file cannot be written.
         """
         if not self.frames:
             raise UserError(
@@ -84,7 +85,7 @@ class DatasetRecorder(Recorder):
         env: The world, with its transforms.
         seed: Of the session.
         policy: Who acts at the start, for the dataset's provenance.
-        format: How pictures are stored; see :data:`~franka_wm.data.lerobot.schema.FORMATS`.
+        format: How images are stored; see :data:`~franka_wm.data.lerobot.schema.FORMATS`.
         most: Steps after which it is full.
 
     Raises:

@@ -22,7 +22,7 @@ from franka_wm.errors import UserError
 from franka_wm.live.commanded import commanded_path
 from franka_wm.live.frame import Frame
 from franka_wm.live.recorder import DatasetRecorder, VideoRecorder
-from franka_wm.live.settings import Setting, planner_settings, rebuilt, work
+from franka_wm.live.sliders import Setting, planner_settings, rebuilt, work
 from franka_wm.policies.names import refuse_old_name
 
 SPEEDS = (0.1, 1.0)

@@ -214,7 +214,7 @@ class LeWorldModel(HistoryWorldModel):
         """The embedding (..., embed_dim) of a goal: of its images where the model reads any (state vectors
         are not needed then), else of its state vectors."""
         if self.image_sizes:
-            return self._picture(observation, batch_statistics=False)
+            return self._image(observation, batch_statistics=False)
         return self._comparable(self.encode_frame(observation))
 
     def reward(self, z: Tensor, action: Tensor) -> Tensor:
@@ -285,7 +285,7 @@ class LeWorldModel(HistoryWorldModel):
 
     # ------------------------------------------------------------------ pieces
 
-    def _picture(self, observation: TensorDictBase, *, batch_statistics: bool) -> Tensor:
+    def _image(self, observation: TensorDictBase, *, batch_statistics: bool) -> Tensor:
         assert self.encoder is not None and self.projector is not None
         images = stack_cameras(observation, self.image_sizes)  # (..., V, height, width, C)
         tokens = self.encoder(images.flatten(0, -4))[:, 0]
@@ -296,7 +296,7 @@ class LeWorldModel(HistoryWorldModel):
         """Embeddings (..., F) of observations (...): the image's, then the state's."""
         parts = []
         if self.encoder is not None:
-            parts.append(self._picture(observation, batch_statistics=batch_statistics))
+            parts.append(self._image(observation, batch_statistics=batch_statistics))
         if self.state_encoder is not None:
             parts.append(self.state_encoder(self.vectors(observation)))
         return parts[0] if len(parts) == 1 else torch.cat(parts, dim=-1)

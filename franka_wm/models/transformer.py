@@ -146,30 +146,15 @@ class CausalTransformer(nn.Module):
         dropout: float = 0.0,
     ) -> None:
         super().__init__()
-        for name, value in (
-            ("width", width),
-            ("depth", depth),
-            ("heads", heads),
-            ("head_dim", head_dim),
-            ("hidden", hidden),
-        ):
+        sizes = {"width": width, "heads": heads, "head_dim": head_dim, "hidden": hidden}
+        for name, value in {**sizes, "depth": depth}.items():
             if value < 1:
                 raise ValueError(f"{name} of a transformer must be at least 1, got {value}")
         if head_dim % 2:
             raise ValueError(f"head_dim must be even (rotary codes turn pairs of features), got {head_dim}")
         if not 0.0 <= dropout < 1.0:
             raise ValueError(f"dropout must be in [0, 1), got {dropout}")
-        blocks = [
-            CausalBlock(
-                width=width,
-                heads=heads,
-                head_dim=head_dim,
-                hidden=hidden,
-                condition=condition,
-                dropout=dropout,
-            )
-            for _ in range(depth)
-        ]
+        blocks = [CausalBlock(**sizes, condition=condition, dropout=dropout) for _ in range(depth)]
         self.blocks = nn.ModuleList(blocks)
         self.norm = nn.LayerNorm(width, eps=1e-6)
         # Unit gain, as in DiT: with the usual 0.02, narrow transformers pass on next to nothing of an action.

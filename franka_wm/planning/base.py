@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import ClassVar, Protocol
+from typing import ClassVar, NamedTuple, Protocol
 
 import torch
 from tensordict import TensorDict
@@ -11,7 +11,7 @@ from torch import Tensor
 from franka_wm.errors import UserError
 from franka_wm.options import POSITIVE, Bounds, check_arguments
 from franka_wm.planning.objectives import Score
-from franka_wm.planning.sampling import roll_prior, warm_start
+from franka_wm.planning.sampling import explored, require_is_init, rollout
 
 Next = Callable[[Tensor, Tensor], Tensor]
 """(z (..., D), action (..., A)) -> next latents (..., D)."""
@@ -56,9 +56,29 @@ class Planner(Protocol):
         ...
 
 
+class Query(NamedTuple):
+    """What one decision is asked with: the arguments of `Planner.plan`."""
+
+    z: Tensor
+    next: Next
+    objective: Score
+    prior: Prior | None
+    previous: Tensor | None
+    is_init: Tensor | None
+    explore: bool
+    generator: torch.Generator | None
+
+    def score(self, actions: Tensor) -> Tensor:
+        """Scores (E, S) of candidates (E, S, H, A), rolled out with the model."""
+        return self.objective(rollout(self.z, actions, self.next), actions)
+
+
 @dataclass(kw_only=True, eq=False)
 class ContinuousPlanner:
-    """Settings of a planner over continuous actions; each field is one of `conf/planner`.
+    """A planner over continuous actions: its settings, each a field of `conf/planner`, and what all of them do.
+
+    Plain tensor code: static shapes, no data-dependent control flow, no host synchronisation. It holds no
+    state; `previous` carries the plan from one call to the next. Rollouts hold E · S · (H + 1) · D numbers.
 
     Args:
         action_dim: A.
@@ -103,27 +123,66 @@ class ContinuousPlanner:
         """`low` and `high`."""
         return {"low": self.low, "high": self.high}
 
-    def start(
-        self, z: Tensor, previous: Tensor | None, is_init: Tensor | None, *, repeat_last: bool = False
-    ) -> Tensor:
-        """Plan to start from (E, H, A), see `warm_start`."""
-        return warm_start(
-            z,
-            previous,
-            is_init,
-            horizon=self.horizon,
-            action_dim=self.action_dim,
-            repeat_last=repeat_last,
-            **self.bounds,
-        )
+    @torch.no_grad()
+    def plan(
+        self,
+        z: Tensor,
+        next: Next,
+        objective: Score,
+        *,
+        prior: Prior | None = None,
+        previous: Tensor | None = None,
+        is_init: Tensor | None = None,
+        explore: bool = False,
+        generator: torch.Generator | None = None,
+    ) -> TensorDict:
+        """See `Planner.plan`; what the result holds besides `action` and `plan` stands at `search`."""
+        return self.search(Query(z, next, objective, prior, previous, is_init, explore, generator))
 
-    def guided(self, z: Tensor, next: Next, prior: Prior | None) -> list[Tensor]:
-        """The policy's candidates (E, `num_policy_samples`, H, A), if there are any."""
-        if prior is None or not self.num_policy_samples:
+    def search(self, query: Query) -> TensorDict:
+        """The plan of one decision: a TensorDict as `Planner.plan` returns it."""
+        raise NotImplementedError
+
+    def start(self, query: Query, *, repeat_last: bool = False) -> Tensor:
+        """Plan to start from (E, H, A): the previous one, one step on, or the middle of the bounds.
+
+        Args:
+            repeat_last: fill the step that comes into sight with the last action; else with the middle.
+
+        Raises:
+            ValueError: `previous` or `is_init` has another shape.
+        """
+        z, previous = query.z, query.previous
+        shape = (z.shape[0], self.horizon, self.action_dim)
+        cold = torch.full(shape, 0.5 * (self.low + self.high), device=z.device, dtype=z.dtype)
+        if previous is None:
+            return cold
+        if previous.shape != shape:
+            raise ValueError(f"previous must have shape (E, H, A) = {shape}, got {tuple(previous.shape)}")
+        previous = previous.to(z.dtype)
+        shifted = torch.cat((previous[:, 1:], previous[:, -1:] if repeat_last else cold[:, :1]), dim=1)
+        if query.is_init is None:
+            return shifted
+        require_is_init(query.is_init, z.shape[0])
+        return torch.where(query.is_init.unsqueeze(-1), cold, shifted)
+
+    def guided(self, query: Query) -> list[Tensor]:
+        """The policy's candidates (E, `num_policy_samples`, H, A), unrolled from z, if there are any."""
+        z, samples = query.z, self.num_policy_samples
+        if query.prior is None or not samples:
             return []
-        return [
-            roll_prior(z, next, prior, samples=self.num_policy_samples, horizon=self.horizon, **self.bounds)
-        ]
+        latent = z.unsqueeze(1).expand(z.shape[0], samples, *z.shape[1:])
+        actions = []
+        for _ in range(self.horizon):
+            # A weight of zero does not remove a nan from a weighted mean, so it must not get in.
+            actions.append(torch.nan_to_num(query.prior(latent), nan=0.0).clamp(self.low, self.high))
+            latent = query.next(latent, actions[-1])
+        return [torch.stack(actions, dim=2)]
+
+    def result(self, query: Query, action: Tensor, noise: Tensor | float, **entries: Tensor) -> TensorDict:
+        """What `plan` returns: the action (E, A), explored with a deviation of `noise` if asked, and `entries`."""
+        action = explored(action, noise, query.explore, generator=query.generator, **self.bounds)
+        return TensorDict({"action": action, **entries}, batch_size=[action.shape[0]])
 
 
 @dataclass(kw_only=True, eq=False)

@@ -6,13 +6,11 @@ from typing import ClassVar
 
 import torch
 from tensordict import TensorDict
-from torch import Tensor
 
 from franka_wm.errors import UserError
 from franka_wm.options import Bounds
-from franka_wm.planning.base import ElitePlanner, Next, Prior
-from franka_wm.planning.objectives import Score
-from franka_wm.planning.sampling import best, explored, gaussian_candidates, refit, rollout, take
+from franka_wm.planning.base import ElitePlanner, Query
+from franka_wm.planning.sampling import best, gaussian_candidates, refit, take
 
 
 @dataclass(kw_only=True, eq=False)
@@ -27,22 +25,11 @@ class CEM(ElitePlanner):
     standard deviation has a floor, `min_std`, without which there would be nothing left to explore with;
     0 is the plain method. A score that is not finite counts for nothing.
 
-    Plain tensor code, see `MPPI`. Rollouts hold E · S · (H + 1) · D numbers.
-
-    Args:
-        action_dim: A.
-        horizon: H, steps looked ahead.
+    Args beside those of `ElitePlanner`:
         num_samples: S, candidates per environment and iteration, the mean and those of the policy included.
-        num_policy_samples: how many of them are rolled out with `prior`, if `plan` gets one.
-        num_elites: how many candidates the Gaussian is refitted to.
-        iterations: rounds of sampling and refitting.
         momentum: share of the old mean and standard deviation that each refit keeps.
         std: standard deviation that every search starts with, in units of the action.
         min_std: the least it becomes.
-        low, high: bounds of every action component.
-
-    Raises:
-        ValueError: a setting that cannot work.
     """
 
     horizon: int = 5
@@ -65,46 +52,26 @@ class CEM(ElitePlanner):
         if self.min_std > self.std:
             raise UserError(f"planner.min_std={self.min_std}: must be at most std={self.std}")
 
-    @torch.no_grad()
-    def plan(
-        self,
-        z: Tensor,
-        next: Next,
-        objective: Score,
-        *,
-        prior: Prior | None = None,
-        previous: Tensor | None = None,
-        is_init: Tensor | None = None,
-        explore: bool = False,
-        generator: torch.Generator | None = None,
-    ) -> TensorDict:
+    def search(self, query: Query) -> TensorDict:
         """See `Planner.plan`; with `explore`, the noise has the final standard deviation.
 
         Returns:
             TensorDict of batch size [E]: `action` (E, A), the first of the final mean; `plan`, the final
             mean, and `std`, both (E, H, A); `value` (E, 1), the mean score of the last elites.
         """
-        mean = self.start(z, previous, is_init).clamp(self.low, self.high)
+        mean = self.start(query).clamp(self.low, self.high)
         std = torch.full_like(mean, self.std)
-        given = self.guided(z, next, prior)
+        given = self.guided(query)
         drawing = self.num_samples - 1 - sum(one.shape[1] for one in given)
 
-        value = mean.new_zeros(z.shape[0], 1)
+        value = mean.new_zeros(mean.shape[0], 1)
         for _ in range(self.iterations):
-            drawn = gaussian_candidates(mean, std, drawing, generator=generator, **self.bounds)
+            drawn = gaussian_candidates(mean, std, drawing, generator=query.generator, **self.bounds)
             actions = torch.cat((mean.unsqueeze(1), *given, drawn), dim=1)
-            elites = best(objective(rollout(z, actions, next), actions), self.num_elites)
+            elites = best(query.score(actions), self.num_elites)
             mean, std = refit(take(actions, elites.which), elites.valid, mean, std, momentum=self.momentum)
             # Rounding can carry a mean of actions at a bound just past it.
             mean, std = mean.clamp(self.low, self.high), std.clamp(min=self.min_std)
             value = elites.mean_score()
 
-        return TensorDict(
-            {
-                "action": explored(mean[:, 0], std[:, 0], explore, generator=generator, **self.bounds),
-                "plan": mean,
-                "std": std,
-                "value": value,
-            },
-            batch_size=[z.shape[0]],
-        )
+        return self.result(query, mean[:, 0], std[:, 0], plan=mean, std=std, value=value)

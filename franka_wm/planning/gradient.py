@@ -10,9 +10,8 @@ from torch import Tensor
 
 from franka_wm.errors import UserError
 from franka_wm.options import Bounds
-from franka_wm.planning.base import ContinuousPlanner, Next, Prior
-from franka_wm.planning.objectives import Score
-from franka_wm.planning.sampling import explored, gaussian_candidates, rollout
+from franka_wm.planning.base import ContinuousPlanner, Query
+from franka_wm.planning.sampling import gaussian_candidates
 
 
 @dataclass(kw_only=True, eq=False)
@@ -28,14 +27,11 @@ class GradientPlanner(ContinuousPlanner):
     worse than what it began with (`tanh` first moves starts at a bound in by 1 % of half the range). A
     gradient that is not finite moves nothing; a score that is not finite never wins.
 
-    Works under `torch.no_grad`, and leaves no gradient in the model's parameters. Static shapes, no
-    data-dependent control flow, no host synchronisation. Memory: the graph of one rollout of E · S · H steps.
+    Works under `torch.no_grad`, and leaves no gradient in the model's parameters. Memory: the graph of one
+    rollout of E · S · H steps.
 
-    Args:
-        action_dim: A.
-        horizon: H, steps looked ahead.
+    Args beside those of `ContinuousPlanner`:
         num_samples: S, starts per environment, those of the policy included.
-        num_policy_samples: how many of them are rolled out with `prior`, if `plan` gets one.
         iterations: steps of Adam.
         lr: length of a step, in units of the action (before squashing with `tanh`).
         betas: Adam's decay rates.
@@ -43,10 +39,6 @@ class GradientPlanner(ContinuousPlanner):
         explore_std: noise added to the action with `explore`.
         bound: what keeps actions within bounds. `clamp`: each step is projected, and plans reach the bounds.
             `tanh`: actions are a squashed free variable; smooth, but slow near the bounds.
-        low, high: bounds of every action component.
-
-    Raises:
-        ValueError: a setting that cannot work.
     """
 
     horizon: int = 5
@@ -71,23 +63,11 @@ class GradientPlanner(ContinuousPlanner):
             raise UserError(f"planner.betas={self.betas}: both must be at least 0 and below 1")
         self.betas = first, second  # may have come as a list
 
-    @torch.no_grad()
-    def plan(
-        self,
-        z: Tensor,
-        next: Next,
-        objective: Score,
-        *,
-        prior: Prior | None = None,
-        previous: Tensor | None = None,
-        is_init: Tensor | None = None,
-        explore: bool = False,
-        generator: torch.Generator | None = None,
-    ) -> TensorDict:
+    def search(self, query: Query) -> TensorDict:
         """See `Planner.plan`; with `explore`, the noise has the deviation `explore_std`.
 
         Args:
-            next, objective: differentiable.
+            query: `next` and `objective` are differentiable.
 
         Returns:
             TensorDict of batch size [E]: `action` (E, A), the first of the best plan; `plan` (E, H, A), the
@@ -96,8 +76,8 @@ class GradientPlanner(ContinuousPlanner):
         Raises:
             ValueError: `previous` or `is_init` has another shape, or the scores have no gradient.
         """
-        z = z.detach()
-        starts = self._starts(z, next, prior, previous, is_init, generator)
+        query = query._replace(z=query.z.detach())
+        starts = self._starts(query)
         free = starts if self.bound == "clamp" else self._unsquash(starts)
         first_moment, second_moment = torch.zeros_like(free), torch.zeros_like(free)
         first, second = self.betas
@@ -105,7 +85,7 @@ class GradientPlanner(ContinuousPlanner):
         actions, score = starts, None
         best_actions = best_score = None
         for step in range(1, self.iterations + 1):
-            actions, score, gradient = self._ascent(z, next, objective, free)
+            actions, score, gradient = self._ascent(query, free)
             best_actions, best_score = self._keep(best_actions, best_score, actions, score)
             first_moment = first * first_moment + (1.0 - first) * gradient
             second_moment = second * second_moment + (1.0 - second) * gradient.square()
@@ -115,7 +95,7 @@ class GradientPlanner(ContinuousPlanner):
                 free = free.clamp(self.low, self.high)
 
         actions = self._bounded(free)
-        score = objective(rollout(z, actions, next), actions)
+        score = query.score(actions)
         best_actions, best_score = self._keep(best_actions, best_score, actions, score)
 
         winner = best_score.argmax(1, keepdim=True)  # (E, 1)
@@ -124,42 +104,27 @@ class GradientPlanner(ContinuousPlanner):
         ).squeeze(1)
         value = best_score.gather(1, winner)
         value = torch.where(torch.isfinite(value), value, torch.zeros_like(value))
-        return TensorDict(
-            {
-                "action": explored(plan[:, 0], self.explore_std, explore, generator=generator, **self.bounds),
-                "plan": plan,
-                "value": value,
-            },
-            batch_size=[z.shape[0]],
-        )
+        return self.result(query, plan[:, 0], self.explore_std, plan=plan, value=value)
 
-    def _starts(
-        self,
-        z: Tensor,
-        next: Next,
-        prior: Prior | None,
-        previous: Tensor | None,
-        is_init: Tensor | None,
-        generator: torch.Generator | None,
-    ) -> Tensor:
+    def _starts(self, query: Query) -> Tensor:
         """Where the search starts (E, S, H, A): the warm start, the policy's, and some around the former."""
-        warm = self.start(z, previous, is_init)
-        guided = self.guided(z, next, prior)
+        warm = self.start(query)
+        guided = self.guided(query)
         scattered = gaussian_candidates(
             warm,
             torch.full_like(warm, self.std),
             self.num_samples - 1 - sum(one.shape[1] for one in guided),
-            generator=generator,
+            generator=query.generator,
             **self.bounds,
         )
         return torch.cat((warm.clamp(self.low, self.high).unsqueeze(1), *guided, scattered), dim=1)
 
-    def _ascent(self, z: Tensor, next: Next, objective: Score, free: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    def _ascent(self, query: Query, free: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """The free variable's actions, their scores (E, S), and the scores' gradient, where finite."""
         with torch.enable_grad():
             free = free.detach().requires_grad_()
             actions = self._bounded(free)
-            score = objective(rollout(z, actions, next), actions)
+            score = query.score(actions)
             # Candidates do not interact, so the gradient of the sum holds each one's own. Unlike backward(),
             # grad() writes to no parameter.
             gradient = (

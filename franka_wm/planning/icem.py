@@ -9,10 +9,9 @@ from tensordict import TensorDict
 from torch import Tensor
 
 from franka_wm.options import FRACTION, Bounds
-from franka_wm.planning.base import Next, Prior
+from franka_wm.planning.base import Query
 from franka_wm.planning.cem import CEM
-from franka_wm.planning.objectives import Score
-from franka_wm.planning.sampling import best, explored, refit, require_is_init, rollout, take
+from franka_wm.planning.sampling import best, refit, require_is_init, take
 
 
 def coloured_noise(
@@ -71,27 +70,14 @@ class ICEM(CEM):
     iteration, which costs R rollouts and keeps the code free of special cases; `min_std` is new (0 is the
     published method). A score that is not finite counts for nothing.
 
-    Plain tensor code, see `MPPI`.
-
-    Args:
-        action_dim: A.
-        horizon: H, steps looked ahead.
+    Args beside those of `CEM`:
         num_samples: candidates per environment of the first iteration, those of the policy included; the R
             reused elites come on top.
         num_policy_samples: how many of them are rolled out with `prior`, if `plan` gets one. They are
             candidates of the first iteration; the good ones stay as elites.
-        num_elites: how many candidates the Gaussian is refitted to.
-        iterations: rounds of sampling and refitting.
         noise_beta: exponent of the noise's spectrum, 0 (white) to about 4.
         reuse: share of the elites that is kept.
         decay: factor by which the population shrinks, at least 1.
-        momentum: share of the old mean and standard deviation that each refit keeps.
-        std: standard deviation that every search starts with, in units of the action.
-        min_std: the least it becomes.
-        low, high: bounds of every action component.
-
-    Raises:
-        ValueError: a setting that cannot work.
     """
 
     horizon: int = 30
@@ -121,53 +107,42 @@ class ICEM(CEM):
         least = min(self.num_samples, 2 * self.num_elites)
         return [max(least, int(self.num_samples * self.decay**-i)) for i in range(self.iterations)]
 
-    @torch.no_grad()
-    def plan(
-        self,
-        z: Tensor,
-        next: Next,
-        objective: Score,
-        *,
-        prior: Prior | None = None,
-        previous: Tensor | None = None,
-        is_init: Tensor | None = None,
-        explore: bool = False,
-        generator: torch.Generator | None = None,
-    ) -> TensorDict:
+    def search(self, query: Query) -> TensorDict:
         """See `Planner.plan`; with `explore`, the noise has the final standard deviation.
 
         Args:
-            z: float32 or float64.
-            previous: the `plan` of the last call (E, 1 + R, H, A): mean and elites, both shifted by one
-                step. The step that comes into sight repeats the mean's last action; elites draw theirs.
+            query: `z` float32 or float64; `previous` the `plan` of the last call (E, 1 + R, H, A): mean and
+                elites, both shifted by one step. The step that comes into sight repeats the mean's last
+                action; elites draw theirs.
 
         Returns:
             TensorDict of batch size [E]: `action` (E, A), the first of the best plan (of the mean, if no
             score is finite); `plan` (E, 1 + R, H, A), the final mean and the elites to keep; `best`, the best
             plan, and `std`, both (E, H, A); `value` (E, 1), the score of the best plan.
         """
-        carried = (z.shape[0], 1 + self.num_kept, self.horizon, self.action_dim)
+        previous, generator = query.previous, query.generator
+        carried = (query.z.shape[0], 1 + self.num_kept, self.horizon, self.action_dim)
         if previous is not None and previous.shape != carried:
             raise ValueError(
                 f"previous must have shape (E, 1 + R, H, A) = {carried}, got {tuple(previous.shape)}"
             )
         cold = None if previous is None else previous[:, 0]
-        mean = self.start(z, cold, is_init, repeat_last=True).clamp(self.low, self.high)
+        mean = self.start(query._replace(previous=cold), repeat_last=True).clamp(self.low, self.high)
         std = torch.full_like(mean, self.std)
-        guided = 0 if prior is None else self.num_policy_samples
+        guided = 0 if query.prior is None else self.num_policy_samples
 
         kept, chosen, elites = mean[:, None][:, :0], mean[:, None], None
         for i, population in enumerate(self.population()):
             if i == 0:
                 drawn = self._draw(mean, std, population - guided + self.num_kept, generator)
-                pool = [self._shifted(previous, is_init, drawn), drawn[:, self.num_kept :]]
-                pool += self.guided(z, next, prior)
+                pool = [self._shifted(previous, query.is_init, drawn), drawn[:, self.num_kept :]]
+                pool += self.guided(query)
             else:
                 pool = [kept, self._draw(mean, std, population, generator)]
             if i == self.iterations - 1:
                 pool.append(mean.unsqueeze(1))
             actions = torch.cat(pool, dim=1)
-            elites = best(objective(rollout(z, actions, next), actions), self.num_elites)
+            elites = best(query.score(actions), self.num_elites)
             chosen = take(actions, elites.which)
             kept = chosen[:, : self.num_kept]
             mean, std = refit(chosen, elites.valid, mean, std, momentum=self.momentum)
@@ -176,16 +151,8 @@ class ICEM(CEM):
 
         assert elites is not None  # iterations >= 1
         winner = torch.where(elites.valid[:, :1, None], chosen[:, 0], mean)
-        return TensorDict(
-            {
-                "action": explored(winner[:, 0], std[:, 0], explore, generator=generator, **self.bounds),
-                "plan": torch.cat((mean.unsqueeze(1), kept), dim=1),
-                "best": winner,
-                "std": std,
-                "value": elites.scores[:, :1],
-            },
-            batch_size=[z.shape[0]],
-        )
+        plan, value = torch.cat((mean.unsqueeze(1), kept), dim=1), elites.scores[:, :1]
+        return self.result(query, winner[:, 0], std[:, 0], plan=plan, best=winner, std=std, value=value)
 
     def _draw(self, mean: Tensor, std: Tensor, samples: int, generator: torch.Generator | None) -> Tensor:
         """Candidates (E, samples, H, A) around the mean, each action component a series of its own."""

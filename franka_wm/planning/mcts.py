@@ -29,7 +29,7 @@ class MCTS:
 
     `gumbel` (Danihelka et al., "Policy improvement by planning with Gumbel", ICLR 2022). The root takes the
     `max_num_considered_actions` best by Gumbel noise + logits and halves them in rounds by noise + logits +
-    σ(Q). σ(Q) = (`c_visit` + max n) · `c_scale` · Q, with Q completed (a action without visits counts as the
+    σ(Q). σ(Q) = (`c_visit` + max n) · `c_scale` · Q, with Q completed (an action without visits counts as the
     mixed value of its node) and scaled to [0, 1] within its node. Other nodes take, without noise, the action
     whose share of visits lags furthest behind softmax(logits + σ(Q)). The action is the best of the most
     visited; the policy target is softmax(logits + σ(Q)) at the root. The noise is there with `explore` alone.

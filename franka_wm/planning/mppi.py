@@ -10,9 +10,9 @@ from torch import Tensor
 
 from franka_wm.errors import UserError
 from franka_wm.options import Bounds
-from franka_wm.planning.base import ElitePlanner, Next, Prior
+from franka_wm.planning.base import ElitePlanner, Query
 from franka_wm.planning.objectives import Score
-from franka_wm.planning.sampling import best, explored, gaussian_candidates, rollout, take
+from franka_wm.planning.sampling import best, gaussian_candidates, take
 
 __all__ = ["MPPI", "Score"]
 
@@ -34,24 +34,10 @@ class MPPI(ElitePlanner):
       * A score that is not finite counts for nothing, instead of as 0, which would be the best where rewards
         are negative.
 
-    Plain tensor code: static shapes, no data-dependent control flow, no host synchronisation. It holds no
-    state; `previous` carries the plan from one call to the next. Rollouts hold E · S · (H + 1) · D numbers.
-
-    Args:
-        action_dim: A.
-        horizon: H, steps looked ahead.
-        num_samples: S, candidates per environment and iteration, those of the policy included.
-        num_policy_samples: how many of them are rolled out with `prior`; all are drawn from the Gaussian
-            where `plan` gets no prior.
-        num_elites: how many candidates the Gaussian is refitted to.
-        iterations: rounds of sampling and refitting.
+    Args beside those of `ElitePlanner`:
         min_std, max_std: bounds of the standard deviation, in units of the action; it starts at `max_std`.
         temperature: the higher, the more the best elites dominate (the paper's convention).
-        low, high: bounds of every action component.
         normalize: see above; False is the paper's.
-
-    Raises:
-        ValueError: a setting that cannot work.
     """
 
     horizon: int = 3
@@ -75,19 +61,7 @@ class MPPI(ElitePlanner):
         if self.min_std > self.max_std:
             raise UserError(f"planner.min_std={self.min_std}: must be at most max_std={self.max_std}")
 
-    @torch.no_grad()
-    def plan(
-        self,
-        z: Tensor,
-        next: Next,
-        objective: Score,
-        *,
-        prior: Prior | None = None,
-        previous: Tensor | None = None,
-        is_init: Tensor | None = None,
-        explore: bool = False,
-        generator: torch.Generator | None = None,
-    ) -> TensorDict:
+    def search(self, query: Query) -> TensorDict:
         """See `Planner.plan`; with `explore`, the noise has the final standard deviation.
 
         Returns:
@@ -95,18 +69,16 @@ class MPPI(ElitePlanner):
             `value` (E, 1), the weighted score of the last elites; `effective_samples` (E, 1), 1 / Σ w² of
             their weights, between 1 and `num_elites`.
         """
-        mean = self.start(z, previous, is_init)
+        mean = self.start(query)
         std = torch.full_like(mean, self.max_std)
-        given = self.guided(z, next, prior)
+        given = self.guided(query)
         drawing = self.num_samples - sum(one.shape[1] for one in given)
 
-        value = effective = mean.new_zeros(z.shape[0], 1)
+        value = effective = mean.new_zeros(mean.shape[0], 1)
         for _ in range(self.iterations):
-            drawn = gaussian_candidates(mean, std, drawing, generator=generator, **self.bounds)
+            drawn = gaussian_candidates(mean, std, drawing, generator=query.generator, **self.bounds)
             actions = torch.cat((*given, drawn), dim=1)
-            scores = objective(rollout(z, actions, next), actions)
-
-            elite_scores, weights, index = self._elites(scores)
+            elite_scores, weights, index = self._elites(query.score(actions))
             elites = take(actions, index)
             w = weights[..., None, None]
             # Rounding can carry a mean of actions at a bound just past it.
@@ -116,16 +88,8 @@ class MPPI(ElitePlanner):
             value = (weights * elite_scores).sum(1, keepdim=True)
             effective = weights.square().sum(1, keepdim=True).reciprocal()
 
-        return TensorDict(
-            {
-                "action": explored(mean[:, 0], std[:, 0], explore, generator=generator, **self.bounds),
-                "plan": mean,
-                "std": std,
-                "value": value,
-                "effective_samples": effective,
-            },
-            batch_size=[z.shape[0]],
-        )
+        own = {"plan": mean, "std": std, "value": value, "effective_samples": effective}
+        return self.result(query, mean[:, 0], std[:, 0], **own)
 
     def _elites(self, scores: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Scores (E, S) -> the elites' scores, weights and indices, each (E, num_elites)."""

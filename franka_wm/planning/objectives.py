@@ -64,11 +64,6 @@ def as_objective(objective: Objective | Score) -> Objective:
     return objective if isinstance(objective, Objective) else FunctionObjective(objective)
 
 
-def bind(objective: Objective | Score, tensordict: TensorDictBase) -> Score:
-    """Score of the present decision, see `Objective.bind`."""
-    return as_objective(objective).bind(tensordict)
-
-
 class ReturnModel(Protocol):
     """What `RewardPlusValue.of` asks of a world model."""
 

@@ -1,4 +1,4 @@
-"""Shared parts of the planners: the start of a search, rollouts of candidates, and the best candidates.
+"""Shared parts of the planners: rollouts of candidates, draws, and the best candidates.
 
 E environments, S candidates, H steps, A action components, D the size of a latent.
 """
@@ -8,44 +8,6 @@ from typing import NamedTuple
 
 import torch
 from torch import Tensor
-
-# ---------------------------------------------------------------------- the start of a search
-
-
-def warm_start(
-    z: Tensor,
-    previous: Tensor | None,
-    is_init: Tensor | None,
-    *,
-    horizon: int,
-    action_dim: int,
-    low: float,
-    high: float,
-    repeat_last: bool = False,
-) -> Tensor:
-    """Plan to start from (E, H, A): the previous one, one step on, or the middle of the bounds.
-
-    Args:
-        z: current latents (E, ...): how many environments, where, and in which precision.
-        previous: plan of the last call (E, H, A), or None.
-        is_init: (E, 1) bool; where True, `previous` belongs to another episode and is dropped.
-        repeat_last: fill the step that comes into sight with the last action; else with the middle.
-
-    Raises:
-        ValueError: `previous` or `is_init` has another shape.
-    """
-    shape = (z.shape[0], horizon, action_dim)
-    cold = torch.full(shape, 0.5 * (low + high), device=z.device, dtype=z.dtype)
-    if previous is None:
-        return cold
-    if previous.shape != shape:
-        raise ValueError(f"previous must have shape (E, H, A) = {shape}, got {tuple(previous.shape)}")
-    previous = previous.to(z.dtype)
-    shifted = torch.cat((previous[:, 1:], previous[:, -1:] if repeat_last else cold[:, :1]), dim=1)
-    if is_init is None:
-        return shifted
-    require_is_init(is_init, z.shape[0])
-    return torch.where(is_init.unsqueeze(-1), cold, shifted)
 
 
 def require_is_init(is_init: Tensor, envs: int) -> None:
@@ -63,26 +25,6 @@ def rollout(z: Tensor, actions: Tensor, next: Callable[[Tensor, Tensor], Tensor]
     for t in range(actions.shape[2]):
         latents.append(next(latents[-1], actions[:, :, t]))
     return torch.stack(latents, dim=2)
-
-
-def roll_prior(
-    z: Tensor,
-    next: Callable[[Tensor, Tensor], Tensor],
-    prior: Callable[[Tensor], Tensor],
-    *,
-    samples: int,
-    horizon: int,
-    low: float,
-    high: float,
-) -> Tensor:
-    """Candidates of a policy (E, samples, H, A), each unrolled from `z`."""
-    latent = z.unsqueeze(1).expand(z.shape[0], samples, *z.shape[1:])
-    actions = []
-    for _ in range(horizon):
-        # A weight of zero does not remove a nan from a weighted mean, so it must not get in.
-        actions.append(torch.nan_to_num(prior(latent), nan=0.0).clamp(low, high))
-        latent = next(latent, actions[-1])
-    return torch.stack(actions, dim=2)
 
 
 def gaussian_candidates(

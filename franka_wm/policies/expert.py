@@ -73,7 +73,7 @@ class ExpertPolicy(ScriptedPolicy):
         for key in self.in_keys:
             if tensordict.get(key, None) is None:
                 raise UserError(f"the expert reads {key}; add it to the environment's observations")
-        sight = Sight.of(tensordict, k)
+        sight = Sight.of(tensordict, k, joints=c.num_articulated)
         assert self.task.expert is not None
         aim = self.task.expert(sight)
         target = tensordict.get("joint_target")[..., :NUM_JOINTS]

@@ -17,7 +17,7 @@ from franka_wm.models.base import WorldModel
 from franka_wm.planning.base import Planner
 from franka_wm.planning.objectives import Objective, RewardPlusValue, Score, as_objective
 from franka_wm.policies.capture import GraphCache
-from franka_wm.policies.settings import settings
+from franka_wm.policies.graph_key import graph_key
 
 PRECISIONS = ("float32", "bfloat16")
 """How a model may compute while planning."""
@@ -187,7 +187,7 @@ class PlannerPolicy(TensorDictModuleBase):
             decision = self._graphs(
                 lambda entries: self._decide(entries, explore),
                 inputs,
-                key=(modes, settings(self.planner), settings(self.objective)),
+                key=(modes, graph_key(self.planner), graph_key(self.objective)),
                 held=held,
             )
         else:

@@ -89,7 +89,7 @@ class SmoothRandomPolicy(ScriptedPolicy):
         return _go_on(self.generator, state["generator"])
 
 
-class OraclePolicy(ScriptedPolicy):
+class IKPolicy(ScriptedPolicy):
     """Inverse kinematics with the true geometry and the true goal: what the environment allows at best.
 
     Solves for joint angles that put the tool on the goal, starting from the servo's present targets, and
@@ -127,21 +127,21 @@ class OraclePolicy(ScriptedPolicy):
 def _joint_target(tensordict: TensorDictBase) -> torch.Tensor:
     target = tensordict.get("joint_target", None)
     if target is None:
-        raise UserError("the oracle reads joint_target; add it to the environment's observations")
+        raise UserError("policy=ik reads joint_target; add it to the environment's observations")
     return target
 
 
-class DiscreteOraclePolicy(ScriptedPolicy):
-    """The oracle for numbered moves: the first of the two moves after which the tool is nearest to the goal.
+class DiscreteIKPolicy(ScriptedPolicy):
+    """``ik`` for discrete actions: the first of the two actions after which the tool is nearest to the goal.
 
-    All pairs of moves are tried with the true geometry, on the tool's position where the servo's targets put it. A
-    tenth of the distance after the first move counts as well, so that arriving is not put off. How near it
+    All pairs of actions are tried with the true geometry, on the tool's position where the servo's targets put it. A
+    tenth of the distance after the first action counts as well, so that arriving is not put off. How near it
     comes: `docs/results.md`, MuZero's *inverse kinematics*.
 
     Args:
         kinematics: The arm's.
         config: The environment's: what an action means.
-        table: The moves, (M, A).
+        table: The discrete actions, (M, A).
     """
 
     in_keys = ["joint_target", "goal"]
@@ -155,7 +155,7 @@ class DiscreteOraclePolicy(ScriptedPolicy):
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         target, goal = _joint_target(tensordict), tensordict.get("goal")
         if self.config.action_mode == "ee_delta":
-            target = self.kinematics.forward(target)  # tool positions stand for targets: moves shift them
+            target = self.kinematics.forward(target)  # tool positions stand for targets: actions shift them
         once = self._moved(target)  # (N, M, 7 or 3)
         twice = self._moved(once)  # (N, M, M, 7 or 3)
         soon = (self._tool(once) - goal[..., None, :]).norm(dim=-1)
@@ -163,7 +163,7 @@ class DiscreteOraclePolicy(ScriptedPolicy):
         return tensordict.set("action", (late + 0.1 * soon).argmin(-1))
 
     def _moved(self, target: torch.Tensor) -> torch.Tensor:
-        """Targets (..., 7), or tool positions (..., 3), after each move: (..., M, 7 or 3)."""
+        """Targets (..., 7), or tool positions (..., 3), after each action: (..., M, 7 or 3)."""
         c, k, target = self.config, self.kinematics, target.unsqueeze(-2)
         if c.action_mode == "ee_delta":
             return target + c.ee_scale * self.table
@@ -178,11 +178,11 @@ class DiscreteOraclePolicy(ScriptedPolicy):
 
 
 class DiscretePolicy(ScriptedPolicy):
-    """A policy for continuous actions, played with numbered moves: the row of the table nearest to its action.
+    """A policy for continuous actions, played with discrete actions: the row of the table nearest to its action.
 
     Args:
         policy: Writes ``action`` (N, A).
-        table: The moves, (M, A).
+        table: The discrete actions, (M, A).
     """
 
     def __init__(self, policy: TensorDictModuleBase, table: torch.Tensor):
@@ -199,10 +199,10 @@ class DiscretePolicy(ScriptedPolicy):
 
 
 class RandomMovesPolicy(ScriptedPolicy):
-    """A move drawn uniformly, in every step: int64 (N,).
+    """An action drawn uniformly, in every step: int64 (N,).
 
     Args:
-        num_actions: How many moves there are.
+        num_actions: How many actions there are.
         generator: Source of randomness.
     """
 

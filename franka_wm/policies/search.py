@@ -14,8 +14,8 @@ from franka_wm.models.base import WorldModel
 from franka_wm.planning.mcts import MCTS
 from franka_wm.planning.tree import Recurrent
 from franka_wm.policies.capture import GraphCache
+from franka_wm.policies.graph_key import graph_key
 from franka_wm.policies.planner import captures
-from franka_wm.policies.settings import settings
 
 
 class SearchPolicy(TensorDictModuleBase):
@@ -115,7 +115,7 @@ class SearchPolicy(TensorDictModuleBase):
             self._graphs(
                 lambda entries: self._decide(entries, explore),
                 inputs,
-                key=(modes, settings(self.search)),
+                key=(modes, graph_key(self.search)),
                 held=(self.search, self.encode, self.prediction, self.recurrent),
                 generators=() if self.generator is None else (self.generator,),
             )

@@ -1,6 +1,7 @@
 """Several runs on one page: results side by side, curves over each other, and what was configured differently."""
 
 import json
+import math
 import shlex
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -126,6 +127,9 @@ def repetitions(runs: Mapping[str, RunFiles]) -> dict[str, dict[str, RunFiles]]:
 def _results(runs: Mapping[str, RunFiles]) -> str:
     policies = list(dict.fromkeys(policy for run in runs.values() for policy in run.policies))
     body, rest = Markup(), Markup()
+    ends = [run.policies.get(name, {}).get("final_distance") for run in runs.values() for name in SHOWN]
+    highs = [100.0 * end["high"] for end in ends if end and is_interval(end) and end["high"] is not None]
+    longest = max(filter(math.isfinite, highs), default=0.0)
     for policy in sorted(policies, key=lambda name: SHOWN.index(name) if name in SHOWN else len(SHOWN)):
         having = {name: run.policies[policy] for name, run in runs.items() if policy in run.policies}
         tables = [
@@ -146,7 +150,13 @@ def _results(runs: Mapping[str, RunFiles]) -> str:
         if distances:
             colours = dict.fromkeys(distances, style.policy_colour(policy))
             drawn = chart(
-                bars_figure(distances, label="final distance to the goal [cm]", scale=100, colours=colours),
+                bars_figure(
+                    distances,
+                    label="final distance to the goal [cm]",
+                    scale=100,
+                    limits=(0.0, 1.05 * longest) if longest > 0 else None,  # the same for all policies
+                    colours=colours,
+                ),
                 f"final distance of {style.policy_name(policy)} in every run",
                 "Shorter is better; whiskers are 95 % intervals over episodes.",
             )

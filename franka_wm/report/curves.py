@@ -81,9 +81,7 @@ def plot_learning_curves(
         columns=3, width=4.0, height=3.8, theme=theme, sharex=True
     )
     first = "final_distance" if _keys(placed, "final_distance") or not _keys(placed, "return") else "return"
-    _draw_quantity(
-        first_axes, placed, x, first, success_distance if first == "final_distance" else None, theme
-    )
+    _draw_quantity(first_axes, placed, x, first, success_distance, theme)
     _draw_quantity(success, placed, x, "success", None, theme)
     _draw_values(losses, placed, x, _loss_keys(placed), "losses", theme)
     title_figure(figure, title, theme=theme)
@@ -100,22 +98,25 @@ def panel_figure(
 ) -> "Figure | None":
     """One of `panels` of a run as a figure of its own; None where no row holds anything for it.
 
+    All panels of the same rows have the same horizontal axis.
+
     Raises:
         UserError: no row has the key `x`.
     """
     placed = _placed(rows, x)
-    figure, (axes,) = new_figure(theme=theme)
-    if panel not in ("losses", "gradients"):
-        if not _keys(placed, panel):
-            return None
-        mark = success_distance if panel == "final_distance" else None
-        _draw_quantity(axes, placed, x, panel, mark, theme)
-        return figure
-    keys = _loss_keys(placed) if panel == "losses" else _gradient_keys(placed)
+    values = {
+        "losses": (_loss_keys(placed), "losses"),
+        "gradients": (_gradient_keys(placed), "gradient norm before clipping, latent norm"),
+    }
+    keys, title = values.get(panel, (_keys(placed, panel), ""))
     if not keys:
         return None
-    names = {"losses": "losses", "gradients": "gradient norm before clipping, latent norm"}
-    _draw_values(axes, placed, x, keys, names[panel], theme)
+    figure, (axes,) = new_figure(theme=theme)
+    if panel in values:
+        _draw_values(axes, placed, x, keys, title, theme)
+    else:
+        _draw_quantity(axes, placed, x, panel, success_distance, theme)
+    _share_x(axes, [placed], x)
     return figure
 
 
@@ -162,6 +163,8 @@ def seeds_figure(
 ) -> "Figure":
     """A logged quantity of groups of runs: the mean over a group's runs, and a band from lowest to highest.
 
+    All quantities of the same groups have the same horizontal axis.
+
     Args:
         groups: label -> rows of each of its runs (seeds). A group of one run is a line without a band.
         key: such as ``eval/policy/final_distance``; the last part decides name and unit (`QUANTITIES`).
@@ -191,12 +194,8 @@ def seeds_figure(
             axes.fill_between(
                 band["x"], scale * band["low"], scale * band["high"], color=colour, alpha=0.2, linewidth=0
             )
-    _format_x(axes, x)
-    finish_axes(axes, x=X_LABELS.get(x, x), title=title or label, theme=theme)
-    if leaf == "success":
-        axes.set_ylim(-3, 103)
-    elif leaf == "final_distance":
-        axes.set_ylim(bottom=0)
+    _finish(axes, x, title or label, theme, leaf)
+    _share_x(axes, [rows for runs in groups.values() for rows in runs], x)
     return figure
 
 
@@ -210,17 +209,12 @@ def _draw_quantity(
     keys = _keys(rows, leaf)
     for key in keys:
         _draw_policy(axes, rows, x, key, scale, theme)
-    if success_distance is not None and keys:
+    if success_distance is not None and leaf == "final_distance" and keys:
         label = f"success: {style.centimetres(success_distance)}"
         axes.axhline(
             100 * success_distance, color=theme.colour(style.GREY), linestyle=":", linewidth=1, label=label
         )
-    _format_x(axes, x)
-    finish_axes(axes, x=X_LABELS.get(x, x), title=title, theme=theme)
-    if leaf == "final_distance":
-        axes.set_ylim(bottom=0)
-    elif leaf == "success":
-        axes.set_ylim(-3, 103)
+    _finish(axes, x, title, theme, leaf)
 
 
 def _draw_values(axes: "Axes", rows: Rows, x: str, keys: Sequence[str], title: str, theme: Theme) -> None:
@@ -239,8 +233,7 @@ def _draw_values(axes: "Axes", rows: Rows, x: str, keys: Sequence[str], title: s
             marker="o" if len(xs) == 1 else None,
             markersize=3.5,
         )
-    _format_x(axes, x)
-    finish_axes(axes, x=X_LABELS.get(x, x), title=title, theme=theme)
+    _finish(axes, x, title, theme)
     if values and min(values) > 0:
         axes.set_yscale("log")
     elif any(values):
@@ -265,12 +258,25 @@ def _draw_policy(axes: "Axes", rows: Rows, x: str, key: str, scale: float, theme
     )
 
 
-def _format_x(axes: "Axes", x: str) -> None:
+def _finish(axes: "Axes", x: str, title: str, theme: Theme, leaf: str = "") -> None:
+    """Labels, and the vertical range of distances and rates."""
     from matplotlib.ticker import EngFormatter, MaxNLocator
 
     axes.xaxis.set_major_locator(MaxNLocator(5))
     if x != "time_s":
         axes.xaxis.set_major_formatter(EngFormatter())  # 40 k, 1.5 M
+    finish_axes(axes, x=X_LABELS.get(x, x), title=title, theme=theme)
+    if leaf == "final_distance":
+        axes.set_ylim(bottom=0)
+    elif leaf == "success":
+        axes.set_ylim(-3, 103)
+
+
+def _share_x(axes: "Axes", runs: Sequence[Rows], x: str) -> None:
+    """The range of the horizontal axis from 0 to the last row of any run, whatever this panel holds of it."""
+    last = max((row[x] for rows in runs for row in rows if x in row), default=0)
+    if last > 0:
+        axes.set_xlim(-0.02 * last, 1.04 * last)
 
 
 # -- rows ------------------------------------------------------------------------------------------------

@@ -43,13 +43,13 @@ def evaluation_markdown(found: Evaluation) -> str:
 
 def interval(value: Mapping[str, float], scale: float = 1.0, digits: int = 2) -> str:
     """`mean (low – high)`."""
-    mean, low, high = (f"{scale * value[name]:.{digits}f}" for name in ("mean", "low", "high"))
+    mean, low, high = (f"{scale * value[name]:z.{digits}f}" for name in ("mean", "low", "high"))
     return f"{mean} ({low} – {high})"
 
 
 def number(value: float | None, digits: int = 2) -> str:
     """A number, or a dash for what is not defined."""
-    return "–" if value is None or math.isnan(value) else f"{value:.{digits}f}"
+    return "–" if value is None or math.isnan(value) else f"{value:z.{digits}f}"
 
 
 def timing_table(seconds: Mapping[str, float], worlds: int) -> Table:
@@ -131,7 +131,9 @@ def findings(results: Mapping[str, Any]) -> dict[str, str]:
         share = errors["error"] / max(errors["mean_picture"], 1e-12)
         out["decoder's error / that of the mean image"] = number(share)
     if value:
-        line = f"return = {number(value['slope'])} · value + {number(value['intercept'])}"
+        line = f"return = {number(value['slope'])} · value + {number(value['intercept'])}".replace(
+            "+ -", "− "
+        )
         out["value calibration (exact: 1, 0)"] = line
         out["… bias, value − return"] = number(value["bias"])
         out["… correlation"] = number(value["correlation"])

@@ -1,4 +1,4 @@
-"""One self-contained HTML file: pictures and videos inside, one style, light and dark, phone and desktop.
+"""One self-contained HTML file: images and videos inside, one style, light and dark, phone and desktop.
 
 The page's own policy forbids every request, so that a forgotten link to elsewhere fails instead of being followed.
 """
@@ -28,7 +28,7 @@ LARGEST = 24 * 2**20
 
 KINDS = {".png": "image/png", ".gif": "image/gif", ".jpg": "image/jpeg", ".mp4": "video/mp4"}
 
-# What may load: styles written here, and pictures and videos that the page itself carries.
+# What may load: styles written here, and images and videos that the page itself carries.
 POLICY = "default-src 'none'; style-src 'unsafe-inline'; img-src data:; media-src data:"
 
 
@@ -87,7 +87,7 @@ def card(content: str, note: str = "", *, kind: str = "") -> Markup:
     """HTML on a card of its own, with a line of text below.
 
     Args:
-        kind: `wide` (the whole width), `single` (no wider than a picture should be), `strip` (scrolls sideways).
+        kind: `wide` (the whole width), `single` (no wider than an image should be), `strip` (scrolls sideways).
     """
     return _part("card", content, note, kind) if content else Markup()
 
@@ -141,10 +141,10 @@ def folded(title: str, content: str) -> Markup:
     return _part("folded", title, content) if content else Markup()
 
 
-def picture(path: Path, label: str) -> Markup:
-    """A picture inside the page."""
+def image(path: Path, label: str) -> Markup:
+    """An image inside the page."""
     source = data_url(path)
-    return left_out(path) if source is None else _part("picture", source, label)
+    return left_out(path) if source is None else _part("image", source, label)
 
 
 def video(path: Path, label: str, *, poster: Path | None = None) -> Markup:

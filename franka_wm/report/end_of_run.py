@@ -9,8 +9,8 @@ from typing import Any
 import torch
 from tensordict import TensorDictBase
 
-from franka_wm.envs.camera import project
-from franka_wm.evaluation.closed_loop import arm_of, play_episodes, reaches
+from franka_wm.envs.camera import project, whole_arm
+from franka_wm.evaluation.closed_loop import play_episodes, reaches
 from franka_wm.evaluation.protocol import Evaluation, held_out_seeds
 from franka_wm.evaluation.results import FILE, Result, last_row
 from franka_wm.files import atomic_write
@@ -19,7 +19,7 @@ from franka_wm.report.diagnostics import evaluation_markdown, terminal
 from franka_wm.report.style import policy_name
 from franka_wm.report.table import evaluation_tables
 from franka_wm.seeding import seeded
-from franka_wm.training.build import make_evaluation_env
+from franka_wm.training.build import arm_of, make_evaluation_env
 from franka_wm.training.settings import RunSettings
 from franka_wm.video import draw_labels, draw_marker, tile_frames, write_png, write_video
 
@@ -77,22 +77,22 @@ def acting(policies: Mapping[str, Any]) -> str:
 def film(settings: RunSettings, folder: Path, policy: Any, name: str) -> torch.Tensor:
     """``video.mp4`` and ``last_frame.png``: episodes of one policy at half speed, the goal drawn as a ring.
 
-    Each picture says whose episode it is and how it ended; the worst of several is marked.
+    Each image says whose episode it is and how it ended; the worst of several is marked.
     """
     env = make_evaluation_env(settings, num_envs=settings.evaluation.video_episodes)
     arm = arm_of(env)
     assert arm is not None
-    size = settings.evaluation.video_size
+    size, whole = settings.evaluation.video_size, whole_arm(arm.config, arm.kinematics)
     frames: list[torch.Tensor] = []
 
-    def picture() -> None:
-        view = arm.render(size, samples=2)
-        marks = project(arm.goal, arm.config, size)
+    def image() -> None:
+        view = arm.render(size, samples=2, config=whole)
+        marks = project(arm.goal, whole, size)
         frames.append(draw_marker(view.cpu(), marks.cpu(), radius=size / 32))
 
     seed = held_out_seeds(1)[0]  # the first of the episodes that the table is about
     with seeded(seed, policy):
-        played = play_episodes(env, policy, seed=seed, video=picture)
+        played = play_episodes(env, policy, seed=seed, video=image)
     fps = _slow(arm.config.fps)
     frames += frames[-1:] * fps  # a second to look at the end
     film = tile_frames(draw_labels(torch.stack(frames), endings(played, policy_name(name), arm)))

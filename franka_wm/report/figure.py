@@ -120,7 +120,7 @@ def save_figure(figure: "Figure", path: str | Path, *, dpi: int = 150) -> Path:
 def inline_svg(figure: "Figure", label: str) -> str:
     """The figure as an `<svg>` element for a page that gives the colours as CSS variables.
 
-    Draw it in `LIGHT`: every named colour becomes `var(--its-name)`, so that one picture follows the page's
+    Draw it in `LIGHT`: every named colour becomes `var(--its-name)`, so that one image follows the page's
     light and dark theme. Text stays text, in the page's font. The same figure gives the same element.
 
     Args:
@@ -129,14 +129,14 @@ def inline_svg(figure: "Figure", label: str) -> str:
     import matplotlib
 
     buffer = io.StringIO()
-    # Ids of clip paths and markers must differ between the pictures of one page, and not between two runs.
+    # Ids of clip paths and markers must differ between the images of one page, and not between two runs.
     salt = hashlib.sha256(label.encode()).hexdigest()[:12]
     with matplotlib.rc_context({"svg.fonttype": "none", "svg.hashsalt": salt}):
         figure.savefig(buffer, format="svg", metadata={"Date": None}, transparent=True)
     svg = buffer.getvalue()
     svg = svg[svg.index("<svg") :]
     svg = re.sub(r"<metadata>.*?</metadata>\s*", "", svg, flags=re.DOTALL)
-    # Names of groups ("axes_1") repeat in every picture and nothing refers to them.
+    # Names of groups ("axes_1") repeat in every image and nothing refers to them.
     svg = re.sub(r' id="[\w.]+_\d+"', "", svg)
     svg = re.sub(
         r"(fill|stroke): (#[0-9a-f]{6})\b",

@@ -72,7 +72,7 @@ def hide_patches(frame: Tensor, hidden: Tensor, *, keep: float = 0.12, shade: in
         frame: (H, W, 3) uint8.
         hidden: (rows, columns) bool, or a flat vector of a square grid; True where the mask hides. H and W must be
             multiples of rows and columns.
-        keep: share of the picture that shines through.
+        keep: share of the image that shines through.
         shade: of the veil, 0 … 255.
 
     Returns:
@@ -117,10 +117,10 @@ def mask_figure(
     """
     if not masks:
         raise UserError("no mask to draw; give at least one by name.")
-    pictures = {"frame": frame} | {name: hide_patches(frame, mask) for name, mask in masks.items()}
-    figure, panels = new_figure(columns=len(pictures), width=1.6, height=1.8, theme=theme)
-    for axes, (name, picture) in zip(panels, pictures.items(), strict=True):
-        axes.imshow(picture.cpu().numpy(), interpolation="nearest")
+    images = {"frame": frame} | {name: hide_patches(frame, mask) for name, mask in masks.items()}
+    figure, panels = new_figure(columns=len(images), width=1.6, height=1.8, theme=theme)
+    for axes, (name, image) in zip(panels, images.items(), strict=True):
+        axes.imshow(image.cpu().numpy(), interpolation="nearest")
         axes.set_axis_off()
         axes.set_title(name, fontsize=9, color=theme.colour(INK))
     if title:

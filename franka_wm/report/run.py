@@ -5,8 +5,8 @@
     versions.json           packages and machine, as `franka_wm.versions` writes them
     evaluation.json         results, as :mod:`franka_wm.evaluation.results` describes them
     checkpoints/…           counters and the logged rows; without a checkpoint, rows come from ``csv/``
-    video.mp4, last_frame.png, imagined.mp4, imagined.png, masks.png    pictures
-    evaluation/             what ``franka-wm evaluate`` wrote: evaluation.json, timing.json and pictures. Of two
+    video.mp4, last_frame.png, imagined.mp4, imagined.png, masks.png    images
+    evaluation/             what ``franka-wm evaluate`` wrote: evaluation.json, timing.json and images. Of two
                             evaluation.json the one with more episodes is shown first, and the other is named
 
 ``timing.json`` holds {policy: {"seconds_per_decision", "worlds"}}.
@@ -29,7 +29,7 @@ from franka_wm.untrusted import UntrustedFolder, check_image, check_video, value
 SAME_BUT = ("seed", "device", "resume")
 """Runs whose configurations differ in these alone are repetitions of one another."""
 
-PICTURES = ("video.mp4", "last_frame.png", "imagined.mp4", "imagined.png", "masks.png")
+IMAGES = ("video.mp4", "last_frame.png", "imagined.mp4", "imagined.png", "masks.png")
 
 
 @dataclass(frozen=True)
@@ -44,7 +44,7 @@ class RunFiles:
         results: of the run's end and of ``franka-wm evaluate``; the one with most episodes, which is shown, first.
         rows: logged while training, and what its end found.
         counters: of the checkpoint: ``updates``, ``env_steps``, ``seconds``.
-        pictures: name -> path, of `PICTURES`.
+        images: name -> path, of `IMAGES`.
         timing: policy -> ``seconds_per_decision``, ``worlds``.
     """
 
@@ -55,7 +55,7 @@ class RunFiles:
     results: Sequence[Result] = ()
     rows: list[dict[str, float]] = field(default_factory=list)
     counters: Mapping[str, float] = field(default_factory=dict)
-    pictures: Mapping[str, Path] = field(default_factory=dict)
+    images: Mapping[str, Path] = field(default_factory=dict)
     timing: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
 
     @property
@@ -133,7 +133,7 @@ def _read_run(run: Path) -> RunFiles:
         results=found,
         rows=rows,
         counters=counters,
-        pictures={name: path for name in PICTURES if (path := _picture(files, name)) is not None},
+        images={name: path for name in IMAGES if (path := _image(files, name)) is not None},
         timing=files.json("evaluation/timing.json") or files.json("timing.json") or {},
     )
 
@@ -170,7 +170,7 @@ def _config(files: UntrustedFolder) -> dict[str, Any] | None:
     return found
 
 
-def _picture(files: UntrustedFolder, name: str) -> Path | None:
+def _image(files: UntrustedFolder, name: str) -> Path | None:
     """An image or video by its name, that of ``franka-wm evaluate`` first; checked, since a page will hold it."""
     path = files.path(f"evaluation/{name}") or files.path(name)
     if path is not None:
@@ -183,12 +183,12 @@ def _history(files: UntrustedFolder) -> tuple[list[dict[str, float]], dict[str, 
     checkpoints = files.below("checkpoints")
     if any(checkpoints.root.glob("*/manifest.json")):
         from franka_wm.training.checkpoint import latest_checkpoint, load_checkpoint
+        from franka_wm.training.manifest import read_manifest
 
         checkpoints.check_links()
         checkpoint = load_checkpoint(latest_checkpoint(files.root))
         rows = (checkpoint.extra() or {}).get("rows") or []
-        manifest = json.loads((checkpoint.folder / "manifest.json").read_text())
-        return list(rows), dict(checkpoint.counters), manifest.get("franka_wm")
+        return list(rows), dict(checkpoint.counters), read_manifest(checkpoint.folder).written_by
     return csv_rows(files.below("csv/scalars").root), {}, None
 
 

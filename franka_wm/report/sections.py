@@ -23,8 +23,8 @@ from franka_wm.report.document import (
     facts,
     folded,
     headed,
+    image,
     paragraph,
-    picture,
     sparkline,
     table,
     video,
@@ -87,7 +87,7 @@ def curves(run: RunFiles) -> str:
 
 
 def videos(run: RunFiles) -> str:
-    film, still = run.pictures.get("video.mp4"), run.pictures.get("last_frame.png")
+    film, still = run.images.get("video.mp4"), run.images.get("last_frame.png")
     if film is not None:
         return card(
             video(film, "episodes of the planner", poster=still),
@@ -96,7 +96,7 @@ def videos(run: RunFiles) -> str:
         )
     if still is not None:
         return card(
-            picture(still, "last frame of the episodes"),
+            image(still, "last frame of the episodes"),
             "The last frame; the ring marks the goal.",
             kind="single",
         )
@@ -104,10 +104,10 @@ def videos(run: RunFiles) -> str:
 
 
 def imagined(run: RunFiles) -> str:
-    film, strip = run.pictures.get("imagined.mp4"), run.pictures.get("imagined.png")
+    film, strip = run.images.get("imagined.mp4"), run.images.get("imagined.png")
     parts = [
         card(
-            picture(strip, "imagined frames below real ones"),
+            image(strip, "imagined frames below real ones"),
             "Above what happened, below what the model imagined from the first frame and the actions alone.",
             kind="wide strip",
         )
@@ -115,9 +115,9 @@ def imagined(run: RunFiles) -> str:
         else "",
         card(video(film, "imagined beside real"), "Real and imagined, side by side.") if film else "",
     ]
-    masks = run.pictures.get("masks.png")
+    masks = run.images.get("masks.png")
     parts.append(
-        card(picture(masks, "what the masks hide"), "What the masks hide.", kind="single") if masks else ""
+        card(image(masks, "what the masks hide"), "What the masks hide.", kind="single") if masks else ""
     )
     text = "A decoder, trained on the side and used by nothing else, turns latents into images."
     return paragraph(text if film or strip else "") + cards(*parts)

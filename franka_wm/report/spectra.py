@@ -89,7 +89,7 @@ def latent_figure(
             f"points have shape {places.shape} and the quantity {colours.shape}; (N, 2) and (N,) are needed."
         )
     figure, (axes,) = new_figure(theme=theme)
-    # As a picture: thousands of vector points would make a page slow.
+    # As an image: thousands of vector points would make a page slow.
     drawn: Any = axes.scatter(*places.T, c=colours, cmap=_colour_map(), s=7, linewidths=0, rasterized=True)
     bar = figure.colorbar(drawn, ax=axes)
     bar.set_label(label, color=theme.colour(INK), fontsize=9)

@@ -193,10 +193,12 @@ def _text(path: tuple[str, ...], value: Any, digits: int) -> str:
         return "–"
     if known is not None:
         _, scale, places = known
-        mean, *ends = (f"{scale * number:.{places}f}" for number in numbers)
+        mean, *ends = (f"{scale * number:z.{places}f}" for number in numbers)
     else:
+        # What is left of rounding, such as -3.6e-16, is 0.
+        rounded = [0 if abs(number) < 1e-12 else number for number in numbers]
         mean, *ends = (
-            f"{number:.{digits}g}" if isinstance(number, float) else str(number) for number in numbers
+            f"{number:.{digits}g}" if isinstance(number, float) else str(number) for number in rounded
         )
     return f"{mean} ({ends[0]} – {ends[1]})" if ends else mean
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from functools import partial
 from inspect import signature
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import torch
 from torchrl.data import ReplayBuffer
@@ -23,16 +23,19 @@ from franka_wm.planning import registry
 from franka_wm.policies import ExploringPolicy, ModelPolicy, PlannerPolicy, SearchPolicy
 from franka_wm.policies.expert import ExpertPolicy
 from franka_wm.policies.scripted import (
-    DiscreteOraclePolicy,
+    DiscreteIKPolicy,
     DiscretePolicy,
+    IKPolicy,
     NoopPolicy,
-    OraclePolicy,
     RandomMovesPolicy,
     SmoothRandomPolicy,
 )
 from franka_wm.seeding import derive_seed, evaluation_seed
 from franka_wm.training.settings import CollectorSettings, RunSettings
 from franka_wm.training.spaces import Spaces
+
+if TYPE_CHECKING:
+    from franka_wm.models.base import WorldModel
 
 # -- environments -------------------------------------------------------------------------------------------
 
@@ -56,16 +59,16 @@ def make_env(
 
 
 def make_evaluation_env(run: RunSettings, *, num_envs: int | None = None, **changes: Any) -> Any:
-    """The same task for evaluation: with what ``ik`` and ``expert`` read, and the pictures that the model reads."""
+    """The same task for evaluation: with what ``ik`` and ``expert`` read, and the images that the model reads."""
     num_envs = run.evaluation.episodes if num_envs is None else num_envs
     if run.is_arm:
         read = run.model.observations or ()
         goal = ("goal_pixels",) if run.objective_name == "goal_image" else ()
         arm = run.env.arm
-        vectors = ["state", "joint_target"] + ["objects"] * (arm.num_objects > 0)
+        vectors = ["state", "joint_target"] + ["objects"] * (arm.object_dim > 0)
         vectors += ["contacts"] * (arm.contact_dim > 0)
-        pictures = [o for o in run.env.arm.observations if o not in vectors]
-        used = [o for o in pictures if any(key == o or key.startswith(f"{o}_") for key in (*read, *goal))]
+        images = [o for o in run.env.arm.observations if o not in vectors]
+        used = [o for o in images if any(key == o or key.startswith(f"{o}_") for key in (*read, *goal))]
         changes = {"observations": [*used, *vectors]} | changes
     return make_env(run, num_envs=num_envs, seed=evaluation_seed(run.seed), **changes)
 
@@ -138,12 +141,12 @@ def make_planner(run: RunSettings, actions: int) -> Any:
         raise UserError(f"planner={name}: {error}") from error
 
 
-def goal_pictures(keys: Iterable[str]) -> dict[str, str]:
-    """Key of a picture that a model reads → that of the same camera's picture of the goal."""
+def goal_images(keys: Iterable[str]) -> dict[str, str]:
+    """Key of an image that a model reads → that of the same camera's image of the goal."""
     return {key: f"goal_{key}" for key in keys}
 
 
-def make_objective(run: RunSettings, model: Any) -> Any:
+def make_objective(run: RunSettings, model: WorldModel) -> Any:
     """What the planner maximises, by ``run.objective``."""
     o = run.objective
     name = run.objective_name
@@ -162,7 +165,7 @@ def make_objective(run: RunSettings, model: Any) -> Any:
         chosen = planning.GoalImage(
             model.encode_goal,
             embed=model.embed,
-            goals=goal_pictures(model.image_sizes),
+            goals=goal_images(model.image_sizes),
             metric=o.metric,  # pyright: ignore[reportArgumentType]  # one of its choices
             summed=o.summed,
         )
@@ -183,7 +186,7 @@ def make_objective(run: RunSettings, model: Any) -> Any:
 
 
 def make_policies(
-    model: Any,
+    model: WorldModel,
     planner: Any,
     env: Any,
     *,
@@ -198,8 +201,8 @@ def make_policies(
 
     ``planner`` and ``policy`` where the model has what they need; ``noop`` and ``random`` (smooth random:
     first-order autoregressive); for the arm ``ik``, inverse kinematics with true geometry, or a search over pairs
-    of moves. ``capture``,
-    ``precision`` and ``compile``: of the planner's, see :class:`~franka_wm.policies.PlannerPolicy`.
+    of discrete actions. ``capture``, ``precision`` and ``compile`` are the planner's, see
+    :class:`~franka_wm.policies.PlannerPolicy`.
     """
     policies: dict[str, Any] = {}
     discrete = not env.action_spec.dtype.is_floating_point
@@ -230,19 +233,19 @@ def make_scripted_policies(env: Any, *, seed: int = 0, smoothness: float = 0.7) 
         moves: Any = env.transform
         scripted = {name: DiscretePolicy(policy, moves.table) for name, policy in scripted.items()}
         if not env.config.has_gripper:
-            scripted["ik"] = DiscreteOraclePolicy(env.kinematics, env.config, moves.table)
+            scripted["ik"] = DiscreteIKPolicy(env.kinematics, env.config, moves.table)
     elif arm and env.config.has_gripper:
         task = env.simulation.task
         fits = env.config.gravity_compensation and env.config.action_mode != "ee_delta"
         if task.expert is not None and fits:
             scripted["expert"] = ExpertPolicy(task, env.kinematics, env.config)
     elif arm:
-        scripted["ik"] = OraclePolicy(env.kinematics, env.config)
+        scripted["ik"] = IKPolicy(env.kinematics, env.config)
     return scripted
 
 
 def make_agent_policies(
-    run: RunSettings, model: Any, env: Any, spaces: Spaces, *, purpose: str = "evaluation"
+    run: RunSettings, model: WorldModel, env: Any, spaces: Spaces, *, purpose: str = "evaluation"
 ) -> dict[str, Any]:
     """Planner, objective and policies by the configuration; none without an environment to act in.
 
@@ -300,29 +303,37 @@ def make_hindsight(run: RunSettings, env: Any) -> Hindsight | None:
         if share is not None:
             raise UserError(f"replay.hindsight={share}: {why}; leave it at null")
         return None
-    arm = _arm(env)
-    assert arm is not None and arm.simulation.task.relabel is not None
+    arm = arm_of(env)
+    assert arm is not None
+    task = arm.simulation.task
+    assert task.relabel is not None
     share = HINDSIGHT if share is None else share
     say(f"hindsight: {100 * share:.0f} % of the windows get a goal that their episode reached later")
     return Hindsight(
-        arm.simulation.task.relabel, achieved, share=share, episode_length=arm.config.episode_length
+        task.relabel,
+        achieved=task.achieved,
+        reads=task.relabel_reads,
+        share=share,
+        episode_length=arm.config.episode_length,
     )
 
 
 def no_hindsight(run: RunSettings, env: Any) -> str | None:
     """Why windows cannot be given other goals, or gain nothing from them; ``None``: they can."""
-    arm = _arm(env)
+    arm = arm_of(env)
     if arm is None or run.is_discrete:
         return "only the arm with continuous actions has goals to exchange"
     config, keys = arm.config, run.model.observations
     if not arm.simulation.task.relabels():
         return f"env.task={config.task} does not say what another goal changes (Task.relabel)"
-    if config.reward == "normalized" or config.randomization.observation_noise:
+    noise = config.randomization.observation_noise or config.randomization.object_noise
+    if config.reward == "normalized" or noise:
         return "rewards of another goal are exact without observation noise and with reward=dense or sparse alone"
     if config.goal_sampling == "fixed":
         return "there is one goal (env.goal_sampling=fixed)"
-    if "state" not in config.observations:
-        return "it reads where the tool was from state; add it to env.observations"
+    for key in arm.simulation.task.relabel_reads:
+        if key not in config.observations:
+            return f"it reads {key}; add it to env.observations"
     if keys is not None and not {"state", "goal"} & set(keys):
         return f"model={run.model.name} does not read where the goal is"
     if config.show_goal or any("goal_pixels" in key for key in keys or ()):
@@ -330,15 +341,11 @@ def no_hindsight(run: RunSettings, env: Any) -> str | None:
     return None
 
 
-def _arm(env: Any) -> FrankaEnv | None:
+def arm_of(env: Any) -> FrankaEnv | None:
+    """The arm inside an environment, under whatever transforms; ``None`` for one of another library."""
     while env is not None and not isinstance(env, FrankaEnv):
         env = getattr(env, "base_env", None)
     return env
-
-
-def achieved(state: torch.Tensor) -> torch.Tensor:
-    """Place of the tool [m]: (…, 20) → (…, 3)."""
-    return state[..., 14:17]
 
 
 def make_replay_buffer(

@@ -46,6 +46,8 @@ def check(run: RunSettings) -> None:
         raise UserError(
             f"pretrain: model={run.model.name} takes no pretrained encoder; use action_world_model or tdmpc2_pixels"
         )
+    if run.pretrain.kind != "none":
+        _check_first_stage(run)
     _check_planner(run)
     _check_parts(run)
 
@@ -80,6 +82,20 @@ def _check_windows(run: RunSettings) -> None:
         raise UserError(
             f"replay.hindsight={run.replay.hindsight}: recorded data keep their goals; leave it at null"
         )
+
+
+def _check_first_stage(run: RunSettings) -> None:
+    """The model that pretrains the encoder, its windows and its memory."""
+    try:
+        first = run.first_stage()
+        _check_windows(first)
+        if first.is_arm and not first.is_offline:
+            spaces = Spaces.of_config(first.env.arm, discrete=first.is_discrete)
+            model = sketch(first, spaces)
+            if model is not None:
+                check_memory(first, model, spaces)
+    except UserError as error:
+        raise UserError(f"pretrain: {error}") from error
 
 
 def _check_evaluation(run: RunSettings) -> None:
@@ -119,12 +135,12 @@ def _check_parts(run: RunSettings) -> None:
     if model is None:
         model = build.make_model(run, spaces)
     if run.objective_name == "goal_image":
-        goals = build.goal_pictures(model.image_sizes).values()
+        goals = build.goal_images(model.image_sizes).values()
         if not goals or any(goal not in spaces.image_sizes for goal in goals):
             raise UserError(
                 "planning to a goal image needs goal_pixels among env.observations="
                 f"{list(run.env.arm.observations)}, and a model that reads pixels, not {model.observation_keys}; "
-                "use env=reach_goal_image or reach_fixed_goal_image"
+                "use env=reach_goal_image, lift_goal_image or another …_goal_image"
             )
     build.make_objective(run, model)
     if model.has_next:

@@ -40,6 +40,7 @@ from franka_wm.training.manifest import MANIFEST, Manifest, read_manifest, saved
 from franka_wm.training.optimizer_state import Optimizers, load_optimizer_state, optimizer_state
 from franka_wm.training.tree import (
     damaged,
+    only_tensors,
     read_tensors,
     read_tree,
     save_tensors,
@@ -255,7 +256,7 @@ class Checkpoint:
         if saved is None:
             return None
         with damaged(self.folder, "replay.json"):
-            return TensorDict(saved["entries"], batch_size=saved["batch_size"], device=device or "cpu")
+            return only_tensors(saved["entries"], saved["batch_size"], device or "cpu")
 
     def extra(self) -> dict[str, Any] | None:
         """What was saved as `extra`, tensors on the CPU; None if nothing was."""

@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import math
-from typing import Any
+from typing import TYPE_CHECKING
 
 import torch
 from tensordict import TensorDictBase
 from torch import nn
 
 from franka_wm.errors import UserError
+
+if TYPE_CHECKING:
+    from franka_wm.models.base import WorldModel
 
 PRECISIONS = ("float32", "bfloat16")
 SCHEDULES = ("constant", "cosine")
@@ -42,7 +45,7 @@ class Learner:
 
     def __init__(
         self,
-        model: Any,
+        model: WorldModel,
         *,
         lr: float = 3e-4,
         grad_clip: float = 20.0,

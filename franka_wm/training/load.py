@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import torch
 
@@ -17,6 +17,9 @@ from franka_wm.training.checkpoint import Checkpoint, latest_checkpoint, load_ch
 from franka_wm.training.settings import RunSettings
 from franka_wm.training.spaces import Spaces
 from franka_wm.training.tree import damaged
+
+if TYPE_CHECKING:
+    from franka_wm.models.base import WorldModel
 
 HUB = "hf:"
 
@@ -38,7 +41,7 @@ class Agent:
     folder: Path
     settings: RunSettings
     env: Any
-    model: Any
+    model: WorldModel
     planner: Any
     policies: dict[str, Any]
     counters: dict[str, float]

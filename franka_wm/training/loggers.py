@@ -127,7 +127,7 @@ def log_config(loggers: Iterable[Any], config: Mapping[str, Any]) -> None:
 def log_video(loggers: Iterable[Any], name: str, frames: Tensor, *, fps: int, step: int) -> None:
     """Log a video where the logger can show or keep it; all of `NAMES` can.
 
-    ``csv`` keeps ``csv/videos/NAME_STEP.mp4``; TensorBoard shows an animated picture; services get an .mp4.
+    ``csv`` keeps ``csv/videos/NAME_STEP.mp4``; TensorBoard shows an animated image; services get an .mp4.
 
     Args:
         frames: (T, H, W, 3) uint8, H and W even.
@@ -148,7 +148,7 @@ def log_video(loggers: Iterable[Any], name: str, frames: Tensor, *, fps: int, st
                 continue
             if which == "tensorboard":
                 moving = write_gif(frames, film.with_suffix(".gif"), fps)
-                _tensorboard_picture(logger, name, moving.read_bytes(), frames, step)
+                _tensorboard_image(logger, name, moving.read_bytes(), frames, step)
                 continue
             if not film.exists():
                 write_video(frames, film, fps)
@@ -217,8 +217,8 @@ def _open(name: str, folder: Path, options: dict[str, Any]) -> Any:
     return logger
 
 
-def _tensorboard_picture(logger: Any, name: str, gif: bytes, frames: Tensor, step: int) -> None:
-    """TensorBoard plays a .gif that is logged as a picture; its own `add_video` needs moviepy."""
+def _tensorboard_image(logger: Any, name: str, gif: bytes, frames: Tensor, step: int) -> None:
+    """TensorBoard plays a .gif that is logged as an image; its own `add_video` needs moviepy."""
     Summary = import_module("tensorboard.compat.proto.summary_pb2").Summary
     _, height, width, _ = frames.shape
     image = Summary.Image(height=height, width=width, colorspace=3, encoded_image_string=gif)

@@ -24,10 +24,12 @@ class Manifest(NamedTuple):
     Attributes:
         model: class name of the model that was saved.
         files: name of every other file → `bytes` and `sha256`.
+        written_by: version of the package that saved the model.
     """
 
     model: str
     files: Mapping[str, Mapping[str, Any]]
+    written_by: str | None
 
     def check_size(self, folder: Path, name: str) -> None:
         """Raise a `UserError` unless the file is there and as long as it was written."""
@@ -51,16 +53,24 @@ class Manifest(NamedTuple):
             )
 
 
-def write_manifest(folder: Path, model: str) -> None:
-    """Write the manifest of all files of `folder`, and make sure that they have reached the disk."""
+def write_manifest(
+    folder: Path, model: str, *, written_by: str | None = __version__, saved_at_ns: int | None = None
+) -> None:
+    """Write the manifest of all files of `folder`, and make sure that they have reached the disk.
+
+    Args:
+        model: class name of the model.
+        written_by: version of the package that saved it.
+        saved_at_ns: when that was [ns]; now if None.
+    """
     files = sorted(folder.iterdir())
     for path in files:
         sync(path)
     manifest = {
         "format_version": FORMAT_VERSION,
-        "franka_wm": __version__,
+        "franka_wm": written_by,
         "model": model,
-        "saved_at_ns": time.time_ns(),
+        "saved_at_ns": time.time_ns() if saved_at_ns is None else saved_at_ns,
         "files": {p.name: {"bytes": p.stat().st_size, "sha256": _sha256(p)} for p in files},
     }
     write_json(folder / MANIFEST, manifest)
@@ -94,7 +104,7 @@ def read_manifest(folder: Path) -> Manifest:
             f"checkpoint {folder} has format version {version}, this franka_wm {__version__} reads "
             f"{FORMAT_VERSION}; use the franka_wm that wrote it ({manifest.get('franka_wm', 'unknown')})."
         )
-    return Manifest(model, files)
+    return Manifest(model, files, manifest.get("franka_wm"))
 
 
 def saved_at(folder: Path) -> int:

@@ -2,29 +2,19 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 import shutil
-import tempfile
 from pathlib import Path
 
 from omegaconf import OmegaConf
 
-from franka_wm.console import announced, say
 from franka_wm.data.lerobot.card import model_card
-from franka_wm.data.lerobot.hub import check_repo_id, explained
+from franka_wm.data.lerobot.hub import check_repo_id
 from franka_wm.data.lerobot.paths import shortened, without_paths
-from franka_wm.data.lerobot.publish import (
-    README,
-    check_name,
-    files_of,
-    hub_client,
-    send,
-    show_files,
-    write_card,
-)
+from franka_wm.data.lerobot.publish import README, publish_staged
 from franka_wm.errors import UserError
 from franka_wm.training.checkpoint import latest_checkpoint, load_checkpoint
+from franka_wm.training.manifest import read_manifest, saved_at, write_manifest
 from franka_wm.untrusted import UntrustedFolder
 
 
@@ -47,19 +37,12 @@ def publish_model(
         UserError: One line.
     """
     check_repo_id(repo_id)
-    with tempfile.TemporaryDirectory() as place:
-        staged = stage_model(Path(checkpoint), Path(place), repo_id=repo_id, license=license)
-        files = files_of(staged)
-        show_files(files, staged, repo_id, private, "model")
-        if dry_run:
-            write_card(staged, repo_id)
-            return
-        api = hub_client(repo_id)
-        with explained(repo_id):
-            check_name(api, repo_id, "model", update)
-            with announced(f"sending {len(files)} files"):
-                send(api, staged, repo_id, "model", private, update)
-        say(f"published: {api.endpoint}/{repo_id} ({'private' if private else 'public'})")
+    latest_checkpoint(Path(checkpoint))  # refused before the Hub's token is asked for
+
+    def stage(place: Path) -> Path:
+        return stage_model(Path(checkpoint), place, repo_id=repo_id, license=license)
+
+    publish_staged(stage, repo_id, "model", private=private, update=update, dry_run=dry_run)
 
 
 def stage_model(checkpoint: Path, place: Path, *, repo_id: str, license: str) -> Path:
@@ -78,10 +61,10 @@ def stage_model(checkpoint: Path, place: Path, *, repo_id: str, license: str) ->
     files = UntrustedFolder(run)
     files.below(folder.relative_to(run)).check_links()
     opened = load_checkpoint(folder)
-    manifest = json.loads((opened.folder / "manifest.json").read_text(encoding="utf-8"))
+    manifest = read_manifest(opened.folder)
     kept = ("model.safetensors", "counters.json", "extra.json", "extra.safetensors")
     for name in kept:
-        if name in manifest["files"]:
+        if name in manifest.files:
             shutil.copyfile(opened.folder / name, place / name)
     config = without_paths(OmegaConf.to_container(opened.config), clear=True)
     if "resume" in config:
@@ -89,14 +72,7 @@ def stage_model(checkpoint: Path, place: Path, *, repo_id: str, license: str) ->
     OmegaConf.save(OmegaConf.create(config), place / "config.yaml")
     if (place / "extra.json").is_file():
         _copy_json(place / "extra.json", place / "extra.json")
-    manifest["files"] = {
-        path.name: {
-            "bytes": path.stat().st_size,
-            "sha256": hashlib.sha256(path.read_bytes()).hexdigest(),
-        }
-        for path in sorted(place.iterdir())
-    }
-    (place / "manifest.json").write_text(json.dumps(manifest, indent=1), encoding="utf-8")
+    write_manifest(place, manifest.model, written_by=manifest.written_by, saved_at_ns=saved_at(opened.folder))
     # Where the verb evaluate puts them; a published model has them at its top.
     written = "evaluation/" if files.path("evaluation/evaluation.md") else ""
     if source := files.path(f"{written}evaluation.json"):

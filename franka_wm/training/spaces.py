@@ -9,7 +9,6 @@ from typing import Any
 import torch
 
 from franka_wm.envs.config import IMAGES, FrankaConfig
-from franka_wm.envs.constants import OBJECT_DIM
 from franka_wm.envs.discretize import discrete_action_table
 from franka_wm.envs.tasks import make_task
 from franka_wm.errors import UserError
@@ -24,7 +23,7 @@ class Spaces:
 
     Attributes:
         observation_sizes: Vector observations: key → size of the last dimension.
-        image_sizes: Pictures, uint8: key → (height, width, channels).
+        image_sizes: Images, uint8: key → (height, width, channels).
         action_dim: Size of a continuous action; 0 where actions are numbers of moves.
         num_actions: How many moves there are; 0 where actions are continuous.
         episode_length: Steps, at most.
@@ -86,16 +85,16 @@ class Spaces:
     @classmethod
     def of_config(cls, config: FrankaConfig, *, discrete: bool = False) -> Spaces:
         """Of the arm, before it is built."""
-        pictures = [key for key in config.observations if key in IMAGES]
-        names = {key: image_names(key, config) for key in pictures}
+        image_keys = [key for key in config.observations if key in IMAGES]
+        names = {key: image_names(key, config) for key in image_keys}
         channels = {"depth": 1, "segmentation": 1, "pixels": 3 * config.frame_stack}
         channels["goal_pixels"] = channels["pixels"]
         size = config.image_size
-        images = {name: (size, size, channels.get(key, 3)) for key in pictures for name in names[key]}
+        images = {name: (size, size, channels.get(key, 3)) for key in image_keys for name in names[key]}
         vectors = {
             "state": config.state_dim,
             "joint_target": config.target_dim,
-            "objects": OBJECT_DIM * config.num_objects,
+            "objects": config.object_dim,
             "contacts": config.contact_dim,
         }
         moves = discrete_action_table(config.action_dim).shape[0]
@@ -136,7 +135,7 @@ class Spaces:
 
 
 def image_names(key: str, config: FrankaConfig) -> list[str]:
-    """The TensorDict keys of a picture: the plain name for the first camera, with the camera's for others."""
+    """The TensorDict keys of an image: the plain name for the first camera, with the camera's for others."""
     return [key, *(f"{key}_{camera}" for camera in config.cameras[1:])]
 
 

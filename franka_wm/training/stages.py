@@ -1,4 +1,4 @@
-"""Two stages: an encoder from pictures alone, then a model whose dynamics are learned on top of it, frozen.
+"""Two stages: an encoder from images alone, then a model whose dynamics are learned on top of it, frozen.
 
 V-JEPA 2-AC's recipe (arXiv:2506.09985): with the encoder fixed, the targets of the dynamics are fixed, too, and nothing
 can be gained by making them easier.
@@ -37,7 +37,7 @@ def pretrain(run: Run, env: Any, experience: Any, spaces: Spaces) -> None:
         return
     first = settings.first_stage()
     model = build.make_model(first, spaces, run.device)
-    say(f"first stage: {first.model.name}, {first.trainer.updates} updates on pictures alone")
+    say(f"first stage: {first.model.name}, {first.trainer.updates} updates on images alone")
     policies = {}
     if env is not None:
         policies = build.make_scripted_policies(

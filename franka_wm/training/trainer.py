@@ -120,8 +120,8 @@ class Trainer:
         self._keys = self.model.observation_keys
         if settings.export.kind != "none":  # a dataset is for other models, too
             self._keys = [*self.spaces.observation_sizes, *self.spaces.image_sizes]
-        if getattr(replay, "hindsight", None) is not None:  # it reads where the tool was
-            self._keys = list(dict.fromkeys([*self._keys, "state"]))
+        if (hindsight := getattr(replay, "hindsight", None)) is not None:
+            self._keys = list(dict.fromkeys([*self._keys, *hindsight.reads]))
         self._extra = list(self.model.replay_keys)
         # What the acting policy writes for the loss, a random one does not: then the actor fills the replay, too.
         self._acting = None
@@ -246,7 +246,7 @@ class Trainer:
             return False
         if not self._said_too_long:
             say(
-                "  evaluations take long here: some are left out; evaluation.every=UPDATES asks for all of them"
+                "  evaluations take long here: some are left out; evaluation.every=N plays them every N updates"
             )
             self._said_too_long = True
         return True

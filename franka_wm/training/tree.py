@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from safetensors import SafetensorError
 from safetensors.torch import load_file, save_file
+from tensordict import TensorDict
 from torch import Tensor
 
 from franka_wm.errors import UserError
@@ -55,6 +56,19 @@ def read_tensors(folder: Path, name: str) -> dict[str, Tensor]:
         raise UserError(
             f"checkpoint {folder} is damaged: {name}.safetensors cannot be read ({error}); use another checkpoint."
         ) from error
+
+
+def only_tensors(entries: Any, batch_size: Any, device: Any) -> TensorDict:
+    """Nested values as a TensorDict.
+
+    Raises:
+        ValueError: It names an entry that is no tensor.
+    """
+    found = TensorDict(entries, batch_size=batch_size, device=device)
+    other = [key for key, value in found.items(True) if not isinstance(value, Tensor | TensorDict)]
+    if other:
+        raise ValueError(f"{other[0]} is no tensor")
+    return found
 
 
 def damaged(folder: Path, name: str = "one of its files") -> AbstractContextManager[None]:

@@ -4,12 +4,12 @@ A cache is a folder of ``.npy`` files, memory-mapped when read, and ``cache.json
 
     episodes             (E, 3) int64   first row, number of rows, and whether one more row holds o_T, the
                                         observation after the last action
-    observation.<key>    (R, …)         pictures uint8 (H, W, 3), vectors float32
+    observation.<key>    (R, …)         images uint8 (H, W, 3), vectors float32
     action               (R, A) float32, or (R,) int64 where actions are discrete
     next.<entry>         (R, 1)         reward float32, the others bool: what followed the action of that row
 
 Its name is a hash of what it was made from: the dataset's files (path, size, time of change), the mapping, the size
-of pictures, and the version of this form. So a cache is never out of date; those of a dataset that has changed since
+of images, and the version of this form. So a cache is never out of date; those of a dataset that has changed since
 are removed. It is built under another name and renamed, and only one process builds it at a time.
 """
 
@@ -80,7 +80,7 @@ def open_cache(
         say: Takes lines for the terminal.
 
     Raises:
-        UserError: If a file is missing or damaged, pictures do not belong to rows, a number is not finite, or
+        UserError: If a file is missing or damaged, images do not belong to rows, a number is not finite, or
             there is no room.
     """
     from filelock import FileLock, Timeout

@@ -18,7 +18,7 @@ from franka_wm.data.lerobot.schema import OWN_FOLDER, PROVENANCE
 from franka_wm.data.lerobot.terminal import TERMINAL_FOLDER
 from franka_wm.errors import UserError
 
-PICTURE = f"{OWN_FOLDER}/picture.png"
+IMAGE = f"{OWN_FOLDER}/picture.png"
 _CITATION = """```bibtex
 @software{franka_wm,
   title  = {franka_wm: latent world models of a simulated Franka arm},
@@ -95,7 +95,7 @@ def dataset_card(root: Path, *, repo_id: str, license: str) -> str:
         configs=[{"config_name": "default", "data_files": "data/*/*.parquet"}],
     )
     units = {name: UNITS.get(name, "") for name in info["features"]} if provenance is not None else {}
-    picture = f"\n![Frames of one episode]({PICTURE})\n" if (root / PICTURE).is_file() else ""
+    image = f"\n![Frames of one episode]({IMAGE})\n" if (root / IMAGE).is_file() else ""
     table = "\n".join(
         f"| `{name}` | {one['dtype']} | {tuple(one['shape'])} | {units.get(name, '')} | {_names(one.get('names'))} |"
         for name, one in info["features"].items()
@@ -105,7 +105,7 @@ def dataset_card(root: Path, *, repo_id: str, license: str) -> str:
 
 {info["total_episodes"]} episodes, {info["total_frames"]} steps at {info["fps"]} Hz {robot}.
 {f"{task} " if task else ""}{own}.
-{picture}
+{image}
 ## How it was gathered
 
 {gathered or "Not recorded."}{settings}
@@ -153,15 +153,15 @@ def _names(names: Any) -> str:
     return ", ".join(names) if len(names) <= 7 else f"{names[0]}, … {names[-1]} ({len(names)})"
 
 
-def make_picture(root: Path, out: Path, *, frames: int = 6) -> None:
-    """Frames of the first episode, side by side, as PNG; nothing without pictures.
+def make_image(root: Path, out: Path, *, frames: int = 6) -> None:
+    """Frames of the first episode, side by side, as PNG; nothing without images.
 
     Args:
         root: The dataset.
-        out: Where the picture goes.
+        out: Where the image goes.
         frames: How many.
     """
-    from franka_wm.data.lerobot.pictures import encode_png
+    from franka_wm.data.lerobot.png import encode_png
     from franka_wm.files import atomic_write
 
     info = json.loads((root / "meta" / "info.json").read_text(encoding="utf-8"))
@@ -184,7 +184,7 @@ def _first_episode(root: Path, info: Mapping[str, Any], name: str, kind: str) ->
     """(T, H, W, 3) uint8."""
     import pyarrow.parquet as pq
 
-    from franka_wm.data.lerobot.pictures import decode_png
+    from franka_wm.data.lerobot.png import decode_png
 
     data = root / info["data_path"].format(chunk_index=0, file_index=0)
     if kind == "image":

@@ -66,7 +66,7 @@ def gather(
             already; the feature ``seed`` says it.
         out, workers, shard_frames, resume: As for :class:`~franka_wm.data.lerobot.writer.DatasetWriter`.
         episodes: In all.
-        format: Of pictures.
+        format: Of images.
         success_only: Keep only episodes that end in success.
         every: Seconds between lines of progress.
 

@@ -68,9 +68,9 @@ class TableJob:
                     for feature, places in self.images.items():
                         cells = batch.column(feature)
                         for row, cell in zip(rows, cells, strict=True):
-                            picture = self._picture(cell.as_py(), feature)
+                            image = self._image(cell.as_py(), feature)
                             for name, height, width in places:
-                                arrays[name][row] = resized(picture, height, width)
+                                arrays[name][row] = resized(image, height, width)
                     arrays.mark("table", rows)
                     done += len(rows)
         except (pa.ArrowException, OSError, KeyError) as error:
@@ -109,7 +109,7 @@ class TableJob:
             )
         return values
 
-    def _picture(self, cell: Any, feature: str) -> np.ndarray:
+    def _image(self, cell: Any, feature: str) -> np.ndarray:
         from PIL import Image
 
         data = cell.get("bytes") if isinstance(cell, dict) else cell
@@ -118,10 +118,10 @@ class TableJob:
                 f"{self.path}: {feature} holds no image but a path; embed the images (LeRobot's own writer does)"
             )
         try:
-            with Image.open(io.BytesIO(data)) as picture:
-                if picture.width * picture.height > MOST_PIXELS:
-                    raise ValueError(f"{picture.width} × {picture.height} pixels")
-                return np.asarray(picture.convert("RGB"))
+            with Image.open(io.BytesIO(data)) as image:
+                if image.width * image.height > MOST_PIXELS:
+                    raise ValueError(f"{image.width} × {image.height} pixels")
+                return np.asarray(image.convert("RGB"))
         except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:
             raise UserError(f"{self.path}: an image of {feature} cannot be decoded: {error}") from error
 
@@ -172,9 +172,9 @@ class VideoJob:
                     row = row_at.get(round(float(frame.pts * stream.time_base) * self.fps))
                     if row is None:
                         continue
-                    picture = reformatter.reformat(frame, format="rgb24").to_ndarray()
+                    image = reformatter.reformat(frame, format="rgb24").to_ndarray()
                     for name, height, width in self.targets:
-                        arrays[name][row] = resized(picture, height, width)
+                        arrays[name][row] = resized(image, height, width)
                     seen.append(row)
         except (FFmpegError, OSError, IndexError) as error:
             raise UserError(f"{self.path} cannot be decoded: {error}") from error
@@ -206,13 +206,13 @@ class VideoJob:
         return out
 
 
-def resized(picture: np.ndarray, height: int, width: int) -> np.ndarray:
+def resized(image: np.ndarray, height: int, width: int) -> np.ndarray:
     """(H, W, 3) uint8 at another size (bilinear, averaging when it shrinks), or as it is if that is its size."""
-    if picture.shape[:2] == (height, width):
-        return picture
+    if image.shape[:2] == (height, width):
+        return image
     from PIL import Image
 
-    return np.asarray(Image.fromarray(picture).resize((width, height), Image.Resampling.BILINEAR))
+    return np.asarray(Image.fromarray(image).resize((width, height), Image.Resampling.BILINEAR))
 
 
 class _Arrays:

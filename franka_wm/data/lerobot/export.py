@@ -88,7 +88,7 @@ def export_replay(
     """
     from franka_wm.envs.discretize import discrete_action_table
 
-    if config.frame_stack > 1:  # a replay keeps each picture once, and so does a dataset
+    if config.frame_stack > 1:  # a replay keeps each image once, and so does a dataset
         stacked = [str(key) for key in data.keys() if str(key).startswith(("pixels", "goal_pixels"))]  # noqa: SIM118
         data, config = newest(data, stacked, config.frame_stack), replace(config, frame_stack=1)
     after = data.get("next")

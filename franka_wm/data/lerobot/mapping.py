@@ -54,13 +54,13 @@ class FeatureMap:
 
     @property
     def numbers(self) -> list[str]:
-        """All features that are no pictures, each once."""
+        """All features that are no images, each once."""
         out = [f for features, _ in self.vectors.values() for f in features]
         return list(dict.fromkeys([*out, *self.action[0], *self.after.values()]))
 
     @property
     def image_features(self) -> list[str]:
-        """All features that are pictures."""
+        """All features that are images."""
         return [feature for feature, _ in self.images.values()]
 
     def to_dict(self) -> dict[str, Any]:
@@ -85,7 +85,7 @@ def map_features(
     feature                             entry
     ==================================  ==============================================================
     ``observation.images.goal``         ``goal_pixels`` (ours: ``….goal_<camera>`` as ``goal_pixels_<camera>``)
-    first other picture                 ``pixels``
+    first other image                 ``pixels``
     further ones                        ``pixels_<camera>``
     ``observation.state``               ``state``
     ``observation.environment_state``   ``goal`` in a dataset of ours, else ``environment_state``
@@ -95,14 +95,14 @@ def map_features(
     ``next.reward``, ``next.done``, …   the same under ``next``, without the prefix
     ==================================  ==============================================================
 
-    Depth pictures, texts and features of several dimensions are left out.
+    Depth images, texts and features of several dimensions are left out.
 
     Args:
         source: The dataset.
         features: Entry → feature, or a list of vectors that are put one behind the other. It replaces the
             observations above; ``action`` and the entries under ``next`` may be left to convention.
         keys: Observations that are needed; others are not read. ``None``: all.
-        image_size: Side of the square, or (height, width), that pictures are resized to [px].
+        image_size: Side of the square, or (height, width), that images are resized to [px].
 
     Raises:
         UserError: For a feature or key that is not there, or one that cannot be used.
@@ -172,18 +172,18 @@ def map_features(
 
 
 def is_image(spec: Mapping[str, Any]) -> bool:
-    """Whether a feature is a picture (depth included)."""
+    """Whether a feature is an image (depth included)."""
     return spec.get("dtype") in ("image", "video")
 
 
 def is_depth(spec: Mapping[str, Any]) -> bool:
-    """Whether a picture is a depth map, by LeRobot's marks."""
+    """Whether an image is a depth map, by LeRobot's marks."""
     infos = [spec.get("info") or {}, spec.get("video_info") or {}]
     return any(info.get("is_depth_map") or info.get("video.is_depth_map") for info in infos)
 
 
 def image_shape(source: Source, name: str) -> tuple[int, int]:
-    """Height and width of a picture feature, whether it is written (H, W, C) or (C, H, W).
+    """Height and width of an image feature, whether it is written (H, W, C) or (C, H, W).
 
     Raises:
         UserError: If it is a depth map or has no three channels.

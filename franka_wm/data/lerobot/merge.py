@@ -1,7 +1,7 @@
 """Shards into one dataset.
 
 The result is what LeRobot's ``aggregate_datasets`` makes of them, with one data and one video file for each of
-theirs; a test holds the two to the same tables. That function takes every picture out of its file and puts it back,
+theirs; a test holds the two to the same tables. That function takes every image out of its file and puts it back,
 row by row, which is some twenty times slower than writing them was. Here only the numbers that change (places in the
 whole) are rewritten.
 """
@@ -174,7 +174,7 @@ def merge_terminals(out: Path, roots: Sequence[Path]) -> None:
 
 
 def check_merged(out: Path, roots: Sequence[Path]) -> None:
-    """Compares rows, their order and the number of pictures with the datasets that were merged.
+    """Compares rows, their order and the number of images with the datasets that were merged.
 
     Raises:
         UserError: They differ.

@@ -57,7 +57,7 @@ def open_dataset(
         features: Which feature becomes which entry; by convention if not given
             (:func:`~franka_wm.data.lerobot.mapping.map_features`).
         keys: Observations that are needed; others are not decoded.
-        image_size: Pictures are resized to this square, or to (height, width) [px].
+        image_size: Images are resized to this square, or to (height, width) [px].
         normalize_actions: Scale actions to [−1, 1]; ``None``: where the dataset is not of this package.
         cache_dir: Where caches are kept; ``~/.cache/franka_wm/datasets`` if not given.
         in_memory: Keep everything in the device's memory, else read from the disk's cache; ``None``: where it

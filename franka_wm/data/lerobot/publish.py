@@ -6,11 +6,11 @@ import contextlib
 import json
 import shutil
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
-from franka_wm.data.lerobot.card import PICTURE, dataset_card, make_picture
+from franka_wm.data.lerobot.card import IMAGE, dataset_card, make_image
 from franka_wm.data.lerobot.hub import check_repo_id, explained
 from franka_wm.data.lerobot.paths import without_paths
 from franka_wm.data.lerobot.provenance import read_provenance
@@ -38,7 +38,7 @@ def publish_dataset(
     the one that is there. It also leaves files of an earlier version, which are removed here.
 
     Args:
-        root: A LeRobot dataset on disk. Nothing in it is changed: card and picture are made elsewhere, and go in the
+        root: A LeRobot dataset on disk. Nothing in it is changed: card and image are made elsewhere, and go in the
             place of a README.md that is there.
         repo_id: ``user/name``.
         private: Whether only you can see it.
@@ -49,27 +49,57 @@ def publish_dataset(
     Raises:
         UserError: One line: not a dataset, no token, the name is taken, no network.
     """
-    from franka_wm.console import announced, say
-
     root = Path(root).absolute()
     check_repo_id(repo_id)
     _check_dataset(root)
+    note = ""
+    if (root / README).is_file():
+        note = f"the card replaces {README} in what is sent; {root / README} stays as it is"
+
+    def stage(place: Path) -> Path:
+        return stage_dataset(root, place, repo_id=repo_id, license=license)
+
+    publish_staged(stage, repo_id, "dataset", private=private, update=update, dry_run=dry_run, note=note)
+
+
+def publish_staged(
+    stage: Callable[[Path], Path],
+    repo_id: str,
+    kind: Literal["dataset", "model"],
+    *,
+    private: bool,
+    update: bool,
+    dry_run: bool,
+    note: str = "",
+) -> None:
+    """Shows what would be sent, and sends it, or in a dry run writes its card.
+
+    Args:
+        stage: Puts what is sent into an empty folder.
+        repo_id, private, update, dry_run: As for :func:`publish_dataset`.
+        kind: Of the repository.
+        note: Said before anything is sent.
+    """
+    from franka_wm.console import announced, say
+
     api = None if dry_run else hub_client(repo_id)
     with tempfile.TemporaryDirectory() as place:
-        staged = stage_dataset(root, Path(place), repo_id=repo_id, license=license)
+        staged = stage(Path(place))
         files = files_of(staged)
-        show_files(files, staged, repo_id, private, "dataset")
-        if (root / README).is_file():
-            say(f"the card replaces {README} in what is sent; {root / README} stays as it is")
+        show_files(files, staged, repo_id, private, kind)
+        if note:
+            say(note)
         if api is None:
             write_card(staged, repo_id)
             return
         with explained(repo_id):
-            check_name(api, repo_id, "dataset", update)
+            check_name(api, repo_id, kind, update)
             with announced(f"sending {len(files)} files"):
-                send(api, staged, repo_id, "dataset", private, update)
-                _tag(api, repo_id)
-    say(f"published: {api.endpoint}/datasets/{repo_id} ({'private' if private else 'public'})")
+                send(api, staged, repo_id, kind, private, update)
+                if kind == "dataset":
+                    _tag(api, repo_id)
+    address = f"{api.endpoint}/{'datasets/' if kind == 'dataset' else ''}{repo_id}"
+    say(f"published: {address} ({'private' if private else 'public'})")
 
 
 def _check_dataset(root: Path) -> None:
@@ -109,7 +139,7 @@ def _check_dataset(root: Path) -> None:
 
 
 def stage_dataset(root: Path, place: Path, *, repo_id: str, license: str) -> Path:
-    """Links to the files of a dataset, with a card and a picture, and a provenance without absolute paths.
+    """Links to the files of a dataset, with a card and an image, and a provenance without absolute paths.
 
     Args:
         root: The dataset; is only read.
@@ -125,7 +155,7 @@ def stage_dataset(root: Path, place: Path, *, repo_id: str, license: str) -> Pat
     _check_links(root)
     for name in files_of(root):
         (place / name).parent.mkdir(parents=True, exist_ok=True)
-        if name not in (README, PROVENANCE, PICTURE):
+        if name not in (README, PROVENANCE, IMAGE):
             (place / name).symlink_to(root / name)
     provenance = read_provenance(root)
     if provenance is not None:
@@ -134,7 +164,7 @@ def stage_dataset(root: Path, place: Path, *, repo_id: str, license: str) -> Pat
         if cleaned != provenance:
             text = json.dumps(cleaned, indent=1)
         (place / PROVENANCE).write_text(text, encoding="utf-8")
-    make_picture(root, place / PICTURE)
+    make_image(root, place / IMAGE)
     card = dataset_card(place, repo_id=repo_id, license=license)
     (place / README).write_text(card, encoding="utf-8")
     return place
@@ -179,11 +209,11 @@ def show_files(files: Sequence[str], root: Path, repo_id: str, private: bool, ki
 
 
 def write_card(staged: Path, repo_id: str) -> None:
-    """The end of a dry run: the card and its picture, to look at, in a folder of their own."""
+    """The end of a dry run: the card and its image, to look at, in a folder of their own."""
     from franka_wm.console import say
 
     place = Path("outputs") / "publish" / repo_id.replace("/", "--")
-    for name in (README, PICTURE):
+    for name in (README, IMAGE):
         if (staged / name).is_file():
             (place / name).parent.mkdir(parents=True, exist_ok=True)
             shutil.copyfile(staged / name, place / name)

@@ -7,7 +7,7 @@ no row; :mod:`franka_wm.data.lerobot.terminal` keeps it.
 =================================  ==================  ===========================================================
 feature                            shape, dtype        meaning
 =================================  ==================  ===========================================================
-``observation.images.<camera>``    (H, W, 3) uint8     the camera's picture
+``observation.images.<camera>``    (H, W, 3) uint8     the camera's image
 ``observation.images.goal``        (H, W, 3) uint8     the arm at the goal, seen by the first camera
 ``observation.state``              (20,) float32       joints 7 [rad], velocities 7 [rad/s], tool 3, tool − goal 3 [m];
                                                        with a gripper (28,): fingers 2 [m], their speeds 2, tool's
@@ -51,7 +51,7 @@ FORMATS = {
     "video": "LeRobot's default codec (AV1): small, for sharing and viewers; blurs small motion",
     "video_near_lossless": "h264, 4:4:4, crf 0: each channel off by 2 of 255 at most; plays in most viewers",
 }
-"""How pictures are stored: name → what it is."""
+"""How images are stored: name → what it is."""
 
 IMAGE_PREFIX = "observation.images."
 STATE, GOAL, ACTION = "observation.state", "observation.environment_state", "action"
@@ -125,7 +125,7 @@ class Schema:
 
     @property
     def images(self) -> list[str]:
-        """Features that are pictures."""
+        """Features that are images."""
         return [key for key, feature in self.features.items() if feature["dtype"] in ("image", "video")]
 
     @property
@@ -135,7 +135,7 @@ class Schema:
 
     @property
     def numbers(self) -> list[str]:
-        """Features that are no pictures."""
+        """Features that are no images."""
         return [key for key in self.features if key not in self.images]
 
     def numpy_dtype(self, feature: str) -> np.dtype:
@@ -161,14 +161,14 @@ def schema_for(
 
     Args:
         config: The environment's.
-        format: How pictures are stored; one of :data:`FORMATS`.
+        format: How images are stored; one of :data:`FORMATS`.
         keys: Observations that the data has (a replay keeps fewer than the environment emits). If not given:
             what the environment emits.
         success: Whether the data says if the task was solved.
 
     Raises:
         UserError: An unknown format, a frame rate that is not whole, or an observation that has no place in a
-            LeRobot dataset, stacked pictures among them.
+            LeRobot dataset, stacked images among them.
     """
     if format not in FORMATS:
         raise UserError(f"format={format!r}: must be one of {', '.join(FORMATS)}")
@@ -226,8 +226,11 @@ def schema_for(
         targets = [f"{joint}.target" for joint in _JOINT_NAMES] + ["gripper.target"] * config.has_gripper
         observed(TARGET, "joint_target", targets)
     if "objects" in keys and config.surroundings:
-        bodies = [body.name for body in config.surroundings.objects]
-        observed(OBJECTS, "objects", [f"{body}.{name}" for body in bodies for name in _OBJECT_NAMES])
+        scene = config.surroundings
+        bodies = [body.name for body in (*scene.objects, *scene.articulated)]
+        numbers = [f"{body}.{name}" for body in bodies for name in _OBJECT_NAMES]
+        joints = [f"{one.name}.{name}" for one in scene.articulated for name in ("opened", "opened.vel")]
+        observed(OBJECTS, "objects", numbers + joints)
     if "contacts" in keys:
         observed(CONTACTS, "contacts", ["finger_1.force", "finger_2.force"])
     features[SEED] = {"dtype": "int64", "shape": (3,), "names": ["run", "world", "episode"]}
@@ -254,7 +257,7 @@ def image_feature(key: str, cameras: Sequence[str]) -> str:
 def episode_key(columns: Mapping[str, np.ndarray]) -> int:
     """Fingerprint of an episode: 52 bits of a hash of its numbers, so that a float holds it exactly.
 
-    Pictures, automatic columns and the key itself do not count: what is read back from any of the
+    Images, automatic columns and the key itself do not count: what is read back from any of the
     formats has the key that was written.
 
     Args:

@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 
 from franka_wm.data.lerobot.episodes import Episode
-from franka_wm.data.lerobot.pictures import encode_png
+from franka_wm.data.lerobot.png import encode_png
 from franka_wm.data.lerobot.schema import AUTOMATIC, DONE, Schema
 from franka_wm.data.lerobot.stats import aggregate, episode_stats
 from franka_wm.data.lerobot.terminal import TERMINAL_FOLDER, write_terminals
@@ -134,7 +134,7 @@ def _write_rows(path: Path, features: dict[str, Any], columns: Sequence[dict[str
 
 
 def arrow_schema(features: dict[str, Any]) -> Any:
-    """Of the data files, with the note that tells ``datasets`` what is a picture."""
+    """Of the data files, with the note that tells ``datasets`` what is an image."""
     import pyarrow as pa
 
     fields, notes = [], {}
@@ -160,7 +160,7 @@ def _table(columns: dict[str, np.ndarray], arrow: Any) -> Any:
     for field in arrow:
         array = columns[field.name]
         if array.ndim == 4:
-            data = pa.array([encode_png(picture) for picture in array], pa.binary())
+            data = pa.array([encode_png(image) for image in array], pa.binary())
             names = pa.array([f"frame-{i:06d}.png" for i in range(len(array))], pa.string())
             arrays.append(pa.StructArray.from_arrays([data, names], fields=list(field.type)))
         elif array.ndim == 2:
@@ -297,27 +297,27 @@ def _video_info(path: Path, schema: Schema) -> dict[str, Any]:
     return info | {f"video.{name}": value for name, value in fields.items()} | {"is_depth_map": False}
 
 
-def encode_video(path: Path, pictures: Sequence[np.ndarray], schema: Schema) -> None:
-    """Writes the episodes' pictures, one after the other, as one video.
+def encode_video(path: Path, images: Sequence[np.ndarray], schema: Schema) -> None:
+    """Writes the episodes' images, one after the other, as one video.
 
     Args:
         path: The mp4 file.
-        pictures: For each episode (T, H, W, 3) uint8.
+        images: For each episode (T, H, W, 3) uint8.
         schema: Gives frame rate and format.
     """
     import av
 
     encoder = ENCODERS[schema.format]
     path.parent.mkdir(parents=True, exist_ok=True)
-    height, width = pictures[0].shape[1:3]
+    height, width = images[0].shape[1:3]
     with av.open(str(path), "w") as container:
         stream: Any = container.add_stream(encoder.codec, schema.fps, options=dict(encoder.options))
         stream.pix_fmt, stream.width, stream.height = encoder.pix_fmt, width, height
         stream.time_base = Fraction(1, schema.fps)
         time = 0
-        for episode in pictures:
-            for picture in episode:
-                frame = av.VideoFrame.from_ndarray(picture, format="rgb24")
+        for episode in images:
+            for image in episode:
+                frame = av.VideoFrame.from_ndarray(image, format="rgb24")
                 frame.pts, frame.time_base = time, Fraction(1, schema.fps)
                 container.mux(stream.encode(frame))
                 time += 1

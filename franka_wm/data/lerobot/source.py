@@ -29,7 +29,7 @@ MOST_EPISODES, MOST_ROWS, MOST_NUMBERS = 10**8, 10**10, 10**8
 
 @dataclass(frozen=True, eq=False)
 class Source:
-    """A LeRobot v3 dataset: where its E episodes are, without a row or a picture read.
+    """A LeRobot v3 dataset: where its E episodes are, without a row or an image read.
 
     Attributes:
         root: Its folder.

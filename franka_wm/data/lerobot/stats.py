@@ -30,12 +30,12 @@ def vector_stats(array: np.ndarray) -> dict[str, np.ndarray]:
     } | {name: ordered[rank] for name, rank in ranks.items()}
 
 
-def picture_stats(pictures: np.ndarray) -> dict[str, np.ndarray]:
+def image_stats(images: np.ndarray) -> dict[str, np.ndarray]:
     """Of (T, H, W, 3) uint8: each (3, 1, 1), for values in [0, 1]. Frames are sampled as LeRobot samples them."""
     from PIL import Image
 
-    count = max(min(len(pictures), 100), min(int(len(pictures) ** 0.75), 10_000))
-    chosen = pictures[np.round(np.linspace(0, len(pictures) - 1, count)).astype(int)]
+    count = max(min(len(images), 100), min(int(len(images) ** 0.75), 10_000))
+    chosen = images[np.round(np.linspace(0, len(images) - 1, count)).astype(int)]
     histogram = Image.fromarray(chosen.reshape(-1, chosen.shape[2], 3)).histogram()
     counts = np.array(histogram, np.float64).reshape(3, 256)
     total = counts.sum(1)
@@ -55,9 +55,9 @@ def picture_stats(pictures: np.ndarray) -> dict[str, np.ndarray]:
 
 
 def episode_stats(columns: Mapping[str, np.ndarray]) -> dict[str, dict[str, np.ndarray]]:
-    """For each column (T, …); uint8 of four dimensions are pictures."""
+    """For each column (T, …); uint8 of four dimensions are images."""
     return {
-        name: picture_stats(array) if array.dtype == np.uint8 and array.ndim == 4 else vector_stats(array)
+        name: image_stats(array) if array.dtype == np.uint8 and array.ndim == 4 else vector_stats(array)
         for name, array in columns.items()
     }
 

@@ -5,7 +5,7 @@ a row of ``meta/franka_wm/terminal/file-NNN.parquet``, which LeRobot's readers d
 
     episode_key  int64       which episode it belongs to; the feature ``episode_key`` of its rows
     length       int64       rows of that episode
-    <feature>    list, or binary (PNG) for pictures, exact in every format
+    <feature>    list, or binary (PNG) for images, exact in every format
 
 Episodes are found by key, not by index: LeRobot's tools may delete, split, reorder or merge episodes. Where such a
 tool has dropped this folder, or has changed an episode's length, reading says so and gives what is left.
@@ -20,7 +20,7 @@ from typing import Any
 
 import numpy as np
 
-from franka_wm.data.lerobot.pictures import decode_png, encode_png
+from franka_wm.data.lerobot.png import decode_png, encode_png
 from franka_wm.data.lerobot.schema import OWN_FOLDER
 from franka_wm.errors import UserError
 from franka_wm.untrusted import values_of
@@ -51,7 +51,7 @@ def write_terminals(
     Args:
         path: The file; its folder is made.
         keys, lengths: (E,) of each episode.
-        values: Feature → (E, …); uint8 of four dimensions (E, H, W, 3) are pictures.
+        values: Feature → (E, …); uint8 of four dimensions (E, H, W, 3) are images.
     """
     import pyarrow as pa
     import pyarrow.parquet as pq
@@ -62,7 +62,7 @@ def write_terminals(
     }
     for feature, array in values.items():
         if array.dtype == np.uint8 and array.ndim == 4:
-            columns[feature] = pa.array([encode_png(picture) for picture in array], pa.binary())
+            columns[feature] = pa.array([encode_png(image) for image in array], pa.binary())
         else:
             flat = pa.array(np.ascontiguousarray(array).reshape(-1))
             columns[feature] = pa.FixedSizeListArray.from_arrays(
@@ -84,7 +84,7 @@ def read_terminals(
     Args:
         root: The dataset's folder.
         keys, lengths: (E,) of each episode: its feature ``episode_key`` and its number of rows.
-        features: The features wanted, with ``dtype`` (``image`` and ``video`` are pictures) and ``shape``.
+        features: The features wanted, with ``dtype`` (``image`` and ``video`` are images) and ``shape``.
 
     Returns:
         What was found, and in ``problem`` one line about what was not.
@@ -96,8 +96,8 @@ def read_terminals(
     found = np.zeros(len(keys), bool)
     values: dict[str, np.ndarray] = {}
     for feature, spec in features.items():
-        picture = spec["dtype"] in ("image", "video")
-        values[feature] = np.zeros((len(keys), *spec["shape"]), "uint8" if picture else spec["dtype"])
+        is_image = spec["dtype"] in ("image", "video")
+        values[feature] = np.zeros((len(keys), *spec["shape"]), "uint8" if is_image else spec["dtype"])
     changed = 0
     for file in files:
         with values_of(str(file), "delete it, and the last step of every episode is left out."):

@@ -67,7 +67,7 @@ class RecordedWindows:
 
     A batch is a TensorDict (B, H): observations, ``action`` and ``is_init`` at its root; the observations that
     followed and, where the dataset has them, ``reward`` (float32), ``done``, ``terminated``, ``truncated``,
-    ``success`` (bool), each (B, H, 1), under ``next``. Pictures are uint8 (B, H, h, w, 3), vectors float32,
+    ``success`` (bool), each (B, H, 1), under ``next``. Images are uint8 (B, H, h, w, 3), vectors float32,
     actions float32 (B, H, A) in [−1, 1] or int64 (B, H) where they are discrete.
 
     So a window has H + 1 observations. Where the observation after an episode's last action is known (datasets
@@ -86,12 +86,12 @@ class RecordedWindows:
         split: ``"train"``, ``"validation"`` or ``"all"``.
         validation_fraction: Of each dataset's episodes, in [0, 1); at least one if it is above 0.
         seed: Draws the validation episodes and the windows.
-        frame_stack: Pictures in each observation under ``pixels`` and ``pixels_…``: the present one and those before
+        frame_stack: Images in each observation under ``pixels`` and ``pixels_…``: the present one and those before
             it in its episode, oldest first along the channels, the first one repeated (as ``env.frame_stack``).
 
     Attributes:
         observation_sizes: Vector key → size.
-        image_sizes: Picture key → (h, w, 3), or (h, w, 3 · ``frame_stack``).
+        image_sizes: Image key → (h, w, 3), or (h, w, 3 · ``frame_stack``).
         action_dim: A; 0 where actions are discrete.
         num_actions: Largest discrete action + 1; 0 where actions are continuous.
         episode_length: Transitions of the longest episode.
@@ -336,7 +336,7 @@ class RecordedWindows:
         if action_dim is not None and not self.num_actions and action_dim != self.action_dim:
             raise UserError(
                 f"the dataset's actions have {self.action_dim} numbers, the environment's {action_dim}; "
-                "choose another env.action_mode, or another dataset"
+                "choose the env that it was recorded in (or its env.action_mode), or another dataset"
             )
 
     def _chosen(self) -> np.ndarray:
@@ -352,8 +352,8 @@ class RecordedWindows:
         """(B, T) rows of episodes that begin at ``first`` (B,) → (B, T, h, w, 3 · frame_stack)."""
         earlier = rows[:, :1] + torch.arange(1 - self.frame_stack, 0, device=rows.device)
         earlier = torch.maximum(earlier, first.unsqueeze(1))  # the first one stands for those before it
-        pictures, steps = self._gather(name, torch.cat((earlier, rows), 1)), rows.shape[1]
-        return torch.cat([pictures[:, k : k + steps] for k in range(self.frame_stack)], -1)
+        images, steps = self._gather(name, torch.cat((earlier, rows), 1)), rows.shape[1]
+        return torch.cat([images[:, k : k + steps] for k in range(self.frame_stack)], -1)
 
     def _gather(self, name: str, rows: Tensor) -> Tensor:
         """(B, T) rows → (B, T, …) on the device."""

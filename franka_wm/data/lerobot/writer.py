@@ -41,7 +41,7 @@ from franka_wm.errors import UserError
 from franka_wm.options import whole_rule
 
 SHARD_BYTES = 64_000_000
-"""Pictures and numbers of one shard in memory, before they are compressed."""
+"""Images and numbers of one shard in memory, before they are compressed."""
 
 
 class DatasetWriter:

@@ -40,16 +40,16 @@ class RecordedView(FrankaVectorEnv):
         super().__init__(num_envs, **options)
         config = self.env.config
         sources = schema.schema_for(config).sources
-        self._pictures = {
+        self._images = {
             feature.removeprefix(schema.IMAGE_PREFIX): key
             for feature, key in sources.items()
             if feature.startswith(schema.IMAGE_PREFIX)
         }
         self.task, self.task_description = config.task, task_sentence(config)
         entries: dict[str, spaces.Space] = {}
-        if self._pictures:
-            picture = spaces.Box(0, 255, (config.image_size, config.image_size, 3), np.uint8)
-            entries["pixels"] = spaces.Dict(dict.fromkeys(self._pictures, picture))
+        if self._images:
+            image = spaces.Box(0, 255, (config.image_size, config.image_size, 3), np.uint8)
+            entries["pixels"] = spaces.Dict(dict.fromkeys(self._images, image))
         entries["agent_pos"] = spaces.Box(-np.inf, np.inf, (config.state_dim,), np.float32)
         entries["environment_state"] = spaces.Box(-np.inf, np.inf, (3,), np.float32)
         self.single_observation_space = spaces.Dict(entries)
@@ -57,9 +57,9 @@ class RecordedView(FrankaVectorEnv):
 
     def _to_numpy(self, tensordict: TensorDictBase) -> tuple[dict[str, Any], np.ndarray]:
         out: dict[str, Any] = {}
-        if self._pictures:
+        if self._images:
             out["pixels"] = {
-                name: tensordict.get(key).contiguous().cpu().numpy() for name, key in self._pictures.items()
+                name: tensordict.get(key).contiguous().cpu().numpy() for name, key in self._images.items()
             }
         out["agent_pos"] = tensordict.get("state").contiguous().cpu().numpy()
         out["environment_state"] = tensordict.get("goal").contiguous().cpu().numpy()
@@ -130,7 +130,7 @@ class FrankaWMEnv(EnvConfig):
 def recorded_settings(root: str) -> dict[str, Any]:
     """The settings of the arm that a dataset was recorded with, as fields of ``FrankaConfig``.
 
-    Without ``frame_stack``: of a run that stacked pictures, too, a dataset holds single ones.
+    Without ``frame_stack``: of a run that stacked images, too, a dataset holds single ones.
 
     Raises:
         UserError: If the dataset does not say, or was recorded with several.

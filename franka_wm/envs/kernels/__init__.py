@@ -2,7 +2,8 @@
 
 ``servo`` turns actions into joint targets, ``observation`` reads the arm, ``bodies`` is about
 fingers and objects, ``episodes`` ends and begins episodes,
-``randomization`` draws what each episode has anew, ``images`` aims cameras and places images.
+``randomization`` draws what each episode has anew, ``goals`` is about images of the goal, ``rendering`` aims cameras and
+places images.
 The kernels of a task are in the task's file.
 
 Python numbers given to a captured launch are frozen into the graph, so whatever may change (seed, masks,

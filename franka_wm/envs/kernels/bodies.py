@@ -4,14 +4,22 @@
 """Fingers and objects: commands, places, observations, and worlds that are to end.
 
 ``rest_q`` and ``rest_qd`` are what Newton's joints have beyond the arm's seven: two fingers, then 7 coordinates (x y z and
-a quaternion x y z w) and 6 speeds of each object.
+a quaternion x y z w) and 6 speeds of each object, then one of each articulated body (``articulated.py``).
 """
 
 # Warp reads annotations as types: no `from __future__ import annotations` here.
 import warp as wp
 
-from franka_wm.envs.constants import HAND_DIM, MOST_OPEN, NUM_FINGERS, NUM_JOINTS, OBJECT_DIM, STATE_DIM
-from franka_wm.envs.kernels.functions import episode_rng
+from franka_wm.envs.constants import (
+    HAND_DIM,
+    JOINT_DIM,
+    MOST_OPEN,
+    NUM_FINGERS,
+    NUM_JOINTS,
+    OBJECT_DIM,
+    STATE_DIM,
+)
+from franka_wm.envs.kernels.functions import away_from, episode_rng
 
 FINGERS = wp.constant(NUM_FINGERS)
 ARM = wp.constant(NUM_JOINTS)
@@ -20,6 +28,7 @@ HAND = wp.constant(STATE_DIM)
 """Where the hand's numbers begin in a state."""
 HAND_END = wp.constant(STATE_DIM + HAND_DIM)
 EACH = wp.constant(OBJECT_DIM)
+JOINT = wp.constant(JOINT_DIM)
 ATTEMPTS = wp.constant(64)
 
 
@@ -64,6 +73,8 @@ def place(
     radius: wp.array[float],
     blocked: wp.array2d[float],
     margin: float,
+    bases: wp.array2d[wp.transformf],
+    footprints: wp.array2d[float],
     # outputs
     rest_q: wp.array2d[float],
     rest_qd: wp.array2d[float],
@@ -107,6 +118,9 @@ def place(
                     v = wp.max(wp.abs(blocked[o, 4] * dy - blocked[o, 5] * dx) - blocked[o, 3], 0.0)
                     if wp.length(wp.vec2f(u, v)) < radius[b] + blocked[o, 6] + margin:
                         clear = False
+                for o in range(footprints.shape[0]):
+                    if away_from(x, y, bases[world, o], footprints, o) < radius[b] + margin:
+                        clear = False
                 for o in range(b):
                     there = FINGERS + 7 * o
                     away = wp.length(wp.vec2f(x - rest_q[world, there], y - rest_q[world, there + 1]))
@@ -131,12 +145,13 @@ def observe(
     tool_body: int,
     tool_frame: wp.array[wp.transformf],
     grip: wp.array[float],
+    count: int,
     # outputs
     state: wp.array2d[float],
     joint_target: wp.array2d[float],
     objects: wp.array2d[float],
 ):
-    """The hand's part of ``state`` and ``joint_target``, and 13 numbers of each object.
+    """The hand's part of ``state`` and ``joint_target``, and 13 numbers of each of ``count`` objects.
 
     Of the two quaternions of an orientation the tool's has x ≥ 0 (its x is 1 where it points down), an object's w ≥ 0.
     """
@@ -149,7 +164,7 @@ def observe(
     for i in range(4):
         state[world, HAND + 2 * FINGERS + i] = sign * turned[i]
     joint_target[world, ARM] = grip[world]
-    for b in range(objects.shape[1] // EACH):
+    for b in range(count):
         at = FINGERS + 7 * b
         speed = FINGERS + 6 * b
         out = EACH * b
@@ -183,6 +198,8 @@ def restore(
     last_state: wp.array2d[float],
     last_target: wp.array2d[float],
     last_objects: wp.array2d[float],
+    count: int,
+    joints: int,
     # outputs
     state: wp.array2d[float],
     joint_target: wp.array2d[float],
@@ -208,9 +225,12 @@ def restore(
         rest_control[world, f] = last_target[world, ARM]
     for i in range(objects.shape[1]):
         objects[world, i] = last_objects[world, i]
-    for b in range(objects.shape[1] // EACH):
+    for b in range(count):
         for i in range(7):
             rest_q[world, FINGERS + 7 * b + i] = last_objects[world, EACH * b + i]
+    for m in range(joints):
+        opened = last_objects[world, EACH * (count + joints) + JOINT * m]
+        rest_q[world, FINGERS + 7 * count + m] = opened
     for j in range(rest_qd.shape[1]):
         rest_qd[world, j] = 0.0
 
@@ -250,6 +270,7 @@ def note_overflow(now: wp.array[int], capacity: int, overflow: wp.array[int]):
 @wp.kernel(enable_backward=False)
 def cut_short(
     objects: wp.array2d[float],
+    count: int,
     overflow: wp.array[int],
     lost_ends: bool,
     center: wp.vec2f,
@@ -267,7 +288,7 @@ def cut_short(
     if stop and not ended[world]:
         statistics[world, column] += wp.float64(1.0)
     if lost_ends:
-        for b in range(objects.shape[1] // EACH):
+        for b in range(count):
             x = wp.abs(objects[world, EACH * b] - center[0])
             y = wp.abs(objects[world, EACH * b + 1] - center[1])
             stop = stop or x > half[0] or y > half[1] or objects[world, EACH * b + 2] < lowest

@@ -31,3 +31,27 @@ def chain_forward(
         turn = wp.transformf(wp.vec3f(0.0, 0.0, 0.0), wp.quat_from_axis_angle(axes[j], q[world, j]))
         frame = frame * parent_frames[j] * turn * wp.transform_inverse(child_frames[j])
     return wp.transform_get_translation(frame * tool_frame[0])
+
+
+@wp.func
+def away_from_box(
+    x: float, y: float, at: wp.vec2f, half_u: float, half_v: float, cos: float, sin: float
+) -> float:
+    """Distance of a point to an upright box on the table [m], given its middle, half sides and angle."""
+    dx = x - at[0]
+    dy = y - at[1]
+    u = wp.max(wp.abs(cos * dx + sin * dy) - half_u, 0.0)
+    v = wp.max(wp.abs(cos * dy - sin * dx) - half_v, 0.0)
+    return wp.length(wp.vec2f(u, v))
+
+
+@wp.func
+def away_from(x: float, y: float, base: wp.transformf, footprints: wp.array2d[float], body: int) -> float:
+    """Distance of a point to what an articulated body takes of the table [m]; rows: middle x, y, half sides."""
+    turn = wp.transform_get_rotation(base)
+    at = wp.transform_point(base, wp.vec3f(footprints[body, 0], footprints[body, 1], 0.0))
+    cos = 1.0 - 2.0 * turn[2] * turn[2]
+    sin = 2.0 * turn[2] * turn[3]
+    half_u = footprints[body, 2]
+    half_v = footprints[body, 3]
+    return away_from_box(x, y, wp.vec2f(at[0], at[1]), half_u, half_v, cos, sin)

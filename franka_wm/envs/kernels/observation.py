@@ -6,7 +6,10 @@
 # Warp reads annotations as types: no `from __future__ import annotations` here.
 import warp as wp
 
+from franka_wm.envs.constants import OBJECT_DIM
 from franka_wm.envs.kernels.functions import JOINTS, STATE, episode_rng
+
+EACH = wp.constant(OBJECT_DIM)
 
 
 @wp.kernel(enable_backward=False)
@@ -54,6 +57,26 @@ def blur_state(
             value += noise * wp.randn(rng)
         elif i < 2 * JOINTS:
             value += 10.0 * noise * wp.randn(rng)
+        out[world, i] = value
+
+
+@wp.kernel(enable_backward=False)
+def blur_objects(
+    seed: wp.array[int],
+    episode: wp.array[int],
+    step_count: wp.array2d[int],
+    noise: float,
+    bodies: int,
+    objects: wp.array2d[float],
+    out: wp.array2d[float],
+):
+    """``objects`` as seen: noise on the positions of the first so many ``bodies``."""
+    world = wp.tid()
+    rng = wp.rand_init(int(episode_rng(seed[0], world, episode[world], 12)), step_count[world, 0])
+    for i in range(objects.shape[1]):
+        value = objects[world, i]
+        if i < EACH * bodies and i % EACH < 3:
+            value += noise * wp.randn(rng)
         out[world, i] = value
 
 

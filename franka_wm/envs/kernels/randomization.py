@@ -10,7 +10,10 @@ would be the same one.
 # Warp reads annotations as types: no `from __future__ import annotations` here.
 import warp as wp
 
+from franka_wm.envs.constants import NUM_FINGERS
 from franka_wm.envs.kernels.functions import JOINTS, episode_rng
+
+FINGERS = wp.constant(NUM_FINGERS)
 
 
 @wp.kernel(enable_backward=False)
@@ -101,6 +104,46 @@ def draw_dynamics(
         f = 1.0 + wp.randf(rng, -mass_width, mass_width)
         mass[world, b] = plain_mass[world, b] * f
         inertia[world, b] = plain_inertia[world, b] * f
+
+
+@wp.kernel(enable_backward=False)
+def draw_frictions(
+    mask: wp.array[wp.bool],
+    seed: wp.array[int],
+    episode: wp.array[int],
+    width: float,
+    plain: wp.array2d[wp.vec3f],
+    # output
+    friction: wp.array2d[wp.vec3f],
+):
+    """Friction of all that is touched in the masked worlds' new episodes."""
+    world = wp.tid()
+    if mask[world]:
+        rng = episode_rng(seed[0], world, episode[world], 10)
+        for g in range(plain.shape[1]):
+            friction[world, g] = plain[world, g] * (1.0 + wp.randf(rng, -width, width))
+
+
+@wp.kernel(enable_backward=False)
+def draw_grip(
+    mask: wp.array[wp.bool],
+    seed: wp.array[int],
+    episode: wp.array[int],
+    width: float,
+    plain_ke: wp.array2d[float],
+    plain_limit: wp.array2d[float],
+    # outputs
+    ke: wp.array2d[float],
+    limit: wp.array2d[float],
+):
+    """How hard both fingers squeeze in the masked worlds' new episodes."""
+    world = wp.tid()
+    if mask[world]:
+        rng = episode_rng(seed[0], world, episode[world], 11)
+        f = 1.0 + wp.randf(rng, -width, width)
+        for j in range(JOINTS, JOINTS + FINGERS):
+            ke[world, j] = plain_ke[world, j] * f
+            limit[world, j] = plain_limit[world, j] * f
 
 
 @wp.kernel(enable_backward=False)

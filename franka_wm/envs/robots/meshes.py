@@ -1,6 +1,6 @@
 """Meshes of a robot: where a URDF's file names lead, and what is drawn of them.
 
-A picture of thousands of worlds pays for every shape and triangle, and CAD meshes have far more of both than
+An image of thousands of worlds pays for every shape and triangle, and CAD meshes have far more of both than
 64 pixels show. So what one link draws in one colour becomes one shape, and its triangles are thinned out
 (:func:`simplify`). Masses and kinematics never come from meshes that are only drawn.
 """

@@ -29,7 +29,7 @@ CELL, COARSEST = 0.008, 0.03
 """Details of meshes smaller than this are not drawn [m] where nobody says otherwise: for people, and at most."""
 
 PIXELS = 1.5
-"""How many pixels of the observed pictures such a detail may span: ``docs/robots.md`` has what that costs and gains."""
+"""How many pixels of the observed images such a detail may span: ``docs/robots.md`` has what that costs and gains."""
 
 
 @dataclass(frozen=True)
@@ -120,7 +120,7 @@ def urdf_source(config: FrankaConfig, urdf_path: str | Path | None) -> Path:
 def detail(source: Source, config: FrankaConfig) -> float:
     """Size of the smallest detail of meshes that is drawn [m]: the source's, the config's, or a pixel and a half.
 
-    Pixels of the observed pictures, where the fixed cameras look at; the wrist camera is closer to what it sees.
+    Pixels of the observed images, where the fixed cameras look at; the wrist camera is closer to what it sees.
     """
     if source.cell is not None:
         return source.cell

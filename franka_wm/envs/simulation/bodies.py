@@ -1,26 +1,21 @@
 # pyright: reportArgumentType=false, reportCallIssue=false
 # (Warp's annotations know neither vectors nor shapes as tuples.)
-"""Fingers, objects and contacts of N worlds: how they get into the model, and what they add to a step and a reset."""
+"""Fingers, objects and contacts of N worlds: what they add to a step and a reset."""
 
 from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-import newton
 import warp as wp
 
 from franka_wm.envs.config import FrankaConfig
+from franka_wm.envs.kernels import articulated, goals
 from franka_wm.envs.kernels import bodies as kernels
-from franka_wm.envs.robots.gripper import add_colliders
-from franka_wm.envs.scene import Scene, Solid
 from franka_wm.envs.simulation.arrays import STATISTICS
 from franka_wm.errors import UserError
 
 if TYPE_CHECKING:
     from franka_wm.envs.simulation.simulator import Simulation
-
-SOLREF, SOLIMP = (0.02, 1.0), (0.95, 0.99, 0.001, 0.5, 2.0)
-"""How stiff contacts are, as MuJoCo says it: 0.7 mm of penetration where 20 N hold a 4 cm cube of 50 g."""
 
 CAPACITY = 1 | 2 | 4 | 8 | 16 | 1 << 16 | 1 << 17
 """Bits of MuJoCo's overflow that mean lost contacts; the others say that iterations were used up."""
@@ -30,63 +25,6 @@ RESTING = 5e-5
 
 SUNK = 0.02
 """An object that is this far below the table's top has left it [m]."""
-
-
-def add_scene(builder: newton.ModelBuilder, scene: Scene, tool_body: int) -> None:
-    """Adds everything that can be touched to a builder that holds one world's arm, the fingers' boxes included.
-
-    Args:
-        builder: Its arm compensated for gravity already: objects are not.
-        scene: What stands there.
-        tool_body: The link that carries the hand.
-    """
-    for shape in add_colliders(builder, tool_body):
-        _harden(builder, shape)
-    for one in (scene.table, *scene.obstacles):
-        x, y, z = one.at
-        if one is scene.table:
-            z -= one.half_height
-        turn = wp.quat_from_axis_angle(wp.vec3(0.0, 0.0, 1.0), one.angle)
-        _add_shape(builder, -1, one, density=0.0, at=wp.transform(wp.vec3(x, y, z), turn))
-    for one in scene.objects:
-        at = wp.transform(wp.vec3(*one.at, scene.top + one.half_height), wp.quat_identity())
-        body = builder.add_body(xform=at, label=one.name)
-        _add_shape(builder, body, one, density=one.mass / one.volume, at=wp.transform_identity())
-
-
-def _add_shape(
-    builder: newton.ModelBuilder, body: int, solid: Solid, *, density: float, at: wp.transform
-) -> None:
-    config = newton.ModelBuilder.ShapeConfig(
-        density=density, mu=solid.friction, gap=0.0, has_particle_collision=False
-    )
-    more: dict[str, Any] = {"xform": at, "cfg": config, "color": solid.color, "label": solid.name}
-    size = solid.size
-    if solid.shape == "box":
-        hx, hy, hz = (0.5 * s for s in size)
-        shape = builder.add_shape_box(body, hx=hx, hy=hy, hz=hz, **more)
-    elif solid.shape == "sphere":
-        shape = builder.add_shape_sphere(body, radius=size[0], **more)
-    elif solid.shape == "cylinder":
-        shape = builder.add_shape_cylinder(body, radius=size[0], half_height=0.5 * size[1], **more)
-    else:
-        shape = builder.add_shape_capsule(body, radius=size[0], half_height=0.5 * size[1], **more)
-    _harden(builder, shape)
-
-
-def _harden(builder: newton.ModelBuilder, shape: int) -> None:
-    """MuJoCo's contact parameters of one shape, as they are: Newton would make others of stiffness and damping."""
-    values = {
-        "mujoco:condim": 3,
-        "mujoco:geom_solimp": wp.types.vector(length=5, dtype=wp.float32)(*SOLIMP),
-        "mujoco:solref": wp.vec2(*SOLREF),
-        "mujoco:solref_mode": 1,
-    }
-    for name, value in values.items():
-        attribute = builder.custom_attributes[name]
-        if attribute.values is None:
-            attribute.values = {}
-        attribute.values[shape] = value
 
 
 def room_for_contacts(config: FrankaConfig) -> int:
@@ -100,9 +38,9 @@ def room_for_contacts(config: FrankaConfig) -> int:
     """
     scene = config.surroundings
     assert scene is not None
-    objects, obstacles = len(scene.objects), len(scene.obstacles)
+    objects, obstacles, joints = len(scene.objects), len(scene.obstacles), len(scene.articulated)
     least = 8 + 4 * objects
-    wanted = 8 + 16 * objects + 4 * obstacles + 2 * objects * (objects - 1)
+    wanted = 8 + 16 * (objects + joints) + 4 * obstacles + 2 * objects * (objects - 1) + 8 * objects * joints
     if config.max_contacts is None:
         return wanted
     if config.max_contacts < least:
@@ -143,21 +81,44 @@ class Bodies:
         def numbers(values: list, *shape: int) -> wp.array:
             return wp.array(values, dtype=float, device=device).reshape(shape)
 
-        count = len(objects)
+        cases = scene.articulated if scene else ()
+        self._count, self._joints = count, joints = len(objects), len(cases)
         blocked = scene.blocked() if scene else []
+        footprints = numbers([one.footprint for one in cases], joints, 4)
+        obstacles = numbers(blocked, len(blocked), 7)
+        space = scene.space if scene else 0.0
         self._places = [
             numbers([one.at for one in objects], count, 2),
             numbers([one.spread for one in objects], count, 2),
             numbers([one.turn for one in objects], count),
             numbers([scene.top + one.half_height - RESTING for one in objects] if scene else [], count),
             numbers([one.radius for one in objects], count),
-            numbers(blocked, len(blocked), 7),
-            scene.space if scene else 0.0,
+            obstacles,
+            space,
+            sim.warp.bases,
+            footprints,
         ]
+        self._case_places = [
+            numbers([(*one.at, one.angle) for one in cases], joints, 3),
+            numbers([(*one.spread, one.turn) for one in cases], joints, 3),
+            footprints,
+            obstacles,
+            scene.top if scene else 0.0,
+            space,
+            count,
+        ]
+        self._joint_axes = [
+            *(wp.array(values, dtype=wp.vec3f, device=device) for values in (
+                [one.grip for one in cases], [one.hinge for one in cases], [one.axis for one in cases],
+            )),
+            wp.array([int(one.slides) for one in cases], dtype=int, device=device),
+        ]  # fmt: skip
         self._per_step = sim.robot.finger_speed / config.fps
         self._articulations = sim.model.articulation_count // sim.num_envs
         self._mask = wp.zeros(sim.model.articulation_count, dtype=wp.bool, device=device)
         self._scene = scene
+        if "goal_pixels" in config.images:
+            sim.task.check_goal_image()
         if config.contact_dim:
             geoms = sim.solver.mjc_geom_to_newton_shape.numpy()[0]  # pyright: ignore[reportAttributeAccessIssue]
             names = [sim.model.shape_label[shape] if shape >= 0 else "" for shape in geoms]
@@ -202,16 +163,47 @@ class Bodies:
             wp.copy(self.sim.warp.contacts, self.sim.warp.next_contacts)
 
     def launch_place(self, mask: wp.array) -> None:
-        """New places of the masked worlds' objects; their fingers are open."""
+        """New places of the masked worlds' cases and objects; their fingers are open."""
         w = self.sim.warp
+        if self._joints:
+            inputs = [mask, w.seed, w.episode, *self._case_places, w.bases, w.rest_q]
+            self._launch(articulated.place_cases, *inputs)
         outputs = [w.rest_q, w.rest_qd, w.rest_control, w.grip, w.contacts, w.history]
         self._launch(kernels.place, mask, w.seed, w.episode, *self._places, *outputs)
+
+    def launch_goal(self, mask: wp.array) -> None:
+        """What images of the goal show of the masked worlds, whose episodes begin."""
+        w = self.sim.warp
+        if w.goal_rest.size:
+            self._launch(goals.begin_goal, mask, w.rest_q, w.goal_rest)
+            self._pose_at_goal(mask)
+
+    def move_goal(self) -> None:
+        """Images of a goal that was moved by hand: the same objects, at the new one. On torch's stream."""
+        sim = self.sim
+        if sim.warp.goal_rest.size:
+            with sim.recorder.on_stream_of_torch():
+                self._pose_at_goal(wp.ones(sim.num_envs, dtype=wp.bool, device=sim.device))
+
+    def _pose_at_goal(self, mask: wp.array) -> None:
+        assert self.sim.task.pose_at_goal is not None  # checked at the start
+        self.sim.task.pose_at_goal(self.sim, mask)
+
+    def launch_upright(self, mask: wp.array) -> None:
+        """Joints of the masked worlds' goals, which put the hand at ``goal_hand``."""
+        w, c = self.sim.warp, self.sim.chain
+        frames = [c.parent_frames, c.child_frames, c.axes, c.tool_frame]
+        inputs = [mask, w.goal_hand, c.home, c.lower, c.upper, *frames, w.origins, w.directions, w.goal_q]
+        self._launch(goals.solve_upright, *inputs)
 
     def launch_observe(self, state: wp.array, joint_target: wp.array, objects: wp.array) -> None:
         """The hand's part of the observation, and the objects."""
         w, c = self.sim.warp, self.sim.chain
         inputs = [w.rest_q, w.rest_qd, w.body_q, c.tool_body, c.tool_frame, w.grip]
-        self._launch(kernels.observe, *inputs, state, joint_target, objects)
+        self._launch(kernels.observe, *inputs, self._count, state, joint_target, objects)
+        if self._joints:
+            inputs = [w.rest_q, w.rest_qd, w.bases, *self._joint_axes, self._count]
+            self._launch(articulated.observe, *inputs, objects)
 
     def launch_mark_nonfinite(self) -> None:
         """Before broken worlds are caught."""
@@ -221,12 +213,14 @@ class Bodies:
     def launch_restore(self) -> None:
         """After broken worlds were caught."""
         w = self.sim.warp
-        last = [w.true_state, w.joint_target, w.objects]
-        after = [w.next_true_state, w.next_joint_target, w.next_objects]
+        last = [w.true_state, w.joint_target, w.true_objects]
+        after = [w.next_true_state, w.next_joint_target, w.next_true_objects]
         self._launch(
             kernels.restore,
             w.broken,
             *last,
+            self._count,
+            self._joints,
             *after,
             w.rest_q,
             w.rest_qd,
@@ -244,8 +238,8 @@ class Bodies:
             wp.vec2f(*(f * v for v in pair)) for f, pair in ((1.0, table.at[:2]), (0.5, table.size[:2]))
         )
         self._launch(
-            kernels.cut_short, w.next_objects, w.overflow, self.sim.config.end_when_lost, center, half,
-            self._scene.top - SUNK, w.ended, STATISTICS.index("overflow"), w.cut, w.statistics,
+            kernels.cut_short, w.next_true_objects, self._count, w.overflow, self.sim.config.end_when_lost,
+            center, half, self._scene.top - SUNK, w.ended, STATISTICS.index("overflow"), w.cut, w.statistics,
         )  # fmt: skip
 
     def _launch(self, kernel: wp.Kernel, *inputs: Any) -> None:

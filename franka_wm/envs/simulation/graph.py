@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import gc
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import AbstractContextManager, contextmanager, nullcontext
+from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
 
 import torch
 import warp as wp
@@ -103,12 +104,32 @@ class Recorder:
         wp.synchronize_device(self.device)
 
     def _capture(self, launches: Function) -> Recording:
-        self._pieces = []
-        with torch.cuda.use_mem_pool(self._pool, self._torch) if self._pool else nullcontext():
+        self._pieces = pieces = []
+        with (
+            torch.cuda.use_mem_pool(self._pool, self._torch) if self._pool else nullcontext(),
+            _no_collection(),
+        ):
             wp.capture_begin(self.device)
             try:
                 launches()
-            finally:
-                last = wp.capture_end(self.device)
-                pieces, self._pieces = self._pieces, None
-        return [*pieces, last]
+            except BaseException:
+                self._pieces = None
+                with suppress(
+                    RuntimeError
+                ):  # a broken capture ends with an error; what broke it is to be told
+                    wp.capture_end(self.device)
+                raise
+            self._pieces = None
+            return [*pieces, wp.capture_end(self.device)]
+
+
+@contextmanager
+def _no_collection() -> Iterator[None]:
+    """Garbage stays: a memory pool of torch's that is freed while something is captured aborts the process."""
+    on = gc.isenabled()
+    gc.disable()
+    try:
+        yield
+    finally:
+        if on:
+            gc.enable()

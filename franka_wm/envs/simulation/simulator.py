@@ -29,7 +29,7 @@ from franka_wm.envs.simulation.arrays import STATISTICS, allocate, as_int32
 from franka_wm.envs.simulation.bodies import Bodies
 from franka_wm.envs.simulation.build import Chain, build_model, make_solver
 from franka_wm.envs.simulation.graph import Recorder, Recording
-from franka_wm.envs.simulation.images import Renderer
+from franka_wm.envs.simulation.rendering import Renderer
 from franka_wm.envs.tasks import Task, make_task
 
 log = logging.getLogger(__name__)
@@ -158,6 +158,8 @@ class Simulation:
         t.goal_center.add_(goal - t.task_goal)
         t.task_goal.copy_(goal)
         t.goal_q.copy_(self.kinematics.solve(goal, t.goal_q, iterations=24))
+        if self.bodies:
+            self.bodies.move_goal()
         self._observe_anew()
         self.renderer.show_goal()
 
@@ -171,6 +173,7 @@ class Simulation:
         state = self.newton_state
         arrays = [array for array in self.warp if array.is_contiguous]
         arrays += [state.joint_q, state.joint_qd, self.control.joint_target_q]  # whose columns have names
+        arrays += [self.model.joint_X_p]  # of which bases are rows
         arrays += [state.body_qd, *worlds.solver_memory(self).values()]
         arrays += [*self.randomizer.arrays(), *self.renderer.arrays()]
         # MuJoCo's copy of the physical values is not among the arrays.
@@ -196,15 +199,15 @@ class Simulation:
         w = self.warp
         self._launch_control_step()
         self.launch_forward_kinematics(w.broken)  # their links are not finite yet; a reset would mend them
-        self._launch_observe(w.true_state, w.joint_target, w.goal, w.objects)
-        self._launch_noise(w.true_state, w.state)
+        self._launch_observe(w.true_state, w.joint_target, w.goal, w.true_objects)
+        self._launch_noise(w.true_state, w.state, w.true_objects, w.objects)
 
     def _launch_control_step(self) -> None:
         cfg, w = self.config, self.warp
         self._launch_action()
         self.launch_physics()
         self.task.advance(self)
-        self._launch_observe(w.next_true_state, w.next_joint_target, w.next_goal, w.next_objects)
+        self._launch_observe(w.next_true_state, w.next_joint_target, w.next_goal, w.next_true_objects)
         if self.bodies:
             self.bodies.launch_contacts()
             self.bodies.launch_mark_nonfinite()
@@ -224,7 +227,7 @@ class Simulation:
             w.step_count, w.episode_return, w.episode_success, w.ended, w.statistics,
             w.terminated, w.truncated, w.done, w.reset_mask,
         )  # fmt: skip
-        self._launch_noise(w.next_true_state, w.next_state)
+        self._launch_noise(w.next_true_state, w.next_state, w.next_true_objects, w.next_objects)
         self.renderer.launch_step()
 
     def _launch_action(self) -> None:
@@ -282,10 +285,12 @@ class Simulation:
         if self.task.num_draws:
             self._launch(randomization.draw_uniform, w.mask, w.seed, w.episode, w.draws)
         self.task.reset(self, w.mask)
+        if self.bodies:
+            self.bodies.launch_goal(w.mask)
         self.launch_forward_kinematics(w.mask)
-        self._launch_observe(w.true_state, w.joint_target, w.goal, w.objects)
+        self._launch_observe(w.true_state, w.joint_target, w.goal, w.true_objects)
         self.task.begin(self, w.mask)
-        self._launch_noise(w.true_state, w.state)
+        self._launch_noise(w.true_state, w.state, w.true_objects, w.objects)
         self.renderer.launch_reset()
 
     def _launch_observe(
@@ -297,10 +302,14 @@ class Simulation:
         if self.bodies:
             self.bodies.launch_observe(state, joint_target, objects)
 
-    def _launch_noise(self, state: wp.array, out: wp.array) -> None:
-        noise, w = self.config.randomization.observation_noise, self.warp
-        if noise:
-            self._launch(observation.blur_state, w.seed, w.episode, w.step_count, float(noise), state, out)
+    def _launch_noise(self, state: wp.array, out: wp.array, objects: wp.array, objects_out: wp.array) -> None:
+        cfg, w = self.config, self.warp
+        ranges, when = cfg.randomization, [w.seed, w.episode, w.step_count]
+        if ranges.observation_noise:
+            self._launch(observation.blur_state, *when, float(ranges.observation_noise), state, out)
+        if ranges.object_noise:
+            inputs = [float(ranges.object_noise), cfg.num_objects + cfg.num_articulated, objects, objects_out]
+            self._launch(observation.blur_objects, *when, *inputs)
 
     def launch_forward_kinematics(self, mask: wp.array) -> None:
         """Frames of the links of the masked worlds from their joints."""

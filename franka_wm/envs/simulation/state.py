@@ -38,6 +38,10 @@ def memory(sim: Simulation) -> dict[str, torch.Tensor]:
             name: getattr(sim.tensors, name)
             for name in ("rest_q", "rest_qd", "rest_control", "grip", "contacts")
         }
+    if sim.tensors.goal_rest.numel():
+        out["goal_rest"] = sim.tensors.goal_rest
+    if sim.config.num_articulated:
+        out["bases"] = sim.tensors.bases
     out["body_qd"] = wp.to_torch(sim.newton_state.body_qd).view(sim.num_envs, -1, 6)
     out |= {f"solver_{name}": wp.to_torch(array) for name, array in solver_memory(sim).items() if array.size}
     if sim.task.num_draws:

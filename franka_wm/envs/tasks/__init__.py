@@ -9,7 +9,9 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from franka_wm.envs.tasks.base import Task
+from franka_wm.envs.tasks.drawer import Drawer
 from franka_wm.envs.tasks.lift import Lift
+from franka_wm.envs.tasks.peg import Peg
 from franka_wm.envs.tasks.pick import Pick
 from franka_wm.envs.tasks.push import Push
 from franka_wm.envs.tasks.reach import Reach, goal_distance, reach_reward
@@ -21,7 +23,9 @@ if TYPE_CHECKING:
     from franka_wm.envs.config import FrankaConfig
 
 __all__ = [
+    "Drawer",
     "Lift",
+    "Peg",
     "Pick",
     "Push",
     "Reach",
@@ -43,6 +47,8 @@ _BUILT_IN: dict[str, type[Task]] = {
     "push": Push,
     "pick": Pick,
     "stack": Stack,
+    "drawer": Drawer,
+    "peg": Peg,
 }
 
 _REGISTERED: dict[str, type[Task]] = {}

@@ -70,6 +70,27 @@ class Task:
         """
         return False
 
+    @classmethod
+    def check(cls, config: FrankaConfig) -> None:
+        """Refuses a config in which the task cannot be played, before anything is built.
+
+        Raises:
+            UserError: One line.
+        """
+
+    @classmethod
+    def check_goal_image(cls) -> None:
+        """Refuses ``goal_pixels`` with a gripper where the task does not say what they show.
+
+        Raises:
+            UserError: One line.
+        """
+        if cls.pose_at_goal is None:
+            raise UserError(
+                f"goal_pixels: {cls.__name__} has no image of its goal; leave it out (show_goal draws it), or write "
+                f"{cls.__name__}.pose_at_goal"
+            )
+
     def brings(self) -> dict[str, Any]:
         """Fields of the config that a task given as an object sets, where the config leaves them to the task."""
         config = self.config
@@ -113,8 +134,19 @@ class Task:
     """Where the hand shall be next, from what is seen (a method in torch, for all worlds at once, without a host sync):
     what makes the task solvable by ``policy=expert``."""
 
+    pose_at_goal: Callable[[Simulation, wp.array], None] | None = None
+    """What ``goal_pixels`` show of a task with a gripper: called after ``reset`` where these are observed, and when a
+    goal is moved by hand. Writes ``sim.warp.goal_rest``, which has ``rest_q`` of the episode's start, and
+    ``sim.warp.goal_q`` (N, 7) where ``mask`` (N,)."""
+
     relabel: Callable[[TensorDictBase, torch.Tensor], TensorDictBase] | None = None
     """Recorded transitions as if the goal had been another, where the task can say so in torch: see `Reach.relabel`."""
+
+    relabel_reads: tuple[str, ...] = ("state",)
+    """Observations that ``relabel`` reads in what an action led to."""
+
+    achieved: tuple[str, slice] = ("state", slice(14, 17))
+    """The observation, and its columns (3) [m], of the place that a goal names, where it was reached: the tool's."""
 
     @classmethod
     def relabels(cls) -> bool:

@@ -82,11 +82,15 @@ class Lift(GripperTask):
         w = sim.warp
         wp.launch(goal_above, sim.num_envs, [mask, w.rest_q, HEIGHT, w.task_goal], device=sim.device)
 
+    def pose_at_goal(self, sim: "Simulation", mask: wp.array) -> None:
+        """The cube up there, in the hand."""
+        self.launch_goal_pose(sim, mask)
+
     def reward_and_success(self, sim: "Simulation") -> None:
         self.launch_reward(sim, lift_reward_and_success, HEIGHT)
 
     def measures(self, sim: "Simulation") -> dict[str, torch.Tensor]:
-        return {"cube's height [m]": sim.tensors.next_objects[:, 2]}
+        return {"cube's height [m]": sim.tensors.next_true_objects[:, 2]}
 
     def expert(self, sight: Sight) -> Aim:
         """Grasp the cube from above and bring it a little higher than the goal."""

@@ -4,6 +4,7 @@
 
 # Warp reads annotations as types: no `from __future__ import annotations` here.
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Self
 
@@ -11,10 +12,13 @@ import torch
 import warp as wp
 from tensordict import TensorDictBase
 
-from franka_wm.envs.constants import MOST_OPEN, NUM_JOINTS, OBJECT_DIM
-from franka_wm.envs.tasks.base import Task
+from franka_wm.envs.constants import JOINT_DIM, MOST_OPEN, NUM_FINGERS, NUM_JOINTS, OBJECT_DIM
+from franka_wm.envs.kernels.goals import nearest_turn
+from franka_wm.envs.tasks.base import Task, with_goal
+from franka_wm.errors import UserError
 
 if TYPE_CHECKING:
+    from franka_wm.envs.config import FrankaConfig
     from franka_wm.envs.kinematics import Kinematics
     from franka_wm.envs.simulation import Simulation
 
@@ -23,6 +27,10 @@ READY = (0.0, 0.1, 0.0, -2.3, 0.0, 2.4, 0.785)
 
 EACH = wp.constant(OBJECT_DIM)
 GRIP = wp.constant(NUM_JOINTS)
+FIRST = wp.constant(NUM_FINGERS)
+"""Where the first object begins in ``rest_q``: behind the fingers."""
+OPEN = wp.constant(MOST_OPEN)
+QUARTER = wp.constant(0.5 * math.pi)
 
 
 @wp.func
@@ -30,6 +38,15 @@ def place_of(objects: wp.array2d[float], world: int, body: int) -> wp.vec3f:
     """Position of an object [m]."""
     at = EACH * body
     return wp.vec3f(objects[world, at], objects[world, at + 1], objects[world, at + 2])
+
+
+@wp.func
+def rotation_of(objects: wp.array2d[float], world: int, body: int) -> wp.quatf:
+    """Orientation of an object."""
+    at = EACH * body + 3
+    return wp.quatf(
+        objects[world, at], objects[world, at + 1], objects[world, at + 2], objects[world, at + 3]
+    )
 
 
 @wp.func
@@ -79,6 +96,42 @@ def effort(action: wp.array2d[float], world: int) -> float:
     return total / float(action.shape[1])
 
 
+@wp.kernel(enable_backward=False)
+def bring_to_goal(
+    mask: wp.array[wp.bool],
+    goal: wp.array2d[float],
+    tool: wp.vec3f,
+    widths: wp.vec2f,
+    opening: float,
+    turned: bool,
+    like: int,
+    rest: wp.array2d[float],
+    hand: wp.array2d[float],
+):
+    """The first object at the goal, and the hand at it; see :meth:`GripperTask.launch_goal_pose`."""
+    world = wp.tid()
+    if not mask[world]:
+        return
+    yaw = 2.0 * wp.atan2(rest[world, FIRST + 5], rest[world, FIRST + 6])
+    turn = float(0.0)
+    if like >= 0:
+        other = 2.0 * wp.atan2(rest[world, FIRST + 7 * like + 5], rest[world, FIRST + 7 * like + 6])
+        turn = nearest_turn(other - yaw, QUARTER)
+    for i in range(3):
+        rest[world, FIRST + i] = goal[world, i]
+        hand[world, i] = goal[world, i] + tool[i]
+    hand[world, 3] = wp.where(
+        turned, nearest_turn(yaw, QUARTER) + turn, 0.0
+    )  # grasped as it stood, then turned
+    yaw += turn
+    rest[world, FIRST + 5] = wp.sin(0.5 * yaw)
+    rest[world, FIRST + 6] = wp.cos(0.5 * yaw)
+    across = wp.abs(wp.sin(hand[world, 3] - yaw)) > 0.5  # the fingers stand along the object's x
+    wide = wp.where(across, widths[0], widths[1])
+    for f in range(FIRST):
+        rest[world, f] = wp.where(opening < 0.0, wp.min(0.5 * wide, OPEN), opening)
+
+
 # -- tasks and their experts ----------------------------------------------------------------------------------
 
 
@@ -88,6 +141,16 @@ class GripperTask(Task):
     gripper = True
     home = READY
     rewards = ("dense", "sparse")
+    least_objects = 1
+    """How many objects the scene must have."""
+
+    @classmethod
+    def check(cls, config: "FrankaConfig") -> None:
+        if config.num_objects < cls.least_objects:
+            raise UserError(
+                f"scene: task={config.task} is about {cls.least_objects} objects, the scene has "
+                f"{config.num_objects}; add to scene.objects"
+            )
 
     @property
     def reward_bounds(self) -> tuple[float, float]:
@@ -100,13 +163,79 @@ class GripperTask(Task):
         inputs = [
             w.next_true_state,
             w.next_joint_target,
-            w.next_objects,
+            w.next_true_objects,
             w.task_goal,
             w.action,
             c.reward == "sparse",
         ]
         inputs += [c.action_penalty, *further, w.reward, w.success]
         wp.launch(kernel, sim.num_envs, inputs, device=sim.device)
+
+    def launch_goal_pose(
+        self,
+        sim: "Simulation",
+        mask: wp.array,
+        *,
+        tool: tuple[float, float, float] = (0.0, 0.0, 0.0),
+        opening: float | None = None,
+        turned: bool = True,
+        like: int | None = None,
+    ) -> None:
+        """For :attr:`pose_at_goal`: the first object at the goal, upright, in the hand, which points down.
+
+        Args:
+            sim, mask: As given.
+            tool: Where the tool is, from the object's centre [m].
+            opening: Of each finger [m]; the object's width if not given.
+            turned: Whether the hand is turned as the object is.
+            like: Number of the object that it is turned like, up to quarter turns; as at the start if not given.
+        """
+        w, scene = sim.warp, self.config.surroundings
+        assert scene is not None
+        widths, wide = wp.vec2f(*scene.objects[0].widths), -1.0 if opening is None else opening
+        inputs = [mask, w.task_goal, wp.vec3f(*tool), widths, wide, turned, -1 if like is None else like]
+        wp.launch(bring_to_goal, sim.num_envs, [*inputs, w.goal_rest, w.goal_hand], device=sim.device)
+        assert sim.bodies is not None
+        sim.bodies.launch_upright(mask)
+
+
+Judge = Callable[[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor], tuple[torch.Tensor, torch.Tensor]]
+"""State (…, 28), joint target (…, 8), objects (…, 13 · K + …), goal (…, 3) -> (…,) dense reward before the penalty of
+the action, and (…,) bool success."""
+
+
+def relabel_place(
+    task: GripperTask, judge: Judge, transitions: TensorDictBase, goal: torch.Tensor
+) -> TensorDictBase:
+    """As :meth:`Reach.relabel`, where the goal is a place for the first object; exact without noise.
+
+    Args:
+        task: Its config says the reward.
+        judge: The task's reward and success in torch.
+        transitions: (B, H) with ``state``, ``action``, and in ``next`` ``state``, ``joint_target``, ``objects``.
+        goal: (B, 3) [m].
+    """
+    c, out = task.config, with_goal(transitions, goal)
+    following = [transitions.get(("next", key)) for key in ("joint_target", "objects")]
+    wide = goal.unsqueeze(1).expand(*transitions.batch_size, 3)
+    value, solved = judge(out.get(("next", "state")), *following, wide)
+    applied = transitions.get("action").nan_to_num(0.0).clamp(-1.0, 1.0)
+    value = solved.float() if c.reward == "sparse" else value
+    out.set(("next", "reward"), (value - c.action_penalty * applied.square().mean(-1)).unsqueeze(-1))
+    out.set(("next", "terminated"), solved.unsqueeze(-1) & c.terminate_on_success)
+    return out
+
+
+def near_in_torch(distance: torch.Tensor) -> torch.Tensor:
+    """:func:`nearness` of distances [m]."""
+    return 1.0 - torch.tanh(5.0 * distance)
+
+
+def held_in_torch(state: torch.Tensor, joint_target: torch.Tensor, at: torch.Tensor) -> torch.Tensor:
+    """:func:`holds`: (…, 28), (…, 8), (…, 3) -> (…,) bool."""
+    near = (state[..., 14:17] - at).norm(dim=-1) < 0.025
+    pressed = state[..., 20] - joint_target[..., NUM_JOINTS] > 0.003
+    return near & pressed & (state[..., 22].abs() < 0.1)
 
 
 @dataclass(frozen=True)
@@ -118,7 +247,9 @@ class Sight:
         yaw, target_yaw: (N,) of the hand, pointing down; at 0 the fingers move along y [rad].
         opening, closing: (N,) each finger's distance from the closed position [m], and how fast it falls [m/s].
         command: (N,) the fingers' set point [m].
-        objects: (N, K, 13), see :data:`~franka_wm.envs.constants.OBJECT_DIM`.
+        objects: (N, K + M, 13), see :data:`~franka_wm.envs.constants.OBJECT_DIM`: objects, then handles of the M
+            articulated bodies.
+        joints: (N, M, 2) how far these are open [m or rad], and their speeds.
         goal: (N, 3) [m].
     """
 
@@ -130,12 +261,14 @@ class Sight:
     closing: torch.Tensor
     command: torch.Tensor
     objects: torch.Tensor
+    joints: torch.Tensor
     goal: torch.Tensor
 
     @classmethod
-    def of(cls, observation: TensorDictBase, kinematics: "Kinematics") -> Self:
-        """From ``state`` (N, 28), ``joint_target`` (N, 8), ``objects`` (N, 13 · K) and ``goal``."""
+    def of(cls, observation: TensorDictBase, kinematics: "Kinematics", *, joints: int = 0) -> Self:
+        """From ``state`` (N, 28), ``joint_target`` (N, 8), ``objects`` with so many ``joints``, and ``goal``."""
         state, objects = observation.get("state"), observation.get("objects")
+        bodies = objects.shape[-1] - JOINT_DIM * joints
         x, y, z, w = state[..., 24:28].unbind(-1)
         target, target_yaw = kinematics.upright(observation.get("joint_target")[..., :NUM_JOINTS])
         return cls(
@@ -146,7 +279,8 @@ class Sight:
             opening=state[..., 20:22].mean(-1),
             closing=-state[..., 22:24].mean(-1),
             command=observation.get("joint_target")[..., NUM_JOINTS],
-            objects=objects.unflatten(-1, (-1, OBJECT_DIM)),
+            objects=objects[..., :bodies].unflatten(-1, (-1, OBJECT_DIM)),
+            joints=objects[..., bodies:].unflatten(-1, (joints, JOINT_DIM)),
             goal=observation.get("goal"),
         )
 
@@ -180,13 +314,20 @@ def moved(place: torch.Tensor, x: float = 0.0, y: float = 0.0, z: float = 0.0) -
     return torch.stack([place[..., 0] + x, place[..., 1] + y, place[..., 2] + z], -1)
 
 
-def quarter_turn(angle: torch.Tensor, near: torch.Tensor) -> torch.Tensor:
-    """The angle nearest to ``near`` that is ``angle`` up to quarter turns: how to grasp a box."""
-    quarter = 0.5 * math.pi
-    return near + torch.remainder(angle - near + 0.5 * quarter, quarter) - 0.5 * quarter
+def quarter_turn(angle: torch.Tensor, near: torch.Tensor, *, step: float = 0.5 * math.pi) -> torch.Tensor:
+    """The angle nearest to ``near`` that is ``angle`` up to quarter turns, or ``step``: how to grasp a box."""
+    return near + torch.remainder(angle - near + 0.5 * step, step) - 0.5 * step
 
 
-def fetch(sight: Sight, number: int, to: torch.Tensor, *, above: float = 0.08) -> tuple[Aim, torch.Tensor]:
+def fetch(
+    sight: Sight,
+    number: int,
+    to: torch.Tensor,
+    *,
+    above: float = 0.08,
+    grip: float = 0.0,
+    step: float = 0.5 * math.pi,
+) -> tuple[Aim, torch.Tensor]:
     """Grasps an object from above and brings it to ``to``; begins anew where it was lost. It remembers nothing.
 
     Over the object, down, close, and once the fingers are stopped by it, on to ``to``.
@@ -196,12 +337,17 @@ def fetch(sight: Sight, number: int, to: torch.Tensor, *, above: float = 0.08) -
         number: Of the object.
         to: (N, 3) where its centre shall be [m].
         above: Height over the object in which the hand gets into place [m].
+        grip: Where to grasp it: so far over its centre [m].
+        step: By which turns of the hand the object can be grasped [rad].
 
     Returns:
         Where the hand shall be, and (N,) bool: the object is held.
     """
     place, angle = sight.body(number)
-    yaw = quarter_turn(angle, sight.yaw)
+    missing = to - place
+    if grip:
+        place = moved(place, z=grip)
+    yaw = quarter_turn(angle, sight.yaw, step=step)
     away = place - sight.tool
     aside, below = away[..., :2].norm(dim=-1), away[..., 2].abs()
     closing = sight.command < 0.9 * MOST_OPEN
@@ -215,7 +361,6 @@ def fetch(sight: Sight, number: int, to: torch.Tensor, *, above: float = 0.08) -
     )
     tool = torch.where((over | there)[..., None], place, hover)
     tool = torch.where((there & closing)[..., None], sight.target, tool)
-    missing = to - place
     gain = torch.where(missing.norm(dim=-1, keepdim=True) < CLOSE, GAIN, 1.0)
     tool = torch.where(held[..., None], sight.target + gain * missing, tool)
     opening = torch.where(there, 0.0, MOST_OPEN)

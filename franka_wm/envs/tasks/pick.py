@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 import torch
 import warp as wp
+from tensordict import TensorDictBase
 
 from franka_wm.envs.scene import Body, Scene
 from franka_wm.envs.tasks.manipulation import (
@@ -17,9 +18,12 @@ from franka_wm.envs.tasks.manipulation import (
     effort,
     fastest_joint,
     fetch,
+    held_in_torch,
     holds,
+    near_in_torch,
     nearness,
     place_of,
+    relabel_place,
     tool_of,
 )
 
@@ -85,6 +89,20 @@ def pick_reward_and_success(
     success[world, 0] = solved
 
 
+def pick_reward(
+    state: torch.Tensor, joint_target: torch.Tensor, objects: torch.Tensor, goal: torch.Tensor
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """The same in torch, see :data:`~franka_wm.envs.tasks.manipulation.Judge`."""
+    cube = objects[..., :3]
+    missing, speed = (goal - cube).norm(dim=-1), state[..., 7:14].abs().amax(-1)
+    near = missing <= NEAR
+    solved = near & (speed < REST)
+    held = 0.2 + 0.4 * near_in_torch(missing) + 0.2 * near_in_torch(speed) * near
+    value = 0.2 * near_in_torch((state[..., 14:17] - cube).norm(dim=-1))
+    value = value + held * held_in_torch(state, joint_target, cube)
+    return torch.where(solved, 1.0, value), solved
+
+
 class Pick(GripperTask):
     """Bring a cube to a point in the air and keep it there.
 
@@ -100,17 +118,28 @@ class Pick(GripperTask):
     scene = Scene(objects=(Body(name="cube", at=(0.5, 0.0), spread=(0.10, 0.10), turn=math.pi / 4),))
     num_draws = 3
     words = "Bring the cube to the goal."
+    relabel_reads = ("state", "joint_target", "objects")
+    achieved = ("objects", slice(0, 3))
 
     def reset(self, sim: "Simulation", mask: wp.array) -> None:
         w = sim.warp
         inputs = [mask, w.draws, w.rest_q, MIDDLE, HALF, HIGHEST, w.task_goal]
         wp.launch(goal_in_the_air, sim.num_envs, inputs, device=sim.device)
 
+    def pose_at_goal(self, sim: "Simulation", mask: wp.array) -> None:
+        """The cube at the goal, in the hand."""
+        self.launch_goal_pose(sim, mask)
+
     def reward_and_success(self, sim: "Simulation") -> None:
         self.launch_reward(sim, pick_reward_and_success, NEAR, REST)
 
+    def relabel(self, transitions: TensorDictBase, goal: torch.Tensor) -> TensorDictBase:
+        return relabel_place(self, pick_reward, transitions, goal)
+
     def measures(self, sim: "Simulation") -> dict[str, torch.Tensor]:
-        return {"cube to goal [m]": (sim.tensors.next_objects[:, :3] - sim.tensors.next_goal).norm(dim=-1)}
+        return {
+            "cube to goal [m]": (sim.tensors.next_true_objects[:, :3] - sim.tensors.next_goal).norm(dim=-1)
+        }
 
     def expert(self, sight: Sight) -> Aim:
         """Grasp the cube from above and bring it to the goal."""

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 import torch
 import warp as wp
+from tensordict import TensorDictBase
 
 from franka_wm.envs.scene import Body, Scene
 from franka_wm.envs.tasks.manipulation import (
@@ -15,8 +16,10 @@ from franka_wm.envs.tasks.manipulation import (
     Sight,
     effort,
     moved,
+    near_in_torch,
     nearness,
     place_of,
+    relabel_place,
     tool_of,
 )
 
@@ -67,6 +70,19 @@ def push_reward_and_success(
     success[world, 0] = solved
 
 
+def push_reward(
+    state: torch.Tensor, _: torch.Tensor, objects: torch.Tensor, goal: torch.Tensor
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """The same in torch, see :data:`~franka_wm.envs.tasks.manipulation.Judge`."""
+    cube = objects[..., :3]
+    missing = (goal - cube)[..., :2].norm(dim=-1)
+    flat = (cube[..., 2] - goal[..., 2]).abs() < 0.005
+    solved = (missing < RADIUS) & flat
+    ready = near_in_torch((state[..., 14:17] - moved(cube, x=-BEHIND)).norm(dim=-1))
+    value = 0.3 * ready + 0.5 * near_in_torch(missing) * flat
+    return torch.where(solved, 0.8 + 0.2 * near_in_torch(missing), value), solved
+
+
 class Push(GripperTask):
     """Push a cube onto a disc.
 
@@ -81,17 +97,26 @@ class Push(GripperTask):
     scene = Scene(objects=(Body(name="cube", at=(0.42, 0.0), spread=(0.07, 0.15)),))
     marker = RADIUS
     words = "Push the cube onto the disc."
+    relabel_reads = ("state", "joint_target", "objects")
+    achieved = ("objects", slice(0, 3))
 
     def reset(self, sim: "Simulation", mask: wp.array) -> None:
         w = sim.warp
         wp.launch(goal_ahead, sim.num_envs, [mask, w.rest_q, AHEAD, w.task_goal], device=sim.device)
 
+    def pose_at_goal(self, sim: "Simulation", mask: wp.array) -> None:
+        """The cube in the middle of the disc, the closed fingers behind it."""
+        self.launch_goal_pose(sim, mask, tool=(-BEHIND, 0.0, 0.0), opening=0.0, turned=False)
+
     def reward_and_success(self, sim: "Simulation") -> None:
         self.launch_reward(sim, push_reward_and_success, RADIUS, BEHIND)
 
+    def relabel(self, transitions: TensorDictBase, goal: torch.Tensor) -> TensorDictBase:
+        return relabel_place(self, push_reward, transitions, goal)
+
     def measures(self, sim: "Simulation") -> dict[str, torch.Tensor]:
-        way = sim.tensors.next_objects[:, :2] - sim.tensors.next_goal[:, :2]
-        return {"cube to the disc's middle [m]": way.norm(dim=-1)}
+        way = sim.tensors.next_true_objects[:, :2] - sim.tensors.next_goal[:, :2]
+        return {"cube to disc [m]": way.norm(dim=-1)}
 
     def expert(self, sight: Sight) -> Aim:
         """Closed fingers down behind the cube, then forward with it."""

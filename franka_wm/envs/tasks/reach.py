@@ -38,6 +38,8 @@ def reach_reward(
     ``dense``: −tanh(distance), bounded, so that a categorical value head needs no tuning. ``sparse``: 1 within
     ``success_distance``, else 0. ``normalized``: the part of ``initial_distance`` (..., 1) [m] that has been
     closed, at least −1. All minus action_penalty · mean(action²), of the action as it is applied: clipped.
+
+    The same stands in the kernel :func:`reach_reward_and_success`. ``tests/envs/test_tasks.py`` holds both equal.
     """
     distance = goal_distance(state).unsqueeze(-1)
     effort = action.clamp(-1.0, 1.0).square().mean(-1, keepdim=True)
@@ -127,7 +129,7 @@ def reach_reward_and_success(
     reward: wp.array2d[float],
     success: wp.array2d[wp.bool],
 ):
-    """Reward and success. ``kind``: 0 dense, 1 sparse, 2 normalized."""
+    """Reward and success, the same as :func:`reach_reward`. ``kind``: 0 dense, 1 sparse, 2 normalized."""
     world = wp.tid()
     distance = wp.length(wp.vec3f(state[world, 17], state[world, 18], state[world, 19]))
     effort = float(0.0)
@@ -203,6 +205,9 @@ class Reach(Task):
             ],
             device=sim.device,
         )  # fmt: skip
+
+    def pose_at_goal(self, sim: "Simulation", mask: wp.array) -> None:
+        """With a gripper: fingers and objects as they are at the start; ``reset`` has written the joints."""
 
     def relabel(self, transitions: TensorDictBase, goal: torch.Tensor) -> TensorDictBase:
         """What another goal changes in recorded transitions; exact where observations have no noise.

@@ -32,6 +32,8 @@ EDGE = 0.04
 """Of both cubes [m]."""
 ASIDE, OFF = 0.5 * EDGE + 0.005, 0.005
 """How far the upper cube may be off, sideways and in height [m]."""
+AWAY = 0.10
+"""How far over it the hand is when all is done [m]."""
 STILL = 0.01
 """It stands still where it is slower [m/s]."""
 
@@ -100,17 +102,22 @@ class Stack(GripperTask):
         ),
         space=0.06,
     )
+    least_objects = 2
     words = "Put the red cube on the green one."
 
     def reset(self, sim: "Simulation", mask: wp.array) -> None:
         w = sim.warp
         wp.launch(goal_on_top, sim.num_envs, [mask, w.rest_q, EDGE, w.task_goal], device=sim.device)
 
+    def pose_at_goal(self, sim: "Simulation", mask: wp.array) -> None:
+        """The first cube on the second, the open hand over it."""
+        self.launch_goal_pose(sim, mask, tool=(0.0, 0.0, AWAY), opening=MOST_OPEN)
+
     def reward_and_success(self, sim: "Simulation") -> None:
         self.launch_reward(sim, stack_reward_and_success, EDGE, ASIDE, OFF, STILL)
 
     def measures(self, sim: "Simulation") -> dict[str, torch.Tensor]:
-        return {"height of the cube [m]": sim.tensors.next_objects[:, 2]}
+        return {"cube's height [m]": sim.tensors.next_true_objects[:, 2]}
 
     def expert(self, sight: Sight) -> Aim:
         """Grasp the first cube from above, bring it over the second, down, let go, and up."""

@@ -49,7 +49,7 @@ class TorchTask(Task):
 
     def present_reward(self, sim: Simulation, action: torch.Tensor) -> torch.Tensor:
         t = sim.tensors
-        return self.reward(_seen(t.true_state, t.objects), _applied(action)).unsqueeze(-1)
+        return self.reward(_seen(t.true_state, t.true_objects), _applied(action)).unsqueeze(-1)
 
     def relabel(self, transitions: TensorDictBase, goal: torch.Tensor) -> TensorDict:
         """As :meth:`Reach.relabel`: observations, reward and end of recorded transitions had the goal been another."""
@@ -76,7 +76,7 @@ class TorchTask(Task):
 
     def _write_reward_and_success(self, sim: Simulation) -> None:
         t, shape = sim.tensors, (sim.num_envs,)
-        state = _seen(t.next_true_state, t.next_objects)
+        state = _seen(t.next_true_state, t.next_true_objects)
         reward = self._checked("reward", self.reward(state, _applied(t.action)), shape)
         success = self._checked("success", self.success(state), shape, boolean=True)
         t.reward.copy_(reward.unsqueeze(-1))

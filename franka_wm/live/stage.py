@@ -14,7 +14,7 @@ from franka_wm.envs import FrankaConfig, FrankaEnv
 from franka_wm.errors import UserError
 from franka_wm.live.commanded import kinematic_planner
 from franka_wm.policies.expert import ExpertPolicy
-from franka_wm.policies.scripted import NoopPolicy, OraclePolicy, SmoothRandomPolicy
+from franka_wm.policies.scripted import IKPolicy, NoopPolicy, SmoothRandomPolicy
 from franka_wm.training.load import find_checkpoint, load_agent
 
 ARM: dict[str, Any] = {
@@ -115,7 +115,7 @@ def untrained(options: Options, changes: Mapping[str, Any]) -> Stage:
     """The arm without a checkpoint."""
 
     config = FrankaConfig.from_mapping({**ARM, **changes})
-    if config.num_objects and "objects" not in config.observations:  # what the expert reads
+    if config.object_dim and "objects" not in config.observations:  # what the expert reads
         config = replace(config, observations=(*config.observations, "objects"))
     env = FrankaEnv(config, num_envs=1, device=options.device, seed=options.seed)
     policies: dict[str, Any] = {}
@@ -124,7 +124,7 @@ def untrained(options: Options, changes: Mapping[str, Any]) -> Stage:
         if task.expert is not None and "joint_target" in config.observations:
             policies = {"expert": ExpertPolicy(task, env.kinematics, config)}
     elif "joint_target" in config.observations:
-        policies = {"planner": kinematic_planner(env), "ik": OraclePolicy(env.kinematics, config)}
+        policies = {"planner": kinematic_planner(env), "ik": IKPolicy(env.kinematics, config)}
     policies |= {"random": SmoothRandomPolicy(env.action_dim), "noop": NoopPolicy(env.action_dim)}
     title = "planning with exact geometry" if "planner" in policies else config.task_class.words
     return Stage(env, policies, title, EPISODE)

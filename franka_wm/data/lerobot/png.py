@@ -1,4 +1,4 @@
-"""Pictures as PNG, bit for bit."""
+"""Images as PNG, bit for bit."""
 
 from __future__ import annotations
 
@@ -11,15 +11,15 @@ import numpy as np
 from franka_wm.untrusted import MOST_PIXELS
 
 
-def encode_png(picture: np.ndarray) -> bytes:
+def encode_png(image: np.ndarray) -> bytes:
     """(H, W, 3) uint8 as PNG, without filters.
 
     Rendered scenes are flat: unfiltered rows compress a fifth smaller, and more than twice as fast, than what Pillow
     writes.
     """
-    height, width, _ = picture.shape
+    height, width, _ = image.shape
     rows = np.zeros((height, 3 * width + 1), np.uint8)
-    rows[:, 1:] = picture.reshape(height, -1)
+    rows[:, 1:] = image.reshape(height, -1)
     header = struct.pack(">IIBBBBB", width, height, 8, 2, 0, 0, 0)
     return (
         b"\x89PNG\r\n\x1a\n"
@@ -41,7 +41,7 @@ def decode_png(data: bytes) -> np.ndarray:
     """
     from PIL import Image
 
-    with Image.open(io.BytesIO(data)) as picture:
-        if picture.width * picture.height > MOST_PIXELS:
-            raise ValueError(f"a picture of {picture.width} × {picture.height} pixels")
-        return np.asarray(picture.convert("RGB"))
+    with Image.open(io.BytesIO(data)) as image:
+        if image.width * image.height > MOST_PIXELS:
+            raise ValueError(f"an image of {image.width} × {image.height} pixels")
+        return np.asarray(image.convert("RGB"))

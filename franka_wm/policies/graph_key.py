@@ -12,7 +12,7 @@ from tensordict import TensorDictBase
 from torch import nn
 
 LOOKED_INTO = 6
-"""How deep :func:`settings` looks for attributes of attributes."""
+"""How deep :func:`graph_key` looks for attributes of attributes."""
 
 
 class _Same:
@@ -30,7 +30,7 @@ class _Same:
         return id(self.it)
 
 
-def settings(value: Any, depth: int = LOOKED_INTO) -> Hashable:
+def graph_key(value: Any, depth: int = LOOKED_INTO) -> Hashable:
     """What a graph of work with `value` depends on, for a `key`: another key, another graph.
 
     Numbers and texts count by value, tensors by the memory they lie in, plain objects and modules by identity or the
@@ -42,23 +42,23 @@ def settings(value: Any, depth: int = LOOKED_INTO) -> Hashable:
     if isinstance(value, torch.Tensor):
         return _memory(value)
     if isinstance(value, MethodType):
-        return settings(value.__self__, 0), value.__func__
+        return graph_key(value.__self__, 0), value.__func__
     if isinstance(value, nn.Module):  # its weights are read anew; its own numbers are not
         plain = {name: one for name, one in vars(value).items() if isinstance(one, bool | int | float | str)}
         return _Same(value), tuple((name, repr(one)) for name, one in sorted(plain.items()))
     if not depth or isinstance(value, FunctionType | type):
         return _Same(value)
     if isinstance(value, partial):
-        return tuple(settings(one, depth - 1) for one in (value.func, value.args, value.keywords))
+        return tuple(graph_key(one, depth - 1) for one in (value.func, value.args, value.keywords))
     if isinstance(value, Mapping | TensorDictBase):
         entries = sorted(((str(key), key) for key in value.keys()), key=lambda entry: entry[0])  # noqa: SIM118
-        return tuple((name, settings(value[key], depth - 1)) for name, key in entries)
+        return tuple((name, graph_key(value[key], depth - 1)) for name, key in entries)
     if isinstance(value, list | tuple):
-        return tuple(settings(one, depth - 1) for one in value)
+        return tuple(graph_key(one, depth - 1) for one in value)
     slots = [name for kind in type(value).__mro__ for name in _names(kind) if hasattr(value, name)]
     if slots or hasattr(value, "__dict__"):
         held = {name: getattr(value, name) for name in slots} | getattr(value, "__dict__", {})
-        return type(value), tuple((name, settings(one, depth - 1)) for name, one in sorted(held.items()))
+        return type(value), tuple((name, graph_key(one, depth - 1)) for name, one in sorted(held.items()))
     return _Same(value)
 
 

@@ -11,7 +11,8 @@ import torch
 import warp as wp
 
 from franka_wm.envs.camera import GOAL_MARKER, SKIP_VIEW, Camera, as_torch
-from franka_wm.envs.kernels import images as kernels
+from franka_wm.envs.kernels import goals
+from franka_wm.envs.kernels import rendering as kernels
 
 if TYPE_CHECKING:
     from franka_wm.envs.simulation.simulator import Simulation
@@ -59,6 +60,8 @@ class Renderer:
                 self.images[key], self.next_images[key] = as_torch("pixels", now), as_torch("pixels", after)
             self._goal_state = model.state()
             self._no_speed = wp.zeros_like(sim.newton_state.joint_qd)
+            coordinates = model.joint_coord_count // n
+            self._goal_joints = wp.zeros((n, coordinates), dtype=float, device=sim.device)
         self._views = wp.zeros(some, dtype=int, device=sim.device)
         self._worlds = wp.zeros(n, dtype=int, device=sim.device)
         self._counts = wp.zeros(3, dtype=int, device=sim.device)
@@ -126,8 +129,10 @@ class Renderer:
 
     def _pose_at_goal(self) -> None:
         if self._goal_cameras:
-            q = self.sim.warp.goal_q.flatten()
-            newton.eval_fk(self.sim.model, q, self._no_speed, self._goal_state)
+            sim, w = self.sim, self.sim.warp
+            inputs = [w.goal_q, w.goal_rest, self._goal_joints]
+            wp.launch(goals.join_goal, sim.num_envs, inputs, device=sim.device)
+            newton.eval_fk(sim.model, self._goal_joints.flatten(), self._no_speed, self._goal_state)
 
     def _render_some(self) -> None:
         """Renders the next few of the listed worlds into their images."""

@@ -18,6 +18,9 @@ if TYPE_CHECKING:
 EYE, LOOK_AT = (1.42, 1.00, 0.90), (0.12, 0.13, 0.40)
 """Where the page's camera starts [m]: the whole arm and its reach, seen from its left front."""
 FIELD_OF_VIEW = np.deg2rad(45.0)
+"""From the lower to the upper edge."""
+PORTRAIT = 0.75
+"""Width by height below which a window is a phone's: its controls cover the lower 60 %."""
 
 SKY, GROUND, CELL, SECTION = (236, 240, 245), (206, 211, 218), (186, 192, 201), (160, 167, 177)
 GOAL, REACHED, PATH, TRAIL = (213, 94, 0), (0, 158, 115), (0, 114, 178), (150, 156, 166)
@@ -26,7 +29,7 @@ DARKEST = 44
 """Of a shape's red, green and blue: in black, shading shows no form."""
 
 
-class Scene:
+class ViserScene:
     """What a :class:`~franka_wm.live.frame.Frame` looks like.
 
     Args:
@@ -79,6 +82,7 @@ class Scene:
             receive_shadow=False,
         )
         self.goal.on_update(self._drag)
+        server.on_client_connect(_aim)
 
     def _stage(self, floor: float) -> None:
         scene = self._server.scene
@@ -155,6 +159,34 @@ class Scene:
         self._dragged = event.phase != "end"
         x, y, z = (float(v) for v in event.target.position)
         self._on_goal((x, y, max(z, 0.02)))
+
+
+def _aim(client: viser.ClientHandle) -> None:
+    """Moves the camera of a phone, so that the arm is above the controls."""
+    camera = client.camera
+    if camera.aspect < PORTRAIT:
+        eye, look_at = portrait_view(camera.aspect)
+        with client.atomic():
+            camera.position = eye  # moves look_at along
+            camera.look_at = look_at
+
+
+def portrait_view(aspect: float) -> tuple[np.ndarray, np.ndarray]:
+    """(eye, look_at) [m] for a window higher than wide: what a wide one shows, in the upper 40 %.
+
+    Args:
+        aspect: Width by height.
+    """
+    eye, look_at, slope = np.array(EYE), np.array(LOOK_AT), np.tan(FIELD_OF_VIEW / 2)
+    away = eye - look_at
+    distance = float(np.linalg.norm(away))
+    away /= distance
+    up = np.cross(away, np.cross((0.0, 0.0, 1.0), away))
+    farther = distance / min(aspect, 0.4)
+    down = (
+        0.45 * farther * slope * up / np.linalg.norm(up)
+    )  # higher would cut a raised arm: it is nearer above
+    return look_at + farther * away - down, look_at - down
 
 
 def _lit(colour: tuple[int, int, int]) -> tuple[int, int, int]:

@@ -26,7 +26,7 @@ def choose_views(worlds: wp.array[int], counts: wp.array[int], skip: int, views:
 
 @wp.kernel(enable_backward=False)
 def place_pixels(views: wp.array[int], rendered: wp.array3d[wp.uint32], image: wp.array3d[wp.uint32]):
-    """Copies each view to its world's picture. dim = (views, height, width)."""
+    """Copies each view to its world's image. dim = (views, height, width)."""
     view, row, column = wp.tid()  # pyright: ignore
     world = views[view]
     if world >= 0:
@@ -35,7 +35,7 @@ def place_pixels(views: wp.array[int], rendered: wp.array3d[wp.uint32], image: w
 
 @wp.kernel(enable_backward=False)
 def place_depth(views: wp.array[int], rendered: wp.array3d[wp.float32], image: wp.array3d[wp.float32]):
-    """Copies each view to its world's picture. dim = (views, height, width)."""
+    """Copies each view to its world's image. dim = (views, height, width)."""
     view, row, column = wp.tid()  # pyright: ignore
     world = views[view]
     if world >= 0:
@@ -44,7 +44,7 @@ def place_depth(views: wp.array[int], rendered: wp.array3d[wp.float32], image: w
 
 @wp.kernel(enable_backward=False)
 def place_segmentation(views: wp.array[int], rendered: wp.array3d[wp.uint8], image: wp.array3d[wp.uint8]):
-    """Copies each view to its world's picture. dim = (views, height, width)."""
+    """Copies each view to its world's image. dim = (views, height, width)."""
     view, row, column = wp.tid()  # pyright: ignore
     world = views[view]
     if world >= 0:

@@ -9,6 +9,7 @@ import numpy as np
 import torch
 
 from franka_wm.errors import UserError
+from franka_wm.options import check_whole
 
 Vector = Sequence[float]
 
@@ -26,8 +27,7 @@ def supersample(frame: torch.Tensor, factor: int) -> torch.Tensor:
     Raises:
         UserError: If the sides are no multiples of ``factor``.
     """
-    if isinstance(factor, bool) or not isinstance(factor, int) or factor < 1:
-        raise UserError(f"factor={factor!r}: must be a whole number of at least 1")
+    check_whole("factor", factor)
     if frame.dim() < 3 or frame.shape[-2] % factor or frame.shape[-1] % factor:
         raise UserError(
             f"frame has shape {tuple(frame.shape)}; it must be (…, 3, H·{factor}, W·{factor}) for factor={factor}"

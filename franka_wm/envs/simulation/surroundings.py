@@ -1,0 +1,147 @@
+# pyright: reportArgumentType=false, reportCallIssue=false
+# (Warp's annotations know neither vectors nor shapes as tuples.)
+"""What can be touched, in Newton's builder: fingers, table, objects, obstacles, drawers and doors."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import newton
+import warp as wp
+
+from franka_wm.envs.articulated import Articulated
+from franka_wm.envs.robots.gripper import add_colliders
+from franka_wm.envs.scene import Scene, Solid
+from franka_wm.envs.solids import Box
+
+SOLREF, SOLIMP = (0.02, 1.0), (0.95, 0.99, 0.001, 0.5, 2.0)
+"""How stiff contacts are, as MuJoCo says it: 0.7 mm of penetration where 20 N hold a 4 cm cube of 50 g."""
+
+
+def add_scene(builder: newton.ModelBuilder, scene: Scene, tool_body: int) -> None:
+    """Adds everything that can be touched to a builder that holds one world's arm, the fingers' boxes included.
+
+    Args:
+        builder: Its arm compensated for gravity already: objects are not.
+        scene: What stands there.
+        tool_body: The link that carries the hand.
+    """
+    for shape in add_colliders(builder, tool_body):
+        _harden(builder, shape)
+    still = []
+    for one in (scene.table, *scene.obstacles):
+        x, y, z = one.at
+        if one is scene.table:
+            z -= one.half_height
+        turn = wp.quat_from_axis_angle(wp.vec3(0.0, 0.0, 1.0), one.angle)
+        still += _add_shape(builder, -1, one, density=0.0, at=wp.transform(wp.vec3(x, y, z), turn))
+    for one in scene.objects:
+        at = wp.transform(wp.vec3(*one.at, scene.top + one.half_height), wp.quat_identity())
+        body = builder.add_body(xform=at, label=one.name)
+        _add_shape(builder, body, one, density=one.mass / one.volume, at=wp.transform_identity())
+    for one in scene.articulated:
+        for shape in _add_articulated(builder, one, scene.top):
+            for other in still:  # it slides or turns free of what it stands on and among
+                builder.add_shape_collision_filter_pair(shape, other)
+
+
+def _add_shape(
+    builder: newton.ModelBuilder, body: int, solid: Solid, *, density: float, at: wp.transform
+) -> list[int]:
+    config = newton.ModelBuilder.ShapeConfig(
+        density=density, mu=solid.friction, gap=0.0, has_particle_collision=False
+    )
+    more: dict[str, Any] = {"xform": at, "cfg": config, "color": solid.color, "label": solid.name}
+    size = solid.size
+    if solid.shape == "socket":
+        return _add_boxes(builder, body, solid, solid.boards, at=at, density=density, color=solid.color)
+    if solid.shape == "box":
+        hx, hy, hz = (0.5 * s for s in size)
+        shape = builder.add_shape_box(body, hx=hx, hy=hy, hz=hz, **more)
+    elif solid.shape == "sphere":
+        shape = builder.add_shape_sphere(body, radius=size[0], **more)
+    elif solid.shape == "cylinder":
+        shape = builder.add_shape_cylinder(body, radius=size[0], half_height=0.5 * size[1], **more)
+    else:
+        shape = builder.add_shape_capsule(body, radius=size[0], half_height=0.5 * size[1], **more)
+    _harden(builder, shape)
+    return [shape]
+
+
+def _add_boxes(
+    builder: newton.ModelBuilder,
+    body: int,
+    solid: Solid,
+    boxes: list[Box],
+    *,
+    density: float,
+    color: tuple[float, float, float],
+    at: wp.transform | None = None,
+) -> list[int]:
+    """Boxes of one body, ``at`` its frame."""
+    config = newton.ModelBuilder.ShapeConfig(
+        density=density, mu=solid.friction, gap=0.0, has_particle_collision=False
+    )
+    shapes = []
+    for center, size in boxes:
+        frame = wp.transform(wp.vec3(*center), wp.quat_identity())
+        hx, hy, hz = (0.5 * s for s in size)
+        more: dict[str, Any] = {"cfg": config, "color": color, "label": solid.name}
+        frame = frame if at is None else at * frame
+        shapes.append(builder.add_shape_box(body, xform=frame, hx=hx, hy=hy, hz=hz, **more))
+        _harden(builder, shapes[-1])
+    return shapes
+
+
+def _add_articulated(builder: newton.ModelBuilder, one: Articulated, top: float) -> list[int]:
+    """A case that is fixed to the world, where each episode says, and what moves in it. Returns all shapes."""
+
+    def shift(point: tuple[float, ...]) -> wp.transform:
+        return wp.transform(wp.vec3(*point), wp.quat_identity())
+
+    base = wp.transform(wp.vec3(*one.at, top), wp.quat_from_axis_angle(wp.vec3(0.0, 0.0, 1.0), one.angle))
+    case = builder.add_link(xform=base, label=f"{one.name}_case")
+    moving = builder.add_link(xform=base * shift(one.grip), label=one.name)
+    shapes = _add_boxes(builder, case, one, one.case, density=0.0, color=one.case_color)
+    density = one.mass / one.moving_volume
+    shapes += _add_boxes(builder, moving, one, one.moving, density=density, color=one.color)
+    fixed = builder.add_joint_fixed(-1, case, parent_xform=base, label=f"{one.name}_base")
+    add = builder.add_joint_prismatic if one.slides else builder.add_joint_revolute
+    from_grip = tuple(h - g for h, g in zip(one.hinge, one.grip, strict=True))
+    joint = add(
+        case,
+        moving,
+        parent_xform=shift(one.hinge),
+        child_xform=shift(from_grip),
+        axis=wp.vec3(*one.axis),
+        limit_lower=0.0,
+        limit_upper=one.travel,
+        friction=one.joint_friction,
+        damping=one.joint_damping,
+        armature=0.0,
+        label=f"{one.name}_joint",
+    )
+    builder.add_articulation([fixed, joint], label=one.name)
+    dof = builder.joint_qd_start[joint]
+    _set(builder, dof, {"mujoco:solreflimit": wp.vec2(*SOLREF), "mujoco:solreflimit_mode": 1})
+    return shapes
+
+
+def _harden(builder: newton.ModelBuilder, shape: int) -> None:
+    """MuJoCo's contact parameters of one shape, as they are: Newton would make others of stiffness and damping."""
+    values = {
+        "mujoco:condim": 3,
+        "mujoco:geom_solimp": wp.types.vector(length=5, dtype=wp.float32)(*SOLIMP),
+        "mujoco:solref": wp.vec2(*SOLREF),
+        "mujoco:solref_mode": 1,
+    }
+    _set(builder, shape, values)
+
+
+def _set(builder: newton.ModelBuilder, index: int, values: dict[str, Any]) -> None:
+    """MuJoCo's own parameters of one shape or degree of freedom."""
+    for name, value in values.items():
+        attribute = builder.custom_attributes[name]
+        if attribute.values is None:
+            attribute.values = {}
+        attribute.values[index] = value
