@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import subprocess
-import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -12,6 +10,7 @@ import pytest
 import torch
 from omegaconf import DictConfig
 
+from forks import train_in_fork
 from franka_wm import conf
 from franka_wm.envs import FrankaConfig, FrankaEnv
 from franka_wm.training.load import Agent, load_agent
@@ -79,11 +78,10 @@ SMOKE = [
 
 
 @pytest.fixture(scope="session")
-def run_folder(tmp_path_factory: pytest.TempPathFactory, root: Path) -> Path:
+def run_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The folder of a finished smoke run."""
     place = tmp_path_factory.mktemp("agent")
-    command = [sys.executable, str(root / "train.py"), *SMOKE, f"hydra.run.dir={place}/run"]
-    done = subprocess.run(command, cwd=place, capture_output=True, text=True, timeout=300, check=False)
+    done = train_in_fork(*SMOKE, f"hydra.run.dir={place}/run", cwd=place)
     assert done.returncode == 0, done.stdout + done.stderr
     return place / "run"
 

@@ -3,20 +3,16 @@
 from __future__ import annotations
 
 import json
-import os
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
 
+from forks import run_in_fork, script, train_in_fork
+
 
 def run(root: Path, *arguments: str) -> str:
     """What the command prints; it must end well."""
-    done = subprocess.run(
-        [sys.executable, *arguments], cwd=root, capture_output=True, text=True, timeout=300,
-        env=os.environ | {"PYTHONPATH": str(root)},
-    )  # fmt: skip
+    done = run_in_fork(script(root / arguments[0], *arguments[1:]), cwd=root)
     assert done.returncode == 0, done.stderr[-3000:]
     return done.stdout
 
@@ -72,11 +68,6 @@ def test_add(arguments: tuple[str, ...], root: Path, tmp_path: Path) -> None:
 
 
 def test_a_plugin_that_is_not_there(root: Path, tmp_path: Path) -> None:
-    done = subprocess.run(
-        [sys.executable, "train.py", "plugins=[no_such_module]", f"hydra.run.dir={tmp_path}/run"],
-        cwd=root,
-        capture_output=True,
-        text=True,
-    )
+    done = train_in_fork("plugins=[no_such_module]", f"hydra.run.dir={tmp_path}/run", cwd=root)
     assert done.returncode == 1 and "no_such_module" in done.stderr
     assert not (tmp_path / "run").exists()

@@ -117,7 +117,7 @@ def test_shifting_what_is_no_arm_is_refused_before_playing(tmp_path: Path, monke
 
 def test_latents_that_never_change_are_said(agent, monkeypatch) -> None:
     """The rest is measured; the reason is in the results and in the table."""
-    held = diagnose.hold_out(agent, pictures=False)
+    held = diagnose.hold_out(agent, images=False)
     held.latents = torch.zeros_like(held.latents)
     for other in ("calibration", "health"):
         monkeypatch.setattr(diagnose, other, lambda *a: {})
@@ -197,8 +197,8 @@ def representation_alone(agent):
 
 
 def test_a_representation_alone(representation_alone) -> None:
-    held = diagnose.hold_out(representation_alone, pictures=False)
-    assert held.pictures is None
+    held = diagnose.hold_out(representation_alone, images=False)
+    assert held.images is None
     assert "curves" not in diagnose.open_loop(representation_alone, held)
     assert diagnose.calibration(representation_alone) == {}
     assert diagnose.health(representation_alone, None) == {}

@@ -3,6 +3,7 @@
 import os
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -10,6 +11,7 @@ import pytest
 import franka_wm
 from franka_wm.commands import bench, listing
 from franka_wm.commands import main as cli
+from light import Answer, answers
 
 
 def test_listing_imports_neither_simulator_nor_torch() -> None:
@@ -39,9 +41,15 @@ def test_list_shows_what_is_one_s_own(tmp_path: Path) -> None:
     for name, text in (("whole", '{"total_episodes": 1200, "total_frames": 60000}'), ("broken", "{")):
         (tmp_path / "datasets" / name / "meta").mkdir(parents=True)
         (tmp_path / "datasets" / name / "meta" / "info.json").write_text(text)
-    command = [sys.executable, "-m", "franka_wm", "list"]
     plugins = [f"examples.add_a_{kind}" for kind in ("model", "planner", "task")]
     own = [f"plugins=[{','.join(plugins)}]", "hydra.searchpath=[file://examples/conf]"]
+
+    command = [
+        sys.executable,
+        "-m",
+        "franka_wm",
+        "list",
+    ]  # no fork: other tests may have imported these plugins
     shown = [
         subprocess.run([*command, *words], capture_output=True, text=True, check=True, cwd=tmp_path).stdout
         for words in ([], own)
@@ -135,61 +143,62 @@ HEAVY = {"torch", "tensordict", "torchrl", "newton", "warp", "pandas", "scipy", 
 """Modules that take seconds to import, or import those that do."""
 
 
-def run_and_list_imports(*arguments: str, cwd: Path) -> tuple[subprocess.CompletedProcess[str], set[str]]:
-    """A verb in a process of its own: its exit status and output, and which heavy modules it imported."""
-    code = (
-        "import sys; from franka_wm.commands.main import main; status = main(sys.argv[1:]);"
-        f"print(*sorted({HEAVY} & set(sys.modules))); sys.exit(status)"
-    )
-    command = [sys.executable, "-c", code, *arguments]
-    done = subprocess.run(command, capture_output=True, text=True, check=False, cwd=cwd)
-    return done, set(done.stdout.splitlines()[-1].split())
+VERBS = [verb for verb in cli.VERBS if verb != "train"]
+WRONG: list[tuple[list[str], str]] = [
+    (["list", "x"], "'x': write options as name=value"),
+    (["list", "hydra.searchpath=[file://nowhere]"], "nowhere is not a folder"),
+    (["list", "plugin=x"], "did you mean plugins?"),
+    (["evaluate", "checkpoint=x", "episode=3"], "did you mean episodes?"),
+    (["evaluate", "checkpoint=x", "episodes=1"], "episodes=1: must be a whole number of at least 2"),
+    (["evaluate", "episodes=3"], "give checkpoint="),
+    (["summary", "--x"], "x: no such option"),
+    (["report", "RUN", "ot=x.html"], "did you mean out?"),
+    (["compare", "A", "B", "--outt=x.html"], "did you mean out?"),
+    (["view", "prot=3"], "did you mean port?"),
+    (["view", "env.goal={"], "env.goal"),
+    (["demo", "port=x"], "port=x: must be a whole number"),
+    (["collect", "out=x", "episode=3"], "did you mean episodes?"),
+    (["collect", "out=x", "policy=smart"], "policy='smart': must be one of"),
+    (["collect", "out=x", "env.image_sise=3"], "did you mean env.image_size?"),
+    (["collect", "out=x", "seed=abc"], "seed=abc: must be a whole number"),
+    (["export", "source=x", "out=y", "format=gif"], "format=gif: must be one of exact, video"),
+    (["publish", "repo_id=user/name", "rot=x"], "did you mean root?"),
+    (["publish", "repo_id=user/name"], "give root=DATASET or checkpoint=RUN"),
+    (["bench", "envv"], "did you mean env?"),
+]
 
 
-@pytest.mark.parametrize("verb", [verb for verb in cli.VERBS if verb != "train"])
-def test_help_of_every_verb_has_one_form_and_imports_nothing_heavy(verb: str, tmp_path: Path) -> None:
+@pytest.fixture(scope="module")
+def answered(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Callable[..., Answer]]:
+    """The folder in which all of them ran, and how each of them ended."""
+    place = tmp_path_factory.mktemp("verbs")
+    program = ("-m", "franka_wm")
+    helps = [(*program, verb, flag) for verb in VERBS for flag in ("--help", "-h")]
+    found = answers([*helps, *((*program, *arguments) for arguments, _ in WRONG)], place)
+    return place, lambda *arguments: found[(*program, *arguments)]
+
+
+@pytest.mark.parametrize("verb", VERBS)
+def test_help_of_every_verb_has_one_form_and_imports_nothing_heavy(verb: str, answered) -> None:
     """The usage, what it does, a line for each option; -h is the same."""
-    done, imported = run_and_list_imports(verb, "--help", cwd=tmp_path)
-    lines = done.stdout.splitlines()[:-1]
+    done = answered[1](verb, "--help")
+    lines = done.stdout.splitlines()
     assert done.returncode == 0 and lines[0].startswith(f"usage: franka-wm {verb}") and not done.stderr
     assert lines[2].startswith("  ") and lines[2].strip()[0].isupper()
     assert [line.split() for line in lines if line.strip()][-1] == ["--help", "print", "this"]
-    assert not imported
-    assert run_and_list_imports(verb, "-h", cwd=tmp_path)[0].stdout == done.stdout
+    assert "click" in done.loaded and not done.loaded & HEAVY
+    assert answered[1](verb, "-h").stdout == done.stdout
 
 
-@pytest.mark.parametrize(
-    ("arguments", "said"),
-    [
-        (["list", "x"], "'x' is not name=value"),
-        (["list", "hydra.searchpath=[file://nowhere]"], "nowhere is not a folder"),
-        (["list", "plugin=x"], "did you mean plugins?"),
-        (["evaluate", "checkpoint=x", "episode=3"], "did you mean episodes?"),
-        (["evaluate", "checkpoint=x", "episodes=1"], "episodes=1: must be a whole number of at least 2"),
-        (["evaluate", "episodes=3"], "give checkpoint="),
-        (["summary", "--x"], "x: no such option"),
-        (["report", "RUN", "ot=x.html"], "did you mean out?"),
-        (["compare", "A", "B", "--outt=x.html"], "did you mean out?"),
-        (["view", "prot=3"], "did you mean port?"),
-        (["view", "env.goal={"], "env.goal"),
-        (["demo", "port=x"], "port=x: must be a whole number"),
-        (["collect", "out=x", "episode=3"], "did you mean episodes?"),
-        (["collect", "out=x", "policy=smart"], "policy='smart': must be one of"),
-        (["collect", "out=x", "env.image_sise=3"], "did you mean env.image_size?"),
-        (["collect", "out=x", "seed=abc"], "seed=abc: must be a whole number"),
-        (["export", "source=x", "out=y", "format=gif"], "format=gif: must be one of exact, video"),
-        (["publish", "repo_id=user/name", "rot=x"], "did you mean root?"),
-        (["publish", "repo_id=user/name"], "give root=DATASET or checkpoint=RUN"),
-        (["bench", "envv"], "did you mean env?"),
-    ],
-)
+@pytest.mark.parametrize(("arguments", "said"), WRONG)
 def test_bad_arguments_are_answered_before_anything_heavy_is_imported(
-    arguments: list[str], said: str, tmp_path: Path
+    arguments: list[str], said: str, answered
 ) -> None:
-    done, imported = run_and_list_imports(*arguments, cwd=tmp_path)
+    place, found = answered
+    done = found(*arguments)
     assert done.returncode == 1 and said in done.stderr and done.stderr.count("\n") == 1, done.stderr
-    assert done.stderr.startswith("error: ") and not imported
-    assert list(tmp_path.iterdir()) == []
+    assert done.stderr.startswith("error: ") and not done.loaded & HEAVY
+    assert list(place.iterdir()) == []
 
 
 def test_shells_complete_verbs_options_and_choices(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -9,6 +9,7 @@ import shutil
 import signal
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import av
@@ -16,12 +17,14 @@ import pytest
 from hydra.core.global_hydra import GlobalHydra
 from omegaconf import OmegaConf
 
+from forks import Fork, script, train_in_fork
 from franka_wm.commands.entry import check_command, with_scale
 from franka_wm.conf import run_name
 from franka_wm.errors import FrankaError
 from franka_wm.report.run import read_run
 from franka_wm.training.checkpoint import latest_checkpoint, load_checkpoint
 from franka_wm.training.run import occupied
+from light import Answer, answers
 
 TRAIN = Path(__file__).resolve().parents[2] / "train.py"
 LENGTH = 20
@@ -138,7 +141,13 @@ def test_checkpoint(run) -> None:
 
 
 def test_going_on(run, tmp_path: Path) -> None:
-    done = train(f"resume={run[0]}", "trainer.updates=50", f"hydra.run.dir={tmp_path}/more", cwd=tmp_path)
+    done = train_in_fork(
+        f"resume={run[0]}",
+        "trainer.updates=50",
+        "evaluation.video_episodes=0",
+        f"hydra.run.dir={tmp_path}/more",
+        cwd=tmp_path,
+    )
     assert done.returncode == 0, done.stdout + done.stderr
     before, after = (load_checkpoint(latest_checkpoint(f)) for f in (run[0], tmp_path / "more"))
     assert after.counters["updates"] == 50
@@ -153,27 +162,15 @@ def test_going_on(run, tmp_path: Path) -> None:
 
 def test_ctrl_c(tmp_path: Path) -> None:
     """Exit status 130, and a whole checkpoint to go on from."""
-    command = [sys.executable, "-u", str(TRAIN), *SMOKE, "trainer.updates=1000000", "trainer.log_every=0.2"]
-    process = subprocess.Popen(
-        [*command, f"hydra.run.dir={tmp_path}/run"],
-        cwd=tmp_path,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.STDOUT,
-        text=True,
-    )
-    assert process.stdout is not None
-    said = []
-    try:
-        for line in process.stdout:
-            said.append(line)
-            if line.startswith("updates"):
-                process.send_signal(signal.SIGINT)
-                break
-        said.append(process.communicate(timeout=60)[0])
-    finally:
-        process.kill()
-    text = "".join(said)
-    assert process.returncode == 130, text
+    command = [*SMOKE, "trainer.updates=1000000", "trainer.log_every=0.2", f"hydra.run.dir={tmp_path}/run"]
+    fork = Fork(script(TRAIN, *command), cwd=tmp_path, log=tmp_path / "log")
+    ends = time.monotonic() + 120
+    while "\nupdates" not in fork.said()[0] and time.monotonic() < ends:
+        time.sleep(0.05)
+    os.kill(fork.pid, signal.SIGINT)
+    done = fork.wait(60)
+    text = done.stdout + done.stderr
+    assert done.returncode == 130, text
     assert "Traceback" not in text and f"resume={tmp_path}/run" in text
     checkpoint = load_checkpoint(latest_checkpoint(tmp_path / "run"))
     assert 0 < checkpoint.counters["updates"] < 1_000_000
@@ -330,8 +327,8 @@ def test_the_folder_of_another_run(run, refuse) -> None:
     assert occupied(run[0], str(run[0].parent / "other")) is not None
 
 
-def test_in_a_process_of_its_own(tmp_path: Path) -> None:
-    done = train("env.substeps=-1", cwd=tmp_path)
+def test_the_exit_status_and_what_the_terminal_shows(tmp_path: Path) -> None:
+    done = train_in_fork("env.substeps=-1", cwd=tmp_path)
     assert done.returncode == 1
     assert_one_line(done.stderr)
     assert "substeps" in done.stderr
@@ -391,34 +388,42 @@ def test_a_resumed_run_s_folder_has_the_name_of_the_first(resume: str | None, na
     assert cfg.dir == f"x-{name}"
 
 
-@pytest.mark.parametrize(
-    ("arguments", "said"),
-    [
-        ("env.image_sise=3", "env.image_sise: no such option; did you mean env.image_size?"),
-        ("model=tdmcp2", "did you mean tdmpc2?"),
-        ("--cfg job env.image_sise=3", "did you mean env.image_size?"),
-        ("seed=1 --cfg job --resolve env.fps=${nope}", "Interpolation key 'nope' not found"),
-        ("--help model=tdmcp2", "did you mean tdmpc2?"),
-        ("--info defaults modle=tdmpc2", "did you mean model?"),
-        ("--multirun seed=0,1 env.image_sise=3,4", "did you mean env.image_size?"),
-        ("-m env=reach,raech", "did you mean reach?"),
-        ("-m env=[", "no viable alternative at input '['"),
-        ("--cfg jbo", "invalid choice: 'jbo' (choose from 'job', 'hydra', 'all')"),
-        ("--fast", "unrecognized arguments: --fast"),
-    ],
-)
-@pytest.mark.parametrize("program", [[str(TRAIN)], ["-m", "franka_wm", "train"]])
+TYPOS = [
+    ("env.image_sise=3", "env.image_sise: no such option; did you mean env.image_size?"),
+    ("model=tdmcp2", "did you mean tdmpc2?"),
+    ("--cfg job env.image_sise=3", "did you mean env.image_size?"),
+    ("seed=1 --cfg job --resolve env.fps=${nope}", "Interpolation key 'nope' not found"),
+    ("--help model=tdmcp2", "did you mean tdmpc2?"),
+    ("--info defaults modle=tdmpc2", "did you mean model?"),
+    ("--multirun seed=0,1 env.image_sise=3,4", "did you mean env.image_size?"),
+    ("-m env=reach,raech", "did you mean reach?"),
+    ("-m env=[", "no viable alternative at input '['"),
+    ("--cfg jbo", "invalid choice: 'jbo' (choose from 'job', 'hydra', 'all')"),
+    ("--fast", "unrecognized arguments: --fast"),
+]
+SCRIPT, VERB = (str(TRAIN),), ("-m", "franka_wm", "train")
+
+
+@pytest.fixture(scope="module")
+def answered(tmp_path_factory) -> tuple[Path, dict[tuple[str, ...], Answer]]:
+    """The folder of all the typing errors, and how each of them ended."""
+    place = tmp_path_factory.mktemp("typos")
+    return place, answers([(*program, *a.split()) for a, _ in TYPOS for program in (SCRIPT, VERB)], place)
+
+
+@pytest.mark.parametrize(("arguments", "said"), TYPOS)
+@pytest.mark.parametrize("program", [SCRIPT, VERB], ids=["train.py", "franka-wm train"])
 def test_a_typo_is_answered_before_torch_and_the_simulator_load(
-    program: list[str], arguments: str, said: str, tmp_path: Path
+    program: tuple[str, ...], arguments: str, said: str, answered
 ) -> None:
-    command = [sys.executable, "-X", "importtime", *program, *arguments.split()]
-    done = subprocess.run(command, capture_output=True, text=True, check=False, cwd=tmp_path)
-    lines = [line for line in done.stderr.splitlines() if not line.startswith("import time:")]
-    assert done.returncode == 1 and lines == [line for line in lines if line.startswith("error: ")], lines
-    assert len(lines) == 1 and said in lines[0] and "+env" not in lines[0] and done.stdout == ""
-    loaded = {line.rsplit("|", 1)[-1].strip() for line in done.stderr.splitlines()}
-    assert "hydra" in loaded and not loaded & {"torch", "newton", "warp", "torchrl", "pandas"}
-    assert list(tmp_path.iterdir()) == []
+    place, found = answered
+    done = found[(*program, *arguments.split())]
+    lines = done.stderr.splitlines()
+    assert done.returncode == 1 and len(lines) == 1 and lines[0].startswith("error: "), lines
+    assert said in lines[0] and "+env" not in lines[0] and done.stdout == ""
+    assert "hydra" in done.loaded
+    assert not done.loaded & {"torch", "newton", "warp", "torchrl", "pandas"}
+    assert list(place.iterdir()) == []
 
 
 def test_cfg_shows_the_configuration_that_would_run(tmp_path: Path) -> None:

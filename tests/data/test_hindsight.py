@@ -7,6 +7,7 @@ from tensordict import TensorDict
 from franka_wm.data.hindsight import Hindsight
 from franka_wm.data.replay import make_replay
 from franka_wm.envs import FrankaConfig, FrankaEnv
+from franka_wm.policies.expert import ExpertPolicy
 
 CONFIG = FrankaConfig(
     observations=("state", "joint_target"), goal_sampling="reachable", episode_length=6, substeps=2
@@ -70,6 +71,48 @@ def test_sparse_rewards_and_ends_follow_the_new_goal() -> None:
     assert torch.equal(sparse["next", "terminated"], window["next", "terminated"])
 
 
+@pytest.mark.parametrize("name", ["push", "pick"])
+@pytest.mark.parametrize("reward", ["dense", "sparse"])
+def test_a_cube_is_judged_for_another_goal_as_the_simulator_does(name: str, reward: str) -> None:
+    """Over an expert's episode: on its way, in contact, held, at the goal."""
+    config = FrankaConfig(
+        task=name,
+        observations=("state", "joint_target", "objects"),
+        substeps=4,
+        action_scale=0.085,
+        limit_velocity=True,
+        gravity_compensation=True,
+        pose_noise=0.02,
+        episode_length=70,
+        reward=reward,
+        terminate_on_success=True,
+    )
+    env = FrankaEnv(config, num_envs=4, device="cpu", seed=2)
+    task, policy = env.simulation.task, ExpertPolicy(env.simulation.task, env.kinematics, env.config)
+    root, judged, solved = env.reset(), 0, 0
+    for t in range(65):
+        root = policy(root)
+        state = env.get_state()
+        step = env.step(root)
+        window = step.unsqueeze(1)
+        same = task.relabel(window, root["goal"])
+        torch.testing.assert_close(same["next", "reward"], window["next", "reward"], atol=1e-5, rtol=0)
+        if t % 8 == 7:  # the same step with the goal near where the cube is
+            goal = step["next", "objects"][:, :3] + torch.tensor([0.02, 0.0, 0.003]) * (t % 3)
+            again = env.set_state(state)
+            env.set_goal(goal)
+            other = env.step(again.set("action", root["action"]))["next"]
+            there = task.relabel(window, goal)["next"]
+            torch.testing.assert_close(there["reward"][:, 0], other["reward"], atol=1e-5, rtol=0)
+            assert torch.equal(there["terminated"][:, 0], other["success"])
+            torch.testing.assert_close(there["state"][:, 0], other["state"], atol=1e-6, rtol=0)
+            judged, solved = judged + 1, solved + int(other["success"].sum())
+            env.set_state(state)
+            step = env.step(root)
+        root = step["next"].exclude("reward")
+    assert judged == 8 and 0 < solved < 32
+
+
 def numbered(worlds: int, steps: int, first: int, length: int) -> TensorDict:
     """Steps whose state is (time, world, episode, …), in episodes of so many steps."""
     time = torch.arange(first, first + steps).expand(worlds, steps)
@@ -102,7 +145,9 @@ def test_goals_are_of_the_same_episode_and_lie_ahead(written: int) -> None:
         window=2,
         batch_size=256,
         device="cpu",
-        hindsight=Hindsight(relabel, lambda state: state[..., :3], share=0.25, episode_length=7),
+        hindsight=Hindsight(
+            relabel, achieved=("state", slice(0, 3)), reads=("state",), share=0.25, episode_length=7
+        ),
     )
     for first in range(0, written, 3):
         replay.extend(numbered(4, min(3, written - first), first, 7))
@@ -126,7 +171,8 @@ def test_a_goal_of_the_newest_step_is_found_and_none_past_it() -> None:
         device="cpu",
         hindsight=Hindsight(
             lambda batch, goal: (goals.append(goal), TensorDict({}, batch.batch_size))[1],
-            lambda state: state[..., :3],
+            achieved=("state", slice(0, 3)),
+            reads=("state",),
             share=1.0,
             episode_length=50,
         ),

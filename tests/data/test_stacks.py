@@ -128,18 +128,18 @@ def test_stacks_are_looked_at_after_single_pictures_as_well(played) -> None:
     again.extend(first[:])
     wrong = played[:, 8:10].clone()
     wrong["pixels"][0, 1, 0, 0, 0] ^= 1
-    with pytest.raises(UserError, match="older pictures are not those"):
+    with pytest.raises(UserError, match="older images are not those"):
         again.extend(wrong)
 
 
 def test_pictures_that_are_no_stacks_are_refused(played) -> None:
     wrong = played.clone()
     wrong["pixels"][1, 4, 0, 0, 0] ^= 1  # an older picture than the newest
-    with pytest.raises(UserError, match="older pictures are not those"):
+    with pytest.raises(UserError, match="older images are not those"):
         filled(wrong, [8], stacked=KEYS)
     wrong = played.clone()
     wrong["next", "pixels_side"][0, 2, 0, 0, 3] ^= 1
-    with pytest.raises(UserError, match="pixels_side: its older pictures"):
+    with pytest.raises(UserError, match="pixels_side: its older images"):
         filled(wrong, [8], stacked=KEYS)
     wrong["pixels"] = wrong["pixels"].repeat(1, 1, 1, 1, 2)
     with pytest.raises(UserError, match="18 channels"):

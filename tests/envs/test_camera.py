@@ -10,7 +10,7 @@ import torch
 from tensordict import TensorDict
 
 from franka_wm.envs import FrankaConfig, FrankaEnv
-from franka_wm.envs.camera import look_at, project
+from franka_wm.envs.camera import look_at, project, whole_arm
 from franka_wm.errors import UserError
 
 PIXELS = {"observations": ("pixels", "state", "joint_target"), "image_size": 48}
@@ -143,6 +143,24 @@ def test_projection_hits_the_fingers(small_env) -> None:
         assert rows.numel() > 20
         distance = torch.hypot(columns + 0.5 - marks[k, 0], rows + 0.5 - marks[k, 1])
         assert distance.mean() < 16 and distance.min() < 14, (k, distance.mean(), distance.min())
+
+
+def test_the_camera_of_videos_has_the_whole_arm_in_view_and_leaves_observations_alone(small_env) -> None:
+    """The tool in poses over the middle 60 % of every joint's range."""
+    env = small_env(64, goal_sampling="reachable", observations=("pixels", "joint_target"))
+    before = env.reset(seed=1)["pixels"].clone()
+    config = whole_arm(env.config, env.kinematics)
+    film = env.render(64, config=config)
+    assert torch.equal(env.render(), before) and not torch.equal(film, env.render(64))
+
+    generator = torch.Generator().manual_seed(3)
+    low, high = env.kinematics.lower, env.kinematics.upper
+    middle, half = (low + high) / 2, 0.3 * (high - low)
+    tools = env.kinematics.forward(middle + half * (2 * torch.rand(512, 7, generator=generator) - 1))
+    seen = project(tools[tools[:, 2] > 0], config, 100)
+    assert ((seen > 0) & (seen < 100)).float().mean() > 0.99
+    seen = project(tools[tools[:, 2] > 0], env.config, 100)
+    assert ((seen > 0) & (seen < 100)).all(-1).float().mean() < 0.9, "the camera of observations cuts"
 
 
 def test_framing(env: FrankaEnv) -> None:

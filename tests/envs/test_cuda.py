@@ -143,10 +143,11 @@ def test_a_task_in_torch_is_part_of_the_graph(observations: tuple[str, ...], ran
     for name in ("goal", "reward", "success"):
         setattr(env.simulation.task, name, never)
     tensordict = env.reset(seed=3)
+    moves = actions.cuda()[..., : env.action_dim].unbind(1)
     torch.cuda.empty_cache()
     with no_waiting():
         others, again = [], []
-        for action in actions.cuda()[..., : env.action_dim].unbind(1):
+        for action in moves:
             others += [torch.full((k * k,), float("nan"), device="cuda") for k in (8, 64, 512)]
             step, tensordict = env.step_and_maybe_reset(tensordict.set("action", action))
             again.append(step["next"].clone())

@@ -322,7 +322,6 @@ def test_objects_start_apart_everywhere_anew() -> None:
         ({"solver": "featherstone"}, "solver=mujoco"),
         ({"task": "reach", "observations": ("objects",)}, "has no objects"),
         ({"task": "reach"}, "touches nothing"),
-        ({"observations": ("goal_pixels", "state")}, "has no image of its goal"),
         ({"reward": "normalized"}, "reward='normalized': must be one of dense, sparse"),
         ({"gripper_force": 100.0}, "gripper_force=100.0: must be from 1 to 70"),
         ({"home": (0.0, 1.0)}, "7 joint angles"),

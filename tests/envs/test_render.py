@@ -14,8 +14,8 @@ import warp as wp
 
 from franka_wm.envs import FrankaConfig, FrankaEnv, high_quality
 from franka_wm.envs.camera import look_at as camera_pose
+from franka_wm.envs.camera_math import look_at_angles, supersample
 from franka_wm.envs.high_quality import HighQualityRenderer, high_quality_renderer, which_backends
-from franka_wm.envs.view import look_at_angles, supersample
 from franka_wm.errors import UserError
 
 CONFIG = FrankaConfig(observations=("state",), substeps=4, gravity_compensation=True)

@@ -15,7 +15,7 @@ from franka_wm.evaluation.closed_loop import (
     summarize,
 )
 from franka_wm.evaluation.protocol import evaluate_policies, held_out_seeds
-from franka_wm.policies.scripted import NoopPolicy, OraclePolicy, SmoothRandomPolicy
+from franka_wm.policies.scripted import IKPolicy, NoopPolicy, SmoothRandomPolicy
 
 LENGTH = 6
 
@@ -104,7 +104,7 @@ def test_summary() -> None:
 
 def test_policies_play_the_same_episodes(env: FrankaEnv) -> None:
     told = []
-    oracle = OraclePolicy(env.kinematics, env.config)
+    oracle = IKPolicy(env.kinematics, env.config)
     results = evaluate_policies(
         env,
         {"a": NoopPolicy(), "ik": oracle, "b": NoopPolicy()},

@@ -17,7 +17,7 @@ from franka_wm.evaluation.closed_loop import (
     summarize,
 )
 from franka_wm.evaluation.protocol import evaluate_policies
-from franka_wm.policies.scripted import NoopPolicy, OraclePolicy, SmoothRandomPolicy
+from franka_wm.policies.scripted import IKPolicy, NoopPolicy, SmoothRandomPolicy
 
 LENGTH = 8
 
@@ -52,7 +52,7 @@ def test_motion_by_hand(env) -> None:
 def test_worlds_that_ended_move_no_further(small_env) -> None:
     """Of episodes that end at success, what comes after in the same world counts for nothing."""
     env = small_env(6, episode_length=12, success_distance=0.25, terminate_on_success=True)
-    episodes = play_episodes(env, OraclePolicy(env.kinematics, env.config), seed=0)
+    episodes = play_episodes(env, IKPolicy(env.kinematics, env.config), seed=0)
     assert episodes["length"].min() < 12
     at_rest = episodes["length"] == 1
     assert at_rest.any() and (episodes["path_length"][at_rest] < 0.1).all()

@@ -15,7 +15,7 @@ from franka_wm.evaluation.closed_loop import play_episodes, reaches
 from franka_wm.evaluation.protocol import Evaluation, describe, evaluate_policies, numbers_to_log, thresholds
 from franka_wm.evaluation.results import END, last_row
 from franka_wm.evaluation.robustness import verdict_of_success
-from franka_wm.policies.scripted import NoopPolicy, OraclePolicy, SmoothRandomPolicy
+from franka_wm.policies.scripted import IKPolicy, NoopPolicy, SmoothRandomPolicy
 from franka_wm.report.compare import compare_page
 from franka_wm.report.curves import axis, panel_figure, panels, plot_learning_curves
 from franka_wm.report.diagnostics import evaluation_markdown, robustness_table
@@ -36,7 +36,7 @@ def env() -> FrankaEnv:
 
 @pytest.fixture(scope="module")
 def found(env: FrankaEnv) -> Evaluation:
-    oracle = OraclePolicy(env.kinematics, env.config)
+    oracle = IKPolicy(env.kinematics, env.config)
     random = SmoothRandomPolicy(generator=torch.Generator().manual_seed(0))
     return evaluate_policies(env, {"planner": random, "ik": oracle, "noop": NoopPolicy()})
 

@@ -125,7 +125,7 @@ def test_every_generator_inside_a_policy_is_seeded() -> None:
 
 def test_half_at_random_half_by_the_model(agent) -> None:
     episodes, pictures = gather_episodes(
-        agent.env, mixture(agent.policies), keys=["state", "joint_target"], picture_size=32, pictures=3
+        agent.env, mixture(agent.policies), keys=["state", "joint_target"], image_size=32, images=3
     )
     assert episodes.batch_size == (6, 12) and pictures is not None
     assert pictures.shape == (3, 12, 32, 32, 3) and pictures.float().std() > 10

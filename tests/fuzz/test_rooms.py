@@ -10,11 +10,11 @@ import pytest
 
 from rooms.campaign import CASES, campaign, outcome, rooms
 
-NUMBER = {"config": 60, "urdf": 60, "dataset": 40, "checkpoint": 40, "run_folder": 20}
+NUMBER = {"config": 60, "urdf": 60, "scene": 60, "dataset": 40, "checkpoint": 40, "run_folder": 20}
 """Cases of the short run: two minutes in all on two cores."""
 
 SLOW = [pytest.param(name, marks=pytest.mark.slow) for name in ("dataset", "checkpoint", "run_folder")]
-ROOMS = ["config", "urdf", *SLOW]
+ROOMS = ["config", "urdf", "scene", *SLOW]
 
 
 @pytest.fixture(scope="module")

@@ -9,7 +9,7 @@ import pytest
 
 from franka_wm.live.commanded import kinematic_planner
 from franka_wm.live.session import Session
-from franka_wm.policies.scripted import NoopPolicy, OraclePolicy, SmoothRandomPolicy
+from franka_wm.policies.scripted import IKPolicy, NoopPolicy, SmoothRandomPolicy
 
 LIVE = {
     "goal_sampling": "reachable",
@@ -25,7 +25,7 @@ def make_session(small_env) -> Callable[..., Session]:
         env = small_env(1, **(LIVE | changes))
         policies = {
             "planner": kinematic_planner(env),
-            "ik": OraclePolicy(env.kinematics, env.config),
+            "ik": IKPolicy(env.kinematics, env.config),
             "random": SmoothRandomPolicy(env.action_dim),
             "noop": NoopPolicy(env.action_dim),
         }

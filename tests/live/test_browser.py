@@ -21,7 +21,7 @@ from selenium.webdriver.common.by import By  # noqa: E402
 from selenium.webdriver.common.keys import Keys  # noqa: E402
 
 from franka_wm.live.page import Page  # noqa: E402
-from franka_wm.live.scene import GOAL  # noqa: E402
+from franka_wm.live.viser_scene import GOAL  # noqa: E402
 
 CHROMIUM, DRIVER = shutil.which("chromium"), shutil.which("chromedriver")
 # Software rendering, and no service of the browser's own.
@@ -50,16 +50,25 @@ def page(make_session) -> Iterator[Page]:
     page.close()
 
 
-@pytest.fixture(scope="module")
-def browser(page: Page) -> Iterator:
+def opened(page: Page, phone: tuple[int, int] | None = None):
+    """A browser that shows the page; of a phone's width and height [px] if given."""
     options = webdriver.ChromeOptions()
     options.binary_location = CHROMIUM
     for flag in FLAGS:
         options.add_argument(f"--{flag}")
     options.set_capability("goog:loggingPrefs", {"browser": "ALL"})
+    if phone is not None:
+        metrics = {"width": phone[0], "height": phone[1], "pixelRatio": 2.0, "touch": True}
+        options.add_experimental_option("mobileEmulation", {"deviceMetrics": metrics})
     browser = webdriver.Chrome(options=options, service=Service(DRIVER))
     browser.set_page_load_timeout(60)
     browser.get(page.address)
+    return browser
+
+
+@pytest.fixture(scope="module")
+def browser(page: Page) -> Iterator:
+    browser = opened(page)
     wait(lambda: browser.find_elements(By.TAG_NAME, "canvas"), "no canvas")
     wait(lambda: page.server.get_clients(), "the page has not connected")
     wait(lambda: drawn(picture(browser)), "the arm was not drawn")
@@ -87,9 +96,9 @@ def drawn(shot: np.ndarray) -> bool:
     return bool(dark > 0.003 and spread > 10)
 
 
-def on_screen(page: Page, point: np.ndarray) -> tuple[int, int]:
-    """Where a world point is in the window [px]."""
-    camera = next(iter(page.server.get_clients().values())).camera
+def on_screen(page: Page, point: np.ndarray, client: int = 0) -> tuple[int, int]:
+    """Where a world point is in the window [px] of one of the page's clients, the oldest first."""
+    camera = page.server.get_clients()[sorted(page.server.get_clients())[client]].camera
     w, x, y, z = camera.wxyz
     rotation = np.array(
         [
@@ -190,3 +199,34 @@ def test_the_goal_has_its_colour_until_it_is_reached(page: Page, browser) -> Non
 
     assert GOAL[0] > GOAL[1] > GOAL[2]
     wait(lambda: hue()[0] > hue()[2] + 40, f"the ball at {x}, {y} is not orange: {hue()}")
+
+
+@pytest.mark.parametrize("size", [(360, 640), (400, 860)])
+def test_on_a_phone_the_arm_is_above_the_controls(page: Page, browser, size) -> None:
+    """Links and goal of every pose within reach: stretched out to each side, up, and folded."""
+    page.session.pause()
+    before = len(page.server.get_clients())
+    phone = opened(page, size)
+    try:
+        wait(lambda: len(page.server.get_clients()) > before, "the phone has not connected")
+        handle = "//*[text()='franka_wm']"
+        wait(lambda: phone.find_elements(By.XPATH, handle), "no controls")
+        top = phone.find_element(By.XPATH, handle).rect["y"]
+        assert 0.35 * size[1] < top < 0.6 * size[1], "the controls open over the lower part"
+        client = page.server.get_clients()[max(page.server.get_clients())]
+        wait(lambda: client.camera.look_at[2] < 0, "the camera was not moved")
+        ratio = client.camera.image_width / size[0]
+        for point in [
+            (0.75, 0, 0.3),
+            (0, 0.75, 0.3),
+            (0, -0.75, 0.3),
+            (0, 0, 1.15),
+            (0, 0, 0),
+            (-0.15, 0, 0),
+        ]:
+            x, y = (value / ratio for value in on_screen(page, np.array(point), -1))
+            assert 0 < x < size[0] and 0 < y < top, (
+                f"{point} m is at {x:.0f}, {y:.0f} px; controls from {top:.0f}"
+            )
+    finally:
+        phone.quit()

@@ -10,7 +10,7 @@ import pytest
 from franka_wm.errors import UserError
 from franka_wm.live.commanded import kinematic_planner
 from franka_wm.live.rerun_recording import record_episode
-from franka_wm.policies.scripted import OraclePolicy
+from franka_wm.policies.scripted import IKPolicy
 
 rr = pytest.importorskip("rerun", reason="needs the extra rerun")
 
@@ -39,7 +39,7 @@ def test_an_episode_reads_back(small_env, tmp_path: Path) -> None:
     env = small_env(
         1, goal_sampling="reachable", observations=("pixels", "state", "joint_target"), image_size=16
     )
-    policies = {"planner": kinematic_planner(env), "ik": OraclePolicy(env.kinematics, env.config)}
+    policies = {"planner": kinematic_planner(env), "ik": IKPolicy(env.kinematics, env.config)}
     path = record_episode(env, policies, tmp_path / "a" / "episode.rrd", policy="planner", steps=6, seed=3)
     assert [file.name for file in path.parent.iterdir()] == ["episode.rrd"]
     recording = read(path)
@@ -60,7 +60,7 @@ def test_an_episode_reads_back(small_env, tmp_path: Path) -> None:
 
 def test_bad_names_are_one_line(small_env, tmp_path: Path) -> None:
     env = small_env(1)
-    policies = {"ik": OraclePolicy(env.kinematics, env.config)}
+    policies = {"ik": IKPolicy(env.kinematics, env.config)}
     with pytest.raises(UserError, match=r"must end in \.rrd"):
         record_episode(env, policies, tmp_path / "episode.bin")
     with pytest.raises(UserError, match="policy='planner': choose from ik; that one needs a checkpoint"):

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import builtins
+import os
 import re
 import signal
 import socket
-import subprocess
 import sys
 import time
 from pathlib import Path
@@ -15,17 +15,18 @@ from types import SimpleNamespace
 import pytest
 from omegaconf import OmegaConf
 
+from forks import Fork, train_in_fork
 from franka_wm.commands import main as cli
 from franka_wm.commands.view import options_of
 from franka_wm.commands.view import view as view_verb
 from franka_wm.envs import FrankaConfig
 from franka_wm.errors import UserError
-from franka_wm.live import view
+from franka_wm.live.stage import ARM, Options, build, serve
 
 CHEAP = ["env.substeps=2", "device=cpu"]
 
 
-def parse(arguments: list[str]) -> view.Options:
+def parse(arguments: list[str]) -> Options:
     return options_of(**view_verb.make_context("view", arguments).params)
 
 
@@ -33,7 +34,7 @@ def test_arguments() -> None:
     options = parse(["port=0", "policy=noop", "seconds=2.5", "env.goal=[0.3,0,0.5]", "env.episode_length=20"])
     assert (options.port, options.policy, options.seconds) == (0, "noop", 2.5)
     assert options.env == {"goal": [0.3, 0, 0.5], "episode_length": 20}
-    assert parse([]) == view.Options()
+    assert parse([]) == Options()
 
 
 @pytest.mark.parametrize(
@@ -43,7 +44,7 @@ def test_arguments() -> None:
         ("--fast", "fast: no such option"),
         ("env=dm_control", "the page shows the arm only"),
         ("sed=3", "sed: no such option; did you mean seed?"),
-        ("port", "'port' is not name=value; franka-wm view --help"),
+        ("port", "'port': write options as name=value; all of them: franka-wm view --help"),
         ("port=http", "port=http: must be a whole number"),
         ("port=70000", "must be a whole number of at least 0, at most 65535"),
         ("seconds=0", "must be a finite number above 0"),
@@ -64,8 +65,8 @@ def test_a_checkpoint_of_another_environment_is_refused_before_anything_is_built
     kind: str, what: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     found = SimpleNamespace(config=OmegaConf.create({"env": {"kind": kind}}))
-    monkeypatch.setattr(view, "find_checkpoint", lambda folder: found)
-    monkeypatch.setattr(view, "load_agent", lambda *a, **k: pytest.fail("built"))
+    monkeypatch.setattr("franka_wm.live.stage.find_checkpoint", lambda folder: found)
+    monkeypatch.setattr("franka_wm.live.stage.load_agent", lambda *a, **k: pytest.fail("built"))
     assert cli.main(["view", "checkpoint=run"]) == 1
     captured = capsys.readouterr()
     assert what in captured.err and "the live page shows the arm only" in captured.err
@@ -118,7 +119,7 @@ def test_bad_worlds_policies_and_checkpoints_are_one_line(
 def test_help_names_every_option(capsys: pytest.CaptureFixture[str]) -> None:
     assert cli.main(["view", "--help"]) == 0
     out = capsys.readouterr().out
-    for name in vars(view.Options()):
+    for name in vars(Options()):
         assert f"{name}=" in out or f"{name}." in out
 
 
@@ -156,7 +157,7 @@ def test_without_a_checkpoint_the_arm_is_that_of_the_preset(root: Path) -> None:
     )
     for other in ("defaults", "kind", "urdf_path", "episode_length"):
         del preset[other]
-    assert FrankaConfig.from_mapping(view.ARM | {"episode_length": 50}) == FrankaConfig.from_mapping(
+    assert FrankaConfig.from_mapping(ARM | {"episode_length": 50}) == FrankaConfig.from_mapping(
         preset | {"episode_length": 50}
     )
 
@@ -210,13 +211,12 @@ def test_a_port_in_use_is_said(capsys: pytest.CaptureFixture[str]) -> None:
 
 
 @pytest.mark.slow
-def test_a_checkpoint_brings_its_own_planner_and_policy(root: Path, tmp_path: Path) -> None:
+def test_a_checkpoint_brings_its_own_planner_and_policy(tmp_path: Path) -> None:
     from franka_wm.live.session import Session
 
-    train = [sys.executable, "train.py", "scale=smoke", "device=cpu", f"hydra.run.dir={tmp_path / 'run'}"]
-    done = subprocess.run(train, cwd=root, capture_output=True, text=True, check=False)
+    done = train_in_fork("scale=smoke", "device=cpu", f"hydra.run.dir={tmp_path}/run", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
-    stage = view.build(parse([f"checkpoint={tmp_path / 'run'}", "device=cpu"]))
+    stage = build(parse([f"checkpoint={tmp_path / 'run'}", "device=cpu"]))
     assert stage.title.startswith("tdmpc2, ")
     assert stage.steps == 50
     assert stage.env.config.episode_length > 1000, "nobody asked for the episode to end"
@@ -238,45 +238,40 @@ def test_a_checkpoint_brings_its_own_planner_and_policy(root: Path, tmp_path: Pa
 
 
 def test_an_exception_while_it_plays_ends_it(monkeypatch: pytest.MonkeyPatch) -> None:
-    stage = view.build(parse([*CHEAP, "policy=noop", "port=0"]))
+    stage = build(parse([*CHEAP, "policy=noop", "port=0"]))
 
     def broken(_tensordict):
-        raise UserError("the oracle is out")
+        raise UserError("the policy is out")
 
     stage.policies["noop"] = broken
-    with pytest.raises(UserError, match="the oracle is out"):
-        view.serve(stage, parse(["policy=noop", "port=0"]))
+    with pytest.raises(UserError, match="the policy is out"):
+        serve(stage, parse(["policy=noop", "port=0"]))
 
 
-BUSY = """
-import signal
-import time
-from franka_wm.live import view
-signal.signal(signal.SIGINT, signal.default_int_handler)  # may have been inherited as ignored
-stage = view.build(view.Options(device="cpu", env={{"substeps": 2}}))
-real = stage.policies["noop"]
-def slow(tensordict):
-    print("deciding", flush=True)
-    time.sleep(60)
-    return real(tensordict)
-stage.policies["noop"] = slow
-view.serve(stage, view.Options(policy="noop", port=0))
-"""
+def deciding_for_a_minute() -> None:
+    """A stage whose policy prints that it decides, and takes its time."""
+    stage = build(Options(device="cpu", env={"substeps": 2}))
+    real = stage.policies["noop"]
+
+    def slow(tensordict):
+        print("deciding", flush=True)
+        time.sleep(60)
+        return real(tensordict)
+
+    stage.policies["noop"] = slow
+    serve(stage, Options(policy="noop", port=0))
 
 
-def test_ctrl_c_ends_it_within_two_seconds_whatever_it_is_doing() -> None:
-    script = BUSY.format()
-    with subprocess.Popen([sys.executable, "-c", script], stdout=subprocess.PIPE, text=True) as process:
-        assert process.stdout is not None
-        while "deciding" not in process.stdout.readline():
-            assert process.poll() is None
-        process.send_signal(signal.SIGINT)
-        started = time.monotonic()
-        try:
-            process.wait(timeout=10)
-        finally:
-            process.kill()
-        assert time.monotonic() - started < 2.0
+def test_ctrl_c_ends_it_within_two_seconds_whatever_it_is_doing(tmp_path: Path) -> None:
+    fork = Fork(deciding_for_a_minute, cwd=tmp_path, log=tmp_path / "log")
+    ends = time.monotonic() + 60
+    while "deciding" not in fork.said()[0] and time.monotonic() < ends:
+        time.sleep(0.02)
+    os.kill(fork.pid, signal.SIGINT)
+    started = time.monotonic()
+    done = fork.wait(10)
+    assert time.monotonic() - started < 2.0
+    assert "deciding" in done.stdout and "Traceback" not in done.stderr, done.stderr
 
 
 def test_rerun_writes_an_episode(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -292,7 +287,7 @@ def test_rerun_writes_an_episode(tmp_path: Path, capsys: pytest.CaptureFixture[s
 def test_a_task_with_a_gripper_is_shown_by_its_expert() -> None:
     """By name, without a checkpoint; the page and the recording have the same stage."""
     options = options_of([], None, env="stack", seed=0, device="cpu")
-    stage = view.build(options)
+    stage = build(options)
     assert list(stage.policies) == ["expert", "random", "noop"] and stage.env.config.num_objects == 2
     observation = stage.env.reset()
     for _ in range(120):

@@ -16,7 +16,7 @@ from torch import nn
 from franka_wm import models
 from franka_wm.conf import compose
 from franka_wm.planning import CEM, ICEM, MPPI, GoalDistance, GradientPlanner, RewardPlusValue
-from franka_wm.planning.objectives import bind
+from franka_wm.planning.objectives import as_objective
 from franka_wm.policies import PlannerPolicy
 from franka_wm.training.settings import RunSettings
 
@@ -177,7 +177,7 @@ def imagined(case, objective, z, plan):
 
 def test_the_plan_is_finite_within_bounds_and_better_than_doing_nothing(case, planner):
     observation = case.observation()
-    objective = bind(case.objective, observation)
+    objective = as_objective(case.objective).bind(observation)
     prior = case.model.policy if case.model.has_policy else None
     with torch.no_grad():
         z = case.model.encode(observation)

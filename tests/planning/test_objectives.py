@@ -17,7 +17,6 @@ from franka_wm.planning import (
     Smoothness,
     Sum,
 )
-from franka_wm.planning.objectives import bind
 from franka_wm.policies import PlannerPolicy
 
 # Two environments, three candidates, two steps, latents of two numbers.
@@ -171,8 +170,8 @@ def test_a_sum_adds_weighted_terms_and_binds_them(trajectory, actions):
         + 0.3 * ActionPenalty(1.0)(trajectory, actions)
         + 4.0 * smooth.bind(td)(trajectory, actions)
     )
-    torch.testing.assert_close(bind(nested, td)(trajectory, actions), expected)
-    assert bind(goal, td) is goal
+    torch.testing.assert_close(nested.bind(td)(trajectory, actions), expected)
+    assert goal.bind(td) is goal
     with pytest.raises(ValueError, match="at least one"):
         Sum([])
     with pytest.raises(ValueError, match="ActionPenalty"):

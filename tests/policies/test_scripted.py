@@ -11,7 +11,7 @@ from tensordict import TensorDict
 
 from franka_wm.envs import FrankaConfig, FrankaEnv
 from franka_wm.errors import UserError
-from franka_wm.policies.scripted import DiscretePolicy, NoopPolicy, OraclePolicy, SmoothRandomPolicy
+from franka_wm.policies.scripted import DiscretePolicy, IKPolicy, NoopPolicy, SmoothRandomPolicy
 from franka_wm.training import build
 
 
@@ -61,12 +61,12 @@ def test_impossible_smoothness() -> None:
         SmoothRandomPolicy(smoothness=1.0)
 
 
-def test_oracle_reaches_every_goal(env: FrankaEnv) -> None:
-    oracle = OraclePolicy(env.kinematics, env.config)
+def test_ik_reaches_every_goal(env: FrankaEnv) -> None:
+    ik = IKPolicy(env.kinematics, env.config)
     observation = env.reset(seed=0)
     start = env.goal_distance()
     for _ in range(30):
-        observation = env.step(oracle(observation))["next"]
+        observation = env.step(ik(observation))["next"]
     assert start.mean() > 0.1
     assert observation["state"][:, 17:].norm(dim=-1).max() < 0.01
     assert observation["success"].all()
@@ -90,21 +90,21 @@ def final_distance(env: Any, policy: Any, steps: int) -> torch.Tensor:
     return observation["state"][:, 17:].norm(dim=-1)
 
 
-def test_the_oracle_with_numbered_moves_is_better_than_the_nearest_row_of_the_table(moving) -> None:
+def test_ik_with_discrete_actions_is_better_than_the_nearest_row_of_the_table(moving) -> None:
     env = moving()
     reached = final_distance(env, build.make_scripted_policies(env)["ik"], 40)
-    rounded = DiscretePolicy(OraclePolicy(env.kinematics, env.config), env.transform.table)
+    rounded = DiscretePolicy(IKPolicy(env.kinematics, env.config), env.transform.table)
     assert reached.mean() < 0.01 and reached.max() < 0.025
     assert reached.mean() < 0.6 * final_distance(env, rounded, 40).mean()
 
 
-def test_the_oracle_with_moves_of_the_tool_ends_where_no_move_helps(moving) -> None:
+def test_ik_with_moves_of_the_tool_ends_where_no_move_helps(moving) -> None:
     env = moving(action_mode="ee_delta")
     reached = final_distance(env, build.make_scripted_policies(env)["ik"], 30)
     assert reached.max() < 0.06  # of a grid of 5 cm, 4.3 cm to the farthest point
 
 
-def test_the_oracle_with_moves_to_poses_takes_the_best(moving) -> None:
+def test_ik_with_moves_to_poses_takes_the_best(moving) -> None:
     """There, a move is a pose, whatever was before."""
     env = moving(action_mode="joint_position")
     observation, k = env.reset(seed=0), env.kinematics
@@ -114,11 +114,11 @@ def test_the_oracle_with_moves_to_poses_takes_the_best(moving) -> None:
     assert torch.equal(move, distances.argmin(1))
 
 
-def test_oracle_needs_the_targets() -> None:
+def test_ik_needs_the_targets() -> None:
     with pytest.raises(UserError, match="joint_target"):
-        OraclePolicy(None, FrankaConfig())(TensorDict({"goal": torch.zeros(1, 3)}, batch_size=[1]))  # type: ignore[arg-type]
+        IKPolicy(None, FrankaConfig())(TensorDict({"goal": torch.zeros(1, 3)}, batch_size=[1]))  # type: ignore[arg-type]
 
 
 def test_inverse_kinematics_of_the_tool_alone_refuses_a_gripper() -> None:
     with pytest.raises(UserError, match="task=lift has; use policy=expert"):
-        OraclePolicy(None, FrankaConfig(task="lift"))  # type: ignore[arg-type]
+        IKPolicy(None, FrankaConfig(task="lift"))  # type: ignore[arg-type]

@@ -185,6 +185,17 @@ def test_panels_are_drawn_only_where_there_is_something() -> None:
     assert norms is not None and list(lines(norms)) == ["gradient, model"]
 
 
+def test_panels_of_the_same_runs_share_the_horizontal_axis() -> None:
+    """Losses are logged from the start, evaluations later: side by side, the same step is at the same place."""
+    logged = [*rows([0.3, 0.1], start=400), *rows([2.0, 1.0, 0.5], "loss")]
+    panels = [panel_figure(logged, name) for name in ("final_distance", "losses")]
+    bands = [seeds_figure({"a": [logged]}, key) for key in ("eval/planner/final_distance", "loss")]
+    ranges = {figure.axes[0].get_xlim() for figure in (*panels, *bands) if figure is not None}
+    assert len(ranges) == 1 and len(panels) == 2, ranges
+    low, high = ranges.pop()
+    assert low <= 0 and high > max(row["env_steps"] for row in logged)
+
+
 # -- horizon -----------------------------------------------------------------------------------------------
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -417,3 +418,11 @@ def test_committed_pages_are_what_the_files_say() -> None:
 def test_readme_without_its_place_is_refused() -> None:
     with pytest.raises(UserError, match="needs the lines"):
         render.with_tables("# a readme", "tables")
+
+
+def test_a_row_that_many_files_make_stale_has_a_short_line(monkeypatch) -> None:
+    main = import_module("benchmarks.results.__main__")
+    monkeypatch.setattr(main, "state", lambda *_: ("stale", [f"file{k}.py" for k in range(9)]))
+    monkeypatch.setattr(main.confirm, "confirmed", lambda *_: None)
+    (line,) = overview({"reach-cpu": load_rows()["reach-cpu"]}, records.PLACE).splitlines()
+    assert "file2.py; 6 more, see docs/results.md" in line and "file3.py" not in line

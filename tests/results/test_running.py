@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+
 import pytest
 
 from benchmarks.results import records, running
@@ -21,8 +23,6 @@ ROW = Row(
 
 
 def test_runs_on_cores_have_them_alone() -> None:
-    import os
-
     with pytest.raises(UserError, match="cores"):
         running.Machine(jobs=len(os.sched_getaffinity(0)) + 1, threads=1).slots(ROW)
     ((before, after, environment),) = running.Machine(threads=1).slots(ROW)
@@ -40,14 +40,20 @@ def test_runs_on_gpus_are_spread_over_them() -> None:
     assert all("OMP_NUM_THREADS" not in environment for _, _, environment in slots)
 
 
+def test_packages_are_found_where_this_process_finds_them(monkeypatch) -> None:
+    monkeypatch.setenv("PYTHONPATH", f"/some/site{os.pathsep}/another")
+    ((_, _, environment),) = running.Machine(threads=1).slots(ROW)
+    assert environment["PYTHONPATH"].split(os.pathsep) == [str(running.ROOT), "/some/site", "/another"]
+
+
 def test_a_run_that_fails_is_told_and_leaves_no_file(tmp_path) -> None:
     from dataclasses import replace
 
-    row = replace(ROW, arguments="env=reach_fixed trainer.updates=-1")
+    row = replace(ROW, arguments="env=reach_fixed trainer.updatez=1")
     failed = running.run(
         row, running.Machine(threads=1), seeds=[100], out=tmp_path / "out", place=tmp_path / "place"
     )
-    assert len(failed) == 1 and "trainer.updates" in failed[0]
+    assert len(failed) == 1 and "trainer.updatez" in failed[0]
     assert not (tmp_path / "place").exists()
 
 

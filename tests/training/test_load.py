@@ -5,8 +5,6 @@ from __future__ import annotations
 import fcntl
 import gc
 import shutil
-import subprocess
-import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -16,6 +14,7 @@ import torch
 from torchrl.data import LazyTensorStorage
 
 import franka_wm
+from forks import run_in_fork
 from franka_wm.errors import UserError
 from franka_wm.training import build
 from franka_wm.training.check import check
@@ -161,13 +160,11 @@ def test_no_world_and_no_data(settled) -> None:
 
 def test_one_run_in_a_folder(tmp_path: Path) -> None:
     """The second process is refused while the first one lives."""
-    code = "import sys; from pathlib import Path; from franka_wm.training.run import claim; claim(Path(sys.argv[1]))"
-    command = [sys.executable, "-c", code, str(tmp_path)]
     claim(tmp_path)
-    refused = subprocess.run(command, capture_output=True, text=True)
+    refused = run_in_fork(lambda: claim(tmp_path), tmp_path)
     assert refused.returncode and "another run" in refused.stderr
     fcntl.flock(_CLAIMED.pop(), fcntl.LOCK_UN)
-    assert subprocess.run(command, capture_output=True).returncode == 0
+    assert run_in_fork(lambda: claim(tmp_path), tmp_path).returncode == 0
 
 
 def test_no_checkpoint(tmp_path: Path) -> None:

@@ -5,8 +5,6 @@ from __future__ import annotations
 import os
 import random
 import signal
-import subprocess
-import sys
 from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
@@ -18,6 +16,7 @@ import torch
 from safetensors.torch import load_file
 from tensordict import TensorDictBase
 
+from forks import train_in_fork
 from franka_wm.commands.main import main
 from franka_wm.training import build
 from franka_wm.training.checkpoint import Checkpoint, latest_checkpoint, load_checkpoint
@@ -171,8 +170,8 @@ def weights(checkpoint: Checkpoint) -> dict[str, torch.Tensor]:
     return load_file(checkpoint.folder / "model.safetensors")
 
 
-@pytest.mark.slow  # three processes
-def test_after_a_kill(root: Path, train, made: Counter[str], tiny: list[str], tmp_path: Path) -> None:
+@pytest.mark.slow  # three runs
+def test_after_a_kill(train, made: Counter[str], tiny: list[str], tmp_path: Path) -> None:
     """``kill -9`` between two checkpoints: from the last one, in another process, to the same weights."""
     (tmp_path / "killer.py").write_text(
         "import os, signal\n"
@@ -185,20 +184,8 @@ def test_after_a_kill(root: Path, train, made: Counter[str], tiny: list[str], tm
         "Learner.update = killed\n"
     )
     sizes = [*tiny, "evaluation.during=[]", "trainer.updates=40"]
-    command = [
-        sys.executable,
-        str(root / "train.py"),
-        *sizes,
-        "plugins=[killer]",
-        "trainer.checkpoint_every=1e-9",
-    ]
-    killed = subprocess.run(
-        [*command, f"hydra.run.dir={tmp_path}/killed"],
-        cwd=tmp_path,
-        capture_output=True,
-        text=True,
-        check=False,
-    )
+    options = ["plugins=[killer]", "trainer.checkpoint_every=1e-9", f"hydra.run.dir={tmp_path}/killed"]
+    killed = train_in_fork(*sizes, *options, cwd=tmp_path)
     assert killed.returncode == -signal.SIGKILL, killed.stdout + killed.stderr
     assert load_checkpoint(latest_checkpoint(tmp_path / "killed")).counters["updates"] == 20
     whole = weights(train(*sizes, folder=tmp_path / "whole"))

@@ -6,6 +6,7 @@ import json
 import os
 import signal
 import threading
+import time
 
 import numpy as np
 import pytest
@@ -125,10 +126,18 @@ def test_the_same_seed_gives_the_same_dataset(collected, tmp_path, load) -> None
 
 def test_ctrl_c_leaves_a_dataset(tmp_path, load) -> None:
     source = open_source("random", overrides=SMALL, num_envs=4, episodes=100_000)
-    timer = threading.Timer(1.0, os.kill, (os.getpid(), signal.SIGINT))
-    timer.start()
+
+    def interrupt() -> None:  # once it is under way, however long starting takes
+        ends = time.monotonic() + 60
+        while not any(tmp_path.iterdir()) and time.monotonic() < ends:
+            time.sleep(0.05)
+        time.sleep(1.0)
+        os.kill(os.getpid(), signal.SIGINT)
+
+    thread = threading.Thread(target=interrupt)
+    thread.start()
     out, whole = gather(source, out=tmp_path / "set", episodes=100_000, workers=0)
-    timer.join()
+    thread.join()
     assert not whole
     dataset = load(out)
     assert 0 < dataset.num_episodes < 100_000
@@ -148,7 +157,7 @@ def test_ctrl_c_leaves_a_dataset(tmp_path, load) -> None:
         (["out=x", "policy=nonsense"], "random, noop, ik, expert, or the folder of a run"),
         (
             ["out=x", "env=nonsense"],
-            "env=nonsense: must be one of dm_control, franka, gym, ",
+            "env=nonsense: must be one of dm_control, drawer, ",
         ),
         (["out=x", "fmt=exact"], "fmt: no such option; there are out, episodes, policy, checkpoint, format"),
         (
@@ -165,7 +174,7 @@ def test_ctrl_c_leaves_a_dataset(tmp_path, load) -> None:
         (["out=x", "env.fps=29.97"], "whole frames"),
         (["out=x", "env.observations=[depth]"], "depth has no place"),
         (["out=x", "policy=expert"], "policy=expert: task=reach has none; env=lift has one"),
-        (["out=x", "rubbish"], "'rubbish' is not name=value"),
+        (["out=x", "rubbish"], "'rubbish': write options as name=value"),
     ],
 )
 def test_bad_arguments_are_one_line(arguments, says, capsys, tmp_path, monkeypatch) -> None:

@@ -17,7 +17,7 @@ from huggingface_hub import DatasetCard
 from omegaconf import OmegaConf
 
 from franka_wm.data.lerobot import card as cards
-from franka_wm.data.lerobot.card import PICTURE
+from franka_wm.data.lerobot.card import IMAGE
 from franka_wm.data.lerobot.hub import check_repo_id, explained
 from franka_wm.data.lerobot.paths import shortened, without_paths
 from franka_wm.data.lerobot.publish import stage_dataset
@@ -131,7 +131,7 @@ def test_a_dry_run_sends_nothing_and_writes_the_card(hub, publish, dataset, tmp_
     for text in ("user/arm (private)", "data/chunk-000/file-000.parquet", "README.md", "nothing was sent"):
         assert text in done.stdout
     place = tmp_path / "outputs" / "publish" / "user--arm"
-    assert set(contents(place)) == {"README.md", PICTURE}
+    assert set(contents(place)) == {"README.md", IMAGE}
     card = (place / "README.md").read_text()
     loaded = DatasetCard(card)
     assert (loaded.data.license, loaded.data.task_categories) == ("apache-2.0", ["robotics"])

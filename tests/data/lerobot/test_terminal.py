@@ -9,7 +9,7 @@ import av
 import numpy as np
 import pytest
 
-from franka_wm.data.lerobot.pictures import decode_png, encode_png
+from franka_wm.data.lerobot.png import decode_png, encode_png
 from franka_wm.data.lerobot.schema import EPISODE_KEY, OWN_FOLDER
 from franka_wm.data.lerobot.terminal import TERMINAL_FOLDER, read_terminals
 from franka_wm.errors import UserError

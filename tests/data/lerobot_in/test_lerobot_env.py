@@ -4,17 +4,17 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
 import torch
-from lerobot.envs.configs import EnvConfig
-from lerobot.envs.factory import make_env
-from lerobot.envs.utils import env_to_policy_features, preprocess_observation
 
 from franka_wm.data.lerobot.schema import PROVENANCE
-from franka_wm.data.lerobot_env import FrankaWMEnv, recorded_settings
 from franka_wm.errors import UserError
+
+if TYPE_CHECKING:  # inside the tests otherwise: LeRobot's environments take ten seconds to import
+    from franka_wm.data.lerobot_env import FrankaWMEnv
 
 OPTIONS = {
     "observations": ("pixels", "goal_pixels", "state"),
@@ -27,6 +27,10 @@ OPTIONS = {
 
 @pytest.fixture(scope="module")
 def config() -> FrankaWMEnv:
+    from lerobot.envs.configs import EnvConfig
+
+    from franka_wm.data.lerobot_env import FrankaWMEnv
+
     made = EnvConfig.get_choice_class("franka_wm")(options=OPTIONS, device="cpu")
     assert isinstance(made, FrankaWMEnv)
     return made
@@ -34,6 +38,9 @@ def config() -> FrankaWMEnv:
 
 def test_observations_are_those_of_a_dataset(config: FrankaWMEnv) -> None:
     """LeRobot's own conversion gives the features that were announced, of the announced sizes."""
+    from lerobot.envs.factory import make_env
+    from lerobot.envs.utils import env_to_policy_features, preprocess_observation
+
     envs = make_env(config, n_envs=2, use_async_envs=True)
     (env,) = envs["franka_wm"].values()
     observation, info = env.reset(seed=[5, 6])
@@ -69,6 +76,8 @@ def test_observations_are_those_of_a_dataset(config: FrankaWMEnv) -> None:
 
 
 def test_settings_of_a_dataset(tmp_path: Path) -> None:
+    from franka_wm.data.lerobot_env import FrankaWMEnv, recorded_settings
+
     path = tmp_path / PROVENANCE
     path.parent.mkdir(parents=True)
 
@@ -89,6 +98,8 @@ def test_settings_of_a_dataset(tmp_path: Path) -> None:
 
 def test_a_dataset_of_a_run_that_stacked_pictures_shows_single_ones(tmp_path: Path) -> None:
     """As `export` writes it: the run's configuration, and of each stack the newest picture."""
+    from franka_wm.data.lerobot_env import FrankaWMEnv
+
     path = tmp_path / PROVENANCE
     path.parent.mkdir(parents=True)
     env = {**OPTIONS, "kind": "franka", "urdf_path": None, "observations": ["pixels", "state"]}
@@ -102,6 +113,8 @@ def test_a_dataset_of_a_run_that_stacked_pictures_shows_single_ones(tmp_path: Pa
 
 
 def test_refused() -> None:
+    from franka_wm.data.lerobot_env import FrankaWMEnv
+
     with pytest.raises(UserError, match="unknown"):
         FrankaWMEnv(options={"speed": 3})
     with pytest.raises(UserError, match="drives joints"):

@@ -25,9 +25,10 @@ def rooms() -> dict[str, type]:
     from rooms.config import Config
     from rooms.dataset import Dataset
     from rooms.run_folder import RunFolder
+    from rooms.scene import Scenes
     from rooms.urdf import Urdf
 
-    return {one.name: one for one in (Config, Checkpoint, RunFolder, Dataset, Urdf)}
+    return {one.name: one for one in (Config, Checkpoint, RunFolder, Dataset, Urdf, Scenes)}
 
 
 def outcome(room: Any, case: dict[str, Any]) -> Outcome:

@@ -6,8 +6,6 @@ import hashlib
 import json
 import os
 import shutil
-import subprocess
-import sys
 from pathlib import Path
 from typing import Any
 
@@ -15,9 +13,9 @@ import yaml
 from hypothesis import strategies as st
 
 from rooms.forked import NotApplicable
+from rooms.kills import command, train
 from rooms.odd import changed, leaves, mutation
 
-ROOT = Path(__file__).resolve().parents[3]
 RUN = [
     "scale=smoke", "device=cpu", "env.episode_length=12", "env.substeps=2", "collector.num_envs=4",
     "evaluation.episodes=2", "evaluation.video_episodes=1", "evaluation.video_size=32", "trainer.updates=20",
@@ -34,9 +32,8 @@ HOW = ("nan", "inf", "zeros", "flat", "longer", "dtype", "drop", "add", "empty",
 def smoke_run(folder: Path) -> Path:
     """A finished run of twenty updates."""
     run = folder / "run"
-    command = [sys.executable, str(ROOT / "train.py"), *RUN, f"hydra.run.dir={run}"]
-    done = subprocess.run(command, cwd=folder, capture_output=True, text=True, timeout=400, check=False)
-    assert done.returncode == 0, done.stdout + done.stderr
+    ended = command(train(*RUN, f"hydra.run.dir={run}"), run, seconds=400)
+    assert ended.status == 0, ended.said
     return run
 
 
@@ -145,6 +142,8 @@ def _mutate(kind: str, path: Path, rest: list[Any]) -> None:
         _write(path, path.read_bytes()[: rest[0]])
     elif kind == "header":
         content = bytearray(path.read_bytes())
+        if not content:
+            raise NotApplicable("nothing in it")
         content[rest[0] % min(len(content), 3000)] = rest[1]
         _write(path, bytes(content))
     else:

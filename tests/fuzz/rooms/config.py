@@ -9,7 +9,7 @@ from typing import Any
 
 from hypothesis import strategies as st
 
-from rooms.forked import AcceptedError
+from rooms.forked import AcceptedError, NotApplicable
 from rooms.odd import values
 
 SMOKE = ["scale=smoke", "device=cpu"]
@@ -78,7 +78,7 @@ class Config:
             cfg = copy.deepcopy(self.composed[case["base"]])
             try:
                 for option, value in case["mutations"]:
-                    OmegaConf.update(cfg, option, value, merge=False)
+                    _update(cfg, option, value)
                 OmegaConf.to_container(cfg, resolve=True)
             except OmegaConfBaseException as error:  # as commands/entry.py does
                 raise UserError(explain(str(error))) from error
@@ -112,11 +112,23 @@ class Config:
                 raise AcceptedError(f"{option}={value!r} (default {default!r})", option)
 
 
+def _update(cfg: Any, option: str, value: Any) -> None:
+    from omegaconf import OmegaConf
+    from omegaconf.errors import OmegaConfBaseException
+
+    try:
+        OmegaConf.update(cfg, option, value, merge=False)
+    except OmegaConfBaseException:
+        raise
+    except (ValueError, TypeError, IndexError) as error:  # its group is a list by now
+        raise NotApplicable(str(error)) from error
+
+
 def _surely_wrong(default: Any, value: Any) -> bool:
     """Whether a value cannot be meant where the default is this one."""
     if isinstance(value, float) and not math.isfinite(value):
         return True
-    if isinstance(value, int) and abs(value) > 10**18:
+    if isinstance(value, int) and abs(value) > 2**63:
         return True
     if isinstance(default, bool):
         return value is not None and not isinstance(value, bool)

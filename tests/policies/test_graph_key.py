@@ -7,7 +7,7 @@ import numpy as np
 import torch
 from tensordict import TensorDict
 
-from franka_wm.policies.settings import settings
+from franka_wm.policies.graph_key import graph_key
 
 
 def numbers(value):
@@ -46,8 +46,8 @@ def test_settings_tell_what_a_graph_depends_on():
         "k": Slotted(1.0),
         "m": numbers(1.0),
     }
-    same = settings(Other(**values))
-    assert settings(Other(**values)) == same and hash(settings(Other(**values))) == hash(same)
+    same = graph_key(Other(**values))
+    assert graph_key(Other(**values)) == same and hash(graph_key(Other(**values))) == hash(same)
     for change in (
         {"a": 2},
         {"b": [math.nan, "y"]},
@@ -62,20 +62,20 @@ def test_settings_tell_what_a_graph_depends_on():
         {"m": numbers(1.0)},
         {"n": 0},
     ):
-        assert settings(Other(**values | change)) != same, change
+        assert graph_key(Other(**values | change)) != same, change
     tensor += 1  # read anew by every replay
-    assert settings(Other(**values)) == same
+    assert graph_key(Other(**values)) == same
     ring = Other()
     ring.ring = ring
-    hash(settings(ring))
-    hash(settings(Other(x=torch.eye(2).to_sparse())))
+    hash(graph_key(ring))
+    hash(graph_key(Other(x=torch.eye(2).to_sparse())))
     objective = Module(1.0)
-    before = settings(objective)
+    before = graph_key(objective)
     objective.weight = 2.0
-    assert settings(objective) != before
+    assert graph_key(objective) != before
 
 
 def test_what_has_no_settings_keeps_its_address():
     """Arrays made one after the other lie where the one before lay, unless a key keeps that alive."""
-    keys = [settings(Other(goal=np.full(3, float(n)))) for n in range(5)]
+    keys = [graph_key(Other(goal=np.full(3, float(n)))) for n in range(5)]
     assert len(set(keys)) == 5
