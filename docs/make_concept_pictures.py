@@ -22,7 +22,7 @@ from franka_wm.evaluation.projection import principal_components
 from franka_wm.live.commanded import KinematicModel, commanded_path
 from franka_wm.models.masks import make_masks
 from franka_wm.planning import registry
-from franka_wm.policies.scripted import OraclePolicy, SmoothRandomPolicy
+from franka_wm.policies.scripted import IKPolicy, SmoothRandomPolicy
 from franka_wm.report.bars import bars_figure
 from franka_wm.report.figure import finish_axes, new_figure, save_figure
 from franka_wm.report.frames import mask_figure, strip_figure
@@ -55,7 +55,7 @@ def environment() -> None:
         image_size=96,
     )
     env = FrankaEnv(config, num_envs=1, device="cpu", seed=4)
-    policy = OraclePolicy(env.kinematics, config)
+    policy = IKPolicy(env.kinematics, config)
     state, rows = env.reset(), {}
     for _ in range(11):
         kinds = torch.unique(state["segmentation"], return_inverse=True)[1].float()

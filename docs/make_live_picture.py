@@ -17,7 +17,7 @@ from selenium.webdriver.chrome.service import Service
 from franka_wm.commands.view import parse
 from franka_wm.live.page import Page
 from franka_wm.live.session import Session
-from franka_wm.live.view import build
+from franka_wm.live.stage import build
 
 PICTURE = Path(__file__).parent / "images" / "live.png"
 FLAGS = (

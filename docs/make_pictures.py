@@ -30,7 +30,9 @@ def main() -> None:
     write_png(tile_frames(torch.as_tensor(large).unsqueeze(0), columns=6)[0], FOLDER / "observations.png")
 
     experts = [
-        expert_at_work(task, step) for task in ("lift", "push", "pick", "stack") for step in (0, 22, 50)
+        expert_at_work(task, step)
+        for task in ("lift", "push", "pick", "stack", "drawer", "peg")
+        for step in ((0, 34, 80) if task == "peg" else (0, 22, 50))
     ]
     write_png(tile_frames(torch.stack(experts).unsqueeze(0), columns=6)[0], FOLDER / "experts.png")
 
