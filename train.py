@@ -29,22 +29,22 @@ def main(cfg: DictConfig) -> None:
     from franka_wm.training.trainer import Trainer
 
     run = start(cfg)
-    env, judge = run.build_environments()
+    env, eval_env = run.build_environments()
     replay, spaces = run.build_experience(env)
     pretrain(run, env, replay, spaces)
     model = build.make_model(run.settings, spaces, run.device)
-    acting = build.make_agent_policies(run.settings, model, env, spaces, purpose="training")
-    judged = build.make_agent_policies(run.settings, model, judge, spaces)
+    policies = build.make_agent_policies(run.settings, model, env, spaces, purpose="training")
+    eval_policies = build.make_agent_policies(run.settings, model, eval_env, spaces)
     trainer = Trainer(
         env=env,
         learner=Learner(model, **run.settings.learner_options),
         replay=replay,
-        policies=acting,
+        policies=policies,
         actor=run.settings.actor,
         settings=run.settings,
         folder=run.folder,
         loggers=run.loggers,
-        evaluate=during_training(run.settings.evaluation, judge, judged),
+        evaluate=during_training(run.settings.evaluation, eval_env, eval_policies),
         spaces=spaces,
         validation=run.validation,
         diagnose=diagnose_training,
@@ -54,13 +54,13 @@ def main(cfg: DictConfig) -> None:
     trainer.fit()
     if trainer.interrupted:
         run.stop()
-    if judged:
-        found = evaluate_run(run.settings, run.folder, judge, judged, counters=trainer.counters)
+    if eval_policies:
+        found = evaluate_run(run.settings, run.folder, eval_env, eval_policies, counters=trainer.counters)
         report_run(
             run.settings,
             run.folder,
-            judge,
-            judged,
+            eval_env,
+            eval_policies,
             found,
             rows=trainer.rows,
             log=trainer.record,

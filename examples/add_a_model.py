@@ -1,7 +1,7 @@
 """A family of your own: a linear latent model with reward, value and no policy network.
 
     python train.py plugins=[examples.add_a_model] hydra.searchpath=[file://examples/conf] \\
-        model=linear collector.acts=planner
+        model=linear collector.policy=planner
 
 `examples/conf/model/linear.yaml` holds its hyper-parameters.
 """

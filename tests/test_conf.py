@@ -115,8 +115,9 @@ def test_an_option_by_its_former_name_names_the_present_one() -> None:
 
 
 def test_checkpoints_with_former_names_are_read_with_the_present_ones() -> None:
-    old = {"model": {"name": "muzero", "fresh_values": True, "unroll": 3}}
+    old = {"model": {"name": "muzero", "fresh_values": True, "unroll": 3}, "collector": {"acts": "ik"}}
     config = OmegaConf.create({**old, "whole_run": old})
     use_present_names(config)
     present = {"name": "muzero", "reanalyze": True, "unroll": 3}
     assert config.model == present and config.whole_run.model == present
+    assert config.collector == config.whole_run.collector == {"policy": "ik"}

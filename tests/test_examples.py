@@ -44,14 +44,14 @@ RUN = ("scale=smoke", "logger=none", "evaluation.video_episodes=0", "device=cpu"
     "arguments",
     [
         ("plugins=[examples.add_a_task]", "env.task=raise_tool"),
-        ("plugins=[examples.add_a_model]", CONF, "model=linear", "collector.acts=planner"),
+        ("plugins=[examples.add_a_model]", CONF, "model=linear", "collector.policy=planner"),
         ("plugins=[examples.add_a_planner]", CONF, "planner=shooting"),
         (
             "plugins=[examples.add_a_model,examples.add_a_planner]",
             CONF,
             "model=linear",
             "planner=shooting",
-            "collector.acts=planner",
+            "collector.policy=planner",
         ),
     ],
     ids=["task", "model", "planner", "both"],

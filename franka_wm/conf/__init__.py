@@ -20,7 +20,7 @@ SCALES = ("smoke", "laptop", "gpu")
 """The columns of ``${at_scale:…}`` and ``${at_size:…}``."""
 
 
-RENAMED = {"model.fresh_values": "model.reanalyze"}
+RENAMED = {"model.fresh_values": "model.reanalyze", "collector.acts": "collector.policy"}
 """Former names of options -> their present names."""
 
 

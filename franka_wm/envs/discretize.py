@@ -1,4 +1,4 @@
-"""The arm for learners that choose among a few moves."""
+"""The arm with discrete actions."""
 
 from __future__ import annotations
 
@@ -23,14 +23,13 @@ def discrete_action_table(action_dim: int, magnitude: float = 1.0, include_noop:
 
     Returns:
         (2·A + 1, A) float32, or (2·A, A) without the no-op. Row 2·i is +magnitude on axis i, row 2·i + 1 is
-        −magnitude, and the **last** row is the no-op: the indices of moves do not depend on it.
+        −magnitude, and the **last** row is the no-op: the other indices do not depend on it.
     """
     check_whole("action_dim", action_dim)
     if not (math.isfinite(magnitude) and 0.0 < magnitude <= 1.0):
         raise UserError(f"magnitude={magnitude}: must be above 0 and at most 1, where actions are clipped")
-    moves = torch.eye(action_dim).repeat_interleave(2, 0)
-    moves[1::2] *= -1.0
-    table = magnitude * moves
+    table = magnitude * torch.eye(action_dim).repeat_interleave(2, 0)
+    table[1::2] *= -1.0
     return torch.cat([table, torch.zeros(1, action_dim)]) if include_noop else table
 
 
@@ -48,7 +47,7 @@ class DiscreteActions(Transform):
         magnitude, include_noop: As in :func:`discrete_action_table`.
 
     Attributes:
-        table: (moves, A) float32, a buffer that follows the environment's device.
+        table: (number of actions, A) float32, a buffer that follows the environment's device.
 
     Example::
 

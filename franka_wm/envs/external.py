@@ -117,7 +117,7 @@ class ExternalEnv(TransformedEnv):
 
     @property
     def action_dim(self) -> int:
-        """Size of a continuous action, A; the number of moves where actions are discrete."""
+        """Size of a continuous action, A; the number of actions where they are discrete."""
         spec = self.action_spec
         return spec.shape[-1] if spec.dtype.is_floating_point else int(spec.n)  # type: ignore[attr-defined]
 

@@ -156,7 +156,7 @@ def imagined_beside_real(
         model: With ``next``, and ``embed`` where the family has it: the decoder reads what it gives.
         decoder: Of :func:`train_decoder`.
         latent: (Z), at the first image.
-        actions: (H, A), or (H) numbered moves, that were taken.
+        actions: (H, A), or (H) discrete ones, that were taken.
         images: (H + 1, S, S, 3) uint8, what happened.
 
     Raises:

@@ -43,7 +43,7 @@ def horizon_error(
     Args:
         model: With ``next``.
         latents: (E, T + 1, Z), the encoded truth.
-        actions: (E, T, A), or (E, T) of numbered moves.
+        actions: (E, T, A), or (E, T) of discrete ones.
         horizon: Largest h; at most T.
         valid: (E, T + 1) bool, which latents are of the first episode; all if not given.
 

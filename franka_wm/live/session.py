@@ -403,7 +403,7 @@ class Session:
         if plan is not None and plan.dim() == 4:  # iCEM's holds its mean first, then elites
             plan = plan[:, 0]
         if plan is None or not plan.is_floating_point() or plan.shape[2:] != (self.arm.action_dim,):
-            return None  # no plan, or one of numbered moves
+            return None  # no plan, or one of discrete actions
         return commanded_path(self.arm, plan)
 
     def _synchronize(self) -> None:

@@ -45,7 +45,7 @@ def make_env(
 ) -> Any:
     """The environment that ``run.env`` describes; ``changes`` override fields of its config.
 
-    For a model that chooses among moves, the arm's actions are numbers of moves. Its episodes are those of training
+    For a model of discrete actions the arm takes numbers of rows of a table. Its episodes are those of training
     unless ``seed`` says otherwise.
     """
     described = run.env.changed(**changes)
@@ -76,25 +76,25 @@ def make_evaluation_env(run: RunSettings, *, num_envs: int | None = None, **chan
 # -- models -------------------------------------------------------------------------------------------------
 
 
-def make_model(run: RunSettings, surroundings: Any, device: torch.device | str | None = None) -> Any:
+def make_model(run: RunSettings, spaces: Any, device: torch.device | str | None = None) -> Any:
     """The world model that ``run.model`` names.
 
     Args:
-        surroundings: :class:`Spaces`, or an environment.
+        spaces: :class:`Spaces`, or an environment.
         device: The environment's if there is one.
     """
-    if not isinstance(surroundings, Spaces):
-        device = surroundings.device if device is None else device
-        surroundings = Spaces.of_env(surroundings)
+    if not isinstance(spaces, Spaces):
+        device = spaces.device if device is None else device
+        spaces = Spaces.of_env(spaces)
     name, values = run.model.name, run.model.options
-    spaces = surroundings.only(run.model.observations, f"model={name}")
+    spaces = spaces.only(run.model.observations, f"model={name}")
     run.model.family.validate(values)
     discrete = run.is_discrete
     if discrete and not spaces.num_actions:
-        raise UserError(f"model={name} chooses among moves; this environment's actions are continuous")
+        raise UserError(f"model={name} has discrete actions; this environment's actions are continuous")
     if not discrete and not spaces.action_dim:
         raise UserError(
-            f"model={name} needs continuous actions, here are {spaces.num_actions} moves; try model=muzero"
+            f"model={name} needs continuous actions, here are {spaces.num_actions} discrete ones; try model=muzero"
         )
     actions = {"num_actions": spaces.num_actions} if discrete else {"action_dim": spaces.action_dim}
     sizes: dict[str, Any] = {"observation_sizes": spaces.observation_sizes}
@@ -119,7 +119,7 @@ def make_planner(run: RunSettings, actions: int) -> Any:
     """The planner that ``run.planner`` names.
 
     Args:
-        actions: Size of a continuous action, or the number of moves.
+        actions: Size of a continuous action, or how many discrete actions there are.
     """
     name, values, discrete = run.planner.name, run.planner.options, run.is_discrete
     try:
@@ -128,7 +128,7 @@ def make_planner(run: RunSettings, actions: int) -> Any:
             fitting += (
                 ["gumbel"] if discrete else []
             )  # mcts with other settings: a name in conf/planner alone
-            what = "chooses among moves" if discrete else "has continuous actions"
+            what = "has discrete actions" if discrete else "has continuous actions"
             typed = "gumbel" if values.get("variant") == "gumbel" else name
             raise UserError(
                 f"planner={typed}: model={run.model.name} {what}; use planner={' or '.join(fitting)}"
@@ -230,10 +230,10 @@ def make_scripted_policies(env: Any, *, seed: int = 0, smoothness: float = 0.7) 
         "random": SmoothRandomPolicy(size, smoothness=smoothness, generator=generator),
     }
     if discrete:
-        moves: Any = env.transform
-        scripted = {name: DiscretePolicy(policy, moves.table) for name, policy in scripted.items()}
+        numbered: Any = env.transform
+        scripted = {name: DiscretePolicy(policy, numbered.table) for name, policy in scripted.items()}
         if not env.config.has_gripper:
-            scripted["ik"] = DiscreteIKPolicy(env.kinematics, env.config, moves.table)
+            scripted["ik"] = DiscreteIKPolicy(env.kinematics, env.config, numbered.table)
     elif arm and env.config.has_gripper:
         task = env.simulation.task
         fits = env.config.gravity_compensation and env.config.action_mode != "ee_delta"

@@ -13,9 +13,9 @@ from franka_wm.models import WorldModel
 from franka_wm.planning import registry
 from franka_wm.training import build
 from franka_wm.training.loggers import check_loggers
-from franka_wm.training.room import check_memory
 from franka_wm.training.settings import RunSettings
 from franka_wm.training.spaces import Spaces
+from franka_wm.training.storage_budget import check_memory
 
 
 def check(run: RunSettings) -> None:

@@ -98,7 +98,7 @@ class Run:
     def build_environments(self) -> tuple[Any, Any]:
         """The training worlds and the evaluation worlds, compiled and ready; ``None`` where there are none.
 
-        A run on recorded data trains in no world; without an environment (``env=none``) none judges it either.
+        A run on recorded data trains in no world; without an environment (``env=none``) none evaluates it either.
         """
         if self.settings.env.kind == "none":
             return None, None
@@ -108,15 +108,15 @@ class Run:
             worlds = f"{self.settings.collector.num_envs} training and {worlds}"
         compiling = "on a machine's first start this compiles kernels for a minute or two"
         with announced(f"building {worlds}" + (f"; {compiling}" if self.settings.is_arm else "")):
-            judge = build.make_evaluation_env(self.settings)
+            eval_env = build.make_evaluation_env(self.settings)
             env = build.make_env(self.settings) if gathers else None
-            for one in (env, judge):
+            for one in (env, eval_env):
                 if one is not None:
                     with seeded(0):  # how many worlds there are must not decide what a run draws later
                         one.step_and_maybe_reset(one.rand_action(one.reset()))
                     one.statistics()
                     one.set_seed(derive_seed("training" if one is env else "evaluation", self.settings.seed))
-        return env, judge
+        return env, eval_env
 
     def build_experience(self, env: Any) -> tuple[Any, Any]:
         """Where batches come from, and what a model must know of it: ``sample()`` and its :class:`Spaces`."""
@@ -192,7 +192,7 @@ def start(cfg: DictConfig) -> Run:
     torch.manual_seed(derive_seed("weights", settings.seed))
     if device.type == "cuda":
         torch.set_float32_matmul_precision("high")
-    claim(folder)
+    lock_run_dir(folder)
     problem = occupied(folder, settings.resume)  # also of a sweep, whose folders only Hydra knows
     if problem is not None:
         raise UserError(problem)
@@ -213,10 +213,10 @@ def check_once(settings: RunSettings) -> None:
     _checked = settings
 
 
-_CLAIMED: list[Any] = []  # open files: their locks last as long as the process
+_LOCKS: list[Any] = []  # open files: their locks last as long as the process
 
 
-def claim(folder: Path) -> None:
+def lock_run_dir(folder: Path) -> None:
     """Locks a run's folder for as long as this process lives, so that no two runs write into one.
 
     Raises:
@@ -230,7 +230,7 @@ def claim(folder: Path) -> None:
         raise UserError(
             f"another run is writing into {folder}; choose a folder with hydra.run.dir=…"
         ) from error
-    _CLAIMED.append(file)
+    _LOCKS.append(file)
 
 
 def resumed(cfg: DictConfig, overrides: list[str]) -> tuple[Any, DictConfig]:

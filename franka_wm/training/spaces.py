@@ -1,4 +1,4 @@
-"""What a model must know of its surroundings: sizes of observations and actions, length of episodes, rewards."""
+"""What a model must know of its environment: sizes of observations and actions, length of episodes, rewards."""
 
 from __future__ import annotations
 
@@ -24,8 +24,8 @@ class Spaces:
     Attributes:
         observation_sizes: Vector observations: key → size of the last dimension.
         image_sizes: Images, uint8: key → (height, width, channels).
-        action_dim: Size of a continuous action; 0 where actions are numbers of moves.
-        num_actions: How many moves there are; 0 where actions are continuous.
+        action_dim: Size of a continuous action; 0 where actions are discrete.
+        num_actions: How many discrete actions there are; 0 where actions are continuous.
         episode_length: Steps, at most.
         reward_bounds: The least and the largest reward of a step; ``None`` where unknown.
         terminates: Whether episodes may end by more than their length.
@@ -97,13 +97,13 @@ class Spaces:
             "objects": config.object_dim,
             "contacts": config.contact_dim,
         }
-        moves = discrete_action_table(config.action_dim).shape[0]
+        rows = discrete_action_table(config.action_dim).shape[0]
         return cls(
             observation_sizes={key: size for key, size in vectors.items() if key in config.observations}
             | {GOAL: 3},
             image_sizes=images,
             action_dim=0 if discrete else config.action_dim,
-            num_actions=moves if discrete else 0,
+            num_actions=rows if discrete else 0,
             episode_length=config.episode_length,
             reward_bounds=make_task(config).reward_bounds,
             terminates=config.terminate_on_success,

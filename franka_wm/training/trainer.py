@@ -23,9 +23,9 @@ from franka_wm.training.checkpoint import Checkpoint, save_checkpoint
 from franka_wm.training.learner import Learner
 from franka_wm.training.loggers import log_numbers
 from franka_wm.training.moment import draws, go_on_drawing, put_back, restorable, same_worlds, worlds_now
-from franka_wm.training.room import fill, held, left_out
 from franka_wm.training.settings import RunSettings, plain
 from franka_wm.training.spaces import Spaces
+from franka_wm.training.storage_budget import fill, filled_bytes, reason_to_leave_out
 from franka_wm.training.tree import damaged
 
 OTHER_DEVICE = (
@@ -330,7 +330,7 @@ class Trainer:
             "whole_run" not in self.settings.values or self.learner.updates < self.settings.trainer.updates
         )
         if self.env is not None and wanted is not False and len(self.replay) and needed:
-            why = left_out(held(self.replay), self.folder, last=last, wanted=wanted)
+            why = reason_to_leave_out(filled_bytes(self.replay), self.folder, last=last, wanted=wanted)
             replay = self.experience() if why is None else None
             if why is not None and (last or not self._said):
                 say(f"  {why}")

@@ -11,7 +11,7 @@ from tensordict import TensorDict, TensorDictBase
 from franka_wm.data.captured import CapturedSampling
 from franka_wm.data.replay import make_replay
 from franka_wm.errors import UserError
-from franka_wm.training.room import held
+from franka_wm.training.storage_budget import filled_bytes
 
 N, LENGTH, COUNT, WINDOW = 3, 4, 3, 2
 on_gpu = pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
@@ -103,7 +103,7 @@ def test_each_picture_is_kept_once(played) -> None:
     plain.extend(played[:, :9])
     assert (played == before).all()
     pictures = 2 * len(KEYS) * 16 * 16 * 3 * 9 * N
-    assert held(plain) - held(stacked) == (COUNT - 1) * pictures
+    assert filled_bytes(plain) - filled_bytes(stacked) == (COUNT - 1) * pictures
     assert stacked[:]["pixels"].shape[-1] == 3
 
 

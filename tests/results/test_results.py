@@ -378,7 +378,9 @@ def test_a_benchmark(tmp_path) -> None:
 
 
 def test_train_accepts_every_declared_command(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("franka_wm.training.room.free_memory", lambda device: None)  # of a GPU's machine
+    monkeypatch.setattr(
+        "franka_wm.training.storage_budget.free_memory", lambda device: None
+    )  # of a GPU's machine
     from franka_wm.training.check import check
     from franka_wm.training.settings import RunSettings
 

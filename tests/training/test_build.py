@@ -104,8 +104,8 @@ def test_environments_of_a_run(settled) -> None:
     )
     env = build.make_env(cfg)
     assert env.num_envs == 2 and set(env.config.observations) == {"pixels", "state", "joint_target"}
-    judge = build.make_evaluation_env(cfg, num_envs=3)
-    assert judge.num_envs == 3 and set(judge.config.observations) == {"state", "joint_target"}
+    eval_env = build.make_evaluation_env(cfg, num_envs=3)
+    assert eval_env.num_envs == 3 and set(eval_env.config.observations) == {"state", "joint_target"}
 
 
 @pytest.mark.parametrize(
@@ -120,8 +120,8 @@ def test_environments_of_a_run(settled) -> None:
         ("env.episode_length=2", "episode_length"),
         ("collector.num_envs=0", "num_envs"),
         ("collector.num_envs=2.5", "num_envs"),
-        ("collector.acts=fly", "acts"),
-        ("collector.acts=smooth", "acts=smooth: this policy is called random now"),
+        ("collector.policy=fly", "policy"),
+        ("collector.policy=smooth", "policy=smooth: this policy is called random now"),
         ("evaluation.during=[oracle]", "during=oracle: this policy is called ik now"),
         ("collector.steps_per_batch=0", "steps_per_batch"),
         ("collector.seed_steps=0", "seed_steps"),

@@ -20,7 +20,7 @@ from franka_wm.training import build
 from franka_wm.training.check import check
 from franka_wm.training.learner import Learner
 from franka_wm.training.load import load_agent
-from franka_wm.training.run import _CLAIMED, Run, claim
+from franka_wm.training.run import _LOCKS, Run, lock_run_dir
 from franka_wm.training.settings import RunSettings
 from franka_wm.training.stages import pretrain
 from franka_wm.training.trainer import Trainer
@@ -160,11 +160,11 @@ def test_no_world_and_no_data(settled) -> None:
 
 def test_one_run_in_a_folder(tmp_path: Path) -> None:
     """The second process is refused while the first one lives."""
-    claim(tmp_path)
-    refused = run_in_fork(lambda: claim(tmp_path), tmp_path)
+    lock_run_dir(tmp_path)
+    refused = run_in_fork(lambda: lock_run_dir(tmp_path), tmp_path)
     assert refused.returncode and "another run" in refused.stderr
-    fcntl.flock(_CLAIMED.pop(), fcntl.LOCK_UN)
-    assert run_in_fork(lambda: claim(tmp_path), tmp_path).returncode == 0
+    fcntl.flock(_LOCKS.pop(), fcntl.LOCK_UN)
+    assert run_in_fork(lambda: lock_run_dir(tmp_path), tmp_path).returncode == 0
 
 
 def test_no_checkpoint(tmp_path: Path) -> None:
@@ -176,11 +176,11 @@ def test_no_checkpoint(tmp_path: Path) -> None:
     ("overrides", "named"),
     [
         (["planner=mcts"], "continuous"),
-        (["model=muzero"], "moves"),
+        (["model=muzero"], "discrete actions"),
         (["objective=goal_image"], "goal_pixels"),
         (["model=lewm"], "pixels"),
-        (["model=muzero", "planner=mcts", "collector.acts=random"], "planner"),
-        (["model=jepa", "env=reach_pixels", "collector.acts=planner"], "random"),
+        (["model=muzero", "planner=mcts", "collector.policy=random"], "planner"),
+        (["model=jepa", "env=reach_pixels", "collector.policy=planner"], "random"),
         (["model=lewm", "env=reach_pixels"], "goal_pixels"),
         (["export=lerobot", "export.format=gif"], "gif"),
         (["export=lerobot", "env.episode_length=50"], "whole episode"),

@@ -28,8 +28,8 @@ HALF = 15  # amid the updates of a batch, which has 10
 
 KINDS = {
     "policy": (),
-    "planner": ("collector.acts=planner",),
-    "random": ("collector.acts=random",),
+    "planner": ("collector.policy=planner",),
+    "random": ("collector.policy=random",),
     "exploring": ("collector.noise=0.4", "collector.planner_worlds=1", "env.goal_sampling=reachable"),
     "moves": ("model=muzero", "planner=gumbel"),
     "pictures": (
@@ -41,7 +41,7 @@ KINDS = {
         "env.randomization.action_noise=0.1",
         "env.randomization.observation_noise=0.01",
     ),
-    "memory": ("model=lewm", "env=reach_goal_image", "env.image_size=32", "planner=icem", "collector.acts=planner"),
+    "memory": ("model=lewm", "env=reach_goal_image", "env.image_size=32", "planner=icem", "collector.policy=planner"),
 }  # fmt: skip
 
 

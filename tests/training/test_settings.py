@@ -21,7 +21,7 @@ OUT_OF_RANGE = {
     "seed": [-1],
     "env.frame_stack": [0],
     "env.episode_length": [0],
-    "collector.acts": ["judge"],
+    "collector.policy": ["judge"],
     "collector.num_envs": [0],
     "collector.steps_per_batch": [0],
     "collector.seed_steps": [0],

@@ -40,21 +40,21 @@ def kept() -> dict[str, dict[str, torch.Tensor]]:
 
 
 @pytest.mark.parametrize(
-    ("acts", "name"),
-    [("policy", name) for name in OTHERWISE] + [(acts, "more, oftener") for acts in ("random", "planner")],
+    ("actor", "name"),
+    [("policy", name) for name in OTHERWISE] + [(actor, "more, oftener") for actor in ("random", "planner")],
 )
-def test_what_is_looked_at_does_not_change_the_weights(acts: str, name: str, kept, train, tmp_path) -> None:
-    acts = f"collector.acts={acts}"
-    if acts not in kept:  # a run that nobody looks at
-        kept[acts] = weights(train(acts, "evaluation.during=[]", folder=tmp_path / "alone"))
-    run = train(acts, *OTHERWISE[name])
+def test_what_is_looked_at_does_not_change_the_weights(actor: str, name: str, kept, train, tmp_path) -> None:
+    actor = f"collector.policy={actor}"
+    if actor not in kept:  # a run that nobody looks at
+        kept[actor] = weights(train(actor, "evaluation.during=[]", folder=tmp_path / "alone"))
+    run = train(actor, *OTHERWISE[name])
     if "during=[]" not in OTHERWISE[name][0]:
         rows = (run.extra() or {})["rows"]
         assert any(key.startswith("eval/") for row in rows for key in row)
     if "log_every" in OTHERWISE[name][1]:
         assert len((run.extra() or {})["rows"]) == 3
     got = weights(run)
-    assert [key for key in got if not torch.equal(got[key], kept[acts][key])] == []
+    assert [key for key in got if not torch.equal(got[key], kept[actor][key])] == []
 
 
 def test_other_simulators_are_not_disturbed_either(train, tmp_path: Path) -> None:

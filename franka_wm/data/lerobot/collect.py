@@ -163,7 +163,7 @@ class _Choice:
 
 
 def _table(env: Any) -> Any:
-    """The moves of an environment with discrete actions."""
+    """The actions of an environment with discrete ones, a row each."""
     if env.action_spec.dtype.is_floating_point:
         return None
     return env.transform.table

@@ -63,7 +63,7 @@ class EpisodeCutter:
         schema: What is kept.
         seed: Of the run: the first number of the feature ``seed``.
         first_episode: (worlds,) numbers of the episodes that the first batch starts with; 0 if not given.
-        discrete: Table (moves, A) that an integer action is a row of; for continuous actions ``None``.
+        discrete: Table (number of actions, A) that an integer action is a row of; for continuous actions ``None``.
     """
 
     def __init__(

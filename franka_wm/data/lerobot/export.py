@@ -149,7 +149,7 @@ def export_run(settings: Mapping[str, Any], data: TensorDictBase | None, *, fold
         config=arm_config(settings),
         out=wanted["out"] or folder / "dataset",
         seed=int(settings["seed"]),
-        policy=f"training run, {settings['collector']['acts']}",
+        policy=f"training run, {settings['collector']['policy']}",
         settings=settings,
         format=wanted["format"],
         workers=int(wanted["workers"]),

@@ -27,7 +27,7 @@ MOST_UPDATES = 10**12
 class CollectorSettings:
     """Who gathers experience, in how many worlds."""
 
-    acts: str = choice("auto", of=("auto", *POLICIES))
+    policy: str = choice("auto", of=("auto", *POLICIES))
     num_envs: int = whole(least=1, most=10**6)
     steps_per_batch: int = whole(least=1, most=10**6)
     seed_steps: int = whole(least=1)

@@ -93,7 +93,7 @@ class RunSettings:
         for name in (*GROUPS, "env", "model", "planner", "logger"):
             if not isinstance(values.get(name, {}), Mapping):
                 raise UserError(f"{name}={values[name]!r}: must be a group of options")
-        refuse_old_name("collector.acts", values.get("collector", {}).get("acts"))
+        refuse_old_name("collector.policy", values.get("collector", {}).get("policy"))
         for name in _listed(values.get("evaluation", {}).get("during")):
             refuse_old_name("evaluation.during", name)
         groups = {}
@@ -217,15 +217,15 @@ class RunSettings:
 
     @cached_property
     def actor(self) -> str:
-        """The name of the policy that gathers experience, by ``collector.acts``.
+        """The name of the policy that gathers experience, by ``collector.policy``.
 
         Raises:
             UserError: The model's family does not have it.
         """
-        acts, family = self.collector.acts, self.model.family
+        policy, family = self.collector.policy, self.model.family
         there = {"planner": family.has_next, "policy": family.has_policy}
         searched = bool(family.replay_keys)  # the loss needs what the search found
-        if acts == "auto":
+        if policy == "auto":
             if searched:
                 return "planner"
             if there["policy"]:
@@ -233,12 +233,12 @@ class RunSettings:
             # A planner without a policy's candidates takes far longer to decide than the worlds to step, and a model
             # that is given goals by their images can learn from any motion.
             return "planner" if self.objective_name == "reward_value" else "random"
-        if not there.get(acts, True) or (searched and acts != "planner"):
+        if not there.get(policy, True) or (searched and policy != "planner"):
             fitting = "planner" if there["planner"] else "random"
             raise UserError(
-                f"collector.acts={acts}: model={self.model.name} cannot; use collector.acts={fitting}"
+                f"collector.policy={policy}: model={self.model.name} cannot; use collector.policy={fitting}"
             )
-        return acts
+        return policy
 
     def planned_steps(self, updates: int = 0) -> int:
         """Steps that each world will make until the end of the run, after so many ``updates``."""

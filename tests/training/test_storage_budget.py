@@ -10,13 +10,13 @@ from torchrl.data import LazyTensorStorage, ReplayBuffer
 
 from franka_wm.data.replay import make_replay
 from franka_wm.errors import UserError
-from franka_wm.training import room
+from franka_wm.training import storage_budget
 
 
 def test_size_of_what_is_filled() -> None:
     replay = ReplayBuffer(storage=LazyTensorStorage(10 * 4, ndim=2), batch_size=2)
     replay.extend(TensorDict({"x": torch.zeros(4, 5, 3)}, [4, 5]))
-    assert room.held(replay) == replay[:].bytes()
+    assert storage_budget.filled_bytes(replay) == replay[:].bytes()
 
 
 @pytest.mark.parametrize(
@@ -35,8 +35,8 @@ def test_size_of_what_is_filled() -> None:
 def test_left_out(
     size: float, free: float, last: bool, wanted: bool | None, why: str | None, tmp_path: Path, monkeypatch
 ) -> None:
-    monkeypatch.setattr(room.shutil, "disk_usage", lambda folder: SimpleNamespace(free=free))
-    said = room.left_out(int(size), tmp_path / "not" / "yet", last=last, wanted=wanted)
+    monkeypatch.setattr(storage_budget.shutil, "disk_usage", lambda folder: SimpleNamespace(free=free))
+    said = storage_budget.reason_to_leave_out(int(size), tmp_path / "not" / "yet", last=last, wanted=wanted)
     if why is None:
         assert said is None
     else:
@@ -65,23 +65,23 @@ def test_a_replay_that_memory_cannot_hold_is_refused(monkeypatch, settled) -> No
             frame_stack=stack,
             stacked=["pixels"],
         )
-        monkeypatch.setattr(room, "free_memory", lambda device, most=4000 * per_step: most)
-        room.fill(replay, batch, cfg)
+        monkeypatch.setattr(storage_budget, "free_memory", lambda device, most=4000 * per_step: most)
+        storage_budget.fill(replay, batch, cfg)
         replay.empty()
-        monkeypatch.setattr(room, "free_memory", lambda device, most=4000 * per_step - 1: most)
+        monkeypatch.setattr(storage_budget, "free_memory", lambda device, most=4000 * per_step - 1: most)
         with pytest.raises(UserError, match=r"at most replay\.capacity=3599 would") as caught:
-            room.fill(replay, batch, cfg)
+            storage_budget.fill(replay, batch, cfg)
         assert "\n" not in str(caught.value) and len(replay) == 0
     short = cfg.changed(collector={"seed_steps": 999})
-    room.fill(replay, batch, short)  # it never fills what it may
+    storage_budget.fill(replay, batch, short)  # it never fills what it may
     with pytest.raises(UserError, match="do not fit"):  # beside a checkpoint's
-        room.fill(replay, batch, short, restored=True)
+        storage_budget.fill(replay, batch, short, restored=True)
     longer = cfg.changed(trainer={"updates": 30}, collector={"seed_steps": 999})
     with pytest.raises(UserError, match="do not fit"):
-        room.fill(replay, batch, longer)
-    room.fill(replay, batch, longer, updates=30)  # made before
-    monkeypatch.setattr(room, "free_memory", lambda device: None)  # not known: not refused
-    room.fill(replay, batch, cfg)
+        storage_budget.fill(replay, batch, longer)
+    storage_budget.fill(replay, batch, longer, updates=30)  # made before
+    monkeypatch.setattr(storage_budget, "free_memory", lambda device: None)  # not known: not refused
+    storage_budget.fill(replay, batch, cfg)
 
 
 def test_what_cannot_be_allocated_is_one_line_as_well(monkeypatch, settled) -> None:
@@ -93,9 +93,9 @@ def test_what_cannot_be_allocated_is_one_line_as_well(monkeypatch, settled) -> N
     )
     replay = make_replay(capacity=10**14, num_envs=4, window=2, batch_size=2, device="cpu")
     with pytest.raises(UserError, match=r"replay\.capacity=100000000000000: .* cannot be allocated on cpu"):
-        room.fill(replay, TensorDict({"x": torch.zeros(4, 5, 3)}, [4, 5]), cfg)
+        storage_budget.fill(replay, TensorDict({"x": torch.zeros(4, 5, 3)}, [4, 5]), cfg)
 
 
 def test_free_memory_is_that_of_the_machine() -> None:
-    free = room.free_memory(torch.device("cpu"))
+    free = storage_budget.free_memory(torch.device("cpu"))
     assert free is None or 1e7 < free < 1e14

@@ -110,14 +110,14 @@ def fill(
         ) from error
 
 
-def held(replay: Any) -> int:
+def filled_bytes(replay: Any) -> int:
     """Bytes that the filled part of a replay of TorchRL's holds."""
     storage = replay.storage
     filled, slots = storage._len_along_dim0, storage._storage.shape[0]
     return storage._storage.bytes() * filled // slots
 
 
-def left_out(size: int, folder: Path, *, last: bool, wanted: bool | None) -> str | None:
+def reason_to_leave_out(size: int, folder: Path, *, last: bool, wanted: bool | None) -> str | None:
     """Why a checkpoint in ``folder`` is written without ``size`` bytes of experience, in a line; ``None``: it is not.
 
     Args:
