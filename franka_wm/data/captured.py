@@ -89,6 +89,9 @@ class CapturedSampling:
         time, world, crossing = sampler.choose(data, draw, self._oldest, size)
         storage = self.replay.storage
         self._batch = storage.windows(time, world) if isinstance(storage, StackStorage) else data[time, world]
-        if isinstance(self.replay, WindowReplay) and self.replay.hindsight is not None:
-            self.replay.hindsight(self._batch, data, time, world, self._newest)
+        if isinstance(self.replay, WindowReplay):
+            if self.replay.hindsight is not None:
+                self.replay.hindsight(self._batch, data, time, world, self._newest)
+            if self.replay.demonstrations is not None:
+                self.replay.demonstrations(self._batch)
         self._crossing = crossing

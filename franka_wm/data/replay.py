@@ -9,6 +9,7 @@ import torch
 from torchrl.data import LazyTensorStorage, ReplayBuffer
 from torchrl.data.replay_buffers import RoundRobinWriter, Sampler
 
+from franka_wm.data.demonstrations import Demonstrations
 from franka_wm.data.hindsight import Hindsight
 from franka_wm.data.stacks import BOUNDARY, StackStorage
 from franka_wm.errors import UserError
@@ -150,22 +151,31 @@ class WindowSampler(Sampler):
 
 
 class WindowReplay(ReplayBuffer):
-    """A replay buffer of windows, a share of which gets goals in hindsight where that is asked for.
+    """A replay buffer of windows: a share of them may get goals in hindsight, another may be demonstrations.
 
     Args:
-        hindsight: Relabels each batch in place; ``None``: batches are as they were recorded.
+        hindsight: Relabels each batch in place; ``None``: batches are as they were gathered.
+        demonstrations: Replace windows in place; ``None``: batches are of this buffer alone.
         options: Of TorchRL's buffer.
     """
 
-    def __init__(self, *, hindsight: Hindsight | None = None, **options: Any):
+    def __init__(
+        self,
+        *,
+        hindsight: Hindsight | None = None,
+        demonstrations: Demonstrations | None = None,
+        **options: Any,
+    ):
         super().__init__(**options)
-        self.hindsight = hindsight
+        self.hindsight, self.demonstrations = hindsight, demonstrations
 
     def sample(self, batch_size: int | None = None, return_info: bool = False) -> Any:
         batch, info = super().sample(batch_size, return_info=True)
         if self.hindsight is not None:
             (time, world), storage = info["index"], cast(Any, self.storage)
             self.hindsight(batch, storage._storage, time, world, newest_step(self))
+        if self.demonstrations is not None:
+            self.demonstrations(batch)
         return (batch, info) if return_info else batch
 
 
@@ -186,6 +196,7 @@ def make_replay(
     frame_stack: int = 1,
     stacked: Sequence[str] = (),
     hindsight: Hindsight | None = None,
+    demonstrations: Demonstrations | None = None,
 ) -> WindowReplay:
     """A buffer of (time, worlds) that is extended with the collector's (worlds, time) batches.
 
@@ -200,6 +211,7 @@ def make_replay(
             samples have stacks again.
         stacked: Keys of such observations.
         hindsight: Relabels a share of each batch with goals that were reached later.
+        demonstrations: Take the place of a share of each batch.
 
     Returns:
         A ``ReplayBuffer`` whose samples have batch size (batch_size, window).
@@ -218,6 +230,7 @@ def make_replay(
     )
     return WindowReplay(
         hindsight=hindsight,
+        demonstrations=demonstrations,
         storage=storage,
         sampler=WindowSampler(writer, length=window, cross_episode=cross_episode, before=before),
         writer=writer,

@@ -365,6 +365,11 @@ class GaussianPolicy(nn.Module):
         log_slope = 2.0 * (math.log(2.0) - raw - F.softplus(-2.0 * raw))
         return torch.tanh(raw), (log_prob - log_slope).sum(-1, keepdim=True)
 
+    def imitation_error(self, z: Tensor, action: Tensor, shown: Tensor) -> Tensor:
+        """Mean squared error (,) of the mode against actions (..., action_dim) where `shown` (..., 1); 0 if nowhere."""
+        error = (self(z, deterministic=True) - action).square().mean(-1, keepdim=True)
+        return (error * shown).sum() / shown.sum().clamp_min(1)
+
 
 class RunningScale(nn.Module):
     """Running 5-95 percentile range of values, at least 1, by which a policy loss is divided.

@@ -79,6 +79,7 @@ class TDMPC2(SimplicialWorldModel):
         rho: weight of unroll step t is rho^t.
         consistency_coef, reward_coef, value_coef, termination_coef: weights of the losses.
         entropy_coef: weight, against scaled values, of `action_dim` times the policy's entropy [nat].
+        imitation_coef: weight of the policy's squared error at the steps of a batch that are `demonstrated`.
         mode_targets: bootstrap from Q at the policy's mode, so that values are those of the policy that is
             evaluated; False, as in the paper: at a sample, which counts the policy's noise as well.
         tau: how far target Q-functions, and the policy loss's scale, move at each update.
@@ -98,7 +99,10 @@ class TDMPC2(SimplicialWorldModel):
     ranges: ClassVar[Mapping[str, Bounds]] = {
         **dict.fromkeys(("action_dim", "latent_dim", "simnorm_dim", "encoder_dim"), POSITIVE),
         **dict.fromkeys(("encoder_layers", "hidden_dim", "value_members", "channels"), POSITIVE),
-        **dict.fromkeys(("consistency_coef", "reward_coef", "value_coef", "termination_coef"), COEFFICIENT),
+        **dict.fromkeys(
+            ("consistency_coef", "reward_coef", "value_coef", "termination_coef", "imitation_coef"),
+            COEFFICIENT,
+        ),
         **dict.fromkeys(("num_q", "bins"), Bounds(least=2)),
         **dict.fromkeys(("discount", "dropout"), Bounds(least=0, below=1)),
         "tau": Bounds(above=0, most=1),
@@ -135,6 +139,7 @@ class TDMPC2(SimplicialWorldModel):
         value_coef: float = 0.1,
         termination_coef: float = 1.0,
         entropy_coef: float = 1e-4,
+        imitation_coef: float = 0.0,
         mode_targets: bool = False,
         tau: float = 0.01,
         encoder_lr_scale: float = 0.3,
@@ -168,6 +173,7 @@ class TDMPC2(SimplicialWorldModel):
         self.rho, self.tau, self.encoder_lr_scale = rho, tau, encoder_lr_scale
         self.consistency_coef, self.reward_coef = consistency_coef, reward_coef
         self.value_coef, self.entropy_coef, self.mode_targets = value_coef, entropy_coef, mode_targets
+        self.imitation_coef = imitation_coef
         self.terminates, self.termination_coef = terminates, termination_coef
 
         hidden = (hidden_dim, hidden_dim)
@@ -321,6 +327,10 @@ class TDMPC2(SimplicialWorldModel):
             predicted, after, action, reward, target, weight[:-1]
         )
         policy.join(policy_loss, entropy)
+        shown = batch.get("demonstrated", None)
+        if self.imitation_coef and shown is not None:
+            error = self.policy_head.imitation_error(detached[:-1], action, shown.transpose(0, 1))
+            policy_loss = policy_loss + self.imitation_coef * error
 
         total = (
             self.consistency_coef * consistency

@@ -1,5 +1,7 @@
 """How worlds explore while experience is gathered: noise of their own, and a share that acts with the planner."""
 
+from collections.abc import Mapping
+
 import torch
 from tensordict import TensorDictBase
 from tensordict.nn import InteractionType, TensorDictModuleBase
@@ -66,3 +68,20 @@ class ExploringPolicy(TensorDictModuleBase):
                     own = planned.get(key)
                     tensordict.set(key, torch.cat((own.new_zeros(first, *own.shape[1:]), own)))
         return tensordict.set("action", action)
+
+
+class ActingPolicy(TensorDictModuleBase):
+    """One of several policies, exchangeable while a collector runs it."""
+
+    def __init__(self, policies: Mapping[str, TensorDictModuleBase], name: str):
+        super().__init__()
+        self.policies = dict(policies)  # a plain dict: the collector must not copy their models
+        self.out_keys = ["action"]
+        self.use(name)
+
+    def use(self, name: str) -> None:
+        self.name = name
+        self.in_keys = list(self.policies[name].in_keys)  # pyright: ignore[reportAttributeAccessIssue]
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        return self.policies[self.name](tensordict)

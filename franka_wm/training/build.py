@@ -12,6 +12,7 @@ from torchrl.data import ReplayBuffer
 
 from franka_wm import models, planning
 from franka_wm.console import say
+from franka_wm.data.demonstrations import Demonstrations
 from franka_wm.data.hindsight import Hindsight
 from franka_wm.data.replay import make_replay
 from franka_wm.device import resolve_device
@@ -349,7 +350,10 @@ def arm_of(env: Any) -> FrankaEnv | None:
 
 
 def make_replay_buffer(
-    run: RunSettings, device: torch.device, hindsight: Hindsight | None = None
+    run: RunSettings,
+    device: torch.device,
+    hindsight: Hindsight | None = None,
+    demonstrations: Demonstrations | None = None,
 ) -> ReplayBuffer:
     """The replay buffer that ``run.replay`` describes; it keeps each image of a stack once."""
     cameras = run.env.arm.cameras if run.is_arm else ()
@@ -363,6 +367,7 @@ def make_replay_buffer(
         frame_stack=run.env.frame_stack,
         stacked=("pixels", *(f"pixels_{camera}" for camera in cameras)) if run.env.frame_stack > 1 else (),
         hindsight=hindsight,
+        demonstrations=demonstrations,
     )
 
 

@@ -41,6 +41,7 @@ def check(run: RunSettings) -> None:
         )
     else:
         _ = run.actor
+    _check_demonstrations(run)
     _check_export(run)
     if run.pretrain.kind != "none" and "encoder_from" not in run.model.options:
         raise UserError(
@@ -82,6 +83,27 @@ def _check_windows(run: RunSettings) -> None:
         raise UserError(
             f"replay.hindsight={run.replay.hindsight}: recorded data keep their goals; leave it at null"
         )
+
+
+def _check_demonstrations(run: RunSettings) -> None:
+    if run.replay.demos is None:
+        return
+    if run.is_offline:
+        raise UserError(
+            "replay.demos: a run on recorded data gathers nothing to mix them with; add them to dataset.root"
+        )
+    if run.is_discrete:
+        raise UserError(
+            f"replay.demos: model={run.model.name} learns from its own search, not from recordings"
+        )
+    if run.replay.demo_updates > run.trainer.updates:
+        raise UserError(
+            f"replay.demo_updates={run.replay.demo_updates}: must be at most trainer.updates={run.trainer.updates}"
+        )
+    from franka_wm.data.lerobot.source import read_source
+
+    for one in [run.replay.demos] if isinstance(run.replay.demos, str) else run.replay.demos:
+        read_source(one)
 
 
 def _check_first_stage(run: RunSettings) -> None:

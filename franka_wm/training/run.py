@@ -24,6 +24,7 @@ from franka_wm.seeding import derive_seed, seeded
 from franka_wm.training import build
 from franka_wm.training.check import check
 from franka_wm.training.checkpoint import latest_checkpoint, load_checkpoint
+from franka_wm.training.demos import open_demonstrations
 from franka_wm.training.loggers import close_loggers, log_config, log_video, make_loggers
 from franka_wm.training.settings import RunSettings
 from franka_wm.training.spaces import Spaces
@@ -122,9 +123,9 @@ class Run:
         """Where batches come from, and what a model must know of it: ``sample()`` and its :class:`Spaces`."""
         if not self.settings.is_offline:
             hindsight = build.make_hindsight(self.settings, env)
-            return build.make_replay_buffer(self.settings, env.device, hindsight), self.as_saved(
-                Spaces.of_env(env)
-            )
+            shown = open_demonstrations(self.settings, env, hindsight)
+            replay = build.make_replay_buffer(self.settings, env.device, hindsight, shown)
+            return replay, self.as_saved(Spaces.of_env(env))
         windows, self.validation = build.open_recorded(self.settings, self.device)
         spaces = Spaces(
             observation_sizes=dict(windows.observation_sizes),

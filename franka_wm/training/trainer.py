@@ -17,6 +17,7 @@ from franka_wm.console import Progress, say
 from franka_wm.data.captured import CapturedSampling
 from franka_wm.errors import UserError
 from franka_wm.interrupt import interruptible
+from franka_wm.policies.exploration import ActingPolicy
 from franka_wm.seeding import derive_seed, seeded
 from franka_wm.training.build import explore
 from franka_wm.training.checkpoint import Checkpoint, save_checkpoint
@@ -31,23 +32,6 @@ from franka_wm.training.tree import damaged
 OTHER_DEVICE = (
     "the checkpoint is of another kind of device: random numbers start anew; this run will not be the same"
 )
-
-
-class ActingPolicy(TensorDictModuleBase):
-    """One of several policies, exchangeable while a collector runs it."""
-
-    def __init__(self, policies: Mapping[str, TensorDictModuleBase], name: str):
-        super().__init__()
-        self.policies = dict(policies)  # a plain dict: the collector must not copy their models
-        self.out_keys = ["action"]
-        self.use(name)
-
-    def use(self, name: str) -> None:
-        self.name = name
-        self.in_keys = list(self.policies[name].in_keys)  # pyright: ignore[reportAttributeAccessIssue]
-
-    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        return self.policies[self.name](tensordict)
 
 
 EVALUATION_SHARE = 0.1
@@ -122,6 +106,7 @@ class Trainer:
             self._keys = [*self.spaces.observation_sizes, *self.spaces.image_sizes]
         if (hindsight := getattr(replay, "hindsight", None)) is not None:
             self._keys = list(dict.fromkeys([*self._keys, *hindsight.reads]))
+        self.demonstrations = getattr(replay, "demonstrations", None)
         self._extra = list(self.model.replay_keys)
         # What the acting policy writes for the loss, a random one does not: then the actor fills the replay, too.
         self._acting = None
@@ -155,10 +140,13 @@ class Trainer:
             while self.learner.updates < total and not stop():
                 before = self.learner.updates
                 done = before % trainer.updates_per_batch  # by a run that ended amid a batch's updates
-                if self.env is not None and (not done or anew):
+                shown = self.settings.replay.demo_updates if self.demonstrations else 0
+                if self.env is not None and (anew or (not done and before >= shown)):
                     self.gather()
                     anew = False
                 for _ in range(min(trainer.updates_per_batch - done, total - before)):
+                    if self.demonstrations is not None:
+                        self.demonstrations.use(self.settings.demo_windows(self.learner.updates))
                     self._batch = self._draw()
                     self.learner.update(self._batch, static=self._static(self._batch))
                     if self._asks_at_once:
@@ -196,8 +184,10 @@ class Trainer:
         batches = -(-collector.seed_steps // collector.steps_per_batch)
         for _ in range(batches):
             self.gather()
-        data = self.replay[:]  # (worlds, time): TorchRL gives back what it was extended with
-        seen = {key: data.get(key).flatten(0, 1) for key in self._vectors}
+        data = [self.replay[:]]  # (worlds, time): TorchRL gives back what it was extended with
+        if self.demonstrations is not None:
+            data.append(self.demonstrations.transitions)
+        seen = {key: torch.cat([one.get(key).flatten(0, 1) for one in data]) for key in self._vectors}
         self.standardize({key: (x.mean(0), x.std(0)) for key, x in seen.items()})
 
     def standardize(self, statistics: Mapping[str, tuple[torch.Tensor, torch.Tensor]]) -> None:

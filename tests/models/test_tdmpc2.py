@@ -229,3 +229,33 @@ def test_the_loss_of_ends_is_the_cross_entropy_of_what_is_predicted():
     wanted = -torch.where(batch["next", "terminated"], chance.log(), (1 - chance).log()).mean()
     torch.testing.assert_close(losses["loss_termination"], wanted.detach())
     torch.testing.assert_close(losses["loss"], losses["loss_policy"] + 0.5 * wanted)
+
+
+def test_imitation_is_the_error_of_the_mode_at_demonstrated_steps_and_moves_the_policy_alone():
+    model, batch = small(imitation_coef=2.0), windows()
+    model.eval()
+    shown = torch.zeros(6, 3, 1, dtype=torch.bool)
+    shown[:2] = True
+
+    def loss(flags=None):
+        torch.manual_seed(0)
+        marked = batch.clone() if flags is None else batch.clone().set("demonstrated", flags)
+        model.zero_grad()
+        result = model.loss(marked)
+        result["loss"].backward()
+        others = [
+            p.grad.clone()
+            for name, p in model.named_parameters()
+            if p.grad is not None and "policy" not in name
+        ]
+        return result["loss"].detach(), others
+
+    z, errors = model.encode(batch[:, 0]), []
+    for t in range(3):
+        errors.append((model.policy(z, deterministic=True) - batch["action"][:, t]).square().mean(-1))
+        z = model.next(z, batch["action"][:, t])
+    wanted = 2.0 * torch.stack(errors, 1)[shown.squeeze(-1)].mean()
+    (plain, before), (imitating, after), (nowhere, _) = loss(), loss(shown), loss(torch.zeros_like(shown))
+    torch.testing.assert_close(imitating - plain, wanted.detach(), rtol=1e-4, atol=1e-6)
+    torch.testing.assert_close(nowhere, plain)
+    assert all(torch.equal(one, other) for one, other in zip(before, after, strict=True))

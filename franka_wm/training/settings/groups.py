@@ -23,6 +23,13 @@ MOST_UPDATES = 10**12
 """Of a run: a thousand updates a second for thirty years."""
 
 
+def _is_names(given: Any) -> bool:
+    return all(isinstance(one, str) for one in (given if isinstance(given, list | tuple) else [given]))
+
+
+_A_FOLDER, _A_NAME = "a folder or a list of them", "USER/NAME or a list of them"
+
+
 @dataclass(frozen=True)
 class CollectorSettings:
     """Who gathers experience, in how many worlds."""
@@ -44,6 +51,10 @@ class ReplaySettings:
     batch_size: int = whole(least=1)
     window: int | None = whole(None, least=1, null=MODELS_OWN)
     hindsight: float | None = real(0.0, least=0, most=1, null="half, where goals can be exchanged")
+    demos: str | tuple[str, ...] | None = value(None, fits=_is_names, wanted=_A_FOLDER, null="none")
+    demo_share: float = real(0.5, least=0, most=1)
+    demo_share_end: float | None = real(None, least=0, most=1, null="demo_share to the end")
+    demo_updates: int = whole(0, least=0, most=MOST_UPDATES)
 
 
 @dataclass(frozen=True)
@@ -101,10 +112,6 @@ class ExportSettings:
     repo_id: str | None = text(None, null="not published")
 
 
-def _is_names(given: Any) -> bool:
-    return all(isinstance(one, str) for one in (given if isinstance(given, list | tuple) else [given]))
-
-
 def _is_mapping(given: Any) -> bool:
     return isinstance(given, Mapping)
 
@@ -112,9 +119,6 @@ def _is_mapping(given: Any) -> bool:
 def _is_size(given: Any) -> bool:
     sides = given if isinstance(given, list | tuple) else [given, given]
     return len(sides) == 2 and all(is_whole(side) and side >= 1 for side in sides)
-
-
-_A_FOLDER, _A_NAME = "a folder or a list of them", "USER/NAME or a list of them"
 
 
 @dataclass(frozen=True)

@@ -168,6 +168,16 @@ class RunSettings:
         """Transitions of a training window."""
         return self.model.window if self.replay.window is None else self.replay.window
 
+    def demo_windows(self, update: int) -> int:
+        """How many windows of the batch of this update are demonstrations."""
+        r, total = self.replay, self.trainer.updates
+        if r.demos is None:
+            return 0
+        if update < r.demo_updates:
+            return r.batch_size
+        end = r.demo_share if r.demo_share_end is None else r.demo_share_end
+        return round(r.batch_size * (r.demo_share + (end - r.demo_share) * min(1.0, update / max(1, total))))
+
     @property
     def learning_rate(self) -> float:
         """The trainer's, or the model's own."""

@@ -1,0 +1,79 @@
+"""Demonstrations for a run, from the datasets that ``replay.demos`` names."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from tensordict import TensorDict
+
+from franka_wm.data.demonstrations import Demonstrations
+from franka_wm.data.hindsight import Hindsight
+from franka_wm.errors import UserError
+from franka_wm.training.settings import RunSettings
+from franka_wm.training.spaces import Spaces
+
+
+def open_demonstrations(run: RunSettings, env: Any, hindsight: Hindsight | None) -> Demonstrations | None:
+    """The episodes that ``run.replay.demos`` names, on the environment's device; ``None`` where it names none.
+
+    Raises:
+        UserError: They do not fit the task: other observations, actions, rate, task or reward.
+    """
+    if run.replay.demos is None:
+        return None
+    from franka_wm.data.lerobot import open_dataset
+
+    spaces = Spaces.of_env(env)
+    read = spaces.only(run.model.observations, f"model={run.model.name}")
+    vectors = {*read.observation_sizes, *(() if hindsight is None else hindsight.reads)}
+    wanted: dict[str, Any] = {key: spaces.observation_sizes[key] for key in sorted(vectors)} | dict(
+        read.image_sizes
+    )
+    recorded = open_dataset(
+        run.replay.demos,
+        window=1,
+        batch_size=1,
+        device=env.device,
+        validation_fraction=0.0,
+        keys=list(wanted),
+        frame_stack=run.env.frame_stack,
+    )
+    fps = run.env.arm.fps if run.is_arm else None
+    recorded.check(keys=list(wanted), fps=fps, action_dim=spaces.action_dim)
+    there = {**recorded.observation_sizes, **recorded.image_sizes}
+    for key, size in wanted.items():
+        if there[key] != size:
+            raise UserError(
+                f"replay.demos: {key} has size {there[key]} there, {size} in this environment; record them with its "
+                "options"
+            )
+    if recorded.reward_bounds is None:
+        raise UserError("replay.demos: these episodes have no rewards; record them with franka-wm collect")
+    if run.is_arm:
+        _check_same_task(run)
+    keys = [*wanted, "action", "is_init", *(("next", key) for key in (*wanted, "reward", "terminated"))]
+    transitions: Any = TensorDict.cat([one.select(*keys) for one in recorded.batches(4096)])
+    most = max(run.demo_windows(update) for update in (0, run.replay.demo_updates, run.trainer.updates))
+    return Demonstrations(transitions, window=run.window, most=most, hindsight=hindsight)
+
+
+def _check_same_task(run: RunSettings) -> None:
+    """Refuses demonstrations whose actions or rewards mean something else, as far as their datasets say it."""
+    from franka_wm.data.lerobot.provenance import read_provenance
+
+    for root in [run.replay.demos] if isinstance(run.replay.demos, str) else run.replay.demos or ():
+        for session in (read_provenance(root) or {}).get("sessions", ()):
+            recorded = session.get("config", {}).get("env", {})
+            for name in (
+                "task",
+                "reward",
+                "action_mode",
+                "action_scale",
+                "action_penalty",
+                "success_distance",
+            ):
+                here = getattr(run.env.arm, name)
+                if recorded.get(name, here) != here:
+                    raise UserError(
+                        f"replay.demos={root}: recorded with env.{name}={recorded[name]}, this run has {here}"
+                    )

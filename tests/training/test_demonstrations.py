@@ -1,0 +1,105 @@
+"""Runs with demonstrations: what fits is mixed in, what does not is refused, and none is an evaluation's episode."""
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from safetensors.torch import load_file
+
+from franka_wm.commands import main as cli
+from franka_wm.data.lerobot import cache, open_dataset
+from franka_wm.errors import UserError
+from franka_wm.training import build
+from franka_wm.training.check import check
+from franka_wm.training.demos import open_demonstrations
+from franka_wm.training.learner import Learner
+
+ARM = ("env=reach", "env.substeps=1", "env.episode_length=8", "seed=0", "device=cpu")
+
+
+@pytest.fixture(scope="module")
+def demos(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Six episodes of inverse kinematics, eight steps each."""
+    root = tmp_path_factory.mktemp("demos") / "reach"
+    assert cli.main(["collect", f"out={root}", "policy=ik", "episodes=6", "num_envs=3", *ARM]) == 0
+    return root
+
+
+@pytest.fixture(autouse=True)
+def own_cache(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setattr(cache, "default_cache_dir", lambda: tmp_path / "cache")
+
+
+def test_a_run_begins_with_them_alone_and_mixes_them_in(demos: Path, train, monkeypatch) -> None:
+    seen, update = [], Learner.update
+
+    def watched(self: Learner, batch: Any, **options: Any) -> None:
+        seen.append(int(batch["demonstrated"][:, 0].sum()))
+        update(self, batch, **options)
+
+    monkeypatch.setattr(Learner, "update", watched)
+    shares = ("replay.demo_updates=15", "replay.demo_share=0.5", "replay.demo_share_end=0.25")
+    run = train(*ARM, f"replay.demos={demos}", *shares, "evaluation.during=[]")
+    assert seen == [8] * 15 + [round(8 * (0.5 - 0.25 * update / 30)) for update in range(15, 30)]
+    # Ten random steps and a batch before the first update, none while they are alone, then one for ten updates.
+    assert run.counters["env_steps"] == 3 * (10 + 5 + 5)
+
+
+def test_statistics_of_observations_see_them_too(demos: Path, train) -> None:
+    plain = train(*ARM, "trainer.updates=0", "evaluation.during=[]", folder=demos.parent / "plain")
+    mixed = train(*ARM, f"replay.demos={demos}", "trainer.updates=0", "evaluation.during=[]")
+    one, other = (load_file(run.folder / "model.safetensors")["observation_mean"] for run in (plain, mixed))
+    assert not torch.allclose(one, other)
+
+
+def test_none_is_an_episode_of_the_evaluation(demos: Path, settled) -> None:
+    recorded = open_dataset(demos, window=1, batch_size=1, validation_fraction=0.0, say=lambda line: None)
+    run = settled("scale=smoke", *ARM, "evaluation.episodes=64")
+    first = build.make_evaluation_env(run).reset()["state"]
+    starts = torch.cat([one["state"][one["is_init"].squeeze(-1)] for one in recorded.batches(100)])
+    assert starts.shape == (6, first.shape[-1])
+    assert torch.cdist(starts, first).min() > 1e-3
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        (("env.task=track",), "recorded with env.task=reach, this run has track"),
+        (("env.reward=sparse",), "recorded with env.reward=dense, this run has sparse"),
+        (("env.action_scale=0.05",), "recorded with env.action_scale=0.085, this run has 0.05"),
+        (("env.fps=20",), "fps|frames per second"),
+        (("env=lift",), "action|objects"),
+        (("replay.window=20", "env.episode_length=30"), "no demonstration has 20 steps"),
+    ],
+)
+def test_what_does_not_fit_is_refused_in_a_line(demos: Path, settled, changes, message: str) -> None:
+    run = settled("scale=smoke", *ARM, *changes, f"replay.demos={demos}")
+    with pytest.raises(UserError, match=message) as refused:
+        open_demonstrations(run, build.make_env(run), None)
+    assert "\n" not in str(refused.value)
+
+
+def test_episodes_without_rewards_are_refused(demos: Path, settled, monkeypatch) -> None:
+    from franka_wm.data.lerobot.windows import RecordedWindows
+
+    monkeypatch.setattr(RecordedWindows, "reward_bounds", None)
+    run = settled("scale=smoke", *ARM, f"replay.demos={demos}")
+    with pytest.raises(UserError, match="no rewards"):
+        open_demonstrations(run, build.make_env(run), None)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        (("dataset=lerobot", "dataset.root={demos}"), "gathers nothing to mix them with"),
+        (("model=muzero", "planner=gumbel"), "learns from its own search"),
+        (("replay.demo_updates=31",), "must be at most trainer.updates=30"),
+        (("replay.demos={demos}/nowhere",), "nowhere"),
+        (("replay.demo_share=1.5",), "replay.demo_share=1.5"),
+    ],
+)
+def test_what_cannot_be_is_refused_before_anything_is_built(demos: Path, settled, changes, message) -> None:
+    words = [f"replay.demos={demos}", *(one.replace("{demos}", str(demos)) for one in changes)]
+    with pytest.raises(UserError, match=message):
+        check(settled("scale=smoke", *ARM, *words))
