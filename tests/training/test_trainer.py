@@ -15,7 +15,7 @@ from tensordict import TensorDict
 
 from franka_wm.envs import FrankaEnv
 from franka_wm.errors import UserError
-from franka_wm.training import build, room
+from franka_wm.training import build, storage_budget
 from franka_wm.training.checkpoint import latest_checkpoint, load_checkpoint
 from franka_wm.training.learner import Learner
 from franka_wm.training.run import Run
@@ -186,7 +186,7 @@ def test_going_on_without_the_experience_keeps_the_scale_of_observations(make: M
 
 
 def test_a_disk_without_room_costs_the_experience_not_the_weights(make: Make, monkeypatch, capsys) -> None:
-    monkeypatch.setattr(room.shutil, "disk_usage", lambda folder: SimpleNamespace(free=10e6))
+    monkeypatch.setattr(storage_budget.shutil, "disk_usage", lambda folder: SimpleNamespace(free=10e6))
     trainer = make()
     trainer.settings = trainer.settings.changed(trainer={"checkpoint_every": 1e-9})
     trainer.fit()
@@ -197,7 +197,7 @@ def test_a_disk_without_room_costs_the_experience_not_the_weights(make: Make, mo
 
 
 def test_large_experience_is_written_at_the_end_alone(make: Make, monkeypatch, capsys) -> None:
-    monkeypatch.setattr(room, "BETWEEN", 10.0)
+    monkeypatch.setattr(storage_budget, "BETWEEN", 10.0)
     trainer = make(updates=40)
     trainer.settings = trainer.settings.changed(trainer={"checkpoint_every": 1e-9})
     written = []
