@@ -7,6 +7,7 @@ the address that they came by, their kind, and every value against the bounds of
 from __future__ import annotations
 
 import contextlib
+import gc
 import io
 import math
 import threading
@@ -25,6 +26,10 @@ LARGEST = 16 * 1024
 """Largest message of a client [bytes]."""
 RATE, BURST = 300.0, 600.0
 """Messages per second of one client, and how many at once: a dragged goal sends one for each image of the screen."""
+CLIENTS = 128
+"""Clients at once: each takes a descriptor and 0.2 MB."""
+LEFT = 16
+"""After so many clients have left, what they held is collected."""
 
 type Check = Callable[[Any], bool]
 
@@ -56,6 +61,7 @@ class Gate:
         self._lock = threading.Lock()
         self._said = -math.inf
         self._unsaid = 0
+        self._here = self._left = 0
 
     def serve(self, make: Callable[[], Any]) -> Any:
         """The viser server that `make` starts, behind this gate."""
@@ -69,6 +75,11 @@ class Gate:
                     self.ignore(f"a request {wrong}")
                     return connection.respond(
                         HTTPStatus.FORBIDDEN, f"This page does not answer a request {wrong}.\n"
+                    )
+                if self._here >= CLIENTS and "Upgrade" in asked.headers:
+                    self.ignore(f"a client beyond {CLIENTS}, the most at once")
+                    return connection.respond(
+                        HTTPStatus.SERVICE_UNAVAILABLE, f"{CLIENTS} clients are here, the most at once.\n"
                     )
                 return process_request(connection, asked)
 
@@ -134,9 +145,18 @@ class Gate:
 
     def _guarded(self, handler: Any) -> Any:
         """A connection's handler that sees admitted messages only."""
+        import viser
         from websockets.exceptions import ConnectionClosed
 
+        spoken = f"viser-v{viser.__version__}"
+
         async def handle(connection: Any) -> None:
+            if connection.subprotocol != spoken:  # viser refuses it as well, and writes a line each time
+                self.ignore(f"a page of another version: {short(connection.subprotocol)}")
+                await connection.close(
+                    1002, f"Version mismatch: this server speaks {spoken}; reload the page."
+                )
+                return
             receive, left, before = connection.recv, BURST, time.monotonic()
 
             async def admitted() -> bytes:
@@ -156,10 +176,25 @@ class Gate:
                         )
 
             connection.recv = admitted
-            with contextlib.suppress(ConnectionClosed):
-                await handler(connection)
+            self._here += 1
+            try:
+                with contextlib.suppress(ConnectionClosed):
+                    await handler(connection)
+            finally:
+                self._here -= 1
+                self._collect()
 
         return handle
+
+    def _collect(self) -> None:
+        """Free what clients held that have left.
+
+        The objects of a connection hold one another, with 0.2 MB of compression buffers. Python would let hundreds of
+        them wait: it looks through old objects only when a quarter of them is new.
+        """
+        self._left += 1
+        if self._left % LEFT == 0:
+            gc.collect()
 
 
 def foreign(headers: Any) -> str | None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import os
 import threading
 import time
@@ -157,6 +158,8 @@ def serve(stage: Stage, options: Options) -> None:
 
     session = Session(stage.env, stage.policies, policy=options.policy, seed=options.seed)
     page = Page(session, port=options.port, folder=options.out, title=stage.title)
+    gc.freeze()  # what is built stays: the collections after clients have left need not look through it
+    gc.collect()
     try:
         taken = f" (port {options.port} is taken)" if options.port not in (0, page.port) else ""
         say(f"{page.address}{taken}   Ctrl-C ends it")
@@ -172,5 +175,7 @@ def serve(stage: Stage, options: Options) -> None:
         if not page.close(timeout=0.3 * GRACE):
             os._exit(130)  # Python would wait for the thread, or hang on its own way out
         hurry.cancel()
+    finally:
+        gc.unfreeze()
     if session.error is not None:
         raise session.error

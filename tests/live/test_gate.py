@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import json
 import math
 import time
@@ -19,7 +20,7 @@ from websockets.exceptions import ConnectionClosed, InvalidStatus  # noqa: E402
 from websockets.sync.client import connect  # noqa: E402
 
 from franka_wm.errors import UserError  # noqa: E402
-from franka_wm.live.gate import Gate, decoded, foreign, short  # noqa: E402
+from franka_wm.live.gate import LEFT, Gate, decoded, foreign, short  # noqa: E402
 from franka_wm.live.page import PENDING, Page  # noqa: E402
 from franka_wm.live.session import BUDGET  # noqa: E402
 
@@ -49,6 +50,12 @@ def client(page: Page, **headers: str) -> Any:
         additional_headers=headers,
         max_size=None,
     )
+
+
+def quiet(page: Page) -> None:
+    """Nothing was said so far."""
+    page.said.clear()  # pyright: ignore
+    page.gate._said, page.gate._unsaid = -math.inf, 0
 
 
 def update(control: Any, value: Any, **more: Any) -> dict[str, Any]:
@@ -156,6 +163,43 @@ def test_a_message_that_is_too_large_ends_that_client_alone(page: Page) -> None:
         assert socket.recv(timeout=10)
 
 
+def test_what_clients_held_that_have_left_is_freed(page: Page) -> None:
+    gc.disable()
+    try:
+        for _ in range(2 * LEFT):
+            with client(page) as socket:
+                socket.recv(timeout=10)
+        wait(lambda: page.gate._here == 0, "clients that have left are still counted")
+        held = sum(type(one).__name__ == "ServerConnection" for one in gc.get_objects())
+        assert held <= LEFT + 1, held
+    finally:
+        gc.enable()
+
+
+def test_beyond_the_most_clients_a_page_says_so(page: Page, monkeypatch) -> None:
+    monkeypatch.setattr("franka_wm.live.gate.CLIENTS", 1)
+    quiet(page)
+    with client(page) as socket:
+        socket.recv(timeout=10)
+        with pytest.raises(InvalidStatus, match="503"), client(page):
+            pass
+    assert page.said == ["ignored: a client beyond 1, the most at once"]  # pyright: ignore
+    wait(lambda: page.gate._here == 0, "clients that have left are still counted")
+    with client(page) as socket:
+        assert socket.recv(timeout=10)
+
+
+def test_another_version_is_turned_away_in_one_line(page: Page, capfd) -> None:
+    quiet(page)
+    address = f"ws://127.0.0.1:{page.port}"
+    for _ in range(3):
+        socket = connect(address, subprotocols=["viser-v0.0.1"])  # pyright: ignore
+        with socket, pytest.raises(ConnectionClosed, match="reload the page"):
+            socket.recv(timeout=10)
+    assert page.said == ["ignored: a page of another version: 'viser-v0.0.1'"]  # pyright: ignore
+    assert "mismatch" not in "".join(capfd.readouterr())
+
+
 @pytest.mark.parametrize(
     "origin",
     ["https://evil.example", "http://127.0.0.1", "http://localhost:{port}", "null", "http://127.0.0.1:1"],
@@ -201,8 +245,7 @@ def test_many_messages_at_once_are_cut_off() -> None:
 
 
 def test_requests_do_not_pile_up(page: Page) -> None:
-    page.said.clear()  # pyright: ignore
-    page.gate._said = -math.inf
+    quiet(page)
     done = []
     taken = [page._pending.acquire(blocking=False) for _ in range(PENDING)]
     assert all(taken)
