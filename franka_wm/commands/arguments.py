@@ -75,6 +75,7 @@ class Verb(click.Command):
             are none.
         shown: How the help shows those, and what it says of them.
         raw: The usage of a verb that reads its arguments itself; all come as ``arguments``.
+        first: The word whose name may be left out: a bare argument is its value.
     """
 
     def __init__(
@@ -83,10 +84,11 @@ class Verb(click.Command):
         others: str | None = None,
         shown: tuple[str, str] = ("", ""),
         raw: str = "",
+        first: str | None = None,
         **settings: Any,
     ) -> None:
         super().__init__(*args, **settings)
-        self.raw = raw
+        self.raw, self.first = raw, first
         self.words = {str(one.name): one for one in self.params if isinstance(one, Word)}
         self.others, self.shown = others, shown
         if others is not None:
@@ -120,6 +122,8 @@ class Verb(click.Command):
         """Words as click's options; what is neither a word nor an option stays as it is."""
         seen: set[str] = set()
         for argument in args:
+            if self.first and self.first not in seen and not argument.startswith("-") and "=" not in argument:
+                argument = f"{self.first}={argument}"
             dashed = argument.startswith("--")
             name, equals, value = argument.removeprefix("--").partition("=")
             name = name.replace("-", "_") if dashed else name

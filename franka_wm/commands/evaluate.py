@@ -10,8 +10,13 @@ from franka_wm.commands.arguments import FLAG, verb, whole, word
 from franka_wm.errors import UserError
 
 
-@verb("evaluate")
-@word("checkpoint", "a run's folder, a checkpoint in it, or hf:user/name", metavar="FOLDER", required=True)
+@verb("evaluate", first="checkpoint")
+@word(
+    "checkpoint",
+    "a run's folder, a checkpoint in it, or hf:user/name; the bare folder will do",
+    metavar="FOLDER",
+    required=True,
+)
 @word("out", "where results go (RUN/evaluation; for hf: outputs/evaluation/user--name)", metavar="FOLDER")
 @word("episodes", "per policy, on fixed held-out seeds", whole(2), 100)
 @word("device", "auto, cpu, cuda, cuda:K", default="auto")

@@ -91,12 +91,12 @@ def _result(folder: UntrustedFolder, name: str) -> Result:
     path = folder.root / name
     found = folder.json(name)
     if found is None:
-        raise UserError(f"{path} is missing; measure the run: franka-wm evaluate checkpoint=RUN")
+        raise UserError(f"{path} is missing; measure the run: franka-wm evaluate RUN")
     protocol, policies = found.get("protocol"), found.get("policies")
     if not isinstance(protocol, Mapping) or not isinstance(policies, Mapping):
         raise UserError(
             f"{path} is of an older form, without `protocol` and `policies`; remove it and measure again: "
-            "franka-wm evaluate checkpoint=RUN"
+            "franka-wm evaluate RUN"
         )
     if not all(isinstance(one, Mapping) for one in policies.values()):
         raise UserError(f"{path}: `policies` must hold an object for each policy; measure the run again")

@@ -286,7 +286,7 @@ def reproduce(run: RunFiles) -> str:
     if run.counters:
         lines += [
             "# evaluate it, also in shifted worlds",
-            f"franka-wm evaluate checkpoint={place}{_episodes(run)} robustness=true",
+            f"franka-wm evaluate {place}{_episodes(run)} robustness=true",
             "",
         ]
     if run.counters:

@@ -76,7 +76,7 @@ def test_the_closed_loop_alone(run_folder: Path, tmp_path: Path, capsys) -> None
         (["checkpoint=a", "fast=true"], "fast: no such option; there are checkpoint, out"),
         (["checkpoint=a", "--robustnes"], "robustnes: no such option; did you mean robustness?"),
         (["checkpoint=a", "checkpoint=b"], "given twice"),
-        (["outputs/run"], "give checkpoint="),
+        (["a", "outputs/run"], "unexpected extra argument (outputs/run)"),
         (["checkpoint="], "checkpoint=: a value is missing"),
         (["checkpoint=a", "outputs/run"], "unexpected extra argument (outputs/run)"),
     ],
@@ -88,9 +88,10 @@ def test_bad_arguments(arguments: list[str], says: str, capsys) -> None:
 
 
 def test_a_checkpoint_that_is_not_there(tmp_path: Path, capsys) -> None:
-    arguments = [f"checkpoint={tmp_path}/nowhere", f"out={tmp_path}/out", "device=cpu"]
-    assert cli.main(["evaluate", *arguments]) == 1
-    assert "nowhere" in capsys.readouterr().err
+    for name in ("checkpoint=", ""):
+        arguments = [f"{name}{tmp_path}/nowhere", f"out={tmp_path}/out", "device=cpu"]
+        assert cli.main(["evaluate", *arguments]) == 1
+        assert f"no checkpoint in {tmp_path}/nowhere" in capsys.readouterr().err
     assert not (tmp_path / "out").exists()
 
 
