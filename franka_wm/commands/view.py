@@ -14,7 +14,6 @@ if TYPE_CHECKING:
 
 @verb(
     "view",
-    first="checkpoint",
     others="env.",
     shown=(
         "env.KEY=VALUE",
@@ -23,7 +22,7 @@ if TYPE_CHECKING:
 )
 @word(
     "checkpoint",
-    "a run's folder, a checkpoint in it, or hf:user/name; the bare folder will do",
+    "a run's folder, a checkpoint in it, or hf:user/name",
     metavar="FOLDER",
 )
 @word("env", "without a checkpoint: an arm and its task, as train.py names them", metavar="lift")
