@@ -20,11 +20,7 @@ if TYPE_CHECKING:
         "a field of the environment's configuration; episodes have no end unless env.episode_length is given",
     ),
 )
-@word(
-    "checkpoint",
-    "a run's folder, a checkpoint in it, or hf:user/name",
-    metavar="FOLDER",
-)
+@word("checkpoint", "a run's folder, a checkpoint in it, or hf:user/name", metavar="FOLDER")
 @word("env", "without a checkpoint: an arm and its task, as train.py names them", metavar="lift")
 @word("policy", "who acts first: planner, policy, ik, expert, random, noop", metavar="NAME")
 @word("port", "of http://127.0.0.1; 0 takes a free one", whole(0, 65535), 8080)
