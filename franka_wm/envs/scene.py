@@ -100,9 +100,8 @@ class Scene:
         out = []
         for one in self.obstacles:
             if one.at[2] - one.half_height < self.top + 0.2:
-                box = one.shape in ("box", "socket")
-                width = one.size[1] if one.shape == "box" else one.size[0]
-                sides = (0.5 * one.size[0], 0.5 * width) if box else (0.0, 0.0)
+                box = one.shape in ("box", "mesh", "socket")
+                sides = tuple(0.5 * w for w in one.widths) if box else (0.0, 0.0)
                 turn = (math.cos(one.angle), math.sin(one.angle))
                 out.append((*one.at[:2], *sides, *turn, 0.0 if box else one.radius))
         return out

@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import MISSING, dataclass, fields
 from typing import Any, Self
 
+from franka_wm.envs.mesh_solids import Surface, read_surface
 from franka_wm.errors import UserError
 from franka_wm.options import is_real
 
@@ -16,9 +17,13 @@ SIZES = {
     "sphere": ("radius",),
     "capsule": ("radius", "height"),
     "socket": ("edge", "hole", "height"),
+    "mesh": ("length", "width", "height"),
 }
 """Shapes, and what the numbers of their ``size`` mean, in metres. A capsule's height is between its half spheres; a
-socket is a square block with a square hole from above, down to a plate."""
+socket is a square block with a square hole from above, down to a plate; a mesh's follow from its file."""
+
+EDGES = (0.04, 0.04, 0.04)
+"""Size of a box where nothing is said [m]."""
 
 PLATE = 0.005
 """Thickness of what is under a socket's hole [m]."""
@@ -42,15 +47,19 @@ class Solid:
 
     Attributes:
         name: Of letters, digits and _; each only once in a scene.
-        shape: ``box``, ``cylinder``, ``sphere``, ``capsule`` or ``socket``; round ones stand upright.
-        size: As :data:`SIZES` says [m].
+        shape: ``box``, ``cylinder``, ``sphere``, ``capsule``, ``socket`` or ``mesh``; round ones stand upright.
+        size: As :data:`SIZES` says [m]; of a mesh that of the box around it, whose middle is the solid's place.
+        file: Of a mesh: a closed surface (OBJ, STL or PLY), its z up. It is drawn; its convex hull is touched.
+        scale: Of a mesh: metres per unit of the file, one number or one along each of x, y and z.
         friction: Coefficient of sliding friction; of two solids that touch, the larger one counts. The fingers' is 1.
         color: Red, green, blue, from 0 to 1.
     """
 
     name: str
     shape: str = "box"
-    size: tuple[float, ...] = (0.04, 0.04, 0.04)
+    size: tuple[float, ...] = EDGES
+    file: str | None = None
+    scale: float | tuple[float, float, float] = 1.0
     friction: float = 0.4
     color: tuple[float, float, float] = (0.80, 0.20, 0.18)
 
@@ -62,6 +71,7 @@ class Solid:
             raise UserError(f"scene: name={self.name[:20]}…: must have at most {LONGEST_NAME} characters")
         if not isinstance(self.shape, str) or self.shape not in SIZES:
             raise UserError(f"{where}.shape={self.shape!r}: must be one of {', '.join(SIZES)}")
+        self._take_file()
         meaning = SIZES[self.shape]
         size = self._numbers("size", len(meaning), f"{', '.join(meaning)} in metres")
         if not all(0.001 <= s <= 5.0 for s in size):
@@ -73,6 +83,41 @@ class Solid:
         self._real("friction", 0, 10, "0 to 10")
         if not all(0 <= c <= 1 for c in self._numbers("color", 3, "red, green, blue")):
             raise UserError(f"{where}.color={list(self.color)}: red, green and blue must be from 0 to 1")
+
+    def _take_file(self) -> None:
+        """The size of a mesh from its file."""
+        where = self._where
+        if self.shape != "mesh":
+            if self.file is not None:
+                raise UserError(f"{where}.file={self.file!r}: is for shape: mesh, this is a {self.shape}")
+            return
+        if not isinstance(self.file, str) or not self.file:
+            raise UserError(f"{where}.file={self.file!r}: a mesh needs the path of an OBJ, STL or PLY file")
+        if is_real(self.scale):
+            object.__setattr__(self, "scale", (self.scale,) * 3)
+        scale = self._numbers("scale", 3, "or one, metres per unit of the file")
+        if not all(1e-6 <= f <= 1e6 for f in scale):
+            raise UserError(f"{where}.scale={list(scale)}: must be from 1e-6 to 1e6")
+        try:
+            size = self.surface.size
+        except UserError as error:
+            raise UserError(f"{where}.file={error}") from error
+        if tuple(self.size) not in (EDGES, size):
+            raise UserError(
+                f"{where}.size={list(self.size)}: follows from a mesh's file; leave it out, give scale"
+            )
+        if not all(0.001 <= s <= 5.0 for s in size):
+            sides = " × ".join(f"{s:.4g}" for s in size)
+            raise UserError(
+                f"{where}: its mesh is {sides} m; it must be from 0.001 to 5 m each: change scale"
+            )
+        object.__setattr__(self, "size", size)
+
+    @property
+    def surface(self) -> Surface:
+        """Of a mesh."""
+        assert self.file is not None and isinstance(self.scale, tuple)  # seen to at the start
+        return read_surface(self.file, self.scale)
 
     @property
     def _where(self) -> str:
@@ -106,12 +151,12 @@ class Solid:
         """Of the upright cylinder that holds it [m]."""
         if self.shape == "socket":
             return 0.5 * math.hypot(self.size[0], self.size[0])
-        return 0.5 * math.hypot(*self.size[:2]) if self.shape == "box" else self.size[0]
+        return 0.5 * math.hypot(*self.size[:2]) if self.shape in ("box", "mesh") else self.size[0]
 
     @property
     def widths(self) -> tuple[float, float]:
         """Along x and y [m]."""
-        if self.shape == "box":
+        if self.shape in ("box", "mesh"):
             return self.size[0], self.size[1]
         edge = self.size[0] if self.shape == "socket" else 2.0 * self.size[0]
         return edge, edge
@@ -134,6 +179,8 @@ class Solid:
     def volume(self) -> float:
         """[m³]."""
         s = self.size
+        if self.shape == "mesh":
+            return self.surface.volume
         if self.shape == "box":
             return s[0] * s[1] * s[2]
         if self.shape == "socket":

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 import torch
+import yaml
 
 from franka_wm.envs import FrankaConfig, FrankaEnv
 from franka_wm.evaluation.closed_loop import play_episodes
@@ -31,6 +32,19 @@ def test_the_printed_scene(root: Path, tmp_path: Path, monkeypatch: pytest.Monke
     heights = observation["objects"].view(16, 3, 13)[..., 2]
     assert torch.allclose(heights, torch.tensor([0.02, 0.055, 0.03]).expand(16, 3), atol=1e-3)
     assert not observation["done"].any()
+
+
+def test_the_printed_mesh(root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    page = (root / "docs" / "tasks.md").read_text()
+    surface = next(b for b in re.findall(r"```text\n(.*?)```", page, re.DOTALL) if b.startswith("v "))
+    scene = next(b for b in re.findall(r"```yaml\n(.*?)```", page, re.DOTALL) if "file: wedge.obj" in b)
+    (tmp_path / "wedge.obj").write_text(surface)
+    monkeypatch.chdir(tmp_path)
+    env = FrankaEnv(FrankaConfig(task="lift", scene=yaml.safe_load(scene)), num_envs=2, device="cpu")
+    observation, action = env.reset(), torch.zeros(2, 8)
+    for _ in range(10):
+        observation = env.step(observation.set("action", action))["next"]
+    assert torch.allclose(env.simulation.tensors.objects[:, 2], torch.tensor(0.015), atol=1e-3)
 
 
 def test_the_printed_task_and_its_expert(printed_class, composed) -> None:

@@ -53,8 +53,10 @@ def room_for_contacts(config: FrankaConfig) -> int:
 
 def contact_options(config: FrankaConfig) -> dict[str, Any]:
     """Of Newton's MuJoCo solver, for scenes; see docs/tasks.md for what they hold."""
-    contacts = room_for_contacts(config)
+    contacts, scene = room_for_contacts(config), config.surroundings
+    meshes = scene is not None and any(one.shape == "mesh" for one in (*scene.objects, *scene.obstacles))
     return {
+        "enable_multiccd": meshes or None,  # one contact of a mesh and a box is too few to stand on
         "use_mujoco_contacts": True,
         "cone": "elliptic",
         "impratio": 10.0,

@@ -15,7 +15,8 @@ import warp as wp
 from franka_wm.envs.camera import GOAL_MARKER, GROUND, wrist_mount
 from franka_wm.envs.config import FrankaConfig
 from franka_wm.envs.constants import NUM_JOINTS
-from franka_wm.envs.robots import Robot, add_robot, arm_builder
+from franka_wm.envs.robots import SOURCES, Robot, add_robot, arm_builder
+from franka_wm.envs.robots.sources import detail
 from franka_wm.envs.scene import FLOOR
 from franka_wm.envs.simulation.bodies import contact_options
 from franka_wm.envs.simulation.surroundings import add_scene
@@ -44,7 +45,7 @@ def build_model(
     arm = arm_builder()
     robot = add_robot(arm, config, urdf_path)
     if config.surroundings:
-        add_scene(arm, config.surroundings, robot.tool_body)
+        add_scene(arm, config.surroundings, robot.tool_body, detail(SOURCES[config.robot], config))
     scene = newton.ModelBuilder()
     newton.solvers.SolverMuJoCo.register_custom_attributes(scene)
     if config.show_goal:

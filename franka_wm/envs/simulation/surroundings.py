@@ -10,7 +10,9 @@ import newton
 import warp as wp
 
 from franka_wm.envs.articulated import Articulated
+from franka_wm.envs.mesh_solids import MOST_CORNERS
 from franka_wm.envs.robots.gripper import add_colliders
+from franka_wm.envs.robots.meshes import Piece, simplify
 from franka_wm.envs.scene import Scene, Solid
 from franka_wm.envs.solids import Box
 
@@ -18,13 +20,14 @@ SOLREF, SOLIMP = (0.02, 1.0), (0.95, 0.99, 0.001, 0.5, 2.0)
 """How stiff contacts are, as MuJoCo says it: 0.7 mm of penetration where 20 N hold a 4 cm cube of 50 g."""
 
 
-def add_scene(builder: newton.ModelBuilder, scene: Scene, tool_body: int) -> None:
+def add_scene(builder: newton.ModelBuilder, scene: Scene, tool_body: int, cell: float) -> None:
     """Adds everything that can be touched to a builder that holds one world's arm, the fingers' boxes included.
 
     Args:
         builder: Its arm compensated for gravity already: objects are not.
         scene: What stands there.
         tool_body: The link that carries the hand.
+        cell: Details of meshes smaller than this are not drawn [m].
     """
     for shape in add_colliders(builder, tool_body):
         _harden(builder, shape)
@@ -34,11 +37,11 @@ def add_scene(builder: newton.ModelBuilder, scene: Scene, tool_body: int) -> Non
         if one is scene.table:
             z -= one.half_height
         turn = wp.quat_from_axis_angle(wp.vec3(0.0, 0.0, 1.0), one.angle)
-        still += _add_shape(builder, -1, one, density=0.0, at=wp.transform(wp.vec3(x, y, z), turn))
+        still += _add_shape(builder, -1, one, density=0.0, at=wp.transform(wp.vec3(x, y, z), turn), cell=cell)
     for one in scene.objects:
         at = wp.transform(wp.vec3(*one.at, scene.top + one.half_height), wp.quat_identity())
         body = builder.add_body(xform=at, label=one.name)
-        _add_shape(builder, body, one, density=one.mass / one.volume, at=wp.transform_identity())
+        _add_shape(builder, body, one, density=one.mass / one.volume, at=wp.transform_identity(), cell=cell)
     for one in scene.articulated:
         for shape in _add_articulated(builder, one, scene.top):
             for other in still:  # it slides or turns free of what it stands on and among
@@ -46,7 +49,7 @@ def add_scene(builder: newton.ModelBuilder, scene: Scene, tool_body: int) -> Non
 
 
 def _add_shape(
-    builder: newton.ModelBuilder, body: int, solid: Solid, *, density: float, at: wp.transform
+    builder: newton.ModelBuilder, body: int, solid: Solid, *, density: float, at: wp.transform, cell: float
 ) -> list[int]:
     config = newton.ModelBuilder.ShapeConfig(
         density=density, mu=solid.friction, gap=0.0, has_particle_collision=False
@@ -55,7 +58,14 @@ def _add_shape(
     size = solid.size
     if solid.shape == "socket":
         return _add_boxes(builder, body, solid, solid.boards, at=at, density=density, color=solid.color)
-    if solid.shape == "box":
+    if solid.shape == "mesh":
+        _draw(builder, solid, cell, body=body, **more)
+        config.is_visible = False
+        surface = solid.surface
+        # MuJoCo takes its convex hull, Newton the surface for mass, centre and inertia.
+        mesh = newton.Mesh(surface.vertices, surface.faces.flatten(), maxhullvert=MOST_CORNERS)
+        shape = builder.add_shape_mesh(body, mesh=mesh, **more)
+    elif solid.shape == "box":
         hx, hy, hz = (0.5 * s for s in size)
         shape = builder.add_shape_box(body, hx=hx, hy=hy, hz=hz, **more)
     elif solid.shape == "sphere":
@@ -66,6 +76,16 @@ def _add_shape(
         shape = builder.add_shape_capsule(body, radius=size[0], half_height=0.5 * size[1], **more)
     _harden(builder, shape)
     return [shape]
+
+
+def _draw(builder: newton.ModelBuilder, solid: Solid, cell: float, **more: Any) -> None:
+    """What is seen of a mesh: no detail smaller than ``cell`` [m], nor a tenth of its middle side."""
+    piece = simplify(Piece(*solid.surface.flat(), None), min(cell, 0.1 * sorted(solid.size)[1]))
+    mesh = newton.Mesh(piece.vertices, piece.faces.flatten(), normals=piece.normals, compute_inertia=False)
+    unfelt = newton.ModelBuilder.ShapeConfig(
+        density=0.0, has_shape_collision=False, has_particle_collision=False
+    )
+    builder.add_shape_mesh(mesh=mesh, **(more | {"cfg": unfelt}))
 
 
 def _add_boxes(

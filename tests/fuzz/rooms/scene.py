@@ -33,6 +33,8 @@ SCENE: dict[str, Any] = {
     "space": 0.01,
 }  # fmt: skip
 MANY = 3000
+WEDGE = """v 0 0 0\nv 60 0 0\nv 0 0 30\nv 0 40 0\nv 60 40 0\nv 0 40 30
+f 1 2 3\nf 4 6 5\nf 1 4 5 2\nf 1 3 6 4\nf 2 5 6 3\n"""
 
 
 class Scenes:
@@ -46,11 +48,23 @@ class Scenes:
         from franka_wm.envs import FrankaConfig, robots
         from franka_wm.envs.scene import Scene
 
-        self.config = FrankaConfig(task="reach", gripper=True, observations=("state",), scene=Scene.of(SCENE))
+        file = folder / "wedge.obj"
+        file.write_text(WEDGE)
+        wedge = {
+            "name": "wedge",
+            "shape": "mesh",
+            "file": str(file),
+            "scale": [0.001, 0.001, 0.001],
+            "at": [0.2, -0.2],
+        }
+        self.scene = SCENE | {"objects": [*SCENE["objects"], wedge]}
+        self.config = FrankaConfig(
+            task="reach", gripper=True, observations=("state",), scene=Scene.of(self.scene)
+        )
         robots.load_robot(self.config)
         lists = [[name] for name in ("objects", "obstacles", "articulated")]
         many = st.tuples(st.sampled_from(lists), st.just("<many>")).map(list)
-        one = mutation(list(leaves(SCENE)))
+        one = mutation(list(leaves(self.scene)))
         self.cases = st.fixed_dictionaries(
             {"mutations": st.lists(st.one_of(*[one] * 9, many), min_size=1, max_size=3)}
         )
@@ -62,14 +76,14 @@ class Scenes:
         from franka_wm.envs.robots import add_robot, arm_builder
         from franka_wm.envs.simulation.surroundings import add_scene
 
-        scene: Any = SCENE
+        scene: Any = self.scene
         for path, value in case["mutations"]:
             scene = changed(scene, path, _many(path[0]) if value == "<many>" else value)
         config = dataclasses.replace(self.config, scene=scene)
         assert config.surroundings is not None
         builder = arm_builder()
         robot = add_robot(builder, config)
-        add_scene(builder, config.surroundings, robot.tool_body)
+        add_scene(builder, config.surroundings, robot.tool_body, 0.0)
         for what in ("body_mass", "body_inertia", "body_q", "shape_transform", "shape_scale", "joint_X_p"):
             values = np.array([list(np.ravel(one)) for one in getattr(builder, what)], dtype=float)
             if not np.isfinite(values).all() or abs(values).max() > 1e4:
