@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -11,12 +11,25 @@ import torch
 from omegaconf import DictConfig
 
 from forks import train_in_fork
-from franka_wm import conf
-from franka_wm.envs import FrankaConfig, FrankaEnv
+from franka_wm import conf, models
+from franka_wm.envs import FrankaConfig, FrankaEnv, tasks
+from franka_wm.planning import registry
 from franka_wm.training.load import Agent, load_agent
 from franka_wm.training.settings import RunSettings
 
 ROOT = Path(__file__).resolve().parents[1]
+
+
+@pytest.fixture(autouse=True)
+def registries_as_before() -> Iterator[None]:
+    """What a test registers, or removes, is not there for the next one of its process."""
+    names = tasks._REGISTERED, models._REGISTERED, registry._REGISTERED
+    before, known = [dict(one) for one in names], list(tasks.TASKS)
+    yield
+    for one, kept in zip(names, before, strict=True):
+        one.clear()
+        one.update(kept)
+    tasks.TASKS[:] = known
 
 
 SMALL = {"substeps": 2, "gravity_compensation": True, "observations": ("state", "joint_target")}
