@@ -392,7 +392,8 @@ def readme_tables(rows: Mapping[str, Row], place: Path = PLACE) -> str:
     if others:
         parts += [table(["other environments", "model, planner", "machine", "return", "wanted"], others), ""]
     if speed:
-        parts += ["Environment steps per second, resets included, through TorchRL's `Collector`:", "", *speed]
+        text = "*Collector* is TorchRL's, around the *captured step*"
+        parts += [f"Environment steps per second, resets included. {text}:", "", *speed]
     if aged:
         parts += ["¹ Measured before changes of the code; docs/results.md names them.", ""]
     if alike:
