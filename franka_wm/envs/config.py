@@ -361,10 +361,13 @@ class FrankaConfig:
         for name, there, what in (
             ("contact_friction", self.surroundings, "a scene"),
             ("grip_force", self.has_gripper, "the gripper"),
+            ("object_size", self.num_objects, "objects"),
             ("object_noise", self.object_dim, "objects"),
         ):
             if getattr(self.randomization, name) and not there:
                 raise UserError(f"randomization.{name}: needs {what}; task={self.task} has none; set it to 0")
+        if self.randomization.object_size and self.surroundings:
+            self.surroundings.check_sizes(self.randomization.object_size)
         self.task_class.check(self)
 
     def _check_whole(self, name: str, low: int, high: int, unit: str) -> None:

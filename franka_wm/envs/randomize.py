@@ -60,6 +60,8 @@ class Randomizer:
             self._plain_limits = wp.clone(self._limits)
             self._any = wp.zeros(1, dtype=int, device=sim.device)
 
+        if self.ranges.object_size:
+            self._note_sizes()
         if self.ranges.contact_friction:  # MuJoCo's own, which nothing else writes
             self._frictions = sim.solver.mjw_model.geom_friction
             self._plain_frictions = wp.clone(self._frictions)
@@ -71,6 +73,29 @@ class Randomizer:
         out += self._physical if r.dynamics else []
         out += [self._limits] if r.grip_force else []
         return out + ([self._frictions] if r.contact_friction else [])
+
+    def _note_sizes(self) -> None:
+        """Where the objects' sizes are, and what they are."""
+        sim, n = self.sim, self.sim.num_envs
+        model, mujoco = sim.model, sim.solver.mjw_model
+        shapes = int((model.shape_world.numpy() == 0).sum())
+        start = int(np.argmax(model.shape_world.numpy() == 0))
+        bodies = model.shape_body.numpy()
+        first = model.body_label.index(sim.config.surroundings.objects[0].name)
+        self._first_object = first
+        parts = []
+        for geom, shape in enumerate(sim.solver.mjc_geom_to_newton_shape.numpy()[0]):
+            number = int(bodies[shape]) - first
+            if shape >= 0 and 0 <= number < sim.config.num_objects:
+                parts.append((geom, int(shape) - start, number))
+        self._parts = wp.array(parts, dtype=wp.vec3i, device=sim.device)
+        touched = [getattr(mujoco, f"geom_{name}") for name in ("size", "aabb", "rbound", "pos")]
+        seen = [
+            array[start : start + n * shapes].reshape((n, shapes))
+            for array in (model.shape_scale, model.shape_transform)
+        ]
+        self._sized = [*touched, *seen]
+        self._plain_sizes = [wp.clone(array)[0] for array in touched] + [wp.clone(array) for array in seen]
 
     def launch(self, mask: wp.array) -> None:
         """Draws for the masked worlds."""
@@ -109,6 +134,9 @@ class Randomizer:
                 ],
                 device=sim.device,
             )  # fmt: skip
+            if r.object_size:
+                inputs = [*known, r.object_size, self._first_object, w.sizes, *self._physical[4:]]
+                wp.launch(kernels.draw_sizes, sim.num_envs, inputs, device=sim.device)
             if wp.get_device(sim.device).is_cuda:
                 # A conditional part of a CUDA graph must not allocate, which MuJoCo's refresh does; the values of
                 # worlds that are not reset are the ones that they had.
@@ -120,8 +148,12 @@ class Randomizer:
 
     def apply(self) -> None:
         """Hands the physical values to MuJoCo."""
+        sim = self.sim
+        if self.ranges.object_size:
+            inputs = [sim.warp.sizes, self._parts, *self._plain_sizes, *self._sized]
+            wp.launch(kernels.resize, (sim.num_envs, len(self._parts)), inputs, device=sim.device)
         if self.ranges.dynamics:
             flags = ModelFlags.JOINT_DOF_PROPERTIES
-            if self.ranges.mass:
+            if self.ranges.inertial:
                 flags |= ModelFlags.BODY_INERTIAL_PROPERTIES
-            self.sim.solver.notify_model_changed(flags)
+            sim.solver.notify_model_changed(flags)

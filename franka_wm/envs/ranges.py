@@ -24,6 +24,7 @@ class Randomization:
         armature: Factor of the joints' armature.
         friction: Largest dry friction of a joint [N·m]; drawn from [0, friction].
         mass: Factor of every link's and object's mass and inertia.
+        object_size: Factor of each object's size; its mass goes with the cube, its inertia with the fifth power.
         contact_friction: Factor of the sliding friction of each shape that is touched: objects, table, fingers.
         grip_force: Factor of the fingers' stiffness and largest force.
         action_noise: Standard deviation of noise added to actions, in every step.
@@ -42,6 +43,7 @@ class Randomization:
     armature: float = 0.0
     friction: float = 0.0
     mass: float = 0.0
+    object_size: float = 0.0
     contact_friction: float = 0.0
     grip_force: float = 0.0
     action_noise: float = 0.0
@@ -50,7 +52,7 @@ class Randomization:
     object_noise: float = 0.0
 
     def __post_init__(self) -> None:
-        limits = {"color": 1.0, "brightness": 0.99, "object_noise": 1.0}
+        limits = {"color": 1.0, "brightness": 0.99, "object_noise": 1.0, "object_size": 0.5}
         limits |= dict.fromkeys(("gains", "armature", "mass", "contact_friction", "grip_force"), 0.9)
         for f in fields(self):
             value, limit = getattr(self, f.name), limits.get(f.name, 100.0)
@@ -65,7 +67,14 @@ class Randomization:
     @property
     def dynamics(self) -> bool:
         """Whether anything of the physical model is drawn."""
-        return bool(self.gains or self.armature or self.friction or self.mass or self.grip_force)
+        return bool(
+            self.gains or self.armature or self.friction or self.mass or self.grip_force or self.object_size
+        )
+
+    @property
+    def inertial(self) -> bool:
+        """Whether masses are drawn."""
+        return bool(self.mass or self.object_size)
 
     @classmethod
     def from_mapping(cls, values: Mapping) -> Randomization:

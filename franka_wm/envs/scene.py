@@ -17,7 +17,7 @@ from __future__ import annotations
 import math
 import random
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 from franka_wm.envs.articulated import Articulated, box_on_table
@@ -94,6 +94,27 @@ class Scene:
         if name not in names:
             raise UserError(f"scene: no object {name!r}; there are {', '.join(names) or 'none'}")
         return names.index(name)
+
+    def check_sizes(self, width: float) -> None:
+        """Refuses a scene whose objects cannot have sizes from 1 − width to 1 + width of what it says.
+
+        Raises:
+            UserError: An object is a mesh, or the smallest or largest are not allowed or have no room.
+        """
+        for one in self.objects:
+            if one.shape == "mesh":
+                raise UserError(
+                    f"randomization.object_size: scene.{one.name} is a mesh; MuJoCo keeps one hull for all worlds; "
+                    "set it to 0"
+                )
+        for factor in (1 - width, 1 + width):
+            try:
+                objects = [replace(one, size=tuple(factor * s for s in one.size)) for one in self.objects]
+                replace(self, objects=tuple(objects))
+            except UserError as error:
+                raise UserError(
+                    f"randomization.object_size={width:g}: objects of {factor:g} times their size: {error}"
+                ) from error
 
     def blocked(self) -> list[tuple[float, ...]]:
         """What obstacles take of the table: (x, y, half sides, cosine and sine of the angle, radius around these)."""

@@ -47,6 +47,14 @@ def test_the_printed_mesh(root: Path, tmp_path: Path, monkeypatch: pytest.Monkey
     assert torch.allclose(env.simulation.tensors.objects[:, 2], torch.tensor(0.015), atol=1e-3)
 
 
+def test_the_printed_randomization(root: Path) -> None:
+    page = (root / "docs" / "tasks.md").read_text()
+    text = next(b for b in re.findall(r"```yaml\n(.*?)```", page, re.DOTALL) if "object_size" in b)
+    env = FrankaEnv(FrankaConfig(task="lift", **yaml.safe_load(text)), num_envs=4, device="cpu")
+    heights = env.reset()["objects"][:, 2]
+    assert heights.unique().numel() == 4 and ((heights - 0.02).abs() < 0.0041).all()
+
+
 def test_the_printed_task_and_its_expert(printed_class, composed) -> None:
     topple = printed_class("Topple(TorchTask)", lines=40)
     config = RunSettings.of(composed("env=lift", "env.task=topple")).env.arm  # it has registered itself

@@ -71,6 +71,8 @@ def place(
     turn: wp.array[float],
     height: wp.array[float],
     radius: wp.array[float],
+    rise: wp.array[float],
+    sizes: wp.array2d[float],
     blocked: wp.array2d[float],
     margin: float,
     bases: wp.array2d[wp.transformf],
@@ -85,6 +87,7 @@ def place(
 ):
     """New episodes of the masked worlds: fingers open, objects at rest where nothing else stands.
 
+    ``height`` and ``radius`` are those of an object of its plain size, ``rise`` the half of its own height [m].
     A place is drawn anew while something stands there. That one is left is seen to when the scene is made.
     """
     world = wp.tid()
@@ -103,6 +106,7 @@ def place(
     rng = episode_rng(seed[0], world, episode[world], 8)
     for b in range(turn.shape[0]):
         at = FINGERS + 7 * b
+        wide = radius[b] * sizes[world, b]
         found = bool(False)
         x = float(0.0)
         y = float(0.0)
@@ -116,21 +120,21 @@ def place(
                     dy = y - blocked[o, 1]
                     u = wp.max(wp.abs(blocked[o, 4] * dx + blocked[o, 5] * dy) - blocked[o, 2], 0.0)
                     v = wp.max(wp.abs(blocked[o, 4] * dy - blocked[o, 5] * dx) - blocked[o, 3], 0.0)
-                    if wp.length(wp.vec2f(u, v)) < radius[b] + blocked[o, 6] + margin:
+                    if wp.length(wp.vec2f(u, v)) < wide + blocked[o, 6] + margin:
                         clear = False
                 for o in range(footprints.shape[0]):
-                    if away_from(x, y, bases[world, o], footprints, o) < radius[b] + margin:
+                    if away_from(x, y, bases[world, o], footprints, o) < wide + margin:
                         clear = False
                 for o in range(b):
                     there = FINGERS + 7 * o
                     away = wp.length(wp.vec2f(x - rest_q[world, there], y - rest_q[world, there + 1]))
-                    if away < radius[b] + radius[o] + margin:
+                    if away < wide + radius[o] * sizes[world, o] + margin:
                         clear = False
                 found = clear
         angle = turn[b] * wp.randf(rng, -1.0, 1.0)
         rest_q[world, at] = x
         rest_q[world, at + 1] = y
-        rest_q[world, at + 2] = height[b]
+        rest_q[world, at + 2] = height[b] + (sizes[world, b] - 1.0) * rise[b]
         rest_q[world, at + 3] = 0.0
         rest_q[world, at + 4] = 0.0
         rest_q[world, at + 5] = wp.sin(0.5 * angle)

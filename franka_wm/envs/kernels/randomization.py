@@ -107,6 +107,66 @@ def draw_dynamics(
 
 
 @wp.kernel(enable_backward=False)
+def draw_sizes(
+    mask: wp.array[wp.bool],
+    seed: wp.array[int],
+    episode: wp.array[int],
+    width: float,
+    first: int,
+    # outputs
+    sizes: wp.array2d[float],
+    mass: wp.array2d[float],
+    inertia: wp.array2d[wp.mat33f],
+):
+    """Sizes of the objects, bodies ``first`` and on, of the masked worlds' new episodes; their density stays.
+
+    Masses and inertias are multiplied in place: :func:`draw_dynamics` has just written them.
+    """
+    world = wp.tid()
+    if mask[world]:
+        rng = episode_rng(seed[0], world, episode[world], 12)
+        for k in range(sizes.shape[1]):
+            f = 1.0 + wp.randf(rng, -width, width)
+            sizes[world, k] = f
+            mass[world, first + k] = mass[world, first + k] * f * f * f
+            inertia[world, first + k] = inertia[world, first + k] * (f * f * f * f * f)
+
+
+@wp.kernel(enable_backward=False)
+def resize(
+    sizes: wp.array2d[float],
+    parts: wp.array[wp.vec3i],
+    plain_size: wp.array[wp.vec3f],
+    plain_bounds: wp.array2d[wp.vec3f],
+    plain_radius: wp.array[float],
+    plain_place: wp.array[wp.vec3f],
+    plain_scale: wp.array2d[wp.vec3f],
+    plain_frame: wp.array2d[wp.transformf],
+    # outputs
+    size: wp.array2d[wp.vec3f],
+    bounds: wp.array3d[wp.vec3f],
+    radius: wp.array2d[float],
+    place: wp.array2d[wp.vec3f],
+    scale: wp.array2d[wp.vec3f],
+    frame: wp.array2d[wp.transformf],
+):
+    """What MuJoCo touches and what cameras see of the objects. dim = (worlds, parts); a part is MuJoCo's geom, Newton's
+    shape, both counted in a world, and the object."""
+    world, k = wp.tid()  # pyright: ignore
+    geom = parts[k][0]
+    shape = parts[k][1]
+    f = sizes[world, parts[k][2]]
+    size[world, geom] = plain_size[geom] * f
+    for i in range(2):
+        bounds[world, geom, i] = plain_bounds[geom, i] * f
+    radius[world, geom] = plain_radius[geom] * f
+    place[world, geom] = plain_place[geom] * f
+    scale[world, shape] = plain_scale[world, shape] * f
+    at = plain_frame[world, shape]
+    frame[world, shape] = wp.transformf(wp.transform_get_translation(at) * f, wp.transform_get_rotation(at))
+
+
+@wp.kernel(enable_backward=False)
 def draw_frictions(
     mask: wp.array[wp.bool],
     seed: wp.array[int],

@@ -72,6 +72,7 @@ class Arrays[T]:
         bases: (N, M) transforms, (N, M, 7) in torch: where the cases of the M articulated bodies stand; part of
             Newton's frames of joints.
         grip: (N,) the fingers' set point [m].
+        sizes: (N, K) factor of each object's size in this episode.
         body_q: (N, B) transforms, (N, B, 7) in torch: Newton's frames of the moving links.
         origins, directions: (N, 7) vectors, (N, 7, 3) in torch: scratch memory of the differential inverse kinematics.
     """
@@ -130,6 +131,7 @@ class Arrays[T]:
     rest_control: T
     bases: T
     grip: T
+    sizes: T
     body_q: T
     origins: T
     directions: T
@@ -227,6 +229,7 @@ def allocate(
             :, frames.shape[1] - 2 * config.num_articulated :: 2
         ],  # each is fixed, and carries one joint
         grip=zeros(n),
+        sizes=torch.ones(n, config.num_objects, device=device),
         body_q=newtons(state.body_q, 7),
         origins=zeros(n, NUM_JOINTS, 3),
         directions=zeros(n, NUM_JOINTS, 3),

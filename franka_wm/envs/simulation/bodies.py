@@ -95,6 +95,8 @@ class Bodies:
             numbers([one.turn for one in objects], count),
             numbers([scene.top + one.half_height - RESTING for one in objects] if scene else [], count),
             numbers([one.radius for one in objects], count),
+            numbers([one.half_height for one in objects], count),
+            sim.warp.sizes,
             obstacles,
             space,
             sim.warp.bases,

@@ -279,9 +279,9 @@ class Simulation:
             w.target, w.control, w.step_count, w.episode_return, w.episode_success, w.ended, w.history,
             cfg.action_mode == "joint_position",
         )  # fmt: skip
+        self.randomizer.launch(w.mask)  # sizes, before objects are placed
         if self.bodies:
             self.bodies.launch_place(w.mask)
-        self.randomizer.launch(w.mask)
         if self.task.num_draws:
             self._launch(randomization.draw_uniform, w.mask, w.seed, w.episode, w.draws)
         self.task.reset(self, w.mask)

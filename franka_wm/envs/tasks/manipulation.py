@@ -102,6 +102,7 @@ def bring_to_goal(
     goal: wp.array2d[float],
     tool: wp.vec3f,
     widths: wp.vec2f,
+    sizes: wp.array2d[float],
     opening: float,
     turned: bool,
     like: int,
@@ -127,7 +128,7 @@ def bring_to_goal(
     rest[world, FIRST + 5] = wp.sin(0.5 * yaw)
     rest[world, FIRST + 6] = wp.cos(0.5 * yaw)
     across = wp.abs(wp.sin(hand[world, 3] - yaw)) > 0.5  # the fingers stand along the object's x
-    wide = wp.where(across, widths[0], widths[1])
+    wide = wp.where(across, widths[0], widths[1]) * sizes[world, 0]
     for f in range(FIRST):
         rest[world, f] = wp.where(opening < 0.0, wp.min(0.5 * wide, OPEN), opening)
 
@@ -193,7 +194,16 @@ class GripperTask(Task):
         w, scene = sim.warp, self.config.surroundings
         assert scene is not None
         widths, wide = wp.vec2f(*scene.objects[0].widths), -1.0 if opening is None else opening
-        inputs = [mask, w.task_goal, wp.vec3f(*tool), widths, wide, turned, -1 if like is None else like]
+        inputs = [
+            mask,
+            w.task_goal,
+            wp.vec3f(*tool),
+            widths,
+            w.sizes,
+            wide,
+            turned,
+            -1 if like is None else like,
+        ]
         wp.launch(bring_to_goal, sim.num_envs, [*inputs, w.goal_rest, w.goal_hand], device=sim.device)
         assert sim.bodies is not None
         sim.bodies.launch_upright(mask)

@@ -114,6 +114,10 @@ class Peg(GripperTask):
         super().check(config)
         if config.surroundings is None or config.surroundings.objects[1].shape != "socket":
             raise UserError(f"scene: task={config.task} needs a shape=socket as the second in scene.objects")
+        if config.randomization.object_size:
+            raise UserError(
+                f"randomization.object_size: of task={config.task} the peg would not fit its hole; set it to 0"
+            )
 
     def _halves(self) -> tuple[float, float, float]:
         """Half of the peg's and the block's height, and of the hole's width [m]."""

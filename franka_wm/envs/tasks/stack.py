@@ -39,12 +39,18 @@ STILL = 0.01
 
 
 @wp.kernel(enable_backward=False)
-def goal_on_top(mask: wp.array[wp.bool], rest_q: wp.array2d[float], edge: float, goal: wp.array2d[float]):
+def goal_on_top(
+    mask: wp.array[wp.bool],
+    rest_q: wp.array2d[float],
+    edge: float,
+    sizes: wp.array2d[float],
+    goal: wp.array2d[float],
+):
     world = wp.tid()
     if mask[world]:
         for i in range(3):
             goal[world, i] = rest_q[world, 9 + i]  # behind the two fingers and the first cube: the second one
-        goal[world, 2] += edge
+        goal[world, 2] += 0.5 * edge * (sizes[world, 0] + sizes[world, 1])
 
 
 @wp.kernel(enable_backward=False)
@@ -60,15 +66,20 @@ def stack_reward_and_success(
     aside: float,
     off: float,
     still: float,
+    sizes: wp.array2d[float],
     reward: wp.array2d[float],
     success: wp.array2d[wp.bool],
 ):
     world = wp.tid()
     cube = place_of(objects, world, 0)
-    missing = place_of(objects, world, 1) + wp.vec3f(0.0, 0.0, edge) - cube
-    placed = wp.length(wp.vec2f(missing[0], missing[1])) <= aside and wp.abs(missing[2]) <= off
+    upper = edge * sizes[world, 0]
+    rise = 0.5 * (upper + edge * sizes[world, 1])
+    missing = place_of(objects, world, 1) + wp.vec3f(0.0, 0.0, rise) - cube
+    placed = (
+        wp.length(wp.vec2f(missing[0], missing[1])) <= aside * sizes[world, 1] and wp.abs(missing[2]) <= off
+    )
     away = wp.length(tool_of(state, world) - cube)
-    released = away > edge or state[world, 20] + state[world, 21] > edge + 0.004
+    released = away > upper or state[world, 20] + state[world, 21] > upper + 0.004
     solved = placed and released and speed_of(objects, world, 0) < still
     value = 0.2 * nearness(away)
     if holds(state, joint_target, cube, world):
@@ -107,22 +118,38 @@ class Stack(GripperTask):
 
     def reset(self, sim: "Simulation", mask: wp.array) -> None:
         w = sim.warp
-        wp.launch(goal_on_top, sim.num_envs, [mask, w.rest_q, EDGE, w.task_goal], device=sim.device)
+        wp.launch(goal_on_top, sim.num_envs, [mask, w.rest_q, EDGE, w.sizes, w.task_goal], device=sim.device)
 
     def pose_at_goal(self, sim: "Simulation", mask: wp.array) -> None:
         """The first cube on the second, the open hand over it."""
         self.launch_goal_pose(sim, mask, tool=(0.0, 0.0, AWAY), opening=MOST_OPEN)
 
     def reward_and_success(self, sim: "Simulation") -> None:
-        self.launch_reward(sim, stack_reward_and_success, EDGE, ASIDE, OFF, STILL)
+        self.launch_reward(sim, stack_reward_and_success, EDGE, ASIDE, OFF, STILL, sim.warp.sizes)
 
     def measures(self, sim: "Simulation") -> dict[str, torch.Tensor]:
         return {"cube's height [m]": sim.tensors.next_true_objects[:, 2]}
 
+    def _rise(self, sight: Sight) -> float | torch.Tensor:
+        """From the middle of the lower cube to that of the upper one [m]: sizes are not observed, so it looks.
+
+        The lower one stands on the table, the upper one is as thick as the fingers are open. One that is let go and
+        lies where it can is taken to lie on the other.
+        """
+        width, scene = self.config.randomization.object_size, self.config.surroundings
+        if not width or scene is None:
+            return EDGE
+        (upper, _), (lower, _) = sight.body(0), sight.body(1)
+        below = lower[:, 2] - scene.top
+        lies = upper[:, 2] - lower[:, 2] - below
+        half = torch.where(sight.squeezes, sight.opening + 0.001, lies)
+        return below + half.clamp(0.5 * EDGE * (1 - width), 0.5 * EDGE * (1 + width))
+
     def expert(self, sight: Sight) -> Aim:
         """Grasp the first cube from above, bring it over the second, down, let go, and up."""
         cube, _ = sight.body(0)
-        spot = moved(sight.body(1)[0], z=EDGE)
+        spot = moved(sight.body(1)[0])
+        spot[:, 2] += self._rise(sight)
         aside = (cube - spot)[:, :2].norm(dim=-1)
         high = cube[:, 2] > spot[:, 2] + 0.025
         to = torch.where((aside < 0.008)[:, None], spot, moved(spot, z=0.05))
