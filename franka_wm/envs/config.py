@@ -76,6 +76,8 @@ class FrankaConfig:
         gripper_force: Largest force of each finger [N]; the Franka Hand's is 70 continuously.
         scene: What stands around the arm: :class:`~franka_wm.envs.scene.Scene`, or the same as a mapping. ``None``:
             the task's. With objects or obstacles there are contacts; they need the gripper.
+        collisions: What of the robot touches the scene: ``"hand"`` (fingers and palm), ``"arm"`` (all links) or
+            ``"self"`` (all links, and these one another, but not those next to each other).
         max_contacts: Contacts for which there is room in each world, on average. ``None``: by the scene.
         end_when_lost: End the episode where an object has left the table.
         drawer_opening: ``task="drawer"`` is solved where the drawer is open so far [m]. ``None``: 90 % of its travel.
@@ -138,6 +140,7 @@ class FrankaConfig:
     gripper: bool | None = None
     gripper_force: float = 20.0
     scene: Scene | None = None
+    collisions: str = "hand"
     max_contacts: int | None = None
     end_when_lost: bool = True
     drawer_opening: float | None = None
@@ -340,6 +343,11 @@ class FrankaConfig:
             if not ok or len(self.home) != NUM_JOINTS or not all(_is_number(q) for q in self.home):
                 raise UserError(f"home={self.home!r}: give {NUM_JOINTS} joint angles [rad], or null")
             object.__setattr__(self, "home", tuple(float(q) for q in self.home))
+        self._check_choice("collisions", ("hand", "arm", "self"))
+        if self.collisions != "hand" and not self.surroundings:
+            raise UserError(
+                f"collisions={self.collisions}: task={self.task} touches nothing; give a scene, {{}} is a table alone"
+            )
         if self.max_contacts is not None:
             self._check_whole("max_contacts", 1, 10_000, "contacts of a world")
         if self.task_class.gripper and not self.has_gripper:

@@ -51,8 +51,18 @@ def test_the_printed_randomization(root: Path) -> None:
     page = (root / "docs" / "tasks.md").read_text()
     text = next(b for b in re.findall(r"```yaml\n(.*?)```", page, re.DOTALL) if "object_size" in b)
     env = FrankaEnv(FrankaConfig(task="lift", **yaml.safe_load(text)), num_envs=4, device="cpu")
-    heights = env.reset()["objects"][:, 2]
+    env.reset()
+    heights = env.simulation.tensors.objects[:, 2]
     assert heights.unique().numel() == 4 and ((heights - 0.02).abs() < 0.0041).all()
+
+
+def test_the_printed_collisions(root: Path) -> None:
+    page = (root / "docs" / "tasks.md").read_text()
+    text = next(b for b in re.findall(r"```yaml\n(.*?)```", page, re.DOTALL) if "collisions:" in b)
+    config = FrankaConfig(gripper=True, observations=("state",), **yaml.safe_load(text))
+    env = FrankaEnv(config, num_envs=2, device="cpu")
+    assert env.simulation.model.shape_label.count("post") == 2
+    assert "link5_8" in env.simulation.model.shape_label
 
 
 def test_the_printed_task_and_its_expert(printed_class, composed) -> None:

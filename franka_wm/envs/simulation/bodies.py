@@ -41,6 +41,8 @@ def room_for_contacts(config: FrankaConfig) -> int:
     objects, obstacles, joints = len(scene.objects), len(scene.obstacles), len(scene.articulated)
     least = 8 + 4 * objects
     wanted = 8 + 16 * (objects + joints) + 4 * obstacles + 2 * objects * (objects - 1) + 8 * objects * joints
+    if config.collisions != "hand":
+        least, wanted = least + 8, wanted + 32 + 8 * (objects + obstacles + joints)
     if config.max_contacts is None:
         return wanted
     if config.max_contacts < least:

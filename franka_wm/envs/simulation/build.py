@@ -19,7 +19,7 @@ from franka_wm.envs.robots import SOURCES, Robot, add_robot, arm_builder
 from franka_wm.envs.robots.sources import detail
 from franka_wm.envs.scene import FLOOR
 from franka_wm.envs.simulation.bodies import contact_options
-from franka_wm.envs.simulation.surroundings import add_scene
+from franka_wm.envs.simulation.surroundings import add_links, add_scene
 
 FORWARD_ONLY = (
     "mujoco_warp._src.set_const",
@@ -46,6 +46,8 @@ def build_model(
     robot = add_robot(arm, config, urdf_path)
     if config.surroundings:
         add_scene(arm, config.surroundings, robot.tool_body, detail(SOURCES[config.robot], config))
+        if config.collisions != "hand":
+            add_links(arm, robot, itself=config.collisions == "self")
     scene = newton.ModelBuilder()
     newton.solvers.SolverMuJoCo.register_custom_attributes(scene)
     if config.show_goal:

@@ -11,7 +11,9 @@ import warp as wp
 
 from franka_wm.envs.articulated import Articulated
 from franka_wm.envs.mesh_solids import MOST_CORNERS
+from franka_wm.envs.robots import Robot
 from franka_wm.envs.robots.gripper import add_colliders
+from franka_wm.envs.robots.links import add_link_colliders
 from franka_wm.envs.robots.meshes import Piece, simplify
 from franka_wm.envs.scene import Scene, Solid
 from franka_wm.envs.solids import Box
@@ -46,6 +48,12 @@ def add_scene(builder: newton.ModelBuilder, scene: Scene, tool_body: int, cell: 
         for shape in _add_articulated(builder, one, scene.top):
             for other in still:  # it slides or turns free of what it stands on and among
                 builder.add_shape_collision_filter_pair(shape, other)
+
+
+def add_links(builder: newton.ModelBuilder, robot: Robot, *, itself: bool) -> None:
+    """Makes the whole arm touch the scene, and ``itself``, in a builder that has both."""
+    for shape in add_link_colliders(builder, robot, itself=itself):
+        _harden(builder, shape)
 
 
 def _add_shape(
