@@ -15,16 +15,17 @@ def resolve_device(device: torch.device | str | None) -> torch.device:
     """
     if device is None or device == "auto":
         device = "cuda" if torch.cuda.is_available() else "cpu"
+    asked = device
     try:
         device = torch.device(device)
     except (RuntimeError, TypeError, ValueError) as error:
-        raise UserError(f"device={device!r}: must be auto, cpu, cuda or cuda:K") from error
+        raise UserError(f"device={asked!r}: must be auto, cpu, cuda or cuda:K") from error
     if device.type == "cuda":
         index = 0 if device.index is None else device.index
         count = torch.cuda.device_count() if torch.cuda.is_available() else 0
-        if index >= count:
+        if not 0 <= index < count:  # torch keeps the lowest eight bits of a larger one
             raise UserError(
-                f"device={device}: this machine has {count} usable CUDA devices; use device=cpu or auto"
+                f"device={asked}: this machine has {count} usable CUDA devices; use device=cpu or auto"
             )
         return torch.device("cuda", index)
     if device.type != "cpu":

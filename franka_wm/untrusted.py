@@ -152,6 +152,19 @@ class UntrustedFolder:
             self._inside(path.relative_to(self.root))
 
 
+def linked_json(path: Path) -> dict[str, Any]:
+    """The object in a JSON file that may be a link, as the Hub's local copies are.
+
+    Raises:
+        UserError: as for `UntrustedFolder.json`, or there is none.
+    """
+    real = path.resolve()
+    found = UntrustedFolder(real.parent).json(real.name)
+    if found is None:
+        raise UserError(f"{path} is missing; copy the folder again.")
+    return found
+
+
 @contextmanager
 def values_of(what: str, then: str) -> Iterator[None]:
     """Around the use of what a file holds: values of a form that nothing writes end in one line.

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import ast
 import inspect
-import json
 from collections.abc import Sequence
 from pathlib import Path
 
 from franka_wm.commands.arguments import verb, word
 from franka_wm.errors import UserError
+from franka_wm.untrusted import linked_json
 
 # The values of FrankaConfig.robot, which lives in a package that imports the simulator.
 ROBOTS = {
@@ -102,9 +102,9 @@ def datasets(folder: Path) -> dict[str, str]:
     found = {}
     for file in sorted(folder.glob("*/meta/info.json")):
         try:
-            info = json.loads(file.read_text(encoding="utf-8"))
+            info = linked_json(file)
             line = f"{info['total_episodes']:,} episodes, {info['total_frames']:,} steps"
-        except (OSError, ValueError, KeyError, TypeError) as error:
+        except (UserError, KeyError, TypeError, ValueError) as error:
             line = f"{file.relative_to(file.parents[1])} cannot be read ({error!r})"
         found[str(file.parents[1])] = line
     return found

@@ -195,5 +195,11 @@ def external_config(values: Mapping[str, Any]) -> ExternalConfig:
     if unknown:
         raise UserError(f"env.{unknown[0]}: no such field; choose from {', '.join(sorted(known))}")
     given: dict[str, Any] = dict(values)
-    given["observations"] = dict(given.get("observations") or {})
+    observations = given.get("observations") or {}
+    if not isinstance(observations, Mapping):
+        raise UserError(
+            f"env.observations={observations!r}: must be keys with lists of the environment's own, "
+            "as in {state: [position, velocity]}"
+        )
+    given["observations"] = dict(observations)
     return ExternalConfig(**given)

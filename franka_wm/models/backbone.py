@@ -12,6 +12,7 @@ from torch.nn import functional as F
 
 from franka_wm.models.images import check_images
 from franka_wm.models.vision import Architecture, ConvEncoder, ViT, vit_size
+from franka_wm.untrusted import linked_json
 
 IMAGENET_MEAN, IMAGENET_STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
 _WEIGHTS = ("model.safetensors", "checkpoints/latest/model.safetensors")
@@ -240,5 +241,5 @@ def _normalisation(name: str, local_files_only: bool) -> tuple[Sequence[float], 
     )
     if file is None:
         return IMAGENET_MEAN, IMAGENET_STD
-    settings = json.loads(Path(file).read_text(encoding="utf-8"))
+    settings = linked_json(Path(file))
     return settings.get("image_mean", IMAGENET_MEAN), settings.get("image_std", IMAGENET_STD)

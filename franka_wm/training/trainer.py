@@ -401,6 +401,11 @@ class Trainer:
             self.rows = list(extra.get("rows", []))
             experience = None if self.env is None else checkpoint.replay(self.env.device)
             if experience is not None:
+                assert self.env is not None
+                gathered = self.env.fake_tensordict()
+                for key, saved in experience.items(True, True):
+                    if saved.dtype != gathered.get(key, saved).dtype:
+                        raise ValueError(f"experience of {key} is {saved.dtype}")
                 fill(self.replay, experience, self.settings, updates=self.learner.updates, restored=True)
             elif self.env is not None and self.learner.updates < self.settings.trainer.updates:
                 say("  the checkpoint holds no experience: this run gathers anew and will not be the same")

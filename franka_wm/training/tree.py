@@ -13,7 +13,7 @@ from tensordict import TensorDict
 from torch import Tensor
 
 from franka_wm.errors import UserError
-from franka_wm.untrusted import values_of
+from franka_wm.untrusted import UntrustedFolder, values_of
 
 
 def write_tree(folder: Path, name: str, tree: Any) -> None:
@@ -40,7 +40,7 @@ def read_tree(folder: Path, name: str) -> Any:
         UserError: another program wrote these files.
     """
     with damaged(folder, f"{name}.json"):
-        structure = json.loads((folder / f"{name}.json").read_bytes())
+        structure = json.loads(UntrustedFolder(folder).bytes(f"{name}.json") or b"")
         return _decode(structure, read_tensors(folder, name))
 
 

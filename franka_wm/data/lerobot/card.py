@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import json
 from collections.abc import Mapping
 from importlib.metadata import PackageNotFoundError, metadata
 from pathlib import Path
@@ -15,8 +14,10 @@ from huggingface_hub import DatasetCard, DatasetCardData, ModelCard, ModelCardDa
 from franka_wm.data.lerobot.paths import without_paths
 from franka_wm.data.lerobot.provenance import read_provenance
 from franka_wm.data.lerobot.schema import OWN_FOLDER, PROVENANCE
+from franka_wm.data.lerobot.source import Source, read_source
 from franka_wm.data.lerobot.terminal import TERMINAL_FOLDER
 from franka_wm.errors import UserError
+from franka_wm.untrusted import linked_json, values_of
 
 IMAGE = f"{OWN_FOLDER}/picture.png"
 _CITATION = """```bibtex
@@ -62,7 +63,7 @@ def dataset_card(root: Path, *, repo_id: str, license: str) -> str:
         repo_id: Where it goes.
         license: Identifier, as the Hub knows them (``apache-2.0``, ``cc-by-4.0``, …).
     """
-    info = json.loads((root / "meta" / "info.json").read_text(encoding="utf-8"))
+    info = linked_json(root / "meta" / "info.json")
     provenance = read_provenance(root)
     try:
         task, gathered = (
@@ -77,7 +78,7 @@ def dataset_card(root: Path, *, repo_id: str, license: str) -> str:
     settings = cite = ""
     tags = ["LeRobot"]
     if provenance is not None:
-        robot = f"of a simulated {info['robot_type']} arm"
+        robot = f"of a simulated {info.get('robot_type')} arm"
         own += f", gathered with {_project()} in NVIDIA Newton"
         settings = f"\n\nSettings in full: [{PROVENANCE}]({PROVENANCE})."
         cite = f"\n## Citation\n\n{_CITATION}\n"
@@ -150,6 +151,7 @@ def _gathered(provenance: Mapping[str, Any]) -> str:
 def _names(names: Any) -> str:
     if not isinstance(names, list):
         return ""
+    names = [str(name) for name in names]
     return ", ".join(names) if len(names) <= 7 else f"{names[0]}, … {names[-1]} ({len(names)})"
 
 
@@ -164,38 +166,39 @@ def make_image(root: Path, out: Path, *, frames: int = 6) -> None:
     from franka_wm.data.lerobot.png import encode_png
     from franka_wm.files import atomic_write
 
-    info = json.loads((root / "meta" / "info.json").read_text(encoding="utf-8"))
+    source = read_source(root)
     kinds = {
         name: feature["dtype"]
-        for name, feature in info["features"].items()
+        for name, feature in source.features.items()
         if feature["dtype"] in ("image", "video")
     }
     if not kinds:
         return
     name, kind = next(iter(kinds.items()))
-    episode = _first_episode(root, info, name, kind)
+    with values_of(str(root), "copy or download the dataset again"):
+        episode = _first_episode(source, name, kind)
     chosen = episode[np.linspace(0, len(episode) - 1, min(frames, len(episode))).round().astype(int)]
     out.parent.mkdir(parents=True, exist_ok=True)
     with atomic_write(out) as path:
         path.write_bytes(encode_png(np.concatenate(list(chosen), axis=1)))
 
 
-def _first_episode(root: Path, info: Mapping[str, Any], name: str, kind: str) -> np.ndarray:
+def _first_episode(source: Source, name: str, kind: str) -> np.ndarray:
     """(T, H, W, 3) uint8."""
     import pyarrow.parquet as pq
 
     from franka_wm.data.lerobot.png import decode_png
 
-    data = root / info["data_path"].format(chunk_index=0, file_index=0)
+    data = source.data_path(0, 0)
     if kind == "image":
         group = pq.ParquetFile(data).read_row_group(0, columns=[name, "episode_index"])
         rows = zip(group[name].to_pylist(), group["episode_index"].to_pylist(), strict=True)
         return np.stack([decode_png(cell["bytes"]) for cell, episode in rows if episode == 0])
     import av
 
-    length = pq.read_table(data, columns=["episode_index"])["episode_index"].to_pylist().count(0)
+    length = int(source.lengths[0])
     frames = []
-    with av.open(str(root / info["video_path"].format(video_key=name, chunk_index=0, file_index=0))) as video:
+    with av.open(str(source.video_path(name, 0, 0))) as video:
         for frame in video.decode(video=0):
             frames.append(frame.to_ndarray(format="rgb24"))
             if len(frames) == length:
@@ -217,7 +220,7 @@ def model_card(folder: Path, *, repo_id: str, license: str) -> str:
     cfg = OmegaConf.load(folder / "config.yaml")
     if not isinstance(cfg, DictConfig):
         raise UserError(f"{folder / 'config.yaml'} is not a configuration")
-    counters = json.loads((folder / "counters.json").read_text(encoding="utf-8"))
+    counters = linked_json(folder / "counters.json")
     evaluation = folder / "evaluation.md"
     table = evaluation.read_text(encoding="utf-8") if evaluation.is_file() else "Not evaluated."
     head = ModelCardData(

@@ -192,8 +192,8 @@ def image_shape(source: Source, name: str) -> tuple[int, int]:
     shape = tuple(spec["shape"])
     if is_depth(spec) or len(shape) != 3 or 3 not in (shape[0], shape[-1]):
         raise UserError(f"{source.root}: {name} {shape} is not a colour image; leave it out")
-    names = spec.get("names") or []
-    first = names[0] if len(names) == 3 else None
+    names = spec.get("names")
+    first = names[0] if isinstance(names, list) and len(names) == 3 else None
     if shape[0] == 3 and (shape[-1] != 3 or first in ("channel", "channels")):
         return shape[1], shape[2]
     return shape[0], shape[1]

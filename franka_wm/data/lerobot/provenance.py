@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import platform
 import sys
 from collections.abc import Mapping
@@ -12,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from franka_wm.data.lerobot.schema import PROVENANCE
-from franka_wm.errors import UserError
+from franka_wm.untrusted import linked_json
 
 _PACKAGES = ("franka-wm", "torch", "torchrl", "newton", "warp-lang", "lerobot", "numpy")
 
@@ -56,7 +55,4 @@ def read_provenance(root: str | Path) -> dict[str, Any] | None:
     path = Path(root) / PROVENANCE
     if not path.is_file():
         return None
-    try:
-        return json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
-        raise UserError(f"{path} cannot be read ({error}); copy the dataset again") from error
+    return linked_json(path)

@@ -16,6 +16,7 @@ from franka_wm.data.lerobot.paths import without_paths
 from franka_wm.data.lerobot.provenance import read_provenance
 from franka_wm.data.lerobot.schema import PROVENANCE
 from franka_wm.errors import UserError
+from franka_wm.untrusted import linked_json
 
 VERSION_TAG = "v3.0"
 """LeRobot loads the revision of this name from the Hub."""
@@ -107,17 +108,10 @@ def _check_dataset(root: Path) -> None:
     path = root / "meta" / "info.json"
     if not path.is_file():
         raise UserError(f"publish: root={root} is not a LeRobot dataset (no meta/info.json)")
-    try:
-        info = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
-        raise UserError(f"publish: {path} cannot be read ({error}); copy the dataset again") from error
+    info = linked_json(path)
     kinds = {"codebase_version": str, "total_episodes": int, "total_frames": int, "fps": int | float}
     kinds |= {"features": dict, "data_path": str}
-    wrong = [
-        key
-        for key, kind in kinds.items()
-        if not isinstance(info, dict) or not isinstance(info.get(key), kind)
-    ]
+    wrong = [key for key, kind in kinds.items() if not isinstance(info.get(key), kind)]
     features = {} if "features" in wrong else info["features"]
     wrong += [
         f"features.{name}"
@@ -159,11 +153,11 @@ def stage_dataset(root: Path, place: Path, *, repo_id: str, license: str) -> Pat
             (place / name).symlink_to(root / name)
     provenance = read_provenance(root)
     if provenance is not None:
-        text = (root / PROVENANCE).read_text(encoding="utf-8")
         cleaned = without_paths(provenance)
-        if cleaned != provenance:
-            text = json.dumps(cleaned, indent=1)
-        (place / PROVENANCE).write_text(text, encoding="utf-8")
+        if cleaned == provenance:
+            shutil.copyfile(root / PROVENANCE, place / PROVENANCE)
+        else:
+            (place / PROVENANCE).write_text(json.dumps(cleaned, indent=1), encoding="utf-8")
     make_image(root, place / IMAGE)
     card = dataset_card(place, repo_id=repo_id, license=license)
     (place / README).write_text(card, encoding="utf-8")

@@ -16,7 +16,7 @@ import numpy as np
 
 from franka_wm.errors import UserError
 from franka_wm.options import is_real, is_whole
-from franka_wm.untrusted import UntrustedFolder
+from franka_wm.untrusted import linked_json
 
 DEFAULT_DATA_PATH = "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
 DEFAULT_VIDEO_PATH = "videos/{video_key}/chunk-{chunk_index:03d}/file-{file_index:03d}.mp4"
@@ -138,8 +138,7 @@ def read_source(root: str | Path) -> Source:
         raise UserError(
             f"dataset.root={root}: no LeRobot dataset, meta/info.json is missing; give the folder that holds meta/"
         )
-    real = info_path.resolve()  # the Hub's local copies are links
-    info = UntrustedFolder(real.parent).json(real.name) or {}
+    info = linked_json(info_path)
     for name in ("codebase_version", "features", "fps"):
         if name not in info:
             raise UserError(f"{info_path} cannot be read: {name} is missing")

@@ -25,6 +25,7 @@ from franka_wm.data.lerobot.schema import PROVENANCE
 from franka_wm.errors import UserError
 from franka_wm.training.checkpoint import load_checkpoint, save_checkpoint
 from franka_wm.training.publish import stage_model
+from franka_wm.untrusted import MOST_JSON
 
 
 def _fake_hub():
@@ -85,8 +86,7 @@ def one_line(result, *says: str) -> None:
     assert len(error) == 1, result.stderr
     assert "Traceback" not in result.stderr
     assert fake_hub.TOKEN not in result.stderr + result.stdout
-    for text in says:
-        assert text in error[0]
+    assert all(text in error[0] for text in says), error
 
 
 def test_a_dataset_goes_with_our_card_and_tag(hub, publish, dataset) -> None:
@@ -100,15 +100,15 @@ def test_a_dataset_goes_with_our_card_and_tag(hub, publish, dataset) -> None:
     del local[PROVENANCE]  # goes without this machine's paths
     assert {name: repo["files"][name] for name in local} == local
     card = repo["files"]["README.md"].decode()
-    for text in (
+    shown = (
         "license: cc-by-4.0",
         "observation.images.front",
         "picture.png",
         "@software",
         "terminal",
         "LeRobot",
-    ):
-        assert text in card
+    )
+    assert all(text in card for text in shown)
     assert "More Information Needed" not in card  # what push_to_hub's own card says
     assert repo["tags"] == {"v3.0": f"{repo['commits']:040x}"}  # the newest commit, the one with the card
 
@@ -135,12 +135,9 @@ def test_a_dry_run_sends_nothing_and_writes_the_card(hub, publish, dataset, tmp_
     card = (place / "README.md").read_text()
     loaded = DatasetCard(card)
     assert (loaded.data.license, loaded.data.task_categories) == ("apache-2.0", ["robotics"])
-    for text in (
-        "https://huggingface.co/spaces/lerobot/visualize_dataset?path=user/arm",
-        "| `observation.environment_state` | float32 | (3,) | m |",
-        "| `joint_target` | float32 | (7,) | rad |",
-    ):
-        assert text in card
+    assert "https://huggingface.co/spaces/lerobot/visualize_dataset?path=user/arm" in card
+    assert "| `observation.environment_state` | float32 | (3,) | m |" in card
+    assert "| `joint_target` | float32 | (7,) | rad |" in card
     assert publish(f"root={dataset}", "repo_id=user/arm").returncode == 0
     assert hub.repos["datasets/user/arm"]["files"]["README.md"].decode() == card
 
@@ -228,22 +225,26 @@ def test_the_card_of_anothers_dataset_claims_nothing(copy, tmp_path) -> None:
     place = stage_dataset(copy, tmp_path / "place", repo_id="user/arm", license="mit")
     card = (place / "README.md").read_text()
     assert "Not recorded." in card
-    for text in ("Newton", "provenance.json", "simulated", "simulation", "terminal", "gathered with"):
-        assert text not in card
+    ours = "Newton", "provenance.json", "simulated", "simulation", "terminal", "gathered with"
+    assert not any(text in card for text in ours)
 
 
 @pytest.mark.parametrize(
     ("text", "says"),
     [
         ("{}", "lacks codebase_version, total_episodes"),
-        ("[]", "lacks codebase_version"),
+        ("[]", "holds no object"),
         ('{"total', "cannot be read"),
+        (" " * (MOST_JSON + 1), "larger than 32 MiB"),
+        ({"data_path": "{chunk_index:0999999999d}"}, "makes no path"),
     ],
+    ids=["nothing", "list", "cut", "large", "path"],
 )
 def test_a_broken_dataset_is_one_line(text, says, copy, capsys) -> None:
     from franka_wm.commands.main import main
 
-    (copy / "meta" / "info.json").write_text(text)
+    info = copy / "meta" / "info.json"
+    info.write_text(text if isinstance(text, str) else json.dumps(json.loads(info.read_text()) | text))
     assert main(["publish", f"root={copy}", "repo_id=user/arm", "--dry-run"]) == 1
     error = capsys.readouterr().err
     assert says in error
