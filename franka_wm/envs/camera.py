@@ -176,7 +176,7 @@ class Camera:
         if "segmentation" in kinds:
             self._shape_index = self.sensor.allocate_image_shape_index(views, size, size)
             self._segments = wp.array(
-                segment_numbers(model, config.surroundings), dtype=wp.uint8, device=model.device
+                segment_numbers(model, config.resolved_scene), dtype=wp.uint8, device=model.device
             )
         self.images = self.allocate(views)
 

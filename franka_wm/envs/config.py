@@ -271,7 +271,7 @@ class FrankaConfig:
         return self.task_class.gripper if self.gripper is None else self.gripper
 
     @property
-    def surroundings(self) -> Scene | None:
+    def resolved_scene(self) -> Scene | None:
         """What stands around the arm: as given, or the task's; ``None``: nothing."""
         return self.task_class.scene if self.scene is None else self.scene
 
@@ -298,12 +298,12 @@ class FrankaConfig:
     @property
     def num_objects(self) -> int:
         """How many bodies move freely."""
-        return len(self.surroundings.objects) if self.surroundings else 0
+        return len(self.resolved_scene.objects) if self.resolved_scene else 0
 
     @property
     def num_articulated(self) -> int:
         """How many bodies have a joint."""
-        return len(self.surroundings.articulated) if self.surroundings else 0
+        return len(self.resolved_scene.articulated) if self.resolved_scene else 0
 
     @property
     def object_dim(self) -> int:
@@ -344,7 +344,7 @@ class FrankaConfig:
                 raise UserError(f"home={self.home!r}: give {NUM_JOINTS} joint angles [rad], or null")
             object.__setattr__(self, "home", tuple(float(q) for q in self.home))
         self._check_choice("collisions", ("hand", "arm", "self"))
-        if self.collisions != "hand" and not self.surroundings:
+        if self.collisions != "hand" and not self.resolved_scene:
             raise UserError(
                 f"collisions={self.collisions}: task={self.task} touches nothing; give a scene, {{}} is a table alone"
             )
@@ -352,13 +352,13 @@ class FrankaConfig:
             self._check_whole("max_contacts", 1, 10_000, "contacts of a world")
         if self.task_class.gripper and not self.has_gripper:
             raise UserError(f"gripper=false: task={self.task} needs the gripper; leave it at null")
-        if self.surroundings and not self.has_gripper:
+        if self.resolved_scene and not self.has_gripper:
             raise UserError("scene: contacts need the fingers as bodies of their own; set gripper=true")
         if self.has_gripper and "goal_pixels" in self.observations:
             self.task_class.check_goal_image()
         if self.has_gripper and self.solver == "featherstone":
             raise UserError("gripper and scene need solver=mujoco")
-        if self.contact_dim and not self.surroundings:
+        if self.contact_dim and not self.resolved_scene:
             raise UserError(
                 f"observations: task={self.task} touches nothing; leave contacts out, or give a scene"
             )
@@ -367,15 +367,15 @@ class FrankaConfig:
                 f"observations: task={self.task} has no objects; leave objects out, or give a scene"
             )
         for name, there, what in (
-            ("contact_friction", self.surroundings, "a scene"),
+            ("contact_friction", self.resolved_scene, "a scene"),
             ("grip_force", self.has_gripper, "the gripper"),
             ("object_size", self.num_objects, "objects"),
             ("object_noise", self.object_dim, "objects"),
         ):
             if getattr(self.randomization, name) and not there:
                 raise UserError(f"randomization.{name}: needs {what}; task={self.task} has none; set it to 0")
-        if self.randomization.object_size and self.surroundings:
-            self.surroundings.check_sizes(self.randomization.object_size)
+        if self.randomization.object_size and self.resolved_scene:
+            self.resolved_scene.check_sizes(self.randomization.object_size)
         self.task_class.check(self)
 
     def _check_whole(self, name: str, low: int, high: int, unit: str) -> None:

@@ -81,7 +81,7 @@ class Randomizer:
         shapes = int((model.shape_world.numpy() == 0).sum())
         start = int(np.argmax(model.shape_world.numpy() == 0))
         bodies = model.shape_body.numpy()
-        first = model.body_label.index(sim.config.surroundings.objects[0].name)
+        first = model.body_label.index(sim.config.resolved_scene.objects[0].name)
         self._first_object = first
         parts = []
         for geom, shape in enumerate(sim.solver.mjc_geom_to_newton_shape.numpy()[0]):

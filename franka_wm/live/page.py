@@ -87,7 +87,7 @@ class Page:
             arm_shapes(arm.model),
             bodies=len(first.bodies),
             success_distance=arm.config.success_distance,
-            floor=FLOOR if arm.config.surroundings else 0.0,
+            floor=FLOOR if arm.config.resolved_scene else 0.0,
             on_goal=session.ask_goal,
         )
         self._times: deque[float] = deque(maxlen=30)

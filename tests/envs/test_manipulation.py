@@ -72,10 +72,10 @@ def lifted() -> tuple[FrankaEnv, torch.Tensor]:
 def test_a_task_brings_gripper_scene_and_home() -> None:
     config = FrankaConfig(task="lift")
     assert (config.action_dim, config.state_dim, config.target_dim, config.num_objects) == (8, 28, 8, 1)
-    assert config.surroundings is Lift.scene and config.start_pose == Lift.home
+    assert config.resolved_scene is Lift.scene and config.start_pose == Lift.home
     plain = FrankaConfig()
     assert (plain.action_dim, plain.state_dim, plain.target_dim) == (7, 20, 7)
-    assert plain.surroundings is None and not plain.has_gripper
+    assert plain.resolved_scene is None and not plain.has_gripper
 
 
 def test_specs() -> None:

@@ -25,7 +25,7 @@ def test_the_printed_scene(root: Path, tmp_path: Path, monkeypatch: pytest.Monke
     exec(code, names)
     env, observation = names["env"], names["observation"]
     assert observation["objects"].shape == (16, 39)
-    assert [body.name for body in env.config.surroundings.objects] == ["cube", "can", "ball"]
+    assert [body.name for body in env.config.resolved_scene.objects] == ["cube", "can", "ball"]
     action = torch.zeros(16, 8)
     for _ in range(20):
         observation = env.step(observation.set("action", action))["next"]
@@ -68,7 +68,7 @@ def test_the_printed_collisions(root: Path) -> None:
 def test_the_printed_task_and_its_expert(printed_class, composed) -> None:
     topple = printed_class("Topple(TorchTask)", lines=40)
     config = RunSettings.of(composed("env=lift", "env.task=topple")).env.arm  # it has registered itself
-    assert config.num_objects == 1 and config.surroundings is topple.scene
+    assert config.num_objects == 1 and config.resolved_scene is topple.scene
     env = FrankaEnv(config, num_envs=32, device="cpu", seed=0)
     played = play_episodes(env, ExpertPolicy(env.simulation.task, env.kinematics, config), seed=2)
     assert played["success_once"].mean() > 0.95
@@ -83,5 +83,5 @@ def test_the_printed_task_and_its_expert(printed_class, composed) -> None:
 def test_an_own_config_is_not_the_tasks_scene() -> None:
     scene = {"objects": [{"name": "brick", "size": [0.06, 0.03, 0.02], "at": [0.45, 0.1]}]}
     config = FrankaConfig.from_mapping({"task": "lift", "scene": scene})
-    assert config.surroundings is not None
-    assert [body.name for body in config.surroundings.objects] == ["brick"]
+    assert config.resolved_scene is not None
+    assert [body.name for body in config.resolved_scene.objects] == ["brick"]

@@ -225,8 +225,8 @@ def schema_for(
     if "joint_target" in keys:
         targets = [f"{joint}.target" for joint in _JOINT_NAMES] + ["gripper.target"] * config.has_gripper
         observed(TARGET, "joint_target", targets)
-    if "objects" in keys and config.surroundings:
-        scene = config.surroundings
+    if "objects" in keys and config.resolved_scene:
+        scene = config.resolved_scene
         bodies = [body.name for body in (*scene.objects, *scene.articulated)]
         numbers = [f"{body}.{name}" for body in bodies for name in _OBJECT_NAMES]
         joints = [f"{one.name}.{name}" for one in scene.articulated for name in ("opened", "opened.vel")]

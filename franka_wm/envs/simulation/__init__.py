@@ -1,6 +1,6 @@
 """N worlds in Newton, and the one captured graph that steps them.
 
-``build`` makes model, solver and the arrays of the robot, ``surroundings`` adds what it can touch; ``arrays`` holds
+``build`` makes model, solver and the arrays of the robot, ``scene`` adds what it can touch; ``arrays`` holds
 what a step reads and writes; ``graph`` records and replays; ``bodies`` adds fingers and objects to a step;
 ``rendering`` renders; ``state`` saves and restores; ``simulator`` says in which order.
 """

@@ -36,7 +36,7 @@ def room_for_contacts(config: FrankaConfig) -> int:
     Raises:
         UserError: The config allows fewer than the scene needs to stand still.
     """
-    scene = config.surroundings
+    scene = config.resolved_scene
     assert scene is not None
     objects, obstacles, joints = len(scene.objects), len(scene.obstacles), len(scene.articulated)
     least = 8 + 4 * objects
@@ -55,7 +55,7 @@ def room_for_contacts(config: FrankaConfig) -> int:
 
 def contact_options(config: FrankaConfig) -> dict[str, Any]:
     """Of Newton's MuJoCo solver, for scenes; see docs/tasks.md for what they hold."""
-    contacts, scene = room_for_contacts(config), config.surroundings
+    contacts, scene = room_for_contacts(config), config.resolved_scene
     meshes = scene is not None and any(one.shape == "mesh" for one in (*scene.objects, *scene.obstacles))
     return {
         "enable_multiccd": meshes or None,  # one contact of a mesh and a box is too few to stand on
@@ -79,7 +79,7 @@ class Bodies:
     def __init__(self, sim: Simulation):
         self.sim = sim
         config, device = sim.config, sim.device
-        scene = config.surroundings
+        scene = config.resolved_scene
         objects = scene.objects if scene else ()
 
         def numbers(values: list, *shape: int) -> wp.array:

@@ -19,7 +19,7 @@ from franka_wm.envs.robots import SOURCES, Robot, add_robot, arm_builder
 from franka_wm.envs.robots.sources import detail
 from franka_wm.envs.scene import FLOOR
 from franka_wm.envs.simulation.bodies import contact_options
-from franka_wm.envs.simulation.surroundings import add_links, add_scene
+from franka_wm.envs.simulation.scene import add_links, add_scene
 
 FORWARD_ONLY = (
     "mujoco_warp._src.set_const",
@@ -44,8 +44,8 @@ def build_model(
     """N copies of the robot, and the ground that all of them share."""
     arm = arm_builder()
     robot = add_robot(arm, config, urdf_path)
-    if config.surroundings:
-        add_scene(arm, config.surroundings, robot.tool_body, detail(SOURCES[config.robot], config))
+    if config.resolved_scene:
+        add_scene(arm, config.resolved_scene, robot.tool_body, detail(SOURCES[config.robot], config))
         if config.collisions != "hand":
             add_links(arm, robot, itself=config.collisions == "self")
     scene = newton.ModelBuilder()
@@ -54,7 +54,7 @@ def build_model(
         ghost = newton.ModelBuilder.ShapeConfig(
             has_shape_collision=False, has_particle_collision=False, density=0.0
         )
-        color = (0.16, 0.58, 0.62) if config.surroundings else (0.90, 0.22, 0.12)  # unlike the cube's
+        color = (0.16, 0.58, 0.62) if config.resolved_scene else (0.90, 0.22, 0.12)  # unlike the cube's
         look: dict[str, Any] = {"cfg": ghost, "color": color, "label": GOAL_MARKER}
         disc = config.task_class.marker
         if disc is None:
@@ -67,7 +67,7 @@ def build_model(
     scene.replicate(arm, num_envs)
     ground = newton.ModelBuilder.ShapeConfig(has_shape_collision=False, has_particle_collision=False)
     # The arm stands on the table, where there is one, and that on the floor.
-    scene.add_ground_plane(height=FLOOR if config.surroundings else 0.0, cfg=ground, color=GROUND)
+    scene.add_ground_plane(height=FLOOR if config.resolved_scene else 0.0, cfg=ground, color=GROUND)
     return scene.finalize(device=device), robot
 
 
@@ -75,7 +75,7 @@ def make_solver(model: newton.Model, config: FrankaConfig) -> newton.solvers.Sol
     """The physics that ``config.solver`` names; MuJoCo's steps a state in place, Featherstone's from one to another."""
     if config.solver == "featherstone":
         return newton.solvers.SolverFeatherstone(model)
-    options = contact_options(config) if config.surroundings else {"disable_contacts": True}
+    options = contact_options(config) if config.resolved_scene else {"disable_contacts": True}
     solver = newton.solvers.SolverMuJoCo(
         model,
         iterations=config.solver_iterations,
@@ -83,7 +83,7 @@ def make_solver(model: newton.Model, config: FrankaConfig) -> newton.solvers.Sol
         disable_sensors=True,
         **options,
     )
-    if config.surroundings:  # overflow is counted, not printed by every thread
+    if config.resolved_scene:  # overflow is counted, not printed by every thread
         solver.mjw_model.opt.warn_overflow = 0
     return solver
 

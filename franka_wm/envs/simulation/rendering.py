@@ -117,7 +117,7 @@ class Renderer:
     def _launch_marker(self) -> None:
         sim = self.sim
         if sim.config.show_goal:
-            scene = sim.config.surroundings
+            scene = sim.config.resolved_scene
             ground, flat = (scene.top if scene else 0.0), sim.config.task_class.marker is not None
             inputs = [sim.warp.task_goal, flat, ground, self._markers, sim.model.shape_transform]
             wp.launch(kernels.move_goal_marker, sim.num_envs, inputs, device=sim.device)

@@ -123,7 +123,7 @@ class Simulation:
         totals = dict(zip(STATISTICS, self.tensors.statistics.sum(0).tolist(), strict=True))
         if clear:
             self.tensors.statistics.zero_()
-        counts = ("episodes", "nonfinite", *(["overflow"] if self.config.surroundings else []))
+        counts = ("episodes", "nonfinite", *(["overflow"] if self.config.resolved_scene else []))
         out = {key: totals[key] for key in counts}
         if out.get("overflow") and not self._overflowed:
             self._overflowed = True

@@ -105,7 +105,7 @@ class Drawer(GripperTask):
     @classmethod
     def check(cls, config: "FrankaConfig") -> None:
         super().check(config)
-        some = config.surroundings.articulated if config.surroundings else ()
+        some = config.resolved_scene.articulated if config.resolved_scene else ()
         if not some or not some[0].slides:
             raise UserError(f"scene: task={config.task} needs a drawer as the first in scene.articulated")
         if config.drawer_opening is not None and not 0 < config.drawer_opening <= some[0].travel:
@@ -117,8 +117,8 @@ class Drawer(GripperTask):
     @property
     def drawer(self) -> Articulated:
         """The scene's first."""
-        assert self.config.surroundings is not None
-        return self.config.surroundings.articulated[0]
+        assert self.config.resolved_scene is not None
+        return self.config.resolved_scene.articulated[0]
 
     def reset(self, sim: "Simulation", mask: wp.array) -> None:
         w, grip = sim.warp, wp.vec3f(*self.drawer.grip_at(self.drawer.travel))

@@ -191,7 +191,7 @@ class GripperTask(Task):
             turned: Whether the hand is turned as the object is.
             like: Number of the object that it is turned like, up to quarter turns; as at the start if not given.
         """
-        w, scene = sim.warp, self.config.surroundings
+        w, scene = sim.warp, self.config.resolved_scene
         assert scene is not None
         widths, wide = wp.vec2f(*scene.objects[0].widths), -1.0 if opening is None else opening
         inputs = [

@@ -112,7 +112,7 @@ class Peg(GripperTask):
     @classmethod
     def check(cls, config: "FrankaConfig") -> None:
         super().check(config)
-        if config.surroundings is None or config.surroundings.objects[1].shape != "socket":
+        if config.resolved_scene is None or config.resolved_scene.objects[1].shape != "socket":
             raise UserError(f"scene: task={config.task} needs a shape=socket as the second in scene.objects")
         if config.randomization.object_size:
             raise UserError(
@@ -121,8 +121,8 @@ class Peg(GripperTask):
 
     def _halves(self) -> tuple[float, float, float]:
         """Half of the peg's and the block's height, and of the hole's width [m]."""
-        assert self.config.surroundings is not None
-        peg, block = self.config.surroundings.objects[:2]
+        assert self.config.resolved_scene is not None
+        peg, block = self.config.resolved_scene.objects[:2]
         return peg.half_height, block.half_height, 0.5 * block.size[1]
 
     def reset(self, sim: "Simulation", mask: wp.array) -> None:

@@ -136,7 +136,7 @@ class Stack(GripperTask):
         The lower one stands on the table, the upper one is as thick as the fingers are open. One that is let go and
         lies where it can is taken to lie on the other.
         """
-        width, scene = self.config.randomization.object_size, self.config.surroundings
+        width, scene = self.config.randomization.object_size, self.config.resolved_scene
         if not width or scene is None:
             return EDGE
         (upper, _), (lower, _) = sight.body(0), sight.body(1)

@@ -44,7 +44,7 @@ class Scenes:
     seconds = 30.0
 
     def __init__(self, folder: Path) -> None:
-        import franka_wm.envs.simulation.surroundings  # noqa: F401
+        import franka_wm.envs.simulation.scene  # noqa: F401
         from franka_wm.envs import FrankaConfig, robots
         from franka_wm.envs.scene import Scene
 
@@ -74,16 +74,16 @@ class Scenes:
         import numpy as np
 
         from franka_wm.envs.robots import add_robot, arm_builder
-        from franka_wm.envs.simulation.surroundings import add_scene
+        from franka_wm.envs.simulation.scene import add_scene
 
         scene: Any = self.scene
         for path, value in case["mutations"]:
             scene = changed(scene, path, _many(path[0]) if value == "<many>" else value)
         config = dataclasses.replace(self.config, scene=scene)
-        assert config.surroundings is not None
+        assert config.resolved_scene is not None
         builder = arm_builder()
         robot = add_robot(builder, config)
-        add_scene(builder, config.surroundings, robot.tool_body, 0.0)
+        add_scene(builder, config.resolved_scene, robot.tool_body, 0.0)
         for what in ("body_mass", "body_inertia", "body_q", "shape_transform", "shape_scale", "joint_X_p"):
             values = np.array([list(np.ravel(one)) for one in getattr(builder, what)], dtype=float)
             if not np.isfinite(values).all() or abs(values).max() > 1e4:
