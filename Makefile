@@ -47,8 +47,9 @@ demo: $(STAMP) ## the live page with a small trained agent; no training, no netw
 demo-agent: $(STAMP) ## train that agent anew (ten minutes on two CPU cores)
 	@$(BIN)/python scripts/make_demo_agent.py $(ARGS)
 
-# Two processes with a thread each: tests are small, and torch's threads would wait for each other.
-PYTEST = OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 2 --dist loadfile
+# Two processes with a thread each: tests are small, and torch's threads would wait for each other. Bytecode is kept even
+# where the environment forbids it: without, each process that a test starts compiles torch anew, which takes seconds.
+PYTEST = PYTHONDONTWRITEBYTECODE= OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 2 --dist loadfile
 
 test: $(DEV) ## run the quick tests; pytest options in ARGS="..."
 	@$(PYTEST) -m "not slow" $(ARGS)
