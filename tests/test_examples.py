@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from forks import run_in_fork, script, train_in_fork
+from forks import TRAIN, run_in_fork, script
 
 
 def run(root: Path, *arguments: str) -> str:
@@ -68,6 +68,7 @@ def test_add(arguments: tuple[str, ...], root: Path, tmp_path: Path) -> None:
 
 
 def test_a_plugin_that_is_not_there(root: Path, tmp_path: Path) -> None:
-    done = train_in_fork("plugins=[no_such_module]", f"hydra.run.dir={tmp_path}/run", cwd=root)
+    arguments = "plugins=[no_such_module]", f"hydra.run.dir={tmp_path}/run"
+    done = run_in_fork(script(TRAIN, *arguments), root)
     assert done.returncode == 1 and "no_such_module" in done.stderr
     assert not (tmp_path / "run").exists()

@@ -17,7 +17,7 @@ import pytest
 from hydra.core.global_hydra import GlobalHydra
 from omegaconf import OmegaConf
 
-from forks import Fork, script, train_in_fork
+from forks import TRAIN, Fork, run_in_fork, script, train_in_fork
 from franka_wm.commands.entry import check_command, with_scale
 from franka_wm.conf import run_name
 from franka_wm.errors import FrankaError
@@ -26,7 +26,6 @@ from franka_wm.training.checkpoint import latest_checkpoint, load_checkpoint
 from franka_wm.training.run import occupied
 from light import Answer, answers
 
-TRAIN = Path(__file__).resolve().parents[2] / "train.py"
 LENGTH = 20
 SMOKE = ["scale=smoke", "device=cpu", f"env.episode_length={LENGTH}", "env.substeps=2"]
 
@@ -328,7 +327,7 @@ def test_the_folder_of_another_run(run, refuse) -> None:
 
 
 def test_the_exit_status_and_what_the_terminal_shows(tmp_path: Path) -> None:
-    done = train_in_fork("env.substeps=-1", cwd=tmp_path)
+    done = run_in_fork(script(TRAIN, "env.substeps=-1"), tmp_path)
     assert done.returncode == 1
     assert_one_line(done.stderr)
     assert "substeps" in done.stderr
