@@ -1,12 +1,13 @@
 """Kills of what writes and reads datasets: the decoded cache, publishing, merging into a finished dataset.
 
-`FAULTS=all` kills at every operation instead of at some, and says how many kills there were.
+`FAULTS=all` kills at every operation instead of at some; `-s` shows how many kills there were.
 """
 
 from __future__ import annotations
 
 import contextlib
 import os
+import shutil
 import tempfile
 from collections.abc import Callable
 from pathlib import Path
@@ -14,9 +15,7 @@ from typing import Any
 
 import pytest
 
-from rooms.kills import command, train, verb
-from test_faults import COLLECT, in_one_line, whole
-from test_faults import places as some
+from rooms.kills import collect, command, in_one_line, load_commands, places, train, verb, whole
 
 pytestmark = pytest.mark.slow
 
@@ -24,32 +23,7 @@ pytestmark = pytest.mark.slow
 @pytest.fixture(scope="module", autouse=True)
 def loaded() -> None:
     """Once, before the forks."""
-    import franka_wm.commands.collect
-    import franka_wm.commands.main
-    import franka_wm.commands.publish
-    import franka_wm.commands.train
-    import franka_wm.data.lerobot.opening
-    import franka_wm.data.lerobot.publish
-    import franka_wm.data.lerobot.writer
-    import franka_wm.training.trainer  # noqa: F401
-
-
-def places(operations: int) -> list[int]:
-    """At which operations to kill: at all, or in the middle and at the last."""
-    return some(operations) if os.environ.get("FAULTS") == "all" else [operations // 2, operations]
-
-
-def collect(out: Path, *more: str, episodes: int = 6) -> Callable[[], Any]:
-    words = [
-        f"out={out}",
-        f"episodes={episodes}",
-        "num_envs=2",
-        "workers=1",
-        "shard_frames=12",
-        *COLLECT,
-        *more,
-    ]
-    return verb("collect", *words)
+    load_commands()
 
 
 @pytest.fixture(scope="module")
@@ -71,12 +45,11 @@ def test_a_killed_cache_is_built_again(dataset: Path, tmp_path: Path) -> None:
         return [path for path in cache.iterdir() if path.is_dir()]
 
     once = whole(command(learn(tmp_path / "once", "1"), tmp_path / "once"))
-    for at in places(once.operations):
+    for at in places("cache", once.operations, 2):
         cache = tmp_path / f"killed{at}"
         assert command(learn(cache, "1"), cache, kill_at=at).status in (-9, 0), at
         whole(command(learn(cache, "2"), cache))
         assert len(caches(cache)) == 1 and (caches(cache)[0] / "cache.json").is_file(), caches(cache)
-    print(f"cache: {len(places(once.operations))} kills")
 
 
 def test_a_killed_publication_is_repeated(dataset: Path, tmp_path: Path) -> None:
@@ -95,19 +68,16 @@ def test_a_killed_publication_is_repeated(dataset: Path, tmp_path: Path) -> None
     before = content(dataset)
     once = whole(command(dry(tmp_path / "once"), tmp_path / "once"))
     card = tmp_path / "once" / "outputs" / "publish" / "user--arm" / "README.md"
-    for at in places(once.operations):
+    for at in places("publish", once.operations, 2):
         place = tmp_path / f"killed{at}"
         assert command(dry(place), place, kill_at=at).status == -9, at
         whole(command(dry(place), place))
         again = place / "outputs" / "publish" / "user--arm" / "README.md"
         assert again.read_text() == card.read_text()
     assert content(dataset) == before
-    print(f"publish: {len(places(once.operations))} kills")
 
 
 def test_a_killed_merge_into_a_finished_dataset(dataset: Path, tmp_path: Path) -> None:
-    import shutil
-
     from franka_wm.data.lerobot.source import read_source
 
     def more(out: Path) -> Callable[[], Any]:
@@ -116,7 +86,7 @@ def test_a_killed_merge_into_a_finished_dataset(dataset: Path, tmp_path: Path) -
     shutil.copytree(dataset, tmp_path / "once")
     once = whole(command(more(tmp_path / "once"), tmp_path / "once"))
     assert len(read_source(tmp_path / "once").lengths) == 10
-    for at in places(once.operations):
+    for at in places("merge", once.operations, 2):
         out = tmp_path / f"killed{at}"
         shutil.copytree(dataset, out)
         assert command(more(out), out, kill_at=at).status in (-9, 0), at
@@ -127,4 +97,3 @@ def test_a_killed_merge_into_a_finished_dataset(dataset: Path, tmp_path: Path) -
             in_one_line(again)
             again = whole(command(more(out), out))
         assert len(read_source(out).lengths) == 10
-    print(f"merge: {len(places(once.operations))} kills")

@@ -141,3 +141,51 @@ def verb(*words: str) -> Callable[[], Any]:
         return main(list(words))
 
     return run
+
+
+def collect(out: Path, *more: str, episodes: int = 6) -> Callable[[], Any]:
+    """`franka-wm collect`, of short episodes into several shards."""
+    words = [f"out={out}", f"episodes={episodes}", "num_envs=2", "workers=1", "shard_frames=12", *more]
+    small = ["env.episode_length=6", "env.substeps=2", "env.image_size=16", "device=cpu", "scale=smoke"]
+    return verb("collect", *words, "env=reach", *small)
+
+
+def load_commands() -> None:
+    """What the commands import, once, before the forks."""
+    import franka_wm.commands.collect
+    import franka_wm.commands.export
+    import franka_wm.commands.main
+    import franka_wm.commands.publish
+    import franka_wm.commands.report
+    import franka_wm.commands.train
+    import franka_wm.data.lerobot.opening
+    import franka_wm.data.lerobot.publish
+    import franka_wm.data.lerobot.writer
+    import franka_wm.evaluation.protocol
+    import franka_wm.report.end_of_run
+    import franka_wm.report.page
+    import franka_wm.training.trainer  # noqa: F401
+
+
+def places(what: str, operations: int, some: int = 3) -> list[int]:
+    """At which operations of `what` to kill: at `some`, or at all of them (`FAULTS=all`), and says how many."""
+    chosen = sorted({operations - k * operations // some for k in range(some)})
+    if os.environ.get("FAULTS") == "all":
+        chosen = list(range(1, operations + 1))
+    print(f"{what}: {len(chosen)} kills")
+    return chosen
+
+
+def whole(ended: Ended) -> Ended:
+    """It ended well."""
+    assert ended.status == 0, ended.said
+    assert "Traceback" not in ended.said
+    return ended
+
+
+def in_one_line(ended: Ended) -> str:
+    """What it said was wrong; no traceback."""
+    assert "Traceback" not in ended.said, ended.said
+    assert ended.status == 1, ended
+    (line,) = [line for line in ended.said.splitlines() if line.startswith("error: ")]
+    return line
