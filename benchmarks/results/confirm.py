@@ -20,6 +20,7 @@ from typing import Any
 
 from benchmarks.results.records import PLACE, read, read_json
 from benchmarks.results.rows import Row
+from benchmarks.results.running import prepare
 from benchmarks.results.state import Record, composed
 from franka_wm.errors import UserError
 from franka_wm.evaluation.results import to_json
@@ -61,9 +62,11 @@ def confirm(row: Row, place: Path = PLACE) -> Path:
         tree = Path(folder) / "tree"
         _git("worktree", "add", "--detach", str(tree), commits[0])
         try:
+            _prepare(row, tree)
             _run(tree, short(row), before)
         finally:
             _git("worktree", "remove", "--force", str(tree))
+        _prepare(row, ROOT)
         _run(ROOT, short(row), now)
         if apart := [name for name in ("weights", "episodes") if outcome(before)[name] != outcome(now)[name]]:
             raise UserError(
@@ -122,6 +125,11 @@ def _git(*words: str) -> None:
     done = subprocess.run(["git", *words], cwd=ROOT, capture_output=True, text=True, check=False)
     if done.returncode:
         raise UserError(f"git {' '.join(words)}: {done.stderr.strip().splitlines()[-1]}")
+
+
+def _prepare(row: Row, top: Path) -> None:
+    if failure := prepare(row, top):
+        raise UserError(failure)
 
 
 def _run(top: Path, words: Sequence[str], folder: Path) -> None:

@@ -32,6 +32,7 @@ POLICIES = {
     "noop": "doing nothing",
     "random": "random smooth",
     "ik": "inverse kinematics",
+    "expert": "the task's expert",
 }
 DISCRETE_ORACLE = "search with the same actions"
 COUNTS = {1: "One CPU core", 2: "Two CPU cores"}
@@ -63,13 +64,16 @@ WITHIN = {
     cm: Metric(f"within {cm} cm [%]", _within(m), 100, 0)
     for cm, m in (("5", "0.05"), ("2.5", "0.025"), ("1", "0.01"))
 }
+SUCCESS = Metric("success [%]", lambda summary: summary["success"], 100, 0)
 RETURN = Metric("return", lambda summary: summary["return"], 1, 0)
 
 
 def columns(records: Sequence[Record]) -> list[Metric]:
-    """Distances of the arm, returns of other environments."""
-    arm = all("final_distance" in summary for record in records for summary in record["policies"].values())
-    return [DISTANCE, *WITHIN.values()] if arm else [RETURN]
+    """Distances of the arm, success of tasks that say what it is, returns of other environments."""
+    summaries = [summary for record in records for summary in record["policies"].values()]
+    if all("final_distance" in summary for summary in summaries):
+        return [DISTANCE, *WITHIN.values()]
+    return [SUCCESS, RETURN] if all("success" in summary for summary in summaries) else [RETURN]
 
 
 # -- what was wanted ----------------------------------------------------------------------------------------
@@ -90,6 +94,9 @@ def verdicts(row: Row, records: Sequence[Record]) -> list[tuple[str, str, bool]]
         elif name == "return":
             mean = _mean([RETURN.of(record, policy) for record in records])
             found.append((f"return ≥ {wanted:g} on average", f"{mean:.0f}", mean >= wanted))
+        elif name == "success":
+            worst = min(SUCCESS.of(record, policy) for record in records)
+            found.append((f"worst seed ≥ {wanted:g} %", f"{worst:.1f} %", worst >= wanted - 1e-9))
         elif name == "planner_no_worse":
             pairs = {r["seed"]: (DISTANCE.of(r, "planner"), DISTANCE.of(r, "policy")) for r in records}
             worse = [
@@ -250,9 +257,10 @@ def _command(row: Row, records: Sequence[Record]) -> str:
     if row.script is not None:
         return shlex.join(row.command)
     seeds = " ".join(str(record["seed"]) for record in records)
+    before = f"{row.before}\n" if row.before else ""
     if len(records) == 1:
-        return f"{shlex.join(row.command)} seed={seeds}"
-    return f"for seed in {seeds}; do\n  {shlex.join(row.command)} seed=$seed\ndone"
+        return f"{before}{shlex.join(row.command)} seed={seeds}"
+    return f"{before}for seed in {seeds}; do\n  {shlex.join(row.command)} seed=$seed\ndone"
 
 
 def _provenance(row: Row, records: Sequence[Record]) -> str:
@@ -347,7 +355,7 @@ def _mean(values: Sequence[float]) -> float:
 
 def readme_tables(rows: Mapping[str, Row], place: Path = PLACE) -> str:
     """README's part: the arm, other environments, speed; rows of several seeds that belong together."""
-    arm, others, speed = [], [], []
+    arm, manipulation, others, speed = [], [], [], []
     episodes: set[int] = set()
     aged = alike = False
     for row in rows.values():
@@ -373,11 +381,17 @@ def readme_tables(rows: Mapping[str, Row], place: Path = PLACE) -> str:
             continue
         times = _mean([seconds(record) for record in timed(records)])
         command = _mean([record["training"]["command_seconds"] for record in timed(records)])
+        took = [duration(times) + company(records), f"{command / 60:.1f} min"]
+        if columns(records) == [SUCCESS, RETURN]:
+            values = [SUCCESS.of(record, policy) for record in records]
+            expert = _mean([SUCCESS.of(record, "expert") for record in records])
+            found = [SUCCESS.show(_mean(values)), SUCCESS.show(min(values)), SUCCESS.show(expert)]
+            manipulation.append([who, row.model, f"{where}, {runs}", *took, *found])
+            continue
         episodes |= {summary["episodes"] for record in records for summary in record["policies"].values()}
         distance = _mean([DISTANCE.of(record, policy) for record in records])
         worst = min(WITHIN["5"].of(record, policy) for record in records)
         nothing = _mean([DISTANCE.of(record, "noop") for record in records])
-        took = [duration(times) + company(records), f"{command / 60:.1f} min"]
         found = [*took, f"{distance:.1f} cm", f"{worst:.0f} %", f"{nothing:.0f} cm"]
         arm.append([who, row.model, f"{where}, {runs}", *found])
     parts = []
@@ -389,6 +403,9 @@ def readme_tables(rows: Mapping[str, Row], place: Path = PLACE) -> str:
             f"*Whole command*: start, training, and the evaluation of each policy on {many} episodes.",
             "",
         ]
+    if manipulation:
+        titles = ["task", "model, planner", "machine", "training", "whole command", "success [%]"]
+        parts += [table([*titles, "worst seed", "the task's expert"], manipulation), ""]
     if others:
         parts += [table(["other environments", "model, planner", "machine", "return", "wanted"], others), ""]
     if speed:

@@ -13,7 +13,16 @@ import yaml
 from franka_wm.errors import UserError
 
 DECLARED = Path(__file__).with_name("rows.yaml")
-WANTED = ("minutes", "distance_cm", "within_5cm", "within_2.5cm", "within_1cm", "return", "planner_no_worse")
+WANTED = (
+    "minutes",
+    "distance_cm",
+    "within_5cm",
+    "within_2.5cm",
+    "within_1cm",
+    "success",
+    "return",
+    "planner_no_worse",
+)
 
 
 @dataclass(frozen=True)
@@ -41,6 +50,7 @@ class Row:
     section: Section
     title: str
     arguments: str = ""
+    before: str = ""
     model: str = ""
     seeds: tuple[int, ...] = ()
     wanted: Mapping[str, Any] = field(default_factory=dict)
@@ -57,6 +67,17 @@ class Row:
     def command(self) -> list[str]:
         """What is typed, without the seed."""
         return ["python", self.script or "train.py", *self.words]
+
+    @property
+    def prepares(self) -> tuple[list[str], str] | None:
+        """The arguments of ``franka-wm`` that make what the runs read, and the folder that they make; or ``None``."""
+        if not self.before:
+            return None
+        words = shlex.split(self.before)
+        made = [word.removeprefix("out=") for word in words if word.startswith("out=")]
+        if words[0] != "franka-wm" or len(made) != 1:
+            raise UserError(f"row {self.name}: before must be a command of franka-wm with out=FOLDER")
+        return words[1:], made[0]
 
 
 def load_rows(path: Path = DECLARED) -> dict[str, Row]:

@@ -76,6 +76,8 @@ def run(row: Row, machine: Machine, *, seeds: Sequence[int], out: Path, place: P
     Raises:
         UserError: Before anything runs.
     """
+    if made := prepare(row, ROOT):
+        return [made]
     slots: Queue[tuple[list[str], list[str], dict[str, str]]] = Queue()
     for slot in machine.slots(row):
         slots.put(slot)
@@ -113,6 +115,18 @@ def run(row: Row, machine: Machine, *, seeds: Sequence[int], out: Path, place: P
         return [failure] if failure else []
     with ThreadPoolExecutor(slots.qsize()) as pool:
         return [failure for failure in pool.map(one, seeds) if failure]
+
+
+def prepare(row: Row, top: Path) -> str | None:
+    """Makes what the row's runs read, in the repository at ``top``, where it is not there; what failed, if it did."""
+    if row.prepares is None or (top / row.prepares[1]).exists():
+        return None
+    command = [sys.executable, "-m", "franka_wm", *row.prepares[0]]
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join([str(top), os.environ.get("PYTHONPATH", "")])}
+    done = subprocess.run(command, cwd=top, env=environment, capture_output=True, text=True, check=False)
+    if done.returncode == 0:
+        return None
+    return f"{shlex.join(command)}: {((done.stderr or done.stdout).strip().splitlines() or ['nothing printed'])[-1]}"
 
 
 def _call(command: Sequence[str], environment: dict[str, str], log: Path) -> str | None:

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import os
+import subprocess
+from dataclasses import replace
 
 import pytest
 
@@ -31,8 +33,6 @@ def test_runs_on_cores_have_them_alone() -> None:
 
 
 def test_runs_on_gpus_are_spread_over_them() -> None:
-    from dataclasses import replace
-
     row = replace(ROW, section=Section(title="One GPU", arguments="scale=gpu"))
     slots = running.Machine(jobs=2, devices=("cuda:0", "cuda:1"), commit="abc").slots(row)
     assert [after for _, after, _ in slots] == [["device=cuda:0"]] * 2 + [["device=cuda:1"]] * 2
@@ -47,8 +47,6 @@ def test_packages_are_found_where_this_process_finds_them(monkeypatch) -> None:
 
 
 def test_a_run_that_fails_is_told_and_leaves_no_file(tmp_path) -> None:
-    from dataclasses import replace
-
     row = replace(ROW, arguments="env=reach_fixed trainer.updatez=1")
     failed = running.run(
         row, running.Machine(threads=1), seeds=[100], out=tmp_path / "out", place=tmp_path / "place"
@@ -57,10 +55,34 @@ def test_a_run_that_fails_is_told_and_leaves_no_file(tmp_path) -> None:
     assert not (tmp_path / "place").exists()
 
 
+@pytest.mark.parametrize(
+    "before", ["franka-wm collect", "python x.py out=a", "franka-wm collect out=a out=b"]
+)
+def test_what_a_row_needs_first_is_one_command_and_one_folder(before) -> None:
+    with pytest.raises(UserError, match="before must be"):
+        _ = replace(ROW, before=before).prepares
+
+
+def test_what_a_row_needs_first_is_made_once(tmp_path, monkeypatch) -> None:
+    called = []
+
+    def made(command, **_):
+        called.append(command[1:])
+        return subprocess.CompletedProcess(command, 1, "", "first\nthe disk is full\n")
+
+    monkeypatch.setattr(running.subprocess, "run", made)
+    row = replace(ROW, before="franka-wm collect out=push episodes=2")
+    assert "the disk is full" in (running.prepare(row, tmp_path) or "")
+    (failed,) = running.run(row, running.Machine(threads=1), seeds=[100], out=tmp_path / "out")
+    assert "the disk is full" in failed and not (tmp_path / "out").exists()
+    assert called == [["-m", "franka_wm", "collect", "out=push", "episodes=2"]] * 2
+    (tmp_path / "push").mkdir()
+    assert running.prepare(row, tmp_path) is None and len(called) == 2
+    assert running.prepare(ROW, tmp_path) is None
+
+
 @pytest.mark.slow
 def test_a_row_is_run_and_collected(tmp_path, capsys) -> None:
-    from dataclasses import replace
-
     words = "env=reach_fixed evaluation.episodes=2 evaluation.video_episodes=0 logger=none"
     row = replace(ROW, arguments=words, seeds=(100,))
     place = tmp_path / "place"
