@@ -104,8 +104,10 @@ def verdicts(row: Row, records: Sequence[Record]) -> list[tuple[str, str, bool]]
                 for seed, (ours, alone) in pairs.items()
                 if ours > alone
             ]
+            paid = sum(RETURN.of(r, "planner") >= RETURN.of(r, "policy") for r in records)
             reached = f"{len(pairs) - len(worse)} of {len(pairs)} seeds"
             reached += f"; worse on {', '.join(worse)}" if worse else ""
+            reached += f"; its return is no lower on {paid}"
             found.append(("planner no worse than policy, each seed", reached, not worse))
         else:
             cm = name.removeprefix("within_").removesuffix("cm")
