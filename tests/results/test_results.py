@@ -290,7 +290,6 @@ def test_arguments_beside_those_of_the_row_are_told(measured) -> None:
 
 
 def test_the_planner_is_held_against_its_policy_on_each_seed(make_run) -> None:
-    """On average the planner is the better one; on seed 101 it is not."""
     row = replace(ROW, wanted={"planner_no_worse": True})
     found = [records.record_run(ROW, make_run(100 + k, d), jobs=1) for k, d in enumerate((0.01, 0.03))]
     for record, alone in zip(found, (0.09, 0.02), strict=True):
