@@ -40,21 +40,34 @@ _REFUSED = {
     errno.ENFILE: "too many open files on this machine",
     errno.ENOMEM: "out of memory",
 }
-_NO_MEMORY = ("can't allocate memory", "out of memory", "Failed to allocate")
+_NO_MEMORY = (
+    "can't allocate memory",
+    "cannot allocate memory",
+    "out of memory",
+    "Failed to allocate",
+    "failed to map segment",  # of a library: torch's, Warp's
+    "cannot map zero-fill pages",
+    "error return without exception set",  # Python's compiler, without memory
+)
+REFUSALS = (OSError, MemoryError, RuntimeError, ImportError, SystemError)
+"""What `machine_refused` tells apart."""
 
 
 def machine_refused(error: BaseException) -> str | None:
     """In one line, what the machine had no more of; `None` for any other error."""
     reason = _REFUSED.get(error.errno or 0) if isinstance(error, OSError) else None
-    if isinstance(error, MemoryError) or (
-        isinstance(error, RuntimeError) and any(words in str(error) for words in _NO_MEMORY)
-    ):
-        reason = (
-            "out of memory; use fewer worlds (collector.num_envs, evaluation.episodes) or a smaller batch"
-        )
+    said = str(error).strip().splitlines()
+    for one in (error, error.__cause__):  # of a library that cannot be loaded, only the cause says why
+        if isinstance(one, MemoryError) or (
+            isinstance(one, REFUSALS) and any(words in str(one) for words in _NO_MEMORY)
+        ):
+            reason = (
+                "out of memory; allow more (ulimit -v), or use fewer worlds (collector.num_envs, evaluation.episodes) "
+                "or a smaller batch"
+            )
+            said = str(one).strip().splitlines()
     if reason is None:
         return None
-    said = str(error).strip().splitlines()
     return str(
         FrankaError(f"{reason} ({said[0] if said else type(error).__name__}); what was saved before is whole")
     )

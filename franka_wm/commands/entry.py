@@ -17,7 +17,7 @@ from omegaconf.errors import OmegaConfBaseException
 from franka_wm import conf
 from franka_wm.commands.overrides import compose, explain
 from franka_wm.console import say, terminal_log
-from franka_wm.errors import FrankaError, machine_refused
+from franka_wm.errors import REFUSALS, FrankaError, machine_refused
 
 INTERRUPTED = 130
 """Exit status after Ctrl-C, as shells expect."""
@@ -39,7 +39,7 @@ def one_line_refusals() -> Iterator[None]:
     """What the machine has no more of (room on the disk, descriptors, memory) is one line, too."""
     try:
         yield
-    except (OSError, MemoryError, RuntimeError) as error:
+    except REFUSALS as error:
         refused = machine_refused(error)
         if refused is None:
             raise

@@ -10,7 +10,7 @@ from typing import Any
 import click
 
 from franka_wm.commands.arguments import did_you_mean, verb
-from franka_wm.errors import FrankaError, machine_refused
+from franka_wm.errors import REFUSALS, FrankaError, machine_refused
 from franka_wm.version import __version__
 
 VERBS = {
@@ -98,7 +98,7 @@ def main(arguments: list[str] | None = None) -> int:
         # What Python would still flush at exit goes nowhere instead of into a traceback.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 1
-    except (OSError, MemoryError, RuntimeError) as error:
+    except REFUSALS as error:
         refused = machine_refused(error)
         if refused is None:
             raise

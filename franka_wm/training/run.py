@@ -34,6 +34,10 @@ INTERRUPTED = 130
 """Exit status after Ctrl-C, as shells expect."""
 
 
+SMALL_FILES = 65536
+"""Room for a run's configuration and first lines, which are written before there is anything to lose [bytes]."""
+
+
 def import_plugins(names: Iterable[str]) -> None:
     """Imports modules, those of ``plugins``; they register tasks, models and planners of the user's.
 
@@ -58,12 +62,11 @@ def unwritable(folder: Path) -> str | None:
         place = place.parent
     if not place.is_dir():
         return f"hydra.run.dir={folder}: {place} is not a folder; choose another place for the results"
-    try:
-        tempfile.TemporaryDirectory(
-            dir=place
-        ).cleanup()  # asking for permission is not enough: root has it everywhere
-    except OSError:
-        return f"hydra.run.dir={folder}: {place} is not writable; choose another place for the results"
+    try:  # asking for permission is not enough: root has it everywhere
+        with tempfile.TemporaryDirectory(dir=place) as probe:
+            Path(probe, "probe").write_bytes(bytes(SMALL_FILES))
+    except OSError as error:
+        return f"hydra.run.dir={folder}: {place} is not writable ({error.strerror}); choose another place"
     return None
 
 

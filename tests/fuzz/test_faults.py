@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 
 from rooms.checkpoint import RUN
-from rooms.kills import collect, command, in_one_line, load_commands, places, train, verb, whole
+from rooms.kills import beyond, collect, command, in_one_line, load_commands, places, train, verb, whole
 
 pytestmark = pytest.mark.slow
 
@@ -114,15 +114,52 @@ def test_a_killed_export_and_report_are_repeated_as_they_say(tmp_path: Path) -> 
     ("limits", "words"),
     [
         ({resource.RLIMIT_FSIZE: 200_000}, "so large|No space|too large"),
+        ({resource.RLIMIT_FSIZE: 2_000}, "is not writable .File too large.; choose another place"),
         ({resource.RLIMIT_NOFILE: 12}, "open files"),
+        (None, r"out of memory; allow more \(ulimit -v\)"),
     ],
-    ids=["files of 200 kB", "12 descriptors"],
+    ids=["files of 200 kB", "files of 2 kB", "12 descriptors", "30 MB"],
 )
-def test_what_the_machine_refuses_is_one_line(limits: dict[int, int], words: str, tmp_path: Path) -> None:
+def test_what_the_machine_refuses_is_one_line(
+    limits: dict[int, int] | None, words: str, tmp_path: Path
+) -> None:
     run = tmp_path / "run"
-    ended = command(train(*WORDS, f"hydra.run.dir={run}"), run, limits=limits)
-    line = in_one_line(ended)
-    assert re.search(words, line), line
+    ended = command(train(*WORDS, f"hydra.run.dir={run}"), run, limits=limits or beyond(30))
+    assert re.search(words, in_one_line(ended)), ended.said
+
+
+def test_what_the_machine_refuses_of_a_dataset_is_one_line(tmp_path: Path) -> None:
+    out = tmp_path / "set"
+    for limits, words in (
+        ({resource.RLIMIT_FSIZE: 2_000}, "so large"),
+        (beyond(30), r"out of memory; allow more \(ulimit -v\)"),
+    ):
+        ended = command(collect(out), out, limits=limits)
+        assert re.search(words, in_one_line(ended)), ended.said
+        assert not out.exists()
+    whole(command(collect(out), out))
+    before = {path: path.read_bytes() for path in out.rglob("*") if path.is_file()}
+    in_one_line(command(collect(out, "resume=true", episodes=8), out, limits=beyond(30)))
+    assert {path: path.read_bytes() for path in out.rglob("*") if path.is_file()} == before
+
+
+def test_a_read_only_folder_is_one_line(tmp_path: Path) -> None:
+    run, shut = tmp_path / "run", tmp_path / "shut"
+    whole(command(train(*WORDS, f"hydra.run.dir={run}"), run))
+    shut.mkdir()
+    for folder in (shut, run):
+        folder.chmod(0o555)
+    for work, name in (
+        (train(*WORDS, f"hydra.run.dir={shut}/run"), "hydra.run.dir="),
+        (train(f"resume={run}", f"hydra.run.dir={run}"), "hydra.run.dir="),
+        (collect(shut / "set"), "out="),
+        (verb("export", f"source={run}", f"out={shut}/set"), "out="),
+        (verb("report", str(run)), "report.html"),
+        (verb("report", str(run), f"out={shut}/page.html"), "page.html"),
+    ):
+        line = in_one_line(command(work, tmp_path / "work", ordinary=True))
+        assert name in line and "choose a" in line, line
+    assert not list(shut.iterdir())
 
 
 def test_a_disk_that_fills_up_keeps_the_last_checkpoint(tmp_path: Path) -> None:

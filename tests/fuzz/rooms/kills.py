@@ -6,6 +6,8 @@ File operations are counted by Python's audit events: the product needs no hook 
 from __future__ import annotations
 
 import contextlib
+import ctypes
+import faulthandler
 import os
 import resource
 import signal
@@ -43,7 +45,8 @@ def command(
     *,
     kill_at: int | None = None,
     limits: dict[int, int] | None = None,
-    seconds: float = 150.0,
+    ordinary: bool = False,
+    seconds: float = 300.0,
 ) -> Ended:
     """Run a command line in a fork.
 
@@ -52,6 +55,7 @@ def command(
         folder: Operations below it count.
         kill_at: Number of the operation at which it gets SIGKILL; `None`: none.
         limits: Of resources (`resource.RLIMIT_…`).
+        ordinary: Without root's right to write into what is read-only.
     """
     said, counted = folder.parent / f"{folder.name}.said", folder.parent / f"{folder.name}.counted"
     sys.stdout.flush()
@@ -61,8 +65,12 @@ def command(
         status = 99
         with contextlib.suppress(BaseException):
             _redirect(said)
+            faulthandler.dump_traceback_later(seconds - 5)  # where it hangs
             with counted.open("wb", buffering=0) as file:
                 sys.addaudithook(_counter(str(folder), kill_at, file.fileno()))
+                sys.dont_write_bytecode = True  # Python would leave it cut off where files may not grow
+                if ordinary:
+                    _without_overrides()
                 for which, most in (limits or {}).items():
                     resource.setrlimit(which, (most, most))
                 status = _status(work)
@@ -77,6 +85,21 @@ def command(
         os.killpg(child, signal.SIGKILL)
     assert ended, f"more than {seconds:g} s\n{said.read_text()}"
     return Ended(os.waitstatus_to_exitcode(status), said.read_text(), counted.stat().st_size)
+
+
+def _without_overrides() -> None:
+    """Files' modes hold for root, too (capabilities(7): CAP_DAC_OVERRIDE, CAP_DAC_READ_SEARCH)."""
+    libc = ctypes.CDLL(None, use_errno=True)
+    header, sets = (ctypes.c_uint32 * 2)(0x20080522, 0), (ctypes.c_uint32 * 6)()
+    assert libc.capget(header, sets) == 0
+    sets[0] &= ~0b110
+    assert libc.capset(header, sets) == 0
+
+
+def beyond(megabytes: int) -> dict[int, int]:
+    """A limit of address space: so much more than this process has."""
+    pages = int(Path("/proc/self/statm").read_text().split()[0])
+    return {resource.RLIMIT_AS: pages * resource.getpagesize() + megabytes * 2**20}
 
 
 def _redirect(said: Path) -> None:
