@@ -156,6 +156,13 @@ def test_a_task_in_torch_is_part_of_the_graph(observations: tuple[str, ...], ran
     assert all(other.isnan().all() for other in others)
 
 
+@pytest.mark.skipif(torch.cuda.device_count() < 2, reason="needs two CUDA devices")
+def test_another_gpu_than_the_current_one(random_actions) -> None:
+    """What is captured there allocates there."""
+    actions = 0.3 * random_actions(N, STEPS)
+    check_agreement(episodes("pixels", "cuda:0", actions), episodes("pixels", "cuda:1", actions))
+
+
 def test_a_task_in_torch_that_waits_is_told_so() -> None:
     class Waiting(Hover):
         def success(self, state: torch.Tensor) -> torch.Tensor:

@@ -28,7 +28,9 @@ class Recorder:
         self._torch = torch.device(device)
         self._pieces: Recording | None = None  # of the recording under way
         # Replays write where torch's operations wrote while they were recorded: nothing else may live there.
-        self._pool = torch.cuda.MemPool() if self.device.is_cuda else None
+        # A pool belongs to the device that is current when it is made.
+        with torch.cuda.device(self._torch) if self.device.is_cuda else nullcontext():
+            self._pool = torch.cuda.MemPool() if self.device.is_cuda else None
 
     def record(
         self, launches: Function, keep: Iterable[wp.array], warm_up: Function, restored: Function
