@@ -159,7 +159,20 @@ def linked_json(path: Path) -> dict[str, Any]:
         UserError: as for `UntrustedFolder.json`, or there is none.
     """
     real = path.resolve()
-    found = UntrustedFolder(real.parent).json(real.name)
+    return _there(path, UntrustedFolder(real.parent).json(real.name))
+
+
+def linked_bytes(path: Path) -> bytes:
+    """The content of a JSON file that may be a link.
+
+    Raises:
+        UserError: as for `UntrustedFolder.bytes`, or there is none.
+    """
+    real = path.resolve()
+    return _there(path, UntrustedFolder(real.parent).bytes(real.name, MOST_JSON))
+
+
+def _there[T](path: Path, found: T | None) -> T:
     if found is None:
         raise UserError(f"{path} is missing; copy the folder again.")
     return found

@@ -30,6 +30,7 @@ from franka_wm.data.lerobot.decode_workers import Say
 from franka_wm.data.lerobot.mapping import FeatureMap
 from franka_wm.data.lerobot.source import Source
 from franka_wm.errors import UserError
+from franka_wm.untrusted import linked_json
 
 
 @dataclass(frozen=True, eq=False)
@@ -131,8 +132,9 @@ def _read(folder: Path, say: Say) -> Cache | None:
     if not folder.is_dir():
         return None
     try:
-        facts = json.loads((folder / "cache.json").read_text())
-        episodes = np.load(folder / "episodes.npy", allow_pickle=False)
+        facts = linked_json(folder / "cache.json")
+        # Mapped first: what is larger than its file is refused, not allocated.
+        episodes = np.array(np.load(folder / "episodes.npy", mmap_mode="r", allow_pickle=False))
         arrays = {}
         for name, (shape, dtype) in facts["arrays"].items():
             # Copy-on-write: torch warns of arrays that it may not write.
@@ -141,7 +143,7 @@ def _read(folder: Path, say: Say) -> Cache | None:
                 raise ValueError(f"{name}.npy is {array.dtype} {array.shape}")
             arrays[name] = array
         return Cache(folder, float(facts["fps"]), episodes, arrays, tuple(facts["notes"]))
-    except (OSError, ValueError, KeyError, TypeError) as error:
+    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
         say(f"the cache {folder} is damaged ({error}); building it again")
         shutil.rmtree(folder)
         return None
@@ -154,7 +156,7 @@ def _remove_outdated(parent: Path, folder: Path, source: Source, fingerprint: st
         if path.parent == folder or ".writing-" in path.parent.name:
             continue
         try:
-            facts = json.loads(path.read_text())
+            facts = linked_json(path)
         except (OSError, ValueError):
             continue  # not ours to judge: another process may be removing it
         if facts.get("root") == root and facts.get("fingerprint") != fingerprint:

@@ -21,6 +21,7 @@ from franka_wm.data.lerobot.shard import INFO_PATH, STATS_PATH, TASKS_PATH, writ
 from franka_wm.data.lerobot.stats import aggregate
 from franka_wm.data.lerobot.terminal import TERMINAL_FOLDER
 from franka_wm.errors import UserError
+from franka_wm.untrusted import UntrustedFolder, linked_json
 
 _SHIFTED_STATS = ("min", "max", "mean", "q01", "q10", "q50", "q90", "q99")
 
@@ -36,12 +37,17 @@ def merge(out: Path, roots: Sequence[Path], provenance: dict[str, Any]) -> None:
     Raises:
         UserError: The result does not hold the rows that went in.
     """
-    infos = [json.loads((root / INFO_PATH).read_text(encoding="utf-8")) for root in roots]
-    videos = [name for name, feature in infos[0]["features"].items() if feature["dtype"] == "video"]
+    infos = [linked_json(root / INFO_PATH) for root in roots]
+    ours = infos[-1]
+    for root, info in zip(roots, infos, strict=True):  # names of features become folders
+        if _columns(info) != _columns(ours):
+            raise UserError(f"{root}: its features are not those of {roots[-1]}; choose another out")
+        UntrustedFolder(root).check_links()
+    videos = [name for name, feature in ours["features"].items() if feature["dtype"] == "video"]
     (out / "meta").mkdir(parents=True)
     shutil.copyfile(roots[0] / TASKS_PATH, out / TASKS_PATH)
-    data, meta = _places(infos[0]["chunks_size"]), _places(infos[0]["chunks_size"])
-    video = {name: _places(infos[0]["chunks_size"]) for name in videos}
+    data, meta = _places(ours["chunks_size"]), _places(ours["chunks_size"])
+    video = {name: _places(ours["chunks_size"]) for name in videos}
     episodes = frames = 0
     for root, info in zip(roots, infos, strict=True):
         moved = {"data": _move_rows(root / "data", out / "data", data, episodes, frames)}
@@ -50,19 +56,24 @@ def merge(out: Path, roots: Sequence[Path], provenance: dict[str, Any]) -> None:
         _move_episodes(root, out, meta, moved, episodes, frames)
         episodes += info["total_episodes"]
         frames += info["total_frames"]
-    info = infos[0] | {
+    info = ours | {
         "total_episodes": episodes,
         "total_frames": frames,
         "splits": {"train": f"0:{episodes}"},
     }
     write_json(out / INFO_PATH, info)
-    stats = aggregate([json.loads((root / STATS_PATH).read_text(encoding="utf-8")) for root in roots])
+    stats = aggregate([linked_json(root / STATS_PATH) for root in roots])
     write_json(
         out / STATS_PATH, {name: {k: v.tolist() for k, v in one.items()} for name, one in stats.items()}
     )
     merge_terminals(out, roots)
     (out / PROVENANCE).write_text(json.dumps(provenance, indent=1), encoding="utf-8")
     check_merged(out, roots)
+
+
+def _columns(info: dict[str, Any]) -> dict[str, tuple[Any, ...]]:
+    """What the features of a dataset hold, by their names."""
+    return {name: (one["dtype"], list(one["shape"])) for name, one in info["features"].items()}
 
 
 type _Place = tuple[int, int]
@@ -179,7 +190,7 @@ def check_merged(out: Path, roots: Sequence[Path]) -> None:
     Raises:
         UserError: They differ.
     """
-    info = json.loads((out / INFO_PATH).read_text(encoding="utf-8"))
+    info = linked_json(out / INFO_PATH)
     rows = _column(out, EPISODE_KEY)
     expected = np.concatenate([_column(root, EPISODE_KEY) for root in roots])
     if not np.array_equal(rows, expected) or info["total_frames"] != len(rows):

@@ -141,8 +141,10 @@ def _do(kind: str, *job: Any) -> str | None:
     try:
         {"shard": _write_shard, "merge": merge, "nothing": lambda: None}[kind](*job)
     except Exception as error:  # every reason goes to the one who asked
+        if isinstance(error, UserError):
+            return str(error)
         traceback.print_exc()
-        return str(error) if isinstance(error, UserError) else f"{type(error).__name__}: {error}"
+        return f"{type(error).__name__}: {error}"
     return None
 
 

@@ -16,7 +16,7 @@ import numpy as np
 
 from franka_wm.errors import UserError
 from franka_wm.options import is_real, is_whole
-from franka_wm.untrusted import linked_json
+from franka_wm.untrusted import linked_bytes, linked_json
 
 DEFAULT_DATA_PATH = "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
 DEFAULT_VIDEO_PATH = "videos/{video_key}/chunk-{chunk_index:03d}/file-{file_index:03d}.mp4"
@@ -69,7 +69,7 @@ class Source:
 
     def fingerprint(self) -> str:
         """A hash of ``meta/info.json`` and of the path, size and time of change of every file."""
-        digest = hashlib.sha256((self.root / "meta" / "info.json").read_bytes())
+        digest = hashlib.sha256(linked_bytes(self.root / "meta" / "info.json"))
         for folder in ("meta", "data", "videos"):
             for path in sorted((self.root / folder).rglob("*")):
                 if path.is_file():

@@ -36,9 +36,11 @@ from franka_wm.data.lerobot.shard_workers import (
     lock_folder,
     wait_for_orphans,
 )
+from franka_wm.data.lerobot.source import MOST_ROWS
 from franka_wm.data.lerobot.terminal import TERMINAL_FOLDER
 from franka_wm.errors import UserError
-from franka_wm.options import whole_rule
+from franka_wm.options import is_whole, whole_rule
+from franka_wm.untrusted import linked_json, values_of
 
 SHARD_BYTES = 64_000_000
 """Images and numbers of one shard in memory, before they are compressed."""
@@ -134,7 +136,8 @@ class DatasetWriter:
         for folder in (self.working / "shards").glob("*" + PARTIAL):
             shutil.rmtree(folder)
         kept = self._shards()
-        self._check_schema(state)
+        with values_of(str(self.out if self.out.exists() else self.working), "choose another out"):
+            self._check_schema(state)
         totals = [_totals(folder) for folder in ([self.out] if self.out.exists() else []) + kept]
         self.resumed = self.episodes = sum(episodes for episodes, _ in totals)
         self.frames = sum(frames for _, frames in totals)
@@ -145,7 +148,7 @@ class DatasetWriter:
 
     def _state(self) -> dict[str, Any]:
         path = self.working / "writer.json"
-        return json.loads(path.read_text(encoding="utf-8")) if path.is_file() else {}
+        return linked_json(path) if path.is_file() else {}
 
     def _check_schema(self, state: dict[str, Any]) -> None:
         """Refuses to mix: the shards that are kept, and a finished dataset, must have our schema."""
@@ -154,6 +157,8 @@ class DatasetWriter:
             raise UserError(f"out={self.out} was not written by franka-wm; merge with lerobot-edit-dataset")
         mine = json.loads(json.dumps(self.schema.to_dict()))
         for other in (state if self._shards() else None, finished):
+            if other is not None and not isinstance(other["sessions"], list):
+                raise TypeError("sessions that are no list")
             if other is not None and other["schema"] != mine:
                 what = next(key for key in mine if other["schema"].get(key) != mine[key])
                 raise UserError(
@@ -319,5 +324,11 @@ def _number(shard: Path) -> int:
 
 def _totals(folder: Path) -> tuple[int, int]:
     """Episodes and frames of a dataset."""
-    info = json.loads((folder / "meta" / "info.json").read_text(encoding="utf-8"))
-    return info["total_episodes"], info["total_frames"]
+    info = linked_json(folder / "meta" / "info.json")
+    episodes, frames = info.get("total_episodes"), info.get("total_frames")
+    if not (is_whole(episodes) and is_whole(frames) and 0 <= episodes <= frames <= MOST_ROWS):
+        raise UserError(
+            f"{folder}: meta/info.json tells of {episodes!r} episodes and {frames!r} frames, which makes no sense; "
+            "copy the dataset again, or choose another out"
+        )
+    return episodes, frames

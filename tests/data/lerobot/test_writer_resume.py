@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import random
 import signal
@@ -20,6 +21,7 @@ from franka_wm.data.lerobot.provenance import describe, read_provenance
 from franka_wm.data.lerobot.schema import EPISODE_KEY
 from franka_wm.data.lerobot.writer import DatasetWriter
 from franka_wm.errors import UserError
+from franka_wm.untrusted import MOST_JSON
 
 
 def test_a_folder_that_exists_is_not_touched(tmp_path, make_schema, make_episode, write) -> None:
@@ -196,3 +198,59 @@ def test_kills_at_ten_random_moments_leave_whole_episodes(tmp_path, make_schema,
     episodes = [make_episode(schema, i) for i in range(120)]
     moments = [random.Random(i).uniform(0.0, 2.0) for i in range(10)]
     _kill_and_go_on(tmp_path, schema, episodes, load, moments)
+
+
+def large(path: Path) -> None:
+    """JSON that begins well and is larger than what is read."""
+    path.write_bytes(path.read_bytes().rstrip().removesuffix(b"}") + b" " * MOST_JSON + b"}")
+
+
+def changed(path: Path, **values: object) -> None:
+    path.write_text(json.dumps(json.loads(path.read_text()) | values))
+
+
+def linked(data: Path) -> None:
+    secret = data.parents[2] / "secret"
+    secret.write_text("hunter2")
+    file = next(data.rglob("*.parquet"))
+    file.unlink()
+    file.symlink_to(secret)
+
+
+def climbing(info: Path) -> None:
+    features = json.loads(info.read_text())["features"]
+    changed(
+        info, features=features | {"../../../climbed": {"dtype": "video", "shape": [1, 1, 3], "names": None}}
+    )
+    video = info.parents[3] / "climbed" / "chunk-000" / "file-000.mp4"
+    video.parent.mkdir(parents=True)
+    video.write_text("taken from elsewhere")
+
+
+@pytest.mark.parametrize(
+    ("name", "change", "says"),
+    [
+        ("meta/info.json", large, "larger than 32 MiB"),
+        ("meta/stats.json", large, "larger than 32 MiB"),
+        ("meta/info.json", lambda path: changed(path, total_episodes="two"), "'two' episodes"),
+        ("meta/info.json", lambda path: changed(path, total_frames=1e300), "makes no sense"),
+        ("meta/info.json", climbing, "its features are not those"),
+        (
+            "meta/franka_wm/provenance.json",
+            lambda path: changed(path, sessions=3),
+            "sessions that are no list",
+        ),
+        ("meta/franka_wm/provenance.json", lambda path: path.write_text("{}"), "another form"),
+        ("data", linked, "is a link to"),
+    ],
+)
+def test_a_strangers_dataset_is_not_added_to(
+    name: str, change, says: str, tmp_path, make_schema, make_episode, write
+) -> None:
+    schema = make_schema()
+    out = write(tmp_path / "in" / "set", schema, [make_episode(schema, 0)])
+    change(out / name)
+    before = {path: path.read_bytes() for path in out.rglob("*") if path.is_file()}
+    with pytest.raises(UserError, match=says):
+        write(out, schema, [make_episode(schema, 1)], resume=True)
+    assert {path: path.read_bytes() for path in out.rglob("*") if path.is_file()} == before

@@ -21,6 +21,7 @@ import torch
 
 from franka_wm.data.lerobot import build_cache, cache, decode, decode_workers, source
 from franka_wm.errors import UserError
+from franka_wm.untrusted import MOST_JSON
 
 
 def folders(cache_dir: Path) -> list[str]:
@@ -209,7 +210,45 @@ def test_nothing_is_unpickled(pictures: Path, opened: Callable, tmp_path: Path) 
     np.save(path, np.array([print], dtype=object), allow_pickle=True)
     lines: list[str] = []
     opened(pictures, say=lines.append)
-    assert any("is damaged" in line and "allow_pickle" in line for line in lines)
+    assert any("is damaged" in line and "Python objects" in line for line in lines)
+
+
+def endless(folder: Path) -> None:
+    """Of 10¹² episodes, by its header alone."""
+    with (folder / "episodes.npy").open("wb") as file:
+        header = {"descr": "<i8", "fortran_order": False, "shape": (10**12, 3)}
+        np.lib.format.write_array_header_1_0(file, header)
+
+
+def padded(path: Path) -> None:
+    path.write_bytes(path.read_bytes() + b" " * MOST_JSON)
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        endless,
+        lambda folder: padded(folder / "cache.json"),
+        lambda folder: (folder / "cache.json").write_text('{"arrays": []}'),
+    ],
+    ids=["many episodes", "large", "no names"],
+)
+def test_a_strangers_cache_is_built_again(change, pictures: Path, opened: Callable, tmp_path: Path) -> None:
+    opened(pictures)
+    (name,) = folders(tmp_path / "cache")
+    change(tmp_path / "cache" / name)
+    lines: list[str] = []
+    opened(pictures, say=lines.append)
+    assert any("is damaged" in line for line in lines)
+
+
+def test_what_a_fingerprint_reads_is_bounded(pictures: Path, tmp_path: Path) -> None:
+    root = tmp_path / "copy"
+    shutil.copytree(pictures, root)
+    opening = source.read_source(root)
+    padded(root / "meta" / "info.json")
+    with pytest.raises(UserError, match="larger than 32 MiB"):
+        opening.fingerprint()
 
 
 def test_no_room(pictures: Path, opened: Callable, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
