@@ -49,7 +49,8 @@ demo-agent: $(STAMP) ## train that agent anew (ten minutes on two CPU cores)
 
 # Two processes with a thread each: tests are small, and torch's threads would wait for each other. Bytecode is kept even
 # where the environment forbids it: without, each process that a test starts compiles torch anew, which takes seconds.
-PYTEST = PYTHONDONTWRITEBYTECODE= OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 2 --dist loadfile
+# Files begin in the order that tests/conftest.py gives them.
+PYTEST = PYTHONDONTWRITEBYTECODE= OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder
 
 test: $(DEV) ## run the quick tests; pytest options in ARGS="..."
 	@$(PYTEST) -m "not slow" $(ARGS)

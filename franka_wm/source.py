@@ -2,6 +2,7 @@
 
 import hashlib
 import io
+import os
 import sys
 import tokenize
 from collections.abc import Iterable, Mapping
@@ -39,9 +40,10 @@ def snapshot() -> dict[str, bytes]:
 
 def imported() -> list[str]:
     """Files of `snapshot` that this process has imported, and the data files beside them."""
-    modules = {
-        Path(file).resolve() for m in list(sys.modules.values()) if (file := getattr(m, "__file__", None))
-    }
+    files = [file for m in list(sys.modules.values()) if (file := getattr(m, "__file__", None))]
+    real = cache(os.path.realpath)  # of folders: there are thousands of files
+    places = [os.path.join(real(os.path.dirname(file)), os.path.basename(file)) for file in files]
+    modules = {Path(place).resolve() if os.path.islink(place) else Path(place) for place in places}
     folders = {path.parent for path in modules if path.name == "__init__.py"}
     names = []
     for name in snapshot():

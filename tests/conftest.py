@@ -2,15 +2,20 @@
 
 from __future__ import annotations
 
+import copy
+import logging
+import os
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
 import pytest
 import torch
+from hydra._internal.core_plugins.file_config_source import FileConfigSource
+from hydra._internal.core_plugins.importlib_resources_config_source import ImportlibResourcesConfigSource
 from omegaconf import DictConfig
 
-from forks import train_in_fork
+from forks import spare, train_in_fork
 from franka_wm import conf, models
 from franka_wm.envs import FrankaConfig, FrankaEnv, tasks
 from franka_wm.planning import registry
@@ -18,6 +23,34 @@ from franka_wm.training.load import Agent, load_agent
 from franka_wm.training.settings import RunSettings
 
 ROOT = Path(__file__).resolve().parents[1]
+
+LONG = (
+    "tests/training/test_undisturbed.py",
+    "tests/training/test_resume.py",
+    "tests/commands/test_train.py",
+    "tests/fuzz/test_rooms.py",
+    "tests/training/test_build.py",
+    "tests/envs/test_manipulation.py",
+    "tests/data/lerobot/test_collect.py",
+)
+"""Files that take longest. They begin: else one process works at them when the other has nothing left."""
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Long files first; otherwise as they are found."""
+    place = {name: k for k, name in enumerate(LONG)}
+    items.sort(key=lambda item: place.get(item.nodeid.partition("::")[0], len(LONG)))
+
+
+def pytest_collection_finish(session: pytest.Session) -> None:
+    """All modules are loaded, and no test has run."""
+    if session.items:
+        spare()
+
+
+def pytest_sessionfinish() -> None:
+    if spare.cache_info().currsize:
+        spare().close()
 
 
 @pytest.fixture(autouse=True)
@@ -30,6 +63,48 @@ def registries_as_before() -> Iterator[None]:
         one.clear()
         one.update(kept)
     tasks.TASKS[:] = known
+
+
+@pytest.fixture(autouse=True)
+def process_as_before() -> Iterator[None]:
+    """Environment variables, and the root logger, to which Hydra gives handlers on streams that pytest closes."""
+    variables, root = dict(os.environ), logging.getLogger()
+    handlers, level = list(root.handlers), root.level
+    yield
+    root.handlers[:] = handlers
+    root.setLevel(level)
+    for name in os.environ.keys() | variables.keys():
+        if name == "PYTEST_CURRENT_TEST":
+            continue
+        if name not in variables:
+            del os.environ[name]
+        elif os.environ.get(name) != variables[name]:
+            os.environ[name] = variables[name]
+
+
+@pytest.fixture(scope="session", autouse=True)
+def configuration_is_read_once() -> Iterator[None]:
+    """The package's YAML files, which Hydra reads anew for each command line: a third of what that costs."""
+    with pytest.MonkeyPatch.context() as patched:
+        for source, folder in (
+            (FileConfigSource, str(conf.FOLDER)),
+            (ImportlibResourcesConfigSource, "franka_wm.conf"),
+        ):
+            patched.setattr(source, "load_config", _read_once(source.load_config, folder))
+        yield
+
+
+def _read_once(load: Callable[..., Any], folder: str) -> Callable[..., Any]:
+    known: dict[str, Any] = {}
+
+    def load_config(self: Any, config_path: str) -> Any:
+        if self.path != folder:
+            return load(self, config_path)
+        if config_path not in known:
+            known[config_path] = load(self, config_path)
+        return copy.deepcopy(known[config_path])
+
+    return load_config
 
 
 SMALL = {"substeps": 2, "gravity_compensation": True, "observations": ("state", "joint_target")}

@@ -40,7 +40,7 @@ def train(*arguments: str, cwd: Path) -> subprocess.CompletedProcess[str]:
 def run(tmp_path_factory) -> tuple[Path, subprocess.CompletedProcess[str]]:
     """The smoke run: its folder and what it said."""
     place = tmp_path_factory.mktemp("smoke")
-    done = train(*SMOKE, f"hydra.run.dir={place}/run", cwd=place)
+    done = train_in_fork(*SMOKE, f"hydra.run.dir={place}/run", cwd=place)
     assert done.returncode == 0, done.stdout + done.stderr
     return place / "run", done
 

@@ -2,13 +2,20 @@
 
 A Python process of its own takes seconds of CPU time to load them, more than most of what is tested takes. A fork has
 file descriptors, signals and an exit status of its own, too. Where what is imported is what is tested, use `light.py`.
+
+Torch refuses to differentiate in forks of a process that did it before them, and Warp speaks only where it begins: what
+trains is a fork of a `Spare`, which was forked before the first test.
 """
 
 from __future__ import annotations
 
+import functools
+import gc
 import os
+import pickle
 import runpy
 import signal
+import socket
 import subprocess
 import sys
 import tempfile
@@ -26,13 +33,13 @@ TRAIN = Path(__file__).resolve().parents[2] / "train.py"
 
 def script(path: Path, *arguments: str) -> Callable[[], Any]:
     """``python PATH ARGUMENT …``, as work for a fork."""
+    return functools.partial(_script, path, arguments)
 
-    def work() -> None:
-        sys.argv = [str(path), *arguments]
-        sys.path.insert(0, str(path.parent))
-        runpy.run_path(str(path), run_name="__main__")
 
-    return work
+def _script(path: Path, arguments: tuple[str, ...]) -> None:
+    sys.argv = [str(path), *arguments]
+    sys.path.insert(0, str(path.parent))
+    runpy.run_path(str(path), run_name="__main__")
 
 
 class Fork:
@@ -75,6 +82,8 @@ class Fork:
         except BaseException:
             traceback.print_exc()
         finally:
+            if "multiprocessing.util" in sys.modules:  # its exit handler, as in forks of its own
+                sys.modules["multiprocessing.util"]._exit_function()
             sys.stdout.flush()
             sys.stderr.flush()
         return status
@@ -106,17 +115,65 @@ def run_in_fork(
         return Fork(work, cwd, Path(folder, "log")).wait(seconds)
 
 
+class Spare:
+    """A fork of this process as it is now, which does nothing but fork when it is asked to. It ends with this process.
+
+    Its forks have seen nothing of what this process did since.
+    """
+
+    def __init__(self) -> None:
+        self._here, there = socket.socketpair()
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", DeprecationWarning)
+            self.pid = os.fork()
+        if self.pid == 0:
+            self._here.close()
+            self._serve(there)
+            os._exit(0)
+        there.close()
+        self._answers = self._here.makefile("rb")
+
+    def _serve(self, requests: socket.socket) -> None:
+        signal.signal(signal.SIGINT, signal.SIG_IGN)
+        with requests.makefile("rb") as asked:
+            while True:
+                try:
+                    work, cwd, log, seconds = pickle.load(asked)
+                except EOFError:
+                    return
+                fork = Fork(work, cwd, log)
+                requests.sendall(pickle.dumps(fork.pid))
+                try:
+                    requests.sendall(pickle.dumps(fork.wait(seconds)))
+                except AssertionError as error:
+                    requests.sendall(pickle.dumps(error))
+
+    def fork(
+        self, work: Callable[[], Any], cwd: Path, seconds: float = 240.0
+    ) -> subprocess.CompletedProcess[str]:
+        """Run `work`, which can be pickled, in a fork of it to its end; its exit status and output."""
+        with tempfile.TemporaryDirectory() as folder:
+            self._here.sendall(pickle.dumps((work, cwd, Path(folder, "log"), seconds)))
+            pickle.load(self._answers)
+            found = pickle.load(self._answers)
+        if isinstance(found, AssertionError):
+            raise found
+        return found
+
+    def close(self) -> None:
+        """Ends it."""
+        self._answers.close()
+        self._here.close()
+        os.waitpid(self.pid, 0)
+
+
+@functools.cache
+def spare() -> Spare:
+    """The one of this process; the first call makes it."""
+    gc.freeze()  # forks must not touch, and so copy, all that is loaded
+    return Spare()
+
+
 def train_in_fork(*arguments: str, cwd: Path) -> subprocess.CompletedProcess[str]:
-    """``python train.py ARGUMENT …`` in a fork, or in a process of its own where a fork could not train."""
-    if can_differentiate(cwd):
-        return run_in_fork(script(TRAIN, *arguments), cwd)
-    command = [sys.executable, str(TRAIN), *arguments]
-    return subprocess.run(command, cwd=cwd, capture_output=True, text=True, check=False)
-
-
-def can_differentiate(cwd: Path) -> bool:
-    """Whether forks can: torch refuses it in those of a process that did it before them, in any test."""
-    import torch  # light.py has none
-
-    done = run_in_fork(lambda: torch.ones(1, requires_grad=True).sum().backward(), cwd)
-    return done.returncode == 0
+    """``python train.py ARGUMENT …`` in a fork of a process that has run no test yet."""
+    return spare().fork(script(TRAIN, *arguments), cwd)

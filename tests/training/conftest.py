@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 from hydra.core.global_hydra import GlobalHydra
 
+from franka_wm.report import end_of_run, page
 from franka_wm.training.checkpoint import Checkpoint, latest_checkpoint, load_checkpoint
 
 TINY = [
@@ -36,7 +37,12 @@ def tiny() -> list[str]:
 
 @pytest.fixture
 def train(root: Path, tmp_path: Path, monkeypatch) -> Train:
-    """``python train.py`` in this process, with tiny sizes; returns the run's last checkpoint."""
+    """``python train.py`` in this process, with tiny sizes; returns the run's last checkpoint.
+
+    Its curves and its page are not drawn, which takes as long as the run itself.
+    """
+    monkeypatch.setattr(end_of_run, "plot_learning_curves", lambda *_, **__: None)
+    monkeypatch.setattr(page, "write_page", lambda folder: folder / "report.html")
 
     def train(*arguments: str, folder: Path = tmp_path / "run", status: int | None = None) -> Checkpoint:
         given = {argument.split("=", 1)[0] for argument in arguments}

@@ -223,7 +223,6 @@ def test_trackio_gets_one_message_for_a_row(tmp_path: Path, trackio: Fake) -> No
 def test_wandb_offline_for_real(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     pytest.importorskip("wandb")
     monkeypatch.setenv("WANDB_SILENT", "true")
-    monkeypatch.setenv("WANDB_MODE", "offline")  # and put back what TorchRL leaves behind
     loggers = make_loggers(["wandb"], tmp_path / "run", wandb={"project": "arms", "offline": True})
     log_config(loggers, {"env": {"task": "reach"}})
     log_numbers(loggers, {"loss": 0.5, "nan": math.nan}, step=10)

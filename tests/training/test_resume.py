@@ -257,9 +257,15 @@ def test_recorded_data_go_on_where_they_were(train, made: Counter[str], monkeypa
     assert torch.equal(states[0]["windows"], states[1]["windows"])
 
 
+@pytest.fixture(scope="module")
+def kept() -> dict[str, Checkpoint]:
+    """Runs that several tests compare with."""
+    return {}
+
+
 @pytest.mark.parametrize("stage", ["first", "second"])
 def test_any_stage_goes_on(
-    stage: str, train, made: Counter[str], monkeypatch, tmp_path: Path, capsys
+    stage: str, train, kept, made: Counter[str], monkeypatch, tmp_path: Path, capsys
 ) -> None:
     from franka_wm.models.action_world_model import ActionWorldModel
     from franka_wm.models.jepa import JEPA
@@ -278,7 +284,9 @@ def test_any_stage_goes_on(
         "evaluation.during=[]",
     ]
     run += ["planner.num_samples=8", "planner.num_elites=4", "planner.iterations=1"]
-    whole = train(*run, folder=tmp_path / "whole")
+    if not kept:
+        kept["whole"] = train(*run, folder=tmp_path / "whole")
+    whole = kept["whole"]
     with monkeypatch.context() as patched:
         interrupt(patched, 6, JEPA if stage == "first" else ActionWorldModel)
         train(*run, folder=tmp_path / "stopped", status=130)
@@ -294,9 +302,8 @@ def test_any_stage_goes_on(
     }
     assert differing(weights(resumed), weights(whole)) == []
     if stage == "first":
-        one, other = (
-            load_checkpoint(tmp_path / n / "pretrained/checkpoints/latest") for n in ("whole", "resumed")
-        )
+        runs = whole.folder.parents[1], tmp_path / "resumed"
+        one, other = (load_checkpoint(run / "pretrained/checkpoints/latest") for run in runs)
         assert differing(weights(one), weights(other)) == []
 
 

@@ -98,6 +98,28 @@ def campaign(
     return counts, failures
 
 
+def short_run(name: str, number: int, folder: Path) -> None:
+    """A room's cases by a fixed seed, and those that once failed; prints how they ended, as JSON in the last line."""
+    room = rooms()[name](folder)
+    counts, failures = campaign(room, number=number, start=1)
+    bad = {}
+    for path in kept(name):
+        case = json.loads(path.read_text())
+        found = outcome(room, case)
+        if not found.good or (case.get("refused") and found.kind != "refused"):
+            bad[path.name] = f"{found.kind}: {found.text}"
+    print(
+        json.dumps(
+            {"counts": counts, "failures": {k: case for k, (case, _) in failures.items()}, "kept": bad}
+        )
+    )
+
+
+def kept(name: str) -> list[Path]:
+    """The cases that once failed."""
+    return sorted((CASES / name).glob("*.json"))
+
+
 def _stream(room: Any, number: int | None, start: int) -> Iterator[dict[str, Any]]:
     left = number
     while left is None or left > 0:

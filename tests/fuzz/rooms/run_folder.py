@@ -36,7 +36,6 @@ class RunFolder:
         self.read, self.compare, self.write = read_run, compare_page, write_document
         self.page = write_page
         write_page(self.source)
-        os.environ["FUZZ_SECRET"] = SECRET
         files = sorted(p.relative_to(self.source).as_posix() for p in self.source.rglob("*") if p.is_file())
         trees: dict[str, Any] = {}
         for name in files:
@@ -80,6 +79,7 @@ class RunFolder:
         from franka_wm.commands.summary import summary
         from franka_wm.errors import UserError
 
+        os.environ["FUZZ_SECRET"] = SECRET  # of this fork
         run = folder / "run"
         shutil.copytree(self.source, run, copy_function=os.link, symlinks=True)
         for kind, name, *rest in case["mutations"]:
