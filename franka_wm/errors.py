@@ -58,14 +58,13 @@ def machine_refused(error: BaseException) -> str | None:
     reason = _REFUSED.get(error.errno or 0) if isinstance(error, OSError) else None
     said = str(error).strip().splitlines()
     for one in (error, error.__cause__):  # of a library that cannot be loaded, only the cause says why
-        if isinstance(one, MemoryError) or (
-            isinstance(one, REFUSALS) and any(words in str(one) for words in _NO_MEMORY)
-        ):
+        lines = [line for line in str(one).splitlines() if any(words in line for words in _NO_MEMORY)]
+        if isinstance(one, MemoryError) or (isinstance(one, REFUSALS) and lines):
             reason = (
                 "out of memory; allow more (ulimit -v), or use fewer worlds (collector.num_envs, evaluation.episodes) "
                 "or a smaller batch"
             )
-            said = str(one).strip().splitlines()
+            said = lines or str(one).strip().splitlines()
     if reason is None:
         return None
     return str(
