@@ -21,7 +21,7 @@ from typing import Any
 from benchmarks.results.records import PLACE, read, read_json
 from benchmarks.results.rows import Row
 from benchmarks.results.running import prepare
-from benchmarks.results.state import Record, composed
+from benchmarks.results.state import Record, changes, composed
 from franka_wm.errors import UserError
 from franka_wm.evaluation.results import to_json
 from franka_wm.files import atomic_write
@@ -57,6 +57,10 @@ def confirm(row: Row, place: Path = PLACE) -> Path:
         raise UserError(
             f"{row.name}: only a row of train.py that one commit measured can be confirmed; measure it again"
         )
+    now = composed(tuple(shlex.split(records[0]["command"])[2:]))
+    found = [f"refused: {now}"] if isinstance(now, str) else changes(records[0]["code"]["config"], now)
+    if other := [change for change in found if "– → " not in change and not change.endswith("→ –")]:
+        raise UserError(f"{row.name}: its command now has {'; '.join(other)}; measure it again")
     with tempfile.TemporaryDirectory() as folder:
         before, now = Path(folder) / "before", Path(folder) / "now"
         tree = Path(folder) / "tree"

@@ -84,6 +84,15 @@ def test_one_bit_of_difference_is_refused(measured: Path, monkeypatch: pytest.Mo
     assert not (measured / "confirmed").exists()
 
 
+def test_another_value_in_the_commands_configuration_is_refused(measured: Path) -> None:
+    """A smoke run would not show it: its scale has its own."""
+    (record,) = records.read(ROW, measured)
+    then = {"planner": {"max_std": 2.0, "gone": 1}}
+    records.write(record | {"code": {"files": {"gone.py": "0"}, "config": then}}, measured)
+    with pytest.raises(UserError, match=r"planner.max_std 2.0 → 0.1; measure it again"):
+        confirm.confirm(ROW, measured)
+
+
 def test_other_episodes_are_another_outcome(tmp_path: Path) -> None:
     make_run(tmp_path / "a", {"w": torch.ones(2)})
     make_run(tmp_path / "b", {"w": torch.ones(2)}, {"planner": {"return": {"mean": 1.5}}})
