@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import itertools
 import logging
 import os
 from collections.abc import Callable, Iterator
@@ -17,7 +18,7 @@ from omegaconf import DictConfig
 
 from forks import spare, train_in_fork
 from franka_wm import conf, models
-from franka_wm.envs import FrankaConfig, FrankaEnv, tasks
+from franka_wm.envs import FrankaConfig, FrankaEnv, franka, tasks
 from franka_wm.planning import registry
 from franka_wm.training.load import Agent, load_agent
 from franka_wm.training.settings import RunSettings
@@ -67,7 +68,11 @@ def registries_as_before() -> Iterator[None]:
 
 @pytest.fixture(autouse=True)
 def process_as_before() -> Iterator[None]:
-    """Environment variables, and the root logger, to which Hydra gives handlers on streams that pytest closes."""
+    """Environment variables, and the root logger, to which Hydra gives handlers on streams that pytest closes.
+
+    Environments without a seed are counted: the same test makes the same ones wherever it runs.
+    """
+    franka._unseeded = itertools.count()
     variables, root = dict(os.environ), logging.getLogger()
     handlers, level = list(root.handlers), root.level
     yield

@@ -5,8 +5,11 @@ import os
 import sys
 from pathlib import Path
 
+import pytest
+
 from forks import run_in_fork, script, spare
-from franka_wm.envs import tasks
+from franka_wm.envs import franka, tasks
+from franka_wm.seeding import derive_seed
 
 
 def test_a_task_that_a_test_registers_and_removes_others() -> None:
@@ -40,3 +43,8 @@ def test_forks_of_the_spare_have_seen_nothing_of_the_tests(tmp_path: Path) -> No
     work = script(tmp_path / "seen.py")
     assert run_in_fork(work, tmp_path).stdout == "yes\n"
     assert spare().fork(work, tmp_path).stdout == "no\n"
+
+
+@pytest.mark.parametrize("time", [1, 2])
+def test_environments_without_a_seed_are_counted_anew(time: int) -> None:
+    assert franka.own_seed() == derive_seed("worlds", 0)
