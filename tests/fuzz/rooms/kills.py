@@ -15,8 +15,11 @@ import sys
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
+
+from forks import spare
 
 CHANGES = (
     "os.rename",
@@ -96,10 +99,21 @@ def _without_overrides() -> None:
     assert libc.capset(header, sets) == 0
 
 
-def beyond(megabytes: int) -> dict[int, int]:
-    """A limit of address space: so much more than this process has."""
-    pages = int(Path("/proc/self/statm").read_text().split()[0])
-    return {resource.RLIMIT_AS: pages * resource.getpagesize() + megabytes * 2**20}
+def short_of_memory(work: Callable[[], Any], folder: Path) -> Ended:
+    """Run a command line where 30 MB more of address space can be had, and Warp's library is still to be loaded.
+
+    In a fork of a process that has run no test: what others allocated and gave back would be enough.
+    """
+    done = spare().fork(partial(_short_of_memory, work), folder.parent)
+    return Ended(done.returncode, done.stdout + done.stderr, 0)
+
+
+def _short_of_memory(work: Callable[[], Any]) -> None:
+    load_commands()
+    sys.dont_write_bytecode = True
+    most = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize() + 30 * 2**20
+    resource.setrlimit(resource.RLIMIT_AS, (most, most))
+    sys.exit(_status(work))
 
 
 def _redirect(said: Path) -> None:
@@ -146,24 +160,24 @@ def _status(work: Callable[[], Any]) -> int:
 
 def train(*words: str) -> Callable[[], Any]:
     """`python train.py WORDS`."""
+    return partial(_train, words)
 
-    def run() -> None:
-        from franka_wm.commands.train import command as program
 
-        program(list(words))
+def _train(words: tuple[str, ...]) -> None:
+    from franka_wm.commands.train import command as program
 
-    return run
+    program(list(words))
 
 
 def verb(*words: str) -> Callable[[], Any]:
     """`franka-wm WORDS`."""
+    return partial(_verb, words)
 
-    def run() -> int:
-        from franka_wm.commands.main import main
 
-        return main(list(words))
+def _verb(words: tuple[str, ...]) -> int:
+    from franka_wm.commands.main import main
 
-    return run
+    return main(list(words))
 
 
 def collect(out: Path, *more: str, episodes: int = 6) -> Callable[[], Any]:
@@ -175,6 +189,8 @@ def collect(out: Path, *more: str, episodes: int = 6) -> Callable[[], Any]:
 
 def load_commands() -> None:
     """What the commands import, once, before the forks."""
+    from hydra.core.plugins import Plugins
+
     import franka_wm.commands.collect
     import franka_wm.commands.export
     import franka_wm.commands.main
@@ -188,6 +204,8 @@ def load_commands() -> None:
     import franka_wm.report.end_of_run
     import franka_wm.report.page
     import franka_wm.training.trainer  # noqa: F401
+
+    Plugins.instance()  # it looks into every package once
 
 
 def places(what: str, operations: int, some: int = 3) -> list[int]:
