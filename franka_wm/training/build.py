@@ -378,6 +378,7 @@ def open_recorded(run: RunSettings, device: torch.device) -> tuple[Any, Any]:
     """
     from franka_wm.data.lerobot import open_dataset
 
+    arm = run.env.arm if run.is_arm else None  # what is learned will act there
     train = open_dataset(
         **run.dataset.options,
         window=run.window,
@@ -385,7 +386,7 @@ def open_recorded(run: RunSettings, device: torch.device) -> tuple[Any, Any]:
         device=device,
         keys=run.model.observations,
         frame_stack=run.env.frame_stack,
+        fps=arm and arm.fps,
+        action_dim=arm and arm.action_dim,
     )
-    if run.is_arm:  # what is learned will act there
-        train.check(fps=run.env.arm.fps, action_dim=run.env.arm.action_dim)
     return train, train.validation()

@@ -12,6 +12,7 @@ from franka_wm.errors import UserError
 from franka_wm.models import WorldModel
 from franka_wm.planning import registry
 from franka_wm.training import build
+from franka_wm.training.demos import check_demonstrations
 from franka_wm.training.loggers import check_loggers
 from franka_wm.training.settings import RunSettings
 from franka_wm.training.spaces import Spaces
@@ -100,10 +101,7 @@ def _check_demonstrations(run: RunSettings) -> None:
         raise UserError(
             f"replay.demo_updates={run.replay.demo_updates}: must be at most trainer.updates={run.trainer.updates}"
         )
-    from franka_wm.data.lerobot.source import read_source
-
-    for one in [run.replay.demos] if isinstance(run.replay.demos, str) else run.replay.demos:
-        read_source(one)
+    check_demonstrations(run)
 
 
 def _check_first_stage(run: RunSettings) -> None:
@@ -207,7 +205,14 @@ def _check_dataset(run: RunSettings) -> None:
     if (root is None) == (repo_id is None):
         raise UserError("dataset=lerobot: give dataset.root=FOLDER or dataset.repo_id=USER/NAME, one of them")
     if root is not None:
-        from franka_wm.data.lerobot.source import read_source
+        from franka_wm.data.lerobot.opening import read_datasets
 
-        for one in [root] if isinstance(root, str) else root:
-            read_source(one)
+        arm = run.env.arm if run.is_arm else None
+        read_datasets(
+            root,
+            features=run.dataset.features,
+            keys=run.model.observations,
+            image_size=run.dataset.image_size,
+            fps=arm and arm.fps,
+            action_dim=arm and arm.action_dim,
+        )

@@ -12,6 +12,9 @@ from franka_wm.errors import UserError
 from franka_wm.training.settings import RunSettings
 from franka_wm.training.spaces import Spaces
 
+SAME = ("task", "reward", "action_mode", "action_scale", "action_penalty", "success_distance")
+"""Options of the arm that must be those of its demonstrations."""
+
 
 def open_demonstrations(run: RunSettings, env: Any, hindsight: Hindsight | None) -> Demonstrations | None:
     """The episodes that ``run.replay.demos`` names, on the environment's device; ``None`` where it names none.
@@ -37,9 +40,8 @@ def open_demonstrations(run: RunSettings, env: Any, hindsight: Hindsight | None)
         validation_fraction=0.0,
         keys=list(wanted),
         frame_stack=run.env.frame_stack,
+        action_dim=spaces.action_dim,
     )
-    fps = run.env.arm.fps if run.is_arm else None
-    recorded.check(keys=list(wanted), fps=fps, action_dim=spaces.action_dim)
     there = {**recorded.observation_sizes, **recorded.image_sizes}
     for key, size in wanted.items():
         if there[key] != size:
@@ -49,31 +51,31 @@ def open_demonstrations(run: RunSettings, env: Any, hindsight: Hindsight | None)
             )
     if recorded.reward_bounds is None:
         raise UserError("replay.demos: these episodes have no rewards; record them with franka-wm collect")
-    if run.is_arm:
-        _check_same_task(run)
     keys = [*wanted, "action", "is_init", *(("next", key) for key in (*wanted, "reward", "terminated"))]
     transitions: Any = TensorDict.cat([one.select(*keys) for one in recorded.batches(4096)])
     most = max(run.demo_windows(update) for update in (0, run.replay.demo_updates, run.trainer.updates))
     return Demonstrations(transitions, window=run.window, most=most, hindsight=hindsight)
 
 
-def _check_same_task(run: RunSettings) -> None:
-    """Refuses demonstrations whose actions or rewards mean something else, as far as their datasets say it."""
+def check_demonstrations(run: RunSettings) -> None:
+    """Refuses demonstrations whose actions or rewards mean something else, as far as their datasets say it.
+
+    Raises:
+        UserError: One line.
+    """
+    if run.replay.demos is None:
+        return
+    from franka_wm.data.lerobot.opening import read_datasets
     from franka_wm.data.lerobot.provenance import read_provenance
 
-    for root in [run.replay.demos] if isinstance(run.replay.demos, str) else run.replay.demos or ():
-        for session in (read_provenance(root) or {}).get("sessions", ()):
+    arm = run.env.arm if run.is_arm else None
+    sources, _ = read_datasets(run.replay.demos, fps=arm and arm.fps, action_dim=arm and arm.action_dim)
+    for source in sources if arm else ():
+        for session in (read_provenance(source.root) or {}).get("sessions", ()):
             recorded = session.get("config", {}).get("env", {})
-            for name in (
-                "task",
-                "reward",
-                "action_mode",
-                "action_scale",
-                "action_penalty",
-                "success_distance",
-            ):
-                here = getattr(run.env.arm, name)
+            for name in SAME:
+                here = getattr(arm, name)
                 if recorded.get(name, here) != here:
                     raise UserError(
-                        f"replay.demos={root}: recorded with env.{name}={recorded[name]}, this run has {here}"
+                        f"replay.demos={source.root}: recorded with env.{name}={recorded[name]}, this run has {here}"
                     )

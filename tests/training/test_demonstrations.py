@@ -62,20 +62,10 @@ def test_none_is_an_episode_of_the_evaluation(demos: Path, settled) -> None:
     assert torch.cdist(starts, first).min() > 1e-3
 
 
-@pytest.mark.parametrize(
-    ("changes", "message"),
-    [
-        (("env.task=track",), "recorded with env.task=reach, this run has track"),
-        (("env.reward=sparse",), "recorded with env.reward=dense, this run has sparse"),
-        (("env.action_scale=0.05",), "recorded with env.action_scale=0.085, this run has 0.05"),
-        (("env.fps=20",), "fps|frames per second"),
-        (("env=lift",), "action|objects"),
-        (("replay.window=20", "env.episode_length=30"), "no demonstration has 20 steps"),
-    ],
-)
-def test_what_does_not_fit_is_refused_in_a_line(demos: Path, settled, changes, message: str) -> None:
-    run = settled("scale=smoke", *ARM, *changes, f"replay.demos={demos}")
-    with pytest.raises(UserError, match=message) as refused:
+def test_short_ones_are_refused_in_a_line(demos: Path, settled) -> None:
+    longer = ("replay.window=20", "env.episode_length=30")
+    run = settled("scale=smoke", *ARM, *longer, f"replay.demos={demos}")
+    with pytest.raises(UserError, match="no demonstration has 20 steps") as refused:
         open_demonstrations(run, build.make_env(run), None)
     assert "\n" not in str(refused.value)
 
@@ -93,6 +83,11 @@ def test_episodes_without_rewards_are_refused(demos: Path, settled, monkeypatch)
     ("changes", "message"),
     [
         (("dataset=lerobot", "dataset.root={demos}"), "gathers nothing to mix them with"),
+        (("env.task=track",), "recorded with env.task=reach, this run has track"),
+        (("env.reward=sparse",), "recorded with env.reward=dense, this run has sparse"),
+        (("env.action_scale=0.05",), "recorded with env.action_scale=0.085, this run has 0.05"),
+        (("env.fps=20",), "the dataset has 30 frames per second, the environment 20"),
+        (("env=lift",), "the dataset's actions have 7 numbers, the environment's 8"),
         (("model=muzero", "planner=gumbel"), "learns from its own search"),
         (("replay.demo_updates=31",), "must be at most trainer.updates=30"),
         (("replay.demos={demos}/nowhere",), "nowhere"),
@@ -101,5 +96,25 @@ def test_episodes_without_rewards_are_refused(demos: Path, settled, monkeypatch)
 )
 def test_what_cannot_be_is_refused_before_anything_is_built(demos: Path, settled, changes, message) -> None:
     words = [f"replay.demos={demos}", *(one.replace("{demos}", str(demos)) for one in changes)]
-    with pytest.raises(UserError, match=message):
+    with pytest.raises(UserError, match=message) as refused:
         check(settled("scale=smoke", *ARM, *words))
+    assert "\n" not in str(refused.value)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        (("env=lift",), "the dataset's actions have 7 numbers, the environment's 8"),
+        (("env.fps=20",), "the dataset has 30 frames per second, the environment 20"),
+        (("model.observations=[nothing]",), "gives no 'nothing'"),
+    ],
+)
+def test_recorded_data_that_do_not_fit_are_refused_before_anything_is_built(
+    demos: Path, settled, changes, message
+) -> None:
+    with pytest.raises(UserError, match=message):
+        check(
+            settled(
+                "scale=smoke", "trainer=offline", "dataset=lerobot", f"dataset.root={demos}", *ARM, *changes
+            )
+        )

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from franka_wm.data.lerobot.cache import Cache, Say, open_cache
 from franka_wm.data.lerobot.mapping import FeatureMap, map_features
-from franka_wm.data.lerobot.source import find_dataset, read_source
+from franka_wm.data.lerobot.source import Source, find_dataset, read_source
 from franka_wm.data.lerobot.windows import RecordedWindows, Recording
 from franka_wm.data.memory import free_memory
 from franka_wm.errors import UserError
@@ -40,6 +40,8 @@ def open_dataset(
     in_memory: bool | None = None,
     workers: int | None = None,
     frame_stack: int = 1,
+    fps: float | None = None,
+    action_dim: int | None = None,
     say: Say = print,
 ) -> RecordedWindows:
     """Opens one or several LeRobot v3 datasets for training.
@@ -64,24 +66,17 @@ def open_dataset(
             takes at most half of what is free.
         workers: Processes that decode; ``None``: all cores.
         frame_stack: See :class:`RecordedWindows`.
+        fps, action_dim: Frames per second and size of actions of the environment that is to be acted in.
         say: Takes lines for the terminal.
 
     Raises:
         UserError: One line, for a dataset that cannot be used as asked.
     """
     roots = [Path(r) for r in _as_list(root)] + [find_dataset(name) for name in _as_list(repo_id)]
-    if not roots:
-        raise UserError("dataset=lerobot: give dataset.root=FOLDER or dataset.repo_id=USER/NAME")
     device = torch.empty(0, device=device).device  # with its index
-    sources = [read_source(r) for r in roots]
-    mappings = [map_features(s, features=features, keys=keys, image_size=image_size) for s in sources]
-    for other, source in zip(mappings[1:], sources[1:], strict=True):
-        _check_alike(mappings[0], other, str(roots[0]), str(source.root))
-        if source.fps != sources[0].fps:
-            raise UserError(
-                f"{roots[0]} has {sources[0].fps:g} frames per second, {source.root} {source.fps:g}; "
-                "train on them separately"
-            )
+    sources, mappings = read_datasets(
+        roots, features=features, keys=keys, image_size=image_size, fps=fps, action_dim=action_dim
+    )
     caches = [
         open_cache(s, m, cache_dir=cache_dir, workers=workers, say=say)
         for s, m in zip(sources, mappings, strict=True)
@@ -131,6 +126,48 @@ def open_dataset(
     for note in recording.notes:
         say(f"  {note}")
     return windows
+
+
+def read_datasets(
+    root: str | Path | Sequence[str | Path],
+    *,
+    features: Mapping[str, str | Sequence[str]] | None = None,
+    keys: Sequence[str] | None = None,
+    image_size: int | Sequence[int] | None = None,
+    fps: float | None = None,
+    action_dim: int | None = None,
+) -> tuple[list[Source], list[FeatureMap]]:
+    """Reads what datasets say of themselves, and refuses what cannot be used as asked; no row is read.
+
+    Args: as those of :func:`open_dataset`.
+
+    Raises:
+        UserError: One line.
+    """
+    roots = [Path(one) for one in _as_list(root)]
+    if not roots:
+        raise UserError("dataset=lerobot: give dataset.root=FOLDER or dataset.repo_id=USER/NAME")
+    sources = [read_source(one) for one in roots]
+    mappings = [map_features(s, features=features, keys=keys, image_size=image_size) for s in sources]
+    for other, source in zip(mappings[1:], sources[1:], strict=True):
+        _check_alike(mappings[0], other, str(roots[0]), str(source.root))
+        if source.fps != sources[0].fps:
+            raise UserError(
+                f"{roots[0]} has {sources[0].fps:g} frames per second, {source.root} {source.fps:g}; "
+                "train on them separately"
+            )
+    there, size = sources[0].fps, mappings[0].action[1]
+    if fps is not None and abs(fps - there) > 1e-6 * there:
+        raise UserError(
+            f"the dataset has {there:g} frames per second, the environment {fps:g}; a step would mean something "
+            f"else. Use env.fps={there:g}"
+        )
+    if action_dim is not None and not mappings[0].discrete and action_dim != size:
+        raise UserError(
+            f"the dataset's actions have {size} numbers, the environment's {action_dim}; "
+            "choose the env that it was recorded in (or its env.action_mode), or another dataset"
+        )
+    return sources, mappings
 
 
 def _as_list(value: Any) -> list[Any]:

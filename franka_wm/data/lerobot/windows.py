@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
@@ -306,38 +306,6 @@ class RecordedWindows:
             return action
         centre, half = (t.to(action.device) for t in self._scale)
         return action * half + centre
-
-    def check(
-        self, *, keys: Sequence[str] = (), fps: float | None = None, action_dim: int | None = None
-    ) -> None:
-        """Refuses what does not fit what is to be trained.
-
-        Args:
-            keys: Observations that the model reads.
-            fps: Frames per second of the environment that the model will act in.
-            action_dim: Size of that environment's actions.
-
-        Raises:
-            UserError: One line that names what is there.
-        """
-        there = {**self.observation_sizes, **self.image_sizes}
-        for key in keys:
-            if key not in there:
-                listed = ", ".join(f"{k} {v}" for k, v in there.items())
-                raise UserError(
-                    f"the model reads {key!r}, the dataset gives {listed}; choose with model.observations, or name its "
-                    f"feature: dataset.features={{{key}: …}}"
-                )
-        if fps is not None and abs(fps - self.fps) > 1e-6 * self.fps:
-            raise UserError(
-                f"the dataset has {self.fps:g} frames per second, the environment {fps:g}; a step would mean something "
-                f"else. Use env.fps={self.fps:g}"
-            )
-        if action_dim is not None and not self.num_actions and action_dim != self.action_dim:
-            raise UserError(
-                f"the dataset's actions have {self.action_dim} numbers, the environment's {action_dim}; "
-                "choose the env that it was recorded in (or its env.action_mode), or another dataset"
-            )
 
     def _chosen(self) -> np.ndarray:
         first = {

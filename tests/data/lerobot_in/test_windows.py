@@ -190,16 +190,15 @@ def test_statistics(foreign, tmp_path: Path, opened: Callable) -> None:
     assert (statistics["action"].min >= -1).all() and float(statistics["action"].std[2]) == 0
 
 
-def test_check(pictures: Path, opened: Callable) -> None:
-    windows = opened(pictures)
-    windows.check(keys=["joints", "pixels"], fps=10, action_dim=3)
+def test_what_does_not_fit_the_environment_is_refused(pictures: Path, opened: Callable) -> None:
+    opened(pictures, keys=["joints", "pixels"], fps=10, action_dim=3)
     for options, message in (
-        ({"keys": ["state"]}, "reads 'state', the dataset gives joints 2, gripper 1, pixels"),
+        ({"keys": ["state"]}, "gives no 'state'; observations there: joints, gripper, pixels"),
         ({"fps": 30.0}, "10 frames per second, the environment 30"),
         ({"action_dim": 7}, "have 3 numbers, the environment's 7"),
     ):
         with pytest.raises(UserError, match=message):
-            windows.check(**options)
+            opened(pictures, **options)
 
 
 def test_refused(pictures: Path, foreign, tmp_path: Path, opened: Callable) -> None:

@@ -131,7 +131,6 @@ class Dataset:
             batch = windows.sample()
             for key, value in batch.items(True, True):
                 assert not value.is_floating_point() or bool(value.isfinite().all()), f"{key} is not finite"
-        windows.check()
 
 
 def _change_table(kind: str, path: Path, rest: list[Any]) -> None:
