@@ -55,7 +55,7 @@ def explain(message: str, *, allowed: Sequence[str] = ()) -> str:
 
 
 def _allowed(message: str, overrides: Sequence[str], options: Sequence[str]) -> list[str]:
-    """The keys beside the one that an override names in vain; at the top, the verb's own, too."""
+    """The keys besides the one that an override names in vain; at the top, the verb's own, too."""
     from omegaconf import DictConfig, OmegaConf
 
     unknown = _UNKNOWN.search(message)

@@ -137,7 +137,7 @@ class WindowSampler(Sampler):
             )
         self._missing = None
 
-    # What TorchRL asks of a sampler; there is no state beside the buffer's.
+    # What TorchRL asks of a sampler; there is no state besides the buffer's.
     def _empty(self) -> None: ...
 
     def dumps(self, path: Any) -> None: ...

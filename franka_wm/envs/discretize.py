@@ -14,11 +14,11 @@ from franka_wm.options import check_whole
 
 
 def discrete_action_table(action_dim: int, magnitude: float = 1.0, include_noop: bool = True) -> torch.Tensor:
-    """Moves along one axis each, and the no-op that lets an agent stay where it arrived.
+    """Actions along one axis each, and the no-op that lets an agent stay where it arrived.
 
     Args:
         action_dim: Number of axes, A.
-        magnitude: Size of a move, in (0, 1]: actions are clipped there.
+        magnitude: Size of an action, in (0, 1]: actions are clipped there.
         include_noop: Whether the last row is all zeros.
 
     Returns:

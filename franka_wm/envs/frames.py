@@ -21,30 +21,30 @@ class FrameStack:
         """A copy of what is kept under ``key``, (N, H, W, C · count)."""
         return self._frames[key].clone()
 
-    def push(self, key: str, picture: Tensor) -> None:
-        """``picture`` (N, H, W, C) is the present one from now on, and the oldest is forgotten."""
-        kept = self._kept(key, picture)
-        self._frames[key] = torch.cat((kept[..., picture.shape[-1] :], picture), -1)
+    def push(self, key: str, image: Tensor) -> None:
+        """``image`` (N, H, W, C) is the present one from now on, and the oldest is forgotten."""
+        kept = self._kept(key, image)
+        self._frames[key] = torch.cat((kept[..., image.shape[-1] :], image), -1)
 
-    def restart(self, key: str, picture: Tensor, mask: Tensor | None = None) -> None:
-        """Copies of ``picture`` (N, H, W, C) where ``mask`` (N,) is true, or everywhere: an episode begins."""
-        copies = self.still(picture)
+    def restart(self, key: str, image: Tensor, mask: Tensor | None = None) -> None:
+        """Copies of ``image`` (N, H, W, C) where ``mask`` (N,) is true, or everywhere: an episode begins."""
+        copies = self.still(image)
         if mask is not None and key in self._frames:
             copies = torch.where(mask.view(-1, 1, 1, 1), copies, self._frames[key])
         self._frames[key] = copies
 
-    def replace(self, key: str, picture: Tensor) -> None:
-        """``picture`` (N, H, W, C) instead of the present one."""
-        kept = self._kept(key, picture)
-        self._frames[key] = torch.cat((kept[..., : -picture.shape[-1]], picture), -1)
+    def replace(self, key: str, image: Tensor) -> None:
+        """``image`` (N, H, W, C) instead of the present one."""
+        kept = self._kept(key, image)
+        self._frames[key] = torch.cat((kept[..., : -image.shape[-1]], image), -1)
 
-    def _kept(self, key: str, picture: Tensor) -> Tensor:
+    def _kept(self, key: str, image: Tensor) -> Tensor:
         """What is kept, or, before the first reset, as if nothing had ever moved."""
-        return self._frames[key] if key in self._frames else self.still(picture)
+        return self._frames[key] if key in self._frames else self.still(image)
 
-    def still(self, picture: Tensor) -> Tensor:
-        """``picture`` (N, H, W, C) as if nothing had moved, (N, H, W, C · count)."""
-        return picture.repeat(1, 1, 1, self.count)
+    def still(self, image: Tensor) -> Tensor:
+        """``image`` (N, H, W, C) as if nothing had moved, (N, H, W, C · count)."""
+        return image.repeat(1, 1, 1, self.count)
 
     def memory(self) -> dict[str, Tensor]:
         """What is kept, by key: not copies."""

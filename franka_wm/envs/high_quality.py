@@ -356,13 +356,13 @@ class HighQualityRenderer:
         try:
             for _ in range(self._passes):
                 self._log(state)
-            picture = self._viewer.get_frame().numpy()
+            image = self._viewer.get_frame().numpy()
         except RuntimeError as error:
             raise UserError(
                 f"backend='rtx' could not render ({error}); it needs an NVIDIA RTX GPU and a recent driver; "
                 "use backend='usd' and render the stage elsewhere"
             ) from error
-        return torch.from_numpy(np.ascontiguousarray(picture)).permute(2, 0, 1).contiguous()
+        return torch.from_numpy(np.ascontiguousarray(image)).permute(2, 0, 1).contiguous()
 
 
 def _usd_target(path: str | Path) -> Path:

@@ -67,7 +67,7 @@ class Randomizer:
             self._plain_frictions = wp.clone(self._frictions)
 
     def arrays(self) -> list[wp.array]:
-        """What is drawn, each (N, …), beside what the simulation lists itself."""
+        """What is drawn, each (N, …), besides what the simulation lists itself."""
         r = self.ranges
         out = [self._colors] if r.color else []
         out += self._physical if r.dynamics else []

@@ -67,7 +67,7 @@ SHIFTS: dict[str, Shift] = {
     "action noise 0.3": Shift({"action_noise": 0.3}),
     "joint noise 0.02 rad": Shift({"observation_noise": 0.02}),
 }
-"""Name → what is drawn anew in every episode, beside what the run itself randomised."""
+"""Name → what is drawn anew in every episode, besides what the run itself randomised."""
 
 
 def robustness(

@@ -25,7 +25,7 @@ class CEM(ElitePlanner):
     standard deviation has a floor, `min_std`, without which there would be nothing left to explore with;
     0 is the plain method. A score that is not finite counts for nothing.
 
-    Args beside those of `ElitePlanner`:
+    Args besides those of `ElitePlanner`:
         num_samples: S, candidates per environment and iteration, the mean and those of the policy included.
         momentum: share of the old mean and standard deviation that each refit keeps.
         std: standard deviation that every search starts with, in units of the action.

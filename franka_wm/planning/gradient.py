@@ -30,7 +30,7 @@ class GradientPlanner(ContinuousPlanner):
     Works under `torch.no_grad`, and leaves no gradient in the model's parameters. Memory: the graph of one
     rollout of E · S · H steps.
 
-    Args beside those of `ContinuousPlanner`:
+    Args besides those of `ContinuousPlanner`:
         num_samples: S, starts per environment, those of the policy included.
         iterations: steps of Adam.
         lr: length of a step, in units of the action (before squashing with `tanh`).

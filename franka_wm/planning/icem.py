@@ -70,7 +70,7 @@ class ICEM(CEM):
     iteration, which costs R rollouts and keeps the code free of special cases; `min_std` is new (0 is the
     published method). A score that is not finite counts for nothing.
 
-    Args beside those of `CEM`:
+    Args besides those of `CEM`:
         num_samples: candidates per environment of the first iteration, those of the policy included; the R
             reused elites come on top.
         num_policy_samples: how many of them are rolled out with `prior`, if `plan` gets one. They are

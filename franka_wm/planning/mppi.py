@@ -34,7 +34,7 @@ class MPPI(ElitePlanner):
       * A score that is not finite counts for nothing, instead of as 0, which would be the best where rewards
         are negative.
 
-    Args beside those of `ElitePlanner`:
+    Args besides those of `ElitePlanner`:
         min_std, max_std: bounds of the standard deviation, in units of the action; it starts at `max_std`.
         temperature: the higher, the more the best elites dominate (the paper's convention).
         normalize: see above; False is the paper's.

@@ -198,7 +198,7 @@ class DiscretePolicy(ScriptedPolicy):
         return tensordict.set("action", distance.argmin(-1))
 
 
-class RandomMovesPolicy(ScriptedPolicy):
+class RandomDiscretePolicy(ScriptedPolicy):
     """An action drawn uniformly, in every step: int64 (N,).
 
     Args:

@@ -1,4 +1,4 @@
-"""Tables of what ``franka-wm evaluate`` finds beside the outcome; that is of :mod:`franka_wm.report.table`."""
+"""Tables of what ``franka-wm evaluate`` finds besides the outcome; that is of :mod:`franka_wm.report.table`."""
 
 from __future__ import annotations
 
@@ -96,7 +96,7 @@ def robustness_table(
 
 
 def diagnostic_tables(results: Mapping[str, Any], config: Any) -> dict[str, Table]:
-    """Title → table, of what there is in the results beside the policies."""
+    """Title → table, of what there is in the results besides the policies."""
     tables = {}
     if "curves" in results.get("open_loop", {}):
         tables["Open loop: error of predicted latents"] = horizon_table(results["open_loop"])

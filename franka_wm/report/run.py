@@ -65,7 +65,7 @@ class RunFiles:
 
     @property
     def extras(self) -> Mapping[str, Any]:
-        """What was found beside the policies, by whichever looked."""
+        """What was found besides the policies, by whichever looked."""
         return {name: value for one in reversed(self.results) for name, value in one.extras.items()}
 
     @property

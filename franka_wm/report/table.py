@@ -50,7 +50,7 @@ def evaluation_tables(evaluation: Evaluation) -> tuple[Table, Table]:
     """One row per policy, `mean (low – high)` in every cell; distances [m] in centimetres, rates in percent.
 
     The first table says how episodes ended, the second what was measured on the way; it has no rows where nothing
-    more was. Columns beside the `OUTCOME` come from whatever numbers and intervals the policies hold.
+    more was. Columns besides the `OUTCOME` come from whatever numbers and intervals the policies hold.
     """
     tables = []
     for outcome in (True, False):

@@ -28,7 +28,7 @@ from franka_wm.policies.scripted import (
     DiscretePolicy,
     IKPolicy,
     NoopPolicy,
-    RandomMovesPolicy,
+    RandomDiscretePolicy,
     SmoothRandomPolicy,
 )
 from franka_wm.seeding import derive_seed, evaluation_seed
@@ -224,7 +224,7 @@ def make_scripted_policies(env: Any, *, seed: int = 0, smoothness: float = 0.7) 
     discrete = not env.action_spec.dtype.is_floating_point
     arm = isinstance(env, (FrankaEnv, TransformedFrankaEnv))
     if discrete and not arm:
-        return {"random": RandomMovesPolicy(env.action_dim, generator=generator)}
+        return {"random": RandomDiscretePolicy(env.action_dim, generator=generator)}
     size = env.config.action_dim if arm else env.action_dim
     scripted: dict[str, Any] = {
         "noop": NoopPolicy(size),

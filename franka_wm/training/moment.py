@@ -1,4 +1,4 @@
-"""Where worlds, policies and samplers of a run stand: what the next step depends on beside weights and experience."""
+"""Where worlds, policies and samplers of a run stand: what the next step depends on besides weights and experience."""
 
 from __future__ import annotations
 

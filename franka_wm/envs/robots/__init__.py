@@ -125,7 +125,7 @@ def add_robot(
     if len(movable) != NUM_JOINTS or builder.joint_coord_count != NUM_JOINTS + fingers:
         names = ", ".join(builder.joint_label[j] for j in movable)
         raise UserError(
-            f"{path.name}: needs exactly {NUM_JOINTS} arm joints beside the fingers, has {len(movable)} ({names})"
+            f"{path.name}: needs exactly {NUM_JOINTS} arm joints besides the fingers, has {len(movable)} ({names})"
         )
     tool_link, tool_frame = _find_tool(builder, path)
     merged = _merged_inertia(builder)

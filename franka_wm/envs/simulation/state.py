@@ -24,7 +24,7 @@ MEMORY = (
 
 
 def solver_memory(sim: Simulation) -> dict[str, wp.array]:
-    """What MuJoCo carries from step to step beside positions and velocities; each (N, …)."""
+    """What MuJoCo carries from step to step besides positions and velocities; each (N, …)."""
     data = getattr(sim.solver, "mjw_data", None)
     names = ("qacc_warmstart", "ctrl", "act", "qfrc_applied", "xfrc_applied")
     return {} if data is None else {name: getattr(data, name) for name in names}

@@ -209,26 +209,28 @@ class GripperTask(Task):
         sim.bodies.launch_upright(mask)
 
 
-Judge = Callable[[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor], tuple[torch.Tensor, torch.Tensor]]
+RewardInTorch = Callable[
+    [torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor], tuple[torch.Tensor, torch.Tensor]
+]
 """State (…, 28), joint target (…, 8), objects (…, 13 · K + …), goal (…, 3) -> (…,) dense reward before the penalty of
 the action, and (…,) bool success."""
 
 
 def relabel_place(
-    task: GripperTask, judge: Judge, transitions: TensorDictBase, goal: torch.Tensor
+    task: GripperTask, reward_and_success: RewardInTorch, transitions: TensorDictBase, goal: torch.Tensor
 ) -> TensorDictBase:
     """As :meth:`Reach.relabel`, where the goal is a place for the first object; exact without noise.
 
     Args:
         task: Its config says the reward.
-        judge: The task's reward and success in torch.
+        reward_and_success: The task's reward and success in torch.
         transitions: (B, H) with ``state``, ``action``, and in ``next`` ``state``, ``joint_target``, ``objects``.
         goal: (B, 3) [m].
     """
     c, out = task.config, with_goal(transitions, goal)
     following = [transitions.get(("next", key)) for key in ("joint_target", "objects")]
     wide = goal.unsqueeze(1).expand(*transitions.batch_size, 3)
-    value, solved = judge(out.get(("next", "state")), *following, wide)
+    value, solved = reward_and_success(out.get(("next", "state")), *following, wide)
     applied = transitions.get("action").nan_to_num(0.0).clamp(-1.0, 1.0)
     value = solved.float() if c.reward == "sparse" else value
     out.set(("next", "reward"), (value - c.action_penalty * applied.square().mean(-1)).unsqueeze(-1))

@@ -92,7 +92,7 @@ def pick_reward_and_success(
 def pick_reward(
     state: torch.Tensor, joint_target: torch.Tensor, objects: torch.Tensor, goal: torch.Tensor
 ) -> tuple[torch.Tensor, torch.Tensor]:
-    """The same in torch, see :data:`~franka_wm.envs.tasks.manipulation.Judge`."""
+    """The same in torch, see :data:`~franka_wm.envs.tasks.manipulation.RewardInTorch`."""
     cube = objects[..., :3]
     missing, speed = (goal - cube).norm(dim=-1), state[..., 7:14].abs().amax(-1)
     near = missing <= NEAR

@@ -73,7 +73,7 @@ def push_reward_and_success(
 def push_reward(
     state: torch.Tensor, _: torch.Tensor, objects: torch.Tensor, goal: torch.Tensor
 ) -> tuple[torch.Tensor, torch.Tensor]:
-    """The same in torch, see :data:`~franka_wm.envs.tasks.manipulation.Judge`."""
+    """The same in torch, see :data:`~franka_wm.envs.tasks.manipulation.RewardInTorch`."""
     cube = objects[..., :3]
     missing = (goal - cube)[..., :2].norm(dim=-1)
     flat = (cube[..., 2] - goal[..., 2]).abs() < 0.005
