@@ -252,9 +252,7 @@ class Trainer:
         """Reads what the device has summed up, tells the terminal and the loggers."""
         row, text = {}, ""
         self.require_finite()
-        if self.env is None:
-            self.replay.check()
-        else:
+        if self.env is not None:
             self.replay.sampler.check()
             episodes = self.env.statistics()
             row = {f"train/{name}": value for name, value in episodes.items()}
