@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import Any, cast
 
@@ -38,13 +39,15 @@ class WindowSampler(Sampler):
         before: So many steps before each window must be kept as well: for stacked images.
     """
 
+    OVERSAMPLE = 4
+
     def __init__(
         self,
         writer: RoundRobinWriter,
         *,
         length: int,
         boundary: str = BOUNDARY,
-        oversample: int = 4,
+        oversample: int = OVERSAMPLE,
         cross_episode: bool = False,
         before: int = 0,
     ):
@@ -197,6 +200,7 @@ def make_replay(
     stacked: Sequence[str] = (),
     hindsight: Hindsight | None = None,
     demonstrations: Demonstrations | None = None,
+    episode_length: int = 0,
 ) -> WindowReplay:
     """A buffer of (time, worlds) that is extended with the collector's (worlds, time) batches.
 
@@ -212,6 +216,8 @@ def make_replay(
         stacked: Keys of such observations.
         hindsight: Relabels a share of each batch with goals that were reached later.
         demonstrations: Take the place of a share of each batch.
+        episode_length: Steps of an episode, where it is known: windows of more than half of it are seldom whole, so
+            more of them must be drawn.
 
     Returns:
         A ``ReplayBuffer`` whose samples have batch size (batch_size, window).
@@ -223,6 +229,9 @@ def make_replay(
             f"{f', and {before} before them' if before else ''}; use at least {num_envs * (window + before + 1)}"
         )
     writer = RoundRobinWriter()
+    oversample = WindowSampler.OVERSAMPLE
+    if window <= episode_length < 2 * window:
+        oversample = math.ceil(oversample * episode_length / (episode_length - window + 1))
     storage = (
         StackStorage(steps * num_envs, frame_stack=frame_stack, stacked=stacked, device=device)
         if before
@@ -232,7 +241,9 @@ def make_replay(
         hindsight=hindsight,
         demonstrations=demonstrations,
         storage=storage,
-        sampler=WindowSampler(writer, length=window, cross_episode=cross_episode, before=before),
+        sampler=WindowSampler(
+            writer, length=window, oversample=oversample, cross_episode=cross_episode, before=before
+        ),
         writer=writer,
         batch_size=batch_size,
         dim_extend=1,

@@ -21,6 +21,11 @@ _FAMILIES: dict[str, tuple[str, str, str]] = {
         "TDMPC2",
         "TD-MPC2: latent dynamics, reward, value and policy, no decoder",
     ),
+    "dreamer": (
+        "franka_wm.models.dreamer",
+        "Dreamer",
+        "DreamerV3: a recurrent model with decoder, and a policy learned in its imagination",
+    ),
     "muzero": (
         "franka_wm.models.muzero",
         "MuZero",

@@ -108,3 +108,26 @@ def n_step_returns(
     # Not a matrix product: autocast would round the targets.
     rewards, values = reward.transpose(1, 2), bootstrap.transpose(1, 2)  # (B, 1, H)
     return (summed * rewards + last * values).sum(-1, keepdim=True)
+
+
+def lambda_returns(
+    reward: Tensor, going_on: Tensor, value: Tensor, *, discount: float, decay: float
+) -> Tensor:
+    """λ-returns R_t = r_t + γ c_t ((1 - λ) v_t + λ R_{t+1}), with R = v after the last step (TD(λ)).
+
+    Args:
+        reward: (T, ..., 1), time leads.
+        going_on: (T, ..., 1), c: bool, or the probability that the episode goes on after the step.
+        value: (T, ..., 1), v: of the state that follows each step.
+        discount: γ per step.
+        decay: λ.
+
+    Returns:
+        (T, ..., 1).
+    """
+    following, returns = value[-1], []
+    for t in range(reward.shape[0] - 1, -1, -1):
+        ahead = (1.0 - decay) * value[t] + decay * following
+        following = reward[t] + discount * going_on[t] * ahead
+        returns.append(following)
+    return torch.stack(returns[::-1])

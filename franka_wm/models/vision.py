@@ -70,6 +70,39 @@ class ConvEncoder(nn.Module):
         return self.maps(images.reshape(-1, *images.shape[-3:])).reshape(*leading, self.features)
 
 
+class ConvDecoder(nn.Module):
+    """Images from features: four times, twice as large by repetition, then a 3 × 3 convolution.
+
+    (..., in_features) -> (..., height, width, C), 0 black and 1 white, not bounded.
+
+    Args:
+        image_size: (height, width, channels).
+        channels: of the last hidden layer; each one before it has twice as many, up to eight times.
+    """
+
+    def __init__(self, in_features: int, image_size: tuple[int, int, int], *, channels: int = 32) -> None:
+        super().__init__()
+        height, width, outputs = image_size
+        self.image_size, self.grid = image_size, (-(-height // 16), -(-width // 16))
+        widths = [8 * channels, 4 * channels, 2 * channels, channels]
+        self.start = nn.Linear(in_features, widths[0] * self.grid[0] * self.grid[1])
+        layers: list[nn.Module] = []
+        for a, b in zip(widths, [*widths[1:], outputs], strict=True):
+            layers += [
+                nn.GroupNorm(1, a),
+                nn.SiLU(),
+                nn.Upsample(scale_factor=2),
+                nn.Conv2d(a, b, 3, padding=1),
+            ]
+        self.network = nn.Sequential(*layers)
+
+    def forward(self, features: Tensor) -> Tensor:
+        height, width, outputs = self.image_size
+        x = self.start(features).reshape(-1, self.start.out_features // math.prod(self.grid), *self.grid)
+        images = self.network(x)[..., :height, :width].permute(0, 2, 3, 1) + 0.5
+        return images.reshape(*features.shape[:-1], height, width, outputs)
+
+
 # -- the vision transformer ------------------------------------------------------------------------------
 
 

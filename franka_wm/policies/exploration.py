@@ -7,6 +7,8 @@ from tensordict import TensorDictBase
 from tensordict.nn import InteractionType, TensorDictModuleBase
 from tensordict.nn.probabilistic import interaction_type
 
+from franka_wm.policies.planner import CONTEXT
+
 
 class ExploringPolicy(TensorDictModuleBase):
     """A policy whose worlds explore unlike each other, so that planners and critics see more than its own actions.
@@ -60,13 +62,16 @@ class ExploringPolicy(TensorDictModuleBase):
             std = torch.linspace(self.noise, 0.0, worlds, device=action.device).flip(0).unsqueeze(-1)
             action = (action + std * torch.randn_like(action)).clamp(-1.0, 1.0)
         if self.planner is not None:
-            keys = dict.fromkeys([*self.planner.in_keys, "action", "plan", "context", "context_action"])
+            keys = dict.fromkeys([*self.planner.in_keys, "action", "plan", *CONTEXT])
             planned = self.planner(seen.select(*keys, strict=False))  # pyright: ignore[reportCallIssue]
             action = torch.cat((action[:first], planned.get("action")))
             for key in self.planner.out_keys:
                 if key != "action":
-                    own = planned.get(key)
-                    tensordict.set(key, torch.cat((own.new_zeros(first, *own.shape[1:]), own)))
+                    own, others = planned.get(key), tensordict.get(key, None)
+                    others = own.new_zeros(first, *own.shape[1:]) if others is None else others[:first]
+                    tensordict.set(key, torch.cat((others, own)))
+        if "context_action" in tensordict:  # a model with memory must remember what was really done
+            tensordict.set("context_action", action)
         return tensordict.set("action", action)
 
 

@@ -23,6 +23,30 @@ PRECISIONS = ("float32", "bfloat16")
 """How a model may compute while planning."""
 
 
+CONTEXT = ("context", "context_action")
+"""Entries in which a model's memory travels: the last latent, and the action taken in it."""
+
+Encode = Callable[[TensorDictBase], Tensor]
+Observe = Callable[[TensorDictBase, Tensor, Tensor, Tensor], Tensor]
+
+
+def latent_of(tensordict: TensorDictBase, encode: Encode, observe: Observe | None) -> Tensor:
+    """Latents z (E, D) of what a policy is given: with the memory that it carries, if the model has one.
+
+    Raises:
+        ValueError: memory without `is_init`, which tells where it ends.
+    """
+    before = None if observe is None else tensordict.get("context", None)
+    if observe is None or before is None:
+        return encode(tensordict)
+    is_init = tensordict.get("is_init", None)
+    if is_init is None:
+        raise ValueError(
+            "a context is carried but is_init is missing: append torchrl.envs.InitTracker to the env"
+        )
+    return observe(tensordict, before, tensordict.get("context_action"), is_init)
+
+
 def captures(wanted: bool | None, observation: Tensor) -> bool:
     """Whether decisions are captured: where the observations are on CUDA, unless it is not wanted.
 
@@ -83,11 +107,11 @@ class PlannerPolicy(TensorDictModuleBase):
         self,
         planner: Planner,
         *,
-        encode: Callable[[TensorDictBase], Tensor],
+        encode: Encode,
         next: Callable[[Tensor, Tensor], Tensor],
         objective: Objective | Score,
         observation_keys: Sequence[str],
-        observe: Callable[[TensorDictBase, Tensor, Tensor, Tensor], Tensor] | None = None,
+        observe: Observe | None = None,
         prior: Callable[[Tensor], Tensor] | None = None,
         explore: bool | None = None,
         model: nn.Module | None = None,
@@ -105,8 +129,7 @@ class PlannerPolicy(TensorDictModuleBase):
         self.precision = precision
         self.objective = as_objective(objective)
         self.in_keys = [*observation_keys, *self.objective.in_keys, "is_init"]
-        context = [] if observe is None else ["context", "context_action"]
-        self.out_keys = ["action", "plan", *context]
+        self.out_keys = ["action", "plan", *(CONTEXT if observe is not None else ())]
         self.planner, self.explore, self.model = planner, explore, model
         self.encode, self.next, self.prior = encode, next, prior
         self.observe, self.capture = observe, capture
@@ -171,7 +194,7 @@ class PlannerPolicy(TensorDictModuleBase):
         if len(tensordict.batch_size) != 1:
             raise ValueError(f"expected batch size [E], got {list(tensordict.batch_size)}")
         # The last action is read by objectives that weigh smoothness.
-        read = (*self.in_keys, "plan", "context", "context_action", "action")
+        read = (*self.in_keys, "plan", *CONTEXT, "action")
         inputs = TensorDict(
             {key: value for key in read if (value := tensordict.get(key, None)) is not None},
             batch_size=tensordict.batch_size,
@@ -203,7 +226,7 @@ class PlannerPolicy(TensorDictModuleBase):
         low = self.precision == "bfloat16"
         # No cache of cast weights: it would hold tensors of one captured decision into the next.
         with torch.autocast(tensordict.get(self.in_keys[0]).device.type, torch.bfloat16, low, False):
-            z = self._latent(tensordict, is_init)
+            z = latent_of(tensordict, self.encode, self.observe)
             z = z.float() if low else z
             result = self.planner.plan(
                 z,
@@ -222,25 +245,17 @@ class PlannerPolicy(TensorDictModuleBase):
     def _next_in_float32(self, z: Tensor, action: Tensor) -> Tensor:
         return self.next(z, action).float()
 
-    def _latent(self, tensordict: TensorDictBase, is_init: Tensor | None) -> Tensor:
-        before = None if self.observe is None else tensordict.get("context", None)
-        if before is None:
-            return self.encode(tensordict)
-        if is_init is None:
-            raise ValueError(
-                "a context is carried but is_init is missing: append torchrl.envs.InitTracker to the env"
-            )
-        assert self.observe is not None
-        return self.observe(tensordict, before, tensordict.get("context_action"), is_init)
-
 
 class ModelPolicy(TensorDictModuleBase):
     """The policy network alone: observations in, `action` (E, A) out. No gradient is recorded.
+
+    Of a model with memory the last latent and the action taken in it travel along, as with `PlannerPolicy`.
 
     Args:
         encode: observation TensorDict -> latents (..., D).
         policy: called as `policy(z, deterministic=...)` -> actions (..., A).
         observation_keys: what `encode` reads.
+        observe: (observation, latent before, action, is_init) -> latents (E, D), of a model with memory.
         explore: True samples, False takes the mode; None follows TorchRL's exploration type.
         model: see `PlannerPolicy`.
     """
@@ -248,16 +263,19 @@ class ModelPolicy(TensorDictModuleBase):
     def __init__(
         self,
         *,
-        encode: Callable[[TensorDictBase], Tensor],
+        encode: Encode,
         policy: Callable[..., Tensor],
         observation_keys: Sequence[str],
+        observe: Observe | None = None,
         explore: bool | None = None,
         model: nn.Module | None = None,
     ) -> None:
         super().__init__()
-        self.in_keys = list(observation_keys)
-        self.out_keys = ["action"]
+        remembers = observe is not None
+        self.in_keys = [*observation_keys, *(["is_init"] if remembers else [])]
+        self.out_keys = ["action", *(CONTEXT if remembers else ())]
         self.encode, self.policy, self.explore, self.model = encode, policy, explore, model
+        self.observe = observe
 
     @classmethod
     def for_model(cls, model: WorldModel, *, explore: bool | None = None) -> ModelPolicy:
@@ -266,6 +284,7 @@ class ModelPolicy(TensorDictModuleBase):
             encode=model.encode,
             policy=model.policy,
             observation_keys=model.observation_keys,
+            observe=model.observe if model.has_memory else None,
             explore=explore,
             model=model,
         )
@@ -273,5 +292,8 @@ class ModelPolicy(TensorDictModuleBase):
     @torch.no_grad()
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write `action`."""
-        z = self.encode(tensordict)
-        return tensordict.set("action", self.policy(z, deterministic=not _explores(self.explore)))
+        z = latent_of(tensordict, self.encode, self.observe)
+        action = self.policy(z, deterministic=not _explores(self.explore))
+        if self.observe is not None:
+            tensordict.set("context", z).set("context_action", action)
+        return tensordict.set("action", action)

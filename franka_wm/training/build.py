@@ -368,6 +368,7 @@ def make_replay_buffer(
         stacked=("pixels", *(f"pixels_{camera}" for camera in cameras)) if run.env.frame_stack > 1 else (),
         hindsight=hindsight,
         demonstrations=demonstrations,
+        episode_length=run.env.episode_length,
     )
 
 

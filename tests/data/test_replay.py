@@ -199,6 +199,21 @@ def test_windows_end_with_their_episode_unless_asked() -> None:
     assert (usual.length, usual.before, usual.cross_episode) == (1, 0, False)
 
 
+def test_windows_nearly_as_long_as_episodes_are_found_in_every_batch() -> None:
+    def batches(episode_length: int) -> None:
+        torch.manual_seed(0)
+        replay = make_replay(
+            capacity=480, num_envs=3, window=18, batch_size=16, device="cpu", episode_length=episode_length
+        )
+        replay.extend(experience(160, lengths=(20, 20, 20)))
+        for _ in range(500):
+            replay.sample()
+
+    batches(20)
+    with pytest.raises(UserError, match="too few episodes of at least 18 steps"):
+        batches(0)  # not known
+
+
 def test_on_a_gpu_missing_windows_are_kept_in_mind_until_asked_for() -> None:
     """Without waiting for the device: whether a batch was whole is a tensor until :meth:`check`."""
 

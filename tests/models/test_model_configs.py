@@ -30,7 +30,9 @@ NOT_AS_PUBLISHED = {
 """What a run on a GPU takes otherwise, to learn more in its minutes."""
 
 
-@pytest.mark.parametrize("file", ["jepa", "vjepa", "lejepa", "lewm", "action_world_model", "tdmpc2_pixels"])
+@pytest.mark.parametrize(
+    "file", ["jepa", "vjepa", "lejepa", "lewm", "action_world_model", "tdmpc2_pixels", "dreamer"]
+)
 def test_the_file_names_every_hyper_parameter_with_its_default(file):
     assert (FOLDER / "model" / f"{file}.yaml").read_text(encoding="utf-8").startswith("# ")
     cfg = compose(f"model={file}", "scale=gpu")

@@ -43,6 +43,7 @@ FAMILIES = {
     "tdmpc2": ["env=reach"],
     "tdmpc2_pixels": ["env=reach_pixels", "env.image_size=40"],
     "muzero": ["env=reach", "planner=gumbel"],
+    "dreamer": ["env=reach"],
     "lewm": ["env=reach_goal_image", "planner=cem"],
     "action_world_model": ["env=reach_goal_image", "planner=cem"],
     "jepa": ["env=reach_pixels"],

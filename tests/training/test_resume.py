@@ -41,6 +41,7 @@ KINDS = {
         "env.randomization.action_noise=0.1",
         "env.randomization.observation_noise=0.01",
     ),
+    "recurrent": ("model=dreamer", "collector.noise=0.4", "collector.planner_worlds=1"),
     "memory": ("model=lewm", "env=reach_goal_image", "env.image_size=32", "planner=icem", "collector.policy=planner"),
 }  # fmt: skip
 

@@ -1,0 +1,419 @@
+"""DreamerV3: a recurrent model and a policy learned in its imagination (Hafner et al., 2023, arXiv:2301.04104)."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, ClassVar
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+from franka_wm.errors import UserError
+from franka_wm.models.base import WorldModel
+from franka_wm.models.ema import ema_update, frozen_copy
+from franka_wm.models.groups import ParameterGroup
+from franka_wm.models.images import ImageSize, check_image_sizes, check_images
+from franka_wm.models.layers import RunningScale, TwoHotSymlog, symlog
+from franka_wm.models.normalizer import ObservationNormalizer
+from franka_wm.models.returns import discount_per_step, lambda_returns, value_range
+from franka_wm.models.rssm import RSSM, divergence, network
+from franka_wm.models.vision import ConvDecoder, ConvEncoder
+from franka_wm.models.windows import check_windows, window_of
+from franka_wm.options import COEFFICIENT, DEPTH, FRACTION, POSITIVE, Bounds, with_defaults
+
+
+class Dreamer(WorldModel):
+    """RSSM, decoder, reward, end, actor and critic.
+
+    z = (h, s), see `RSSM`. The world model is trained to reconstruct observations, rewards and ends from z, and to
+    guess s before it sees the observation. Actor and critic are trained on trajectories of `imagination` steps that
+    the model imagines from every state of a batch; no gradient of theirs reaches the model, but for the critic's on
+    recorded rewards. The model has memory: `observe` carries z along. The defaults are the published 12 M size.
+
+    Deliberate differences from the paper (docs/models/dreamer.md):
+      * A window starts with an empty memory wherever in its episode it starts, and lies within one episode. So the
+        divergences of its first step, which nothing can foresee, are left out.
+      * `encode`, `observe` and `next` take the likeliest codes: what acts and plans is deterministic. Training draws.
+      * Vectors are standardised before symlog, see `set_observation_statistics`; the default is the identity.
+      * AdamW with clipped gradient norms (of model, actor and critic apart) instead of LaProp with adaptive clipping.
+      * Images go through TD-MPC2's convolutions, and come back through upsampling and convolutions.
+      * The two-hot code is TD-MPC2's: bins are equidistant in symlog space, and its expectation is taken there.
+
+    Args:
+        observation_sizes: observation key -> size of its last dimension; encoded in this order. May be empty
+            where there are images.
+        image_sizes: image key -> (height, width, channels), uint8.
+        action_dim: size of an action; each component lies in [-1, 1].
+        episode_length: steps of an episode, from which the discount follows if it is not given:
+            clamp((T/5 - 1) / (T/5), 0.95, 0.995).
+        discount: per step, in [0, 1); without `episode_length` 0.997, as published.
+        deter_dim: size of h; a multiple of `blocks`.
+        hidden_dim: width of all hidden layers.
+        codes, classes: s are so many one-hot codes of so many classes.
+        blocks: of the recurrent matrix.
+        unimix: share of the uniform distribution in those of codes.
+        encoder_layers: hidden layers of the encoder and of the decoder of vectors.
+        channels: of each convolution over images.
+        bins, value_low, value_high: two-hot code of rewards and values; the range is in symlog space. None:
+            derived from `reward_bounds` and the discount, see `value_range`.
+        reward_bounds: the least and the largest reward of a step; None: unknown.
+        terminates: whether episodes may terminate; otherwise there is no head for it.
+        free_nats: divergences below this are not reduced further.
+        dynamics_coef, representation_coef: weights of the prior's and the posterior's divergence.
+        decoder_coef: weight of reconstruction; at 0 there is no decoder, and rewards, ends and values shape z.
+        reward_coef, termination_coef: weights of these losses.
+        replay_value_coef: weight of the critic's loss on recorded rewards.
+        imagination: steps of an imagined trajectory.
+        return_lambda: λ of the returns.
+        entropy_coef: weight, against scaled advantages, of the actor's entropy [nat].
+        std_min, std_max: bounds of the actor's standard deviation.
+        tau: how far the slow critic moves at each update.
+        scale_tau: how far the scale of returns moves at each update.
+
+    Raises:
+        ValueError: a size or coefficient that cannot work, or nothing to read.
+    """
+
+    ranges: ClassVar[Mapping[str, Bounds]] = {
+        **dict.fromkeys(("action_dim", "deter_dim", "hidden_dim", "codes", "blocks"), POSITIVE),
+        **dict.fromkeys(("channels", "imagination"), POSITIVE),
+        **dict.fromkeys(("classes", "bins"), Bounds(least=2, most=10**6)),
+        **dict.fromkeys(
+            ("free_nats", "dynamics_coef", "representation_coef", "decoder_coef", "reward_coef"), COEFFICIENT
+        ),
+        **dict.fromkeys(("termination_coef", "replay_value_coef", "entropy_coef"), COEFFICIENT),
+        **dict.fromkeys(("discount", "unimix"), Bounds(least=0, below=1)),
+        **dict.fromkeys(("tau", "scale_tau"), Bounds(above=0, most=1)),
+        **dict.fromkeys(("std_min", "std_max"), Bounds(above=0, most=1e6)),
+        "return_lambda": FRACTION,
+        "encoder_layers": DEPTH,
+    }
+
+    def __init__(
+        self,
+        *,
+        observation_sizes: Mapping[str, int] | None = None,
+        image_sizes: Mapping[str, ImageSize] | None = None,
+        action_dim: int,
+        episode_length: int | None = None,
+        discount: float | None = None,
+        deter_dim: int = 2048,
+        hidden_dim: int = 256,
+        codes: int = 32,
+        classes: int = 16,
+        blocks: int = 8,
+        unimix: float = 0.01,
+        encoder_layers: int = 3,
+        channels: int = 32,
+        bins: int = 255,
+        value_low: float | None = None,
+        value_high: float | None = None,
+        reward_bounds: tuple[float, float] | None = None,
+        terminates: bool = False,
+        free_nats: float = 1.0,
+        dynamics_coef: float = 1.0,
+        representation_coef: float = 0.1,
+        decoder_coef: float = 1.0,
+        reward_coef: float = 1.0,
+        termination_coef: float = 1.0,
+        replay_value_coef: float = 0.3,
+        imagination: int = 15,
+        return_lambda: float = 0.95,
+        entropy_coef: float = 3e-4,
+        std_min: float = 0.1,
+        std_max: float = 1.0,
+        tau: float = 0.02,
+        scale_tau: float = 0.01,
+    ) -> None:
+        self.validate(locals())
+        super().__init__()
+        self.vectors = ObservationNormalizer(observation_sizes)
+        self.observation_sizes, self.image_sizes = self.vectors.sizes, check_image_sizes(image_sizes)
+        if not self.observation_keys:
+            raise ValueError("give observation_sizes or image_sizes: there is nothing to read")
+        self.discount = discount_per_step(discount, episode_length, default=0.997)
+        self.action_dim, self.terminates, self.free_nats = action_dim, terminates, free_nats
+        self.dynamics_coef, self.representation_coef = dynamics_coef, representation_coef
+        self.decoder_coef, self.reward_coef = decoder_coef, reward_coef
+        self.termination_coef, self.replay_value_coef = termination_coef, replay_value_coef
+        self.imagination, self.return_lambda, self.entropy_coef = imagination, return_lambda, entropy_coef
+        self.std_min, self.std_max, self.tau = std_min, std_max, tau
+
+        deep, size = (hidden_dim,) * encoder_layers, self.vectors.size
+        convolutions = {key: ConvEncoder(shape, channels=channels) for key, shape in self.image_sizes.items()}
+        self.image_encoders = nn.ModuleDict(convolutions)
+        self.vector_encoder = network(size, deep[1:], hidden_dim) if size else None
+        embed_dim = sum(one.features for one in convolutions.values()) + (hidden_dim if size else 0)
+        self.rssm = RSSM(
+            embed_dim=embed_dim,
+            action_dim=action_dim,
+            deter_dim=deter_dim,
+            hidden_dim=hidden_dim,
+            codes=codes,
+            classes=classes,
+            blocks=blocks,
+            unimix=unimix,
+        )
+        self.latent_dim = width = self.rssm.size
+        decodes = decoder_coef > 0.0
+        self.vector_decoder = network(width, deep, size) if size and decodes else None
+        decoders = {
+            key: ConvDecoder(width, shape, channels=channels) for key, shape in self.image_sizes.items()
+        }
+        self.image_decoders = nn.ModuleDict(decoders if decodes else {})
+        self.reward_head = network(width, (hidden_dim,), bins, scale=0.0)
+        self.termination_head = network(width, (hidden_dim,), 1) if terminates else None
+        self.actor = network(width, (hidden_dim,) * 3, 2 * action_dim, scale=0.01)
+        self.critic = network(width, (hidden_dim,) * 3, bins, scale=0.0)
+        self.slow_critic = frozen_copy(self.critic)
+        self.two_hot = TwoHotSymlog(bins, *value_range(value_low, value_high, reward_bounds, self.discount))
+        self.scale = RunningScale(scale_tau)
+        self.register_buffer("keep", torch.tensor(1.0 - tau), persistent=False)
+
+    keep: Tensor
+
+    @classmethod
+    def validate(cls, options: Mapping[str, Any], *, window: int | None = None) -> None:
+        super().validate(options, window=window)
+        given = with_defaults(cls, options)
+        if given["deter_dim"] % given["blocks"]:
+            raise UserError(
+                f"model.blocks={given['blocks']}: must divide model.deter_dim={given['deter_dim']}"
+            )
+        if not given["std_min"] < given["std_max"]:
+            raise UserError(
+                f"model.std_min={given['std_min']}: must be below model.std_max={given['std_max']}"
+            )
+
+    # ------------------------------------------------------------------ what a planner and a policy use
+
+    def encode(self, observation: TensorDictBase) -> Tensor:
+        """Latents z (..., latent_dim) of an episode's first observation."""
+        embedded = self._embed(observation)
+        return self._see(self.rssm.begin(embedded), embedded, sample=False)
+
+    def observe(
+        self, observation: TensorDictBase, previous_z: Tensor, action: Tensor, is_init: Tensor
+    ) -> Tensor:
+        """Latents z (E, latent_dim) after `action` led to `observation`, see `WorldModel.observe`."""
+        embedded = self._embed(observation)
+        h = torch.where(is_init, self.rssm.begin(embedded), self.rssm.recur(previous_z, action))
+        return self._see(h, embedded, sample=False)
+
+    def next(self, z: Tensor, action: Tensor) -> Tensor:
+        """Next latents (..., latent_dim), with the likeliest codes, after actions (..., action_dim)."""
+        return self.rssm.next(z, action, sample=False)
+
+    def reward(self, z: Tensor, action: Tensor) -> Tensor:
+        """Expected reward (..., 1) of an action (..., action_dim) in z (..., latent_dim): that of the next z."""
+        return self.two_hot.decode(self.reward_head(self.next(z, action)))
+
+    def value(self, z: Tensor) -> Tensor:
+        """Expected discounted return (..., 1) of the policy from z (..., latent_dim)."""
+        return self.two_hot.decode(self.critic(z))
+
+    def terminated(self, z: Tensor) -> Tensor:
+        """Whether an episode ends in z (..., latent_dim), likelier than not: (..., 1) bool.
+
+        Raises:
+            ValueError: the model was built for episodes that do not terminate.
+        """
+        if self.termination_head is None:
+            raise ValueError("this model was built without terminates=True: it does not predict ends")
+        return self.termination_head(z) > 0.0
+
+    def policy(self, z: Tensor, deterministic: bool = False) -> Tensor:
+        """Actions (..., action_dim) in [-1, 1] for z (..., latent_dim): a sample, or the mode."""
+        mean, std = self.action_distribution(z)
+        return mean if deterministic else (mean + std * torch.randn_like(mean)).clamp(-1.0, 1.0)
+
+    def action_distribution(self, z: Tensor) -> tuple[Tensor, Tensor]:
+        """Mean in [-1, 1] and standard deviation of the actor's Gaussian, each (..., action_dim)."""
+        mean, raw = self.actor(z).float().chunk(2, dim=-1)
+        return torch.tanh(mean), self.std_min + (self.std_max - self.std_min) * torch.sigmoid(raw + 2.0)
+
+    # ------------------------------------------------------------------ training
+
+    def loss(self, batch: TensorDictBase) -> TensorDict:
+        """Losses of a batch of windows; call `backward` once on the entry `loss`.
+
+        In training mode the running scale of returns is updated as well.
+
+        Args:
+            batch: batch size [B, H]: H contiguous transitions, all of one episode, with the observation keys,
+                `action` (B, H, A), and in `next` the observation keys, `reward` (B, H, 1) and `terminated`
+                (B, H, 1) bool.
+
+        Returns:
+            batch size []: `loss` to differentiate, and detached: `loss_dynamics` and `loss_representation` [nat, not
+            below `free_nats`], `loss_decoder`, `loss_reward`, `loss_policy`, `loss_value`, `loss_replay_value`,
+            `value_mean`, `return_mean`, `policy_entropy` [nat], `policy_scale`, `reward_error` (mean absolute),
+            `prior_entropy` [nat], `target_outside` (share of rewards and returns that the two-hot code clamps); with
+            `terminates` also `loss_termination`.
+
+        Raises:
+            ValueError: the batch size is not [B, H].
+        """
+        check_windows(batch)
+        # Time leads from here on: (H, B, ...).
+        action, reward, terminated = (
+            batch.get(key).transpose(0, 1) for key in ("action", ("next", "reward"), ("next", "terminated"))
+        )
+        window = window_of(batch, self.observation_keys).transpose(0, 1)
+        z, posterior = self._filter(self._embed(window), action)  # (H+1, B, ...)
+        prior = self.rssm.prior(z[1:, ..., : self.rssm.deter_dim])
+
+        # The world model.
+        dynamics = divergence(posterior[1:].detach(), prior).clamp_min(self.free_nats).mean()
+        representation = divergence(posterior[1:], prior.detach()).clamp_min(self.free_nats).mean()
+        reconstruction = self._reconstruction(z, window)
+        reward_logits = self.reward_head(z[1:])
+        reward_loss = self.two_hot.loss(reward_logits, reward).mean()
+        loss = (
+            self.dynamics_coef * dynamics
+            + self.representation_coef * representation
+            + self.decoder_coef * reconstruction
+            + self.reward_coef * reward_loss
+        )
+        ends = {}
+        if self.termination_head is not None:
+            logits = self.termination_head(z[1:])
+            termination = F.binary_cross_entropy_with_logits(logits, terminated.to(logits.dtype))
+            loss, ends = (
+                loss + self.termination_coef * termination,
+                {"loss_termination": termination.detach()},
+            )
+
+        # Actor and critic, in imagination and on what was recorded.
+        imagined, actions = self._imagine(z.detach().flatten(0, 1))
+        returns, value, weight = self._imagined_returns(imagined)
+        if self.training:
+            self.scale.update(returns)
+        policy_loss, entropy = self._policy_loss(imagined[:-1], actions, returns, value, weight)
+        value_loss = (weight * self._value_loss(imagined[:-1], returns)).mean()
+        recorded = lambda_returns(
+            reward,
+            ~terminated,
+            returns[0].view(*z.shape[:2], 1)[1:],
+            discount=self.discount,
+            decay=self.return_lambda,
+        )
+        replay_value_loss = self._value_loss(z[:-1], recorded).mean()
+        loss = loss + policy_loss + value_loss + self.replay_value_coef * replay_value_loss
+        with torch.no_grad():
+            error = (self.two_hot.decode(reward_logits) - reward).abs().mean()
+            prior_entropy = -(prior.exp() * prior).sum((-2, -1)).mean()
+        metrics = {
+            "loss_dynamics": dynamics,
+            "loss_representation": representation,
+            "loss_decoder": reconstruction,
+            "loss_reward": reward_loss,
+            "loss_policy": policy_loss,
+            "loss_value": value_loss,
+            "loss_replay_value": replay_value_loss,
+            "value_mean": value.mean(),
+            "return_mean": returns.mean(),
+            "policy_entropy": entropy,
+            "policy_scale": self.scale.value.clone(),
+            "reward_error": error,
+            "prior_entropy": prior_entropy,
+            "target_outside": self.two_hot.outside(reward, returns),
+        }
+        detached = {name: value.detach() for name, value in metrics.items()}
+        return TensorDict({"loss": loss, **detached, **ends}, batch_size=[])
+
+    def parameter_groups(self, lr: float) -> list[ParameterGroup]:
+        """Groups for Adam: model, actor and critic, whose gradients are clipped apart."""
+        actor, critic = list(self.actor.parameters()), list(self.critic.parameters())
+        apart = {id(parameter) for parameter in (*actor, *critic, *self.slow_critic.parameters())}
+        model = [parameter for parameter in self.parameters() if id(parameter) not in apart]
+        groups = {"model": model, "policy": actor, "value": critic}
+        return [{"name": name, "clip": name, "params": group, "lr": lr} for name, group in groups.items()]
+
+    def after_update(self) -> None:
+        """Move the slow critic by `tau`; call once after each optimiser step."""
+        ema_update(self.slow_critic, self.critic, self.keep)
+
+    def set_observation_statistics(self, mean: Tensor, std: Tensor) -> None:
+        """Standardise vectors from now on, see `ObservationNormalizer`."""
+        self.vectors.set_statistics(mean, std)
+
+    def rebuild_overrides(self) -> dict[str, Any]:
+        """The range of rewards and values, wherever it came from."""
+        return self.two_hot.rebuild()
+
+    # ------------------------------------------------------------------ pieces
+
+    def _embed(self, observation: TensorDictBase) -> Tensor:
+        """Features (..., embed_dim) of observations (...)."""
+        parts = [one(check_images(observation.get(key))) for key, one in self.image_encoders.items()]
+        if self.vector_encoder is not None:
+            parts.append(self.vector_encoder(symlog(self.vectors(observation))))
+        return torch.cat(parts, dim=-1)
+
+    def _see(self, h: Tensor, embedded: Tensor, *, sample: bool) -> Tensor:
+        return self.rssm.state(h, self.rssm.posterior(h, embedded), sample=sample)
+
+    def _filter(self, embedded: Tensor, action: Tensor) -> tuple[Tensor, Tensor]:
+        """States (H+1, B, Z) and posteriors (H+1, B, codes, classes) of features (H+1, B, E), actions (H, B, A)."""
+        h, states, posteriors = self.rssm.begin(embedded[0]), [], []
+        for t in range(embedded.shape[0]):
+            if t:
+                h = self.rssm.recur(states[-1], action[t - 1])
+            posteriors.append(self.rssm.posterior(h, embedded[t]))
+            states.append(self.rssm.state(h, posteriors[-1], sample=True))
+        return torch.stack(states), torch.stack(posteriors)
+
+    def _reconstruction(self, z: Tensor, window: TensorDictBase) -> Tensor:
+        """Squared errors (), summed over an observation: of symlog vectors, and of images in [0, 1]."""
+        total = z.new_zeros(())
+        if self.vector_decoder is not None:
+            error = self.vector_decoder(z) - symlog(self.vectors(window))
+            total = total + error.square().sum(-1).mean()
+        for key, decoder in self.image_decoders.items():
+            error = decoder(z) - window.get(key).to(z.dtype) / 255.0
+            total = total + error.square().sum((-3, -2, -1)).mean()
+        return total
+
+    @torch.no_grad()
+    def _imagine(self, z: Tensor) -> tuple[Tensor, Tensor]:
+        """States (K+1, N, Z) and actions (K, N, A), not clamped, of the actor from z (N, Z)."""
+        states, actions = [z], []
+        for _ in range(self.imagination):
+            mean, std = self.action_distribution(states[-1])
+            actions.append(mean + std * torch.randn_like(mean))
+            states.append(self.rssm.next(states[-1], actions[-1].clamp(-1.0, 1.0), sample=True))
+        return torch.stack(states), torch.stack(actions)
+
+    @torch.no_grad()
+    def _imagined_returns(self, imagined: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """λ-returns, values and weights (K, N, 1) of states (K+1, N, Z): the discounted chance to get there."""
+        reward, value = self.two_hot.decode(self.reward_head(imagined[1:])), self.value(imagined)
+        going_on = torch.ones_like(reward)
+        if self.termination_head is not None:
+            going_on = torch.sigmoid(-self.termination_head(imagined[1:]))
+        returns = lambda_returns(
+            reward, going_on, value[1:], discount=self.discount, decay=self.return_lambda
+        )
+        weight = torch.cat((torch.ones_like(reward[:1]), self.discount * going_on[:-1])).cumprod(0)
+        return returns, value[:-1], weight
+
+    def _policy_loss(
+        self, z: Tensor, actions: Tensor, returns: Tensor, value: Tensor, weight: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        """Loss (REINFORCE with the critic as baseline) and mean entropy [nat] of the actor."""
+        mean, std = self.action_distribution(z)
+        normal = torch.distributions.Normal(mean, std, validate_args=False)
+        log_prob = normal.log_prob(actions).sum(-1, keepdim=True)
+        entropy = normal.entropy().sum(-1, keepdim=True)
+        advantage = self.scale(returns - value)
+        return -(weight * (advantage * log_prob + self.entropy_coef * entropy)).mean(), entropy.mean()
+
+    def _value_loss(self, z: Tensor, returns: Tensor) -> Tensor:
+        """Cross-entropy (..., 1) of the critic in z (..., Z) with returns, and with what the slow critic says."""
+        logits = self.critic(z)
+        with torch.no_grad():
+            slow = self.two_hot.decode(self.slow_critic(z))
+        return self.two_hot.loss(logits, returns) + self.two_hot.loss(logits, slow)
