@@ -197,9 +197,12 @@ def describe(name: str, summary: Mapping[str, Any]) -> str:
 def during_training(
     settings: EvaluationSettings, env: Any, policies: Mapping[str, Any]
 ) -> Callable[[], dict[str, float]]:
-    """A function for the trainer: plays the policies of ``evaluation.during`` and returns numbers to log."""
+    """A function for the trainer: plays the policies of ``evaluation.during`` and returns numbers to log.
+
+    None where there are none, as without an environment.
+    """
     chosen = {name: policies[name] for name in settings.during if name in policies}
-    return lambda: numbers_to_log(env, chosen, episodes=settings.during_episodes)
+    return lambda: numbers_to_log(env, chosen, episodes=settings.during_episodes) if chosen else {}
 
 
 def evaluate_run(

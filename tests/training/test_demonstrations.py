@@ -46,6 +46,14 @@ def test_a_run_begins_with_them_alone_and_mixes_them_in(demos: Path, train, monk
     assert run.counters["env_steps"] == 3 * (10 + 5 + 5)
 
 
+def test_a_run_without_an_environment_evaluates_nothing(demos: Path, train) -> None:
+    run = train(
+        "env=none", "trainer=offline", "dataset=lerobot", f"dataset.root={demos}", "dataset.workers=1"
+    )
+    assert run.counters["updates"] == 30 and not (run.folder.parents[1] / "evaluation.json").exists()
+    assert not any("eval/" in name for row in (run.extra() or {})["rows"] for name in row)
+
+
 def test_statistics_of_observations_see_them_too(demos: Path, train) -> None:
     plain = train(*ARM, "trainer.updates=0", "evaluation.during=[]", folder=demos.parent / "plain")
     mixed = train(*ARM, f"replay.demos={demos}", "trainer.updates=0", "evaluation.during=[]")
