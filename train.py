@@ -54,7 +54,7 @@ def main(cfg: DictConfig) -> None:
     trainer.fit()
     if trainer.interrupted:
         run.stop()
-    if eval_policies:
+    if eval_env is not None:
         found = evaluate_run(run.settings, run.folder, eval_env, eval_policies, counters=trainer.counters)
         report_run(
             run.settings,

@@ -11,10 +11,14 @@ from franka_wm.envs.config import FrankaConfig, Randomization
 if TYPE_CHECKING:
     from franka_wm.envs.camera_math import look_at_angles, supersample
     from franka_wm.envs.discretize import DiscreteActions, discrete_action_table
+    from franka_wm.envs.external import ExternalEnv
     from franka_wm.envs.franka import FrankaEnv
     from franka_wm.envs.high_quality import HighQualityRenderer, which_backends
     from franka_wm.envs.sequences import franka_sequences, smooth_actions
     from franka_wm.envs.transformed import TransformedFrankaEnv
+
+type Environment = FrankaEnv | TransformedFrankaEnv | ExternalEnv
+"""What may be trained in. Only for annotations."""
 
 __all__ = [
     "DiscreteActions",

@@ -73,6 +73,7 @@ class ExternalEnv(TransformedEnv):
         UserError: The extra is not installed, or there is no such environment or observation.
     """
 
+    device: torch.device
     reward_bounds = None  # of a step: neither library says them
 
     def __init__(

@@ -100,6 +100,8 @@ class FrankaEnv(EnvBase):
         rollout = env.rollout(100, policy, break_when_any_done=False)
     """
 
+    device: torch.device
+
     def __init__(
         self,
         config: FrankaConfig | None = None,
@@ -175,12 +177,7 @@ class FrankaEnv(EnvBase):
         sim.step(restart=self._restart)
         for key in self._stacked:
             self._stack.push(key, sim.renderer.next_images[key])
-        out = {
-            key: self._image(key, sim.renderer.next_images)
-            if key in sim.renderer.images
-            else getattr(sim.tensors, f"next_{key}").clone()
-            for key in self._observed
-        }
+        out = self._present(sim.renderer.next_images, "next_")
         if self._restart:  # the next episode has begun where one has ended
             for key in self._stacked:
                 self._stack.restart(key, sim.renderer.images[key], sim.tensors.done.squeeze(-1))
@@ -219,12 +216,14 @@ class FrankaEnv(EnvBase):
         finally:
             self._restart = False
 
-    def _present(self) -> dict[str, torch.Tensor]:
+    def _present(
+        self, images: dict[str, torch.Tensor] | None = None, prefix: str = ""
+    ) -> dict[str, torch.Tensor]:
+        """Copies of what is observed now; of what an action led to, with its images and ``next_``."""
         sim = self.simulation
+        images = sim.renderer.images if images is None else images
         return {
-            key: self._image(key, sim.renderer.images)
-            if key in sim.renderer.images
-            else getattr(sim.tensors, key).clone()
+            key: self._image(key, images) if key in images else getattr(sim.tensors, prefix + key).clone()
             for key in self._observed
         }
 

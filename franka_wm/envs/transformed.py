@@ -21,6 +21,8 @@ class TransformedFrankaEnv(TransformedEnv):
     ``auto_reset="standard"`` and over other environments it does what TorchRL's does.
     """
 
+    device: torch.device
+
     def _step_and_maybe_reset(self, tensordict: TensorDictBase) -> tuple[TensorDictBase, TensorDictBase]:
         if not self._resets_every_step():
             return super()._step_and_maybe_reset(tensordict)

@@ -12,7 +12,7 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor, nn
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
-from franka_wm.envs import FrankaEnv
+from franka_wm.envs import Environment, FrankaEnv
 from franka_wm.evaluation.intervals import bootstrap_mean, wilson
 from franka_wm.training.build import arm_of
 
@@ -22,13 +22,13 @@ THRESHOLDS = (0.05, 0.025, 0.01)
 Policy = Callable[[TensorDictBase], TensorDictBase]
 
 
-def reaches(env: Any) -> bool:
-    """Whether success is a small distance to the goal: of the arm, by its task."""
+def success_distance(env: Environment) -> float | None:
+    """Distance to the goal that counts as success [m]; ``None`` where success is no distance, or not of the arm."""
     arm = arm_of(env)
-    return arm is not None and arm.simulation.task.goal_distance
+    return None if arm is None or not arm.simulation.task.goal_distance else arm.config.success_distance
 
 
-def begin(env: Any, seed: int) -> TensorDictBase:
+def begin(env: Environment, seed: int) -> TensorDictBase:
     """The first observations of the episodes that ``seed`` names; the same whenever it is asked for."""
     if arm_of(env) is not None:
         return env.reset(seed=seed)
@@ -37,7 +37,7 @@ def begin(env: Any, seed: int) -> TensorDictBase:
 
 
 @contextmanager
-def evaluating(acting: Any) -> Iterator[None]:
+def evaluating(acting: object) -> Iterator[None]:
     """A model, or a policy and the model behind it, in evaluation mode; afterwards every part is in its own again.
 
     Families may act differently in training mode: TD-MPC2 plans by two Q-functions drawn at random. What is evaluated
@@ -56,7 +56,7 @@ def evaluating(acting: Any) -> Iterator[None]:
 
 @torch.no_grad()
 def play_episodes(
-    env: Any,
+    env: Environment,
     policy: Policy,
     *,
     seed: int,
@@ -216,7 +216,7 @@ def summarize(episodes: TensorDictBase, *, thresholds: Sequence[float] = THRESHO
 
 @torch.no_grad()
 def decision_times(
-    env: Any, policy: Policy, *, seed: int = 0, decisions: int = 20, warm_up: int = 3
+    env: Environment, policy: Policy, *, seed: int = 0, decisions: int = 20, warm_up: int = 3
 ) -> Tensor:
     """How long a policy takes to decide for all worlds of the environment at once.
 

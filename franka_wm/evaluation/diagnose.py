@@ -10,7 +10,7 @@ import torch
 from tensordict import TensorDict
 from torch import Tensor
 
-from franka_wm.evaluation.closed_loop import begin, reaches
+from franka_wm.evaluation.closed_loop import begin, success_distance
 from franka_wm.evaluation.decoder import (
     SIZES,
     Decoder,
@@ -93,7 +93,7 @@ def hold_out(agent: Agent, *, images: bool = True, seed: int = ROLLOUT_SEED) -> 
     episodes = cast(TensorDict, episodes[:EPISODES])
     with torch.no_grad():
         latents = encode_episodes(model, episodes)
-    return Held(episodes, latents, encoded_validly(episodes), seen, reaches(env))
+    return Held(episodes, latents, encoded_validly(episodes), seen, success_distance(env) is not None)
 
 
 def image_size(model: WorldModel) -> int:
@@ -185,7 +185,7 @@ def calibration(agent: Agent, *, episodes: int = 32) -> dict[str, Any]:
         values = model.value(latents)
     use = played.get("valid")[:, :length]
     result = value_calibration(values[use].squeeze(-1), returns[use].squeeze(-1))
-    if reaches(env):
+    if success_distance(env) is not None:
         distance = played.get("physical")[:, :length, 17:20].norm(dim=-1)[use].cpu()
         episode = torch.arange(use.shape[0], device=use.device).unsqueeze(1).expand_as(use)[use].cpu()
         groups = torch.stack((episode, episode), -1)

@@ -15,6 +15,7 @@ from franka_wm.evaluation.intervals import bootstrap_mean
 from franka_wm.evaluation.open_loop import correlation
 from franka_wm.evaluation.rollouts import embedding
 from franka_wm.evaluation.spectrum import collapse_warning, latent_statistics
+from franka_wm.policies import PlannerPolicy
 
 if TYPE_CHECKING:
     from franka_wm.models.base import WorldModel
@@ -73,7 +74,7 @@ def _value_consistency(
 
 
 @torch.no_grad()
-def planner_health(policy: Any, observation: TensorDictBase) -> dict[str, Any]:
+def planner_health(policy: PlannerPolicy, observation: TensorDictBase) -> dict[str, Any]:
     """How the planner searches, on held-out states; computed in float32, whatever precision the policy plans in.
 
     Args:
@@ -138,7 +139,7 @@ def paired_gain(planner: TensorDictBase, prior: TensorDictBase) -> dict[str, Any
     return {name: bootstrap_mean((planner.get(name) - prior.get(name)).cpu()).as_dict() for name in names}
 
 
-def diagnose_training(model: WorldModel, batch: Any) -> tuple[dict[str, float], str | None]:
+def diagnose_training(model: WorldModel, batch: TensorDictBase) -> tuple[dict[str, float], str | None]:
     """Whether latents collapse and values drift: numbers to log, and a warning."""
     numbers = training_diagnostics(model, batch)
     if not numbers:

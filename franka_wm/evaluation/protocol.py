@@ -10,14 +10,16 @@ from typing import TYPE_CHECKING, Any, cast
 
 import torch
 from tensordict import TensorDict
+from tensordict.nn import TensorDictModuleBase
 
 from franka_wm import console
+from franka_wm.envs import Environment
 from franka_wm.errors import UserError
 from franka_wm.evaluation.closed_loop import (
     THRESHOLDS,
     decision_times,
     play_episodes,
-    reaches,
+    success_distance,
     summarize,
 )
 from franka_wm.evaluation.results import END, FILE, point, to_json
@@ -70,7 +72,7 @@ def evaluate_agent(
     agent: Agent,
     *,
     episodes: int = EPISODES,
-    policies: Mapping[str, Any] | None = None,
+    policies: Mapping[str, TensorDictModuleBase] | None = None,
     timing: bool = True,
     **options: Any,
 ) -> Evaluation:
@@ -80,13 +82,13 @@ def evaluate_agent(
 
 
 def evaluate_policies(
-    env: Any,
-    policies: Mapping[str, Any],
+    env: Environment,
+    policies: Mapping[str, TensorDictModuleBase],
     *,
     episodes: int | None = None,
     seeds: Sequence[int] | None = None,
     timing: bool = False,
-    report: Callable[[str, dict[str, Any]], None] | None = None,
+    report: Callable[[str, dict[str, Any]], object] | None = None,
 ) -> Evaluation:
     """Plays every policy over the same held-out episodes: while training, at its end, and in ``franka-wm evaluate``.
 
@@ -137,7 +139,7 @@ def evaluate_policies(
 
 
 def protocol(
-    settings: RunSettings, env: Any, evaluation: Evaluation, *, by: str, counters: Mapping[str, float]
+    settings: RunSettings, env: Environment, evaluation: Evaluation, *, by: str, counters: Mapping[str, float]
 ) -> dict[str, Any]:
     """How it was measured, for whoever reads the numbers later: ``protocol`` of ``evaluation.json``.
 
@@ -148,6 +150,7 @@ def protocol(
         by: Who measured: :data:`~franka_wm.evaluation.results.END` or :data:`~franka_wm.evaluation.results.COMMAND`.
         counters: Of the training: ``updates``, ``env_steps``, ``seconds``.
     """
+    distance = success_distance(env)
     return {
         "by": by,
         "task": settings.env.label,
@@ -159,7 +162,7 @@ def protocol(
         "episodes": next(iter(evaluation.policies.values()))["episodes"],
         "worlds": env.num_envs,
         "seeds": ", ".join(map(str, evaluation.seeds)),
-        **({"success_distance": float(env.config.success_distance)} if reaches(env) else {}),
+        **({} if distance is None else {"success_distance": float(distance)}),
         "intervals": INTERVALS,
         "device": str(env.device),
         "hardware": hardware(env.device),
@@ -168,12 +171,15 @@ def protocol(
     }
 
 
-def thresholds(env: Any) -> list[float]:
+def thresholds(env: Environment) -> list[float]:
     """Distances that count as success [m]: those of every table, and the environment's own; none without a goal."""
-    return sorted({*THRESHOLDS, float(env.config.success_distance)}, reverse=True) if reaches(env) else []
+    distance = success_distance(env)
+    return [] if distance is None else sorted({*THRESHOLDS, float(distance)}, reverse=True)
 
 
-def numbers_to_log(env: Any, policies: Mapping[str, Any], *, episodes: int | None = None) -> dict[str, float]:
+def numbers_to_log(
+    env: Environment, policies: Mapping[str, TensorDictModuleBase], *, episodes: int | None = None
+) -> dict[str, float]:
     """A point of the learning curves: what :func:`evaluate_policies` finds now, as :func:`point` names it.
 
     Args:
@@ -183,7 +189,7 @@ def numbers_to_log(env: Any, policies: Mapping[str, Any], *, episodes: int | Non
     """
     episodes = env.num_envs if episodes is None else min(episodes, env.num_envs)
     found = evaluate_policies(env, policies, episodes=episodes).policies
-    return point(found, success_distance=env.config.success_distance if reaches(env) else None)
+    return point(found, success_distance=success_distance(env))
 
 
 def describe(name: str, summary: Mapping[str, Any]) -> str:
@@ -195,24 +201,26 @@ def describe(name: str, summary: Mapping[str, Any]) -> str:
 
 
 def during_training(
-    settings: EvaluationSettings, env: Any, policies: Mapping[str, Any]
+    settings: EvaluationSettings, env: Environment | None, policies: Mapping[str, TensorDictModuleBase]
 ) -> Callable[[], dict[str, float]]:
     """A function for the trainer: plays the policies of ``evaluation.during`` and returns numbers to log.
 
     None where there are none, as without an environment.
     """
     chosen = {name: policies[name] for name in settings.during if name in policies}
-    return lambda: numbers_to_log(env, chosen, episodes=settings.during_episodes) if chosen else {}
+    if env is None or not chosen:
+        return dict
+    return lambda: numbers_to_log(env, chosen, episodes=settings.during_episodes)
 
 
 def evaluate_run(
     settings: RunSettings,
     folder: Path,
-    env: Any,
-    policies: Mapping[str, Any],
+    env: Environment,
+    policies: Mapping[str, TensorDictModuleBase],
     *,
     counters: Mapping[str, float],
-    say: Callable[[str], Any] = console.say,
+    say: Callable[[str], object] = console.say,
 ) -> Evaluation:
     """The end of a run: every policy over the same held-out episodes, and ``evaluation.json`` in the run's folder.
 

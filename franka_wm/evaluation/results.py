@@ -153,10 +153,10 @@ def last_row(found: Sequence[Result], during: Sequence[str]) -> dict[str, float]
     return numbers | placed if numbers else {}
 
 
-def to_json(value: Any) -> str:
+def to_json(value: object) -> str:
     """JSON; what is not a finite number becomes null, since JSON has no word for it."""
 
-    def clean(x: Any) -> Any:
+    def clean(x: object) -> object:
         if isinstance(x, Mapping):
             return {str(key): clean(one) for key, one in x.items()}
         if isinstance(x, (list, tuple)):

@@ -10,7 +10,7 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 from franka_wm.errors import UserError
-from franka_wm.evaluation.closed_loop import play_episodes
+from franka_wm.evaluation.closed_loop import play_episodes, success_distance
 from franka_wm.evaluation.intervals import bootstrap_mean, wilson
 from franka_wm.evaluation.protocol import held_out_seeds
 from franka_wm.seeding import seeded
@@ -124,7 +124,7 @@ def robustness(
             with seeded(seed, policy):
                 played = play_episodes(env, policy, seed=seed).cpu()
             before.setdefault(name, played)
-            results[case][name] = _compared(played, before[name], env.config.success_distance)
+            results[case][name] = _compared(played, before[name], success_distance(env))
         if report is not None:
             report(case, results[case])
     return results
@@ -193,21 +193,19 @@ def verdict_of_success(
     return "breaks" if 2 * int(now.sum()) < int(before.sum()) else "worse"
 
 
-def _chosen(policies: Mapping[str, Any]) -> list[str]:
+def _chosen(policies: Mapping[str, object]) -> list[str]:
     own = [name for name in ("planner", "policy") if name in policies][:1]
     return own + [name for name in ("ik", "expert") if name in policies]
 
 
-def _compared(played: TensorDictBase, before: TensorDictBase, success_distance: float) -> dict[str, Any]:
-    reaches = "final_distance" in played.keys()  # noqa: SIM118
-    what, change = ("final_distance", "change") if reaches else ("return", "return_change")
+def _compared(played: TensorDictBase, before: TensorDictBase, near: float | None) -> dict[str, Any]:
+    what, change = ("return", "return_change") if near is None else ("final_distance", "change")
     value, unshifted = played.get(what), before.get(what)
     now, then = played.get("success").bool(), before.get("success").bool()
-    told = (
-        verdict(value, unshifted, success_distance=success_distance)
-        if reaches
-        else verdict_of_success(now, then)
-    )
+    if near is None:
+        told = verdict_of_success(now, then)
+    else:
+        told = verdict(value, unshifted, success_distance=near)
     same = played is before
     return {
         what: bootstrap_mean(value).as_dict(),

@@ -11,6 +11,7 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
+from franka_wm.envs import Environment
 from franka_wm.evaluation.closed_loop import begin, evaluating
 from franka_wm.seeding import derive_seed, seeded
 from franka_wm.training.build import arm_of
@@ -50,7 +51,7 @@ class Alternating(TensorDictModuleBase):
         return tensordict.set("action", chosen)
 
 
-def mixture(policies: dict[str, Any]) -> TensorDictModuleBase:
+def mixture(policies: dict[str, TensorDictModuleBase]) -> TensorDictModuleBase:
     """Half of the worlds move at random, half as the model wants: its policy, or its planner where it has none."""
     names = ["random", *[name for name in ("policy", "planner") if name in policies][:1]]
     return Alternating([policies[name] for name in names])
@@ -58,8 +59,8 @@ def mixture(policies: dict[str, Any]) -> TensorDictModuleBase:
 
 @torch.no_grad()
 def gather_episodes(
-    env: Any,
-    policy: Any,
+    env: Environment,
+    policy: TensorDictModuleBase,
     *,
     seed: int = ROLLOUT_SEED,
     steps: int | None = None,

@@ -59,7 +59,7 @@ def register(name: str, cls: type, *, search: bool = False, line: str = "") -> N
     _REGISTERED[name] = (cls, search, line)
 
 
-def planner(name: str) -> Any:
+def planner(name: str) -> type:
     """The class of the planner `name`, or what makes one.
 
     Raises:

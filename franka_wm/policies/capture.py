@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import OrderedDict
 from collections.abc import Callable, Hashable, Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import torch
 from tensordict import TensorDict, TensorDictBase
@@ -19,7 +19,7 @@ class _Graph(NamedTuple):
     graph: torch.cuda.CUDAGraph
     inputs: TensorDict
     outputs: TensorDict
-    held: tuple[Any, ...]
+    held: tuple[object, ...]
 
 
 class GraphCache:
@@ -42,7 +42,7 @@ class GraphCache:
     def __init__(self, keep: int = 8) -> None:
         self.keep = keep
         self._seen: dict[
-            Hashable, tuple[int, tuple[Any, ...]]
+            Hashable, tuple[int, tuple[object, ...]]
         ] = {}  # with what is held: its ids stay its own
         self._graphs: OrderedDict[Hashable, _Graph] = OrderedDict()
 
@@ -52,7 +52,7 @@ class GraphCache:
         inputs: TensorDictBase,
         *,
         key: Hashable = None,
-        held: tuple[Any, ...] = (),
+        held: tuple[object, ...] = (),
         generators: Sequence[torch.Generator] = (),
     ) -> TensorDict:
         """`work(inputs)`; from the third call of a kind on, by replaying a graph.
@@ -100,10 +100,10 @@ class GraphCache:
         self._graphs.clear()
 
     # A graph belongs to its process and its memory.
-    def __deepcopy__(self, memo: dict[int, Any]) -> GraphCache:
+    def __deepcopy__(self, memo: dict[int, object]) -> GraphCache:
         return GraphCache(self.keep)
 
-    def __reduce__(self) -> tuple[Any, ...]:
+    def __reduce__(self) -> tuple[object, ...]:
         return GraphCache, (self.keep,)
 
 
@@ -123,7 +123,7 @@ def _device(inputs: TensorDictBase) -> torch.device:
 
 
 def _record(
-    work: Work, inputs: TensorDictBase, held: tuple[Any, ...], generators: Sequence[torch.Generator]
+    work: Work, inputs: TensorDictBase, held: tuple[object, ...], generators: Sequence[torch.Generator]
 ) -> _Graph:
     static = TensorDict({name: x.clone() for name, x in inputs.items()}, batch_size=inputs.batch_size)
     graph = torch.cuda.CUDAGraph()

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Hashable, Mapping
 from functools import partial
 from types import FunctionType, MethodType
-from typing import Any
 
 import torch
 from tensordict import TensorDictBase
@@ -20,7 +19,7 @@ class _Same:
 
     __slots__ = ("it",)
 
-    def __init__(self, it: Any) -> None:
+    def __init__(self, it: object) -> None:
         self.it = it
 
     def __eq__(self, other: object) -> bool:
@@ -30,7 +29,7 @@ class _Same:
         return id(self.it)
 
 
-def graph_key(value: Any, depth: int = LOOKED_INTO) -> Hashable:
+def graph_key(value: object, depth: int = LOOKED_INTO) -> Hashable:
     """What a graph of work with `value` depends on, for a `key`: another key, another graph.
 
     Numbers and texts count by value, tensors by the memory they lie in, plain objects and modules by identity or the

@@ -10,7 +10,7 @@ import torch
 from tensordict import TensorDictBase
 
 from franka_wm.envs.camera import project, whole_arm
-from franka_wm.evaluation.closed_loop import play_episodes, reaches
+from franka_wm.evaluation.closed_loop import play_episodes, success_distance
 from franka_wm.evaluation.protocol import Evaluation, held_out_seeds
 from franka_wm.evaluation.results import FILE, Result, last_row
 from franka_wm.files import atomic_write
@@ -59,7 +59,7 @@ def report_run(
         log({name: value for name, value in last.items() if name.startswith("eval/")})
     arm = arm_of(env)
     if x := axis(drawn):
-        mark = arm.config.success_distance if arm is not None and reaches(env) else None
+        mark = success_distance(env)
         plot_learning_curves(drawn, folder / "curves.png", x=x, success_distance=mark)
     if settings.evaluation.video_episodes and arm is not None:
         name = acting(policies)

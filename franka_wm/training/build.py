@@ -5,22 +5,27 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from functools import partial
 from inspect import signature
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 import torch
-from torchrl.data import ReplayBuffer
+from tensordict.nn import TensorDictModuleBase
+from torchrl.envs import EnvBase, TransformedEnv
 
 from franka_wm import models, planning
 from franka_wm.console import say
 from franka_wm.data.demonstrations import Demonstrations
 from franka_wm.data.hindsight import Hindsight
-from franka_wm.data.replay import make_replay
+from franka_wm.data.lerobot.windows import RecordedWindows
+from franka_wm.data.replay import WindowReplay, make_replay
 from franka_wm.device import resolve_device
-from franka_wm.envs import FrankaEnv, TransformedFrankaEnv
+from franka_wm.envs import Environment, FrankaEnv, TransformedFrankaEnv
 from franka_wm.envs.discretize import DiscreteActions
 from franka_wm.envs.external import ExternalConfig, ExternalEnv
 from franka_wm.errors import UserError
 from franka_wm.planning import registry
+from franka_wm.planning.base import Planner
+from franka_wm.planning.mcts import MCTS
+from franka_wm.planning.objectives import Objective
 from franka_wm.policies import ExploringPolicy, ModelPolicy, PlannerPolicy, SearchPolicy
 from franka_wm.policies.expert import ExpertPolicy
 from franka_wm.policies.scripted import (
@@ -43,7 +48,7 @@ if TYPE_CHECKING:
 
 def make_env(
     run: RunSettings, *, num_envs: int | None = None, seed: int | None = None, **changes: Any
-) -> Any:
+) -> Environment:
     """The environment that ``run.env`` describes; ``changes`` override fields of its config.
 
     For a model of discrete actions the arm takes numbers of rows of a table. Its episodes are those of training
@@ -59,7 +64,7 @@ def make_env(
     return TransformedFrankaEnv(env, DiscreteActions(config.action_dim)) if run.is_discrete else env
 
 
-def make_evaluation_env(run: RunSettings, *, num_envs: int | None = None, **changes: Any) -> Any:
+def make_evaluation_env(run: RunSettings, *, num_envs: int | None = None, **changes: Any) -> Environment:
     """The same task for evaluation: with what ``ik`` and ``expert`` read, and the images that the model reads."""
     num_envs = run.evaluation.episodes if num_envs is None else num_envs
     if run.is_arm:
@@ -77,7 +82,9 @@ def make_evaluation_env(run: RunSettings, *, num_envs: int | None = None, **chan
 # -- models -------------------------------------------------------------------------------------------------
 
 
-def make_model(run: RunSettings, spaces: Any, device: torch.device | str | None = None) -> Any:
+def make_model(
+    run: RunSettings, spaces: Spaces | Environment, device: torch.device | str | None = None
+) -> WorldModel:
     """The world model that ``run.model`` names.
 
     Args:
@@ -116,7 +123,7 @@ def make_model(run: RunSettings, spaces: Any, device: torch.device | str | None 
 # -- planners and policies ----------------------------------------------------------------------------------
 
 
-def make_planner(run: RunSettings, actions: int) -> Any:
+def make_planner(run: RunSettings, actions: int) -> Planner | MCTS:
     """The planner that ``run.planner`` names.
 
     Args:
@@ -147,7 +154,7 @@ def goal_images(keys: Iterable[str]) -> dict[str, str]:
     return {key: f"goal_{key}" for key in keys}
 
 
-def make_objective(run: RunSettings, model: WorldModel) -> Any:
+def make_objective(run: RunSettings, model: WorldModel) -> Objective | None:
     """What the planner maximises, by ``run.objective``."""
     o = run.objective
     name = run.objective_name
@@ -155,7 +162,7 @@ def make_objective(run: RunSettings, model: WorldModel) -> Any:
         return None
     if name == "reward_value":
         try:
-            chosen: Any = planning.RewardPlusValue.of(model)
+            chosen: Objective = planning.RewardPlusValue.of(model)
         except ValueError as error:
             raise UserError(f"objective=reward_value: {error}; use objective=goal_image") from error
     else:
@@ -170,7 +177,7 @@ def make_objective(run: RunSettings, model: WorldModel) -> Any:
             metric=o.metric,  # pyright: ignore[reportArgumentType]  # one of its choices
             summed=o.summed,
         )
-    parts: list[tuple[float, Any]] = [(1.0, chosen)]
+    parts: list[tuple[float, Objective]] = [(1.0, chosen)]
     if o.action_penalty:
         parts.append((1.0, planning.ActionPenalty(o.action_penalty)))
     if o.policy_penalty:
@@ -188,16 +195,16 @@ def make_objective(run: RunSettings, model: WorldModel) -> Any:
 
 def make_policies(
     model: WorldModel,
-    planner: Any,
-    env: Any,
+    planner: Planner | MCTS | None,
+    env: Environment,
     *,
     seed: int = 0,
     smoothness: float = 0.7,
-    objective: Any = None,
+    objective: Objective | None = None,
     capture: bool | None = None,
     precision: str = "float32",
     compile: bool = False,
-) -> dict[str, Any]:
+) -> dict[str, TensorDictModuleBase]:
     """Every policy that can act or be compared, by name.
 
     ``planner`` and ``policy`` where the model has what they need; ``noop`` and ``random`` (smooth random:
@@ -205,49 +212,63 @@ def make_policies(
     of discrete actions. ``capture``, ``precision`` and ``compile`` are the planner's, see
     :class:`~franka_wm.policies.PlannerPolicy`.
     """
-    policies: dict[str, Any] = {}
+    policies: dict[str, TensorDictModuleBase] = {}
     discrete = not env.action_spec.dtype.is_floating_point
     if discrete:
-        policies["planner"] = SearchPolicy.for_model(model, planner, capture=capture)
+        policies["planner"] = SearchPolicy.for_model(model, cast(MCTS, planner), capture=capture)
     elif model.has_next:
         policies["planner"] = PlannerPolicy.for_model(
-            model, planner, objective=objective, capture=capture, precision=precision, compile=compile
+            model,
+            cast(Planner, planner),
+            objective=objective,
+            capture=capture,
+            precision=precision,
+            compile=compile,
         )
     if model.has_policy:
         policies["policy"] = ModelPolicy.for_model(model)
     return policies | make_scripted_policies(env, seed=seed, smoothness=smoothness)
 
 
-def make_scripted_policies(env: Any, *, seed: int = 0, smoothness: float = 0.7) -> dict[str, Any]:
+def make_scripted_policies(
+    env: Environment, *, seed: int = 0, smoothness: float = 0.7
+) -> dict[str, TensorDictModuleBase]:
     """Policies that need no model: ``noop``, ``random`` and, for the arm, ``ik``; with a gripper ``expert``."""
     generator = torch.Generator(device=env.device).manual_seed(seed)
     discrete = not env.action_spec.dtype.is_floating_point
-    arm = isinstance(env, (FrankaEnv, TransformedFrankaEnv))
-    if discrete and not arm:
+    arm = arm_of(env)
+    if discrete and arm is None:
         return {"random": RandomDiscretePolicy(env.action_dim, generator=generator)}
-    size = env.config.action_dim if arm else env.action_dim
-    scripted: dict[str, Any] = {
+    size = env.action_dim if arm is None else arm.config.action_dim
+    scripted: dict[str, TensorDictModuleBase] = {
         "noop": NoopPolicy(size),
         "random": SmoothRandomPolicy(size, smoothness=smoothness, generator=generator),
     }
+    if arm is None:
+        return scripted
     if discrete:
         numbered: Any = env.transform
         scripted = {name: DiscretePolicy(policy, numbered.table) for name, policy in scripted.items()}
-        if not env.config.has_gripper:
-            scripted["ik"] = DiscreteIKPolicy(env.kinematics, env.config, numbered.table)
-    elif arm and env.config.has_gripper:
-        task = env.simulation.task
-        fits = env.config.gravity_compensation and env.config.action_mode != "ee_delta"
+        if not arm.config.has_gripper:
+            scripted["ik"] = DiscreteIKPolicy(arm.kinematics, arm.config, numbered.table)
+    elif arm.config.has_gripper:
+        task = arm.simulation.task
+        fits = arm.config.gravity_compensation and arm.config.action_mode != "ee_delta"
         if task.expert is not None and fits:
-            scripted["expert"] = ExpertPolicy(task, env.kinematics, env.config)
-    elif arm:
-        scripted["ik"] = IKPolicy(env.kinematics, env.config)
+            scripted["expert"] = ExpertPolicy(task, arm.kinematics, arm.config)
+    else:
+        scripted["ik"] = IKPolicy(arm.kinematics, arm.config)
     return scripted
 
 
 def make_agent_policies(
-    run: RunSettings, model: WorldModel, env: Any, spaces: Spaces, *, purpose: str = "evaluation"
-) -> dict[str, Any]:
+    run: RunSettings,
+    model: WorldModel,
+    env: Environment | None,
+    spaces: Spaces,
+    *,
+    purpose: str = "evaluation",
+) -> dict[str, TensorDictModuleBase]:
     """Planner, objective and policies by the configuration; none without an environment to act in.
 
     Those that gather experience and those that are evaluated must not be the same objects: a random policy has a
@@ -273,7 +294,9 @@ def make_agent_policies(
     )
 
 
-def explore(collector: CollectorSettings, policies: Mapping[str, Any], name: str) -> Any:
+def explore(
+    collector: CollectorSettings, policies: Mapping[str, TensorDictModuleBase], name: str
+) -> TensorDictModuleBase:
     """The policy that gathers experience; the model's own explores as ``collector`` says, others as they are."""
     noise, worlds = collector.noise, collector.planner_worlds
     if name != "policy" or not (noise or worlds):
@@ -290,7 +313,7 @@ HINDSIGHT = 0.5
 """Share of windows that ``replay.hindsight=null`` relabels, where that can be done."""
 
 
-def make_hindsight(run: RunSettings, env: Any) -> Hindsight | None:
+def make_hindsight(run: RunSettings, env: Environment) -> Hindsight | None:
     """Goals in hindsight for the share of windows that ``run.replay.hindsight`` asks for; ``None``: for none.
 
     Raises:
@@ -319,7 +342,7 @@ def make_hindsight(run: RunSettings, env: Any) -> Hindsight | None:
     )
 
 
-def no_hindsight(run: RunSettings, env: Any) -> str | None:
+def no_hindsight(run: RunSettings, env: Environment) -> str | None:
     """Why windows cannot be given other goals, or gain nothing from them; ``None``: they can."""
     arm = arm_of(env)
     if arm is None or run.is_discrete:
@@ -342,11 +365,11 @@ def no_hindsight(run: RunSettings, env: Any) -> str | None:
     return None
 
 
-def arm_of(env: Any) -> FrankaEnv | None:
+def arm_of(env: EnvBase | None) -> FrankaEnv | None:
     """The arm inside an environment, under whatever transforms; ``None`` for one of another library."""
-    while env is not None and not isinstance(env, FrankaEnv):
-        env = getattr(env, "base_env", None)
-    return env
+    while isinstance(env, TransformedEnv):
+        env = env.base_env
+    return env if isinstance(env, FrankaEnv) else None
 
 
 def make_replay_buffer(
@@ -354,7 +377,7 @@ def make_replay_buffer(
     device: torch.device,
     hindsight: Hindsight | None = None,
     demonstrations: Demonstrations | None = None,
-) -> ReplayBuffer:
+) -> WindowReplay:
     """The replay buffer that ``run.replay`` describes; it keeps each image of a stack once."""
     cameras = run.env.arm.cameras if run.is_arm else ()
     return make_replay(
@@ -372,7 +395,7 @@ def make_replay_buffer(
     )
 
 
-def open_recorded(run: RunSettings, device: torch.device) -> tuple[Any, Any]:
+def open_recorded(run: RunSettings, device: torch.device) -> tuple[RecordedWindows, RecordedWindows | None]:
     """Training and validation windows of the datasets that ``run.dataset`` names.
 
     The second is ``None`` where no episode is long enough for validation.

@@ -8,6 +8,7 @@ from tensordict import TensorDict
 
 from franka_wm.data.demonstrations import Demonstrations
 from franka_wm.data.hindsight import Hindsight
+from franka_wm.envs import Environment
 from franka_wm.errors import UserError
 from franka_wm.training.settings import RunSettings
 from franka_wm.training.spaces import Spaces
@@ -16,7 +17,9 @@ SAME = ("task", "reward", "action_mode", "action_scale", "action_penalty", "succ
 """Options of the arm that must be those of its demonstrations."""
 
 
-def open_demonstrations(run: RunSettings, env: Any, hindsight: Hindsight | None) -> Demonstrations | None:
+def open_demonstrations(
+    run: RunSettings, env: Environment, hindsight: Hindsight | None
+) -> Demonstrations | None:
     """The episodes that ``run.replay.demos`` names, on the environment's device; ``None`` where it names none.
 
     Raises:

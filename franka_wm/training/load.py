@@ -8,9 +8,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import torch
+from tensordict.nn import TensorDictModuleBase
 
 from franka_wm.device import resolve_device
+from franka_wm.envs import Environment
 from franka_wm.errors import UserError
+from franka_wm.planning.base import Planner
+from franka_wm.planning.mcts import MCTS
 from franka_wm.training import build
 from franka_wm.training.check import sketch
 from franka_wm.training.checkpoint import Checkpoint, latest_checkpoint, load_checkpoint
@@ -40,10 +44,10 @@ class Agent:
 
     folder: Path
     settings: RunSettings
-    env: Any
+    env: Environment
     model: WorldModel
-    planner: Any
-    policies: dict[str, Any]
+    planner: Planner | MCTS | None
+    policies: dict[str, TensorDictModuleBase]
     counters: dict[str, float]
 
 
@@ -83,7 +87,7 @@ def load_agent(
     return Agent(checkpoint.folder, settings, env, model, planner, policies, dict(checkpoint.counters))
 
 
-def load_model(folder: str | Path, *, device: torch.device | str = "cpu") -> Any:
+def load_model(folder: str | Path, *, device: torch.device | str = "cpu") -> WorldModel:
     """The model alone, in evaluation mode.
 
     Args and errors: as for :func:`load_agent`.
@@ -101,7 +105,7 @@ def find_checkpoint(folder: str | Path) -> Checkpoint:
     return load_checkpoint(latest_checkpoint(folder))
 
 
-def _model(checkpoint: Checkpoint, settings: RunSettings, device: torch.device) -> Any:
+def _model(checkpoint: Checkpoint, settings: RunSettings, device: torch.device) -> WorldModel:
     extra = checkpoint.extra()
     saved = extra.get("spaces") if isinstance(extra, dict) else None
     if saved is None:

@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from torch import Tensor
+from torchrl.record.loggers import Logger
 
 from franka_wm.console import say
 from franka_wm.errors import UserError
@@ -57,7 +58,7 @@ def check_loggers(names: Iterable[str], **options: Mapping[str, Any]) -> None:
             )
 
 
-def make_loggers(names: Sequence[str], folder: str | Path, **options: Mapping[str, Any]) -> list[Any]:
+def make_loggers(names: Sequence[str], folder: str | Path, **options: Mapping[str, Any]) -> list[Logger]:
     """Open loggers.
 
     Args:
@@ -83,7 +84,7 @@ def make_loggers(names: Sequence[str], folder: str | Path, **options: Mapping[st
     return loggers
 
 
-def log_numbers(loggers: Iterable[Any], numbers: Mapping[str, float], *, step: int) -> None:
+def log_numbers(loggers: Iterable[Logger], numbers: Mapping[str, float], *, step: int) -> None:
     """Log a row of numbers: one entry of a service's history, not one for each number.
 
     Where a file cannot be written (a full disk), it says so and goes on: the weights are saved after the last row.
@@ -108,7 +109,7 @@ def _log_row(logger: Any, numbers: dict[str, float], step: int) -> None:
         logger.log_metrics(numbers, step=step)
 
 
-def log_config(loggers: Iterable[Any], config: Mapping[str, Any]) -> None:
+def log_config(loggers: Iterable[Logger], config: Mapping[str, Any]) -> None:
     """Tell the services what is being run; files have ``config.yaml`` beside them.
 
     Args:
@@ -124,7 +125,7 @@ def log_config(loggers: Iterable[Any], config: Mapping[str, Any]) -> None:
             logger.log_hparams(dict(config))
 
 
-def log_video(loggers: Iterable[Any], name: str, frames: Tensor, *, fps: int, step: int) -> None:
+def log_video(loggers: Iterable[Logger], name: str, frames: Tensor, *, fps: int, step: int) -> None:
     """Log a video where the logger can show or keep it; all of `NAMES` can.
 
     ``csv`` keeps ``csv/videos/NAME_STEP.mp4``; TensorBoard shows an animated image; services get an .mp4.
@@ -162,7 +163,7 @@ def log_video(loggers: Iterable[Any], name: str, frames: Tensor, *, fps: int, st
                 logger.experiment.log({name: shown}, step=step)
 
 
-def close_loggers(loggers: Iterable[Any]) -> None:
+def close_loggers(loggers: Iterable[Logger]) -> None:
     """Write what is still held back, and end runs, so that services do not show them as running or crashed."""
     for logger in loggers:
         if kind(logger) == "mlflow":
@@ -171,7 +172,7 @@ def close_loggers(loggers: Iterable[Any]) -> None:
             logger.shutdown()
 
 
-def kind(logger: Any) -> str:
+def kind(logger: Logger) -> str:
     """Which of `NAMES` a TorchRL logger is."""
     name = type(logger).__name__.removesuffix("Logger").lower()
     return name if name in NAMES else "other"

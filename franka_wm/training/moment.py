@@ -3,19 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, Protocol, runtime_checkable
 
 import torch
 from tensordict import TensorDict, TensorDictBase
+from tensordict.nn import TensorDictModuleBase
 from torchrl.collectors import Collector
 
-from franka_wm.envs import FrankaEnv
-
-
-def restorable(env: Any) -> FrankaEnv | None:
-    """The arm inside an environment, whose worlds can be put back; ``None``: those of another library cannot."""
-    base = getattr(env, "base_env", env)
-    return base if isinstance(base, FrankaEnv) else None
+from franka_wm.envs import Environment
+from franka_wm.training.build import arm_of
 
 
 def same_worlds(saved: Mapping[str, Any], now: Mapping[str, Any]) -> bool:
@@ -25,44 +21,57 @@ def same_worlds(saved: Mapping[str, Any], now: Mapping[str, Any]) -> bool:
     return fitting and all(saved[part] == now[part] for part in parts)
 
 
-def worlds_now(env: Any, collector: Collector | None) -> dict[str, Any] | None:
+def worlds_now(env: Environment, collector: Collector | None) -> dict[str, Any] | None:
     """The simulation of all worlds and the root that the collector's next step starts from, plans included.
 
     ``None`` before anything was gathered, and for environments of other libraries.
     """
-    arm = restorable(env)
+    arm = arm_of(env)
     if arm is None or collector is None:
         return None
     # TorchRL keeps this to itself; its own state_dict leaves it out.
     return {"state": _nested(arm.get_state()), "carry": _nested(collector._carrier)}
 
 
-def put_back(env: Any, collector: Collector, worlds: Mapping[str, Any]) -> None:
+def put_back(env: Environment, collector: Collector, worlds: Mapping[str, Any]) -> None:
     """Undoes whatever happened to worlds and collector since :func:`worlds_now`, in this process or another."""
-    arm = restorable(env)
+    arm = arm_of(env)
     assert arm is not None
     arm.set_state(TensorDict(worlds["state"], batch_size=arm.batch_size, device=arm.device))
     carry = TensorDict(worlds["carry"], batch_size=arm.batch_size, device=arm.device)
     collector._carrier = carry.clear_device_() if collector._carrier.device is None else carry
 
 
-def draws(policies: Mapping[str, Any]) -> dict[str, Any]:
+@runtime_checkable
+class Drawing(Protocol):
+    """A policy that draws at random: what it carries from step to step can be kept and put back."""
+
+    def get_state(self) -> dict[str, torch.Tensor | None]: ...
+
+    def set_state(self, state: Mapping[str, torch.Tensor | None], device: torch.device) -> bool: ...
+
+
+def draws(policies: Mapping[str, TensorDictModuleBase]) -> dict[str, dict[str, torch.Tensor | None]]:
     """What policies that draw at random carry from step to step: generators, last actions. By name of the module."""
     return {name: module.get_state() for name, module in _drawing(policies).items()}
 
 
-def go_on_drawing(policies: Mapping[str, Any], states: Mapping[str, Any], device: torch.device) -> bool:
+def go_on_drawing(
+    policies: Mapping[str, TensorDictModuleBase],
+    states: Mapping[str, Mapping[str, torch.Tensor | None]],
+    device: torch.device,
+) -> bool:
     """Puts policies where :func:`draws` found them; ``False`` if any drew on another kind of device."""
     there = [(module, states[name]) for name, module in _drawing(policies).items() if name in states]
     return all([module.set_state(state, device) for module, state in there])
 
 
-def _drawing(policies: Mapping[str, Any]) -> dict[str, Any]:
+def _drawing(policies: Mapping[str, TensorDictModuleBase]) -> dict[str, Drawing]:
     return {
         f"{name}/{path}": module
         for name, policy in policies.items()
         for path, module in policy.named_modules()
-        if hasattr(module, "get_state") and hasattr(module, "set_state")
+        if isinstance(module, Drawing)
     }
 
 

@@ -95,7 +95,7 @@ def _optimizer_difference(saved: Mapping[str, Any], optimizer: Optimizer) -> str
     return None
 
 
-def _alike(saved: Any, here: Any) -> bool:
+def _alike(saved: object, here: object) -> bool:
     """Whether a saved option of a group is of the kind that it has here."""
     if isinstance(here, tuple):
         return isinstance(saved, tuple) and len(saved) == len(here) and all(map(_alike, saved, here))

@@ -10,20 +10,25 @@ import tempfile
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import IO, NoReturn
 
 import torch
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf
+from tensordict import TensorDictBase
+from torchrl.record.loggers import Logger
 
 from franka_wm.console import announced, log_to, say
 from franka_wm.data.lerobot.export import export_run
+from franka_wm.data.lerobot.windows import RecordedWindows
+from franka_wm.data.replay import WindowReplay
 from franka_wm.device import resolve_device
+from franka_wm.envs import Environment
 from franka_wm.errors import FrankaError, UserError
 from franka_wm.seeding import derive_seed, seeded
 from franka_wm.training import build
 from franka_wm.training.check import check
-from franka_wm.training.checkpoint import latest_checkpoint, load_checkpoint
+from franka_wm.training.checkpoint import Checkpoint, latest_checkpoint, load_checkpoint
 from franka_wm.training.demos import open_demonstrations
 from franka_wm.training.loggers import close_loggers, log_config, log_video, make_loggers
 from franka_wm.training.settings import RunSettings
@@ -94,12 +99,12 @@ class Run:
 
     settings: RunSettings
     folder: Path
-    checkpoint: Any = None
-    loggers: list[Any] = field(default_factory=list)
-    validation: Any = None
+    checkpoint: Checkpoint | None = None
+    loggers: list[Logger] = field(default_factory=list)
+    validation: RecordedWindows | None = None
     """Windows of recorded episodes that training never sees."""
 
-    def build_environments(self) -> tuple[Any, Any]:
+    def build_environments(self) -> tuple[Environment | None, Environment | None]:
         """The training worlds and the evaluation worlds, compiled and ready; ``None`` where there are none.
 
         A run on recorded data trains in no world; without an environment (``env=none``) none evaluates it either.
@@ -122,9 +127,9 @@ class Run:
                     one.set_seed(derive_seed("training" if one is env else "evaluation", self.settings.seed))
         return env, eval_env
 
-    def build_experience(self, env: Any) -> tuple[Any, Any]:
+    def build_experience(self, env: Environment | None) -> tuple[WindowReplay | RecordedWindows, Spaces]:
         """Where batches come from, and what a model must know of it: ``sample()`` and its :class:`Spaces`."""
-        if not self.settings.is_offline:
+        if env is not None:
             hindsight = build.make_hindsight(self.settings, env)
             shown = open_demonstrations(self.settings, env, hindsight)
             replay = build.make_replay_buffer(self.settings, env.device, hindsight, shown)
@@ -141,17 +146,17 @@ class Run:
         )
         return windows, self.as_saved(spaces)
 
-    def as_saved(self, spaces: Any) -> Any:
+    def as_saved(self, spaces: Spaces) -> Spaces:
         """``spaces`` with what decides on a model's parts as it was when the run that this one goes on from began."""
         saved = None if self.checkpoint is None else (self.checkpoint.extra() or {}).get("spaces")
         return spaces if saved is None else replace(spaces, terminates=saved.get("terminates", False))
 
     @property
-    def device(self) -> Any:
+    def device(self) -> torch.device:
         """Where the run computes."""
         return resolve_device(self.settings.device)
 
-    def log_video(self, name: str, frames: Any, fps: int) -> None:
+    def log_video(self, name: str, frames: torch.Tensor, fps: int) -> None:
         """A film (T, H, W, 3) uint8 to every logger that takes films."""
         log_video(self.loggers, name, frames, fps=fps, step=self.settings.trainer.updates)
 
@@ -166,7 +171,7 @@ class Run:
         close_loggers(self.loggers)
         write_finished(self.folder)
 
-    def export(self, experience: Callable[[], Any]) -> None:
+    def export(self, experience: Callable[[], TensorDictBase | None]) -> None:
         """What ``export`` in the configuration asks for: the replay's whole episodes as a LeRobot dataset.
 
         Args:
@@ -217,7 +222,7 @@ def check_once(settings: RunSettings) -> None:
     _checked = settings
 
 
-_LOCKS: list[Any] = []  # open files: their locks last as long as the process
+_LOCKS: list[IO[str]] = []  # open files: their locks last as long as the process
 
 
 def lock_run_dir(folder: Path) -> None:
@@ -237,7 +242,7 @@ def lock_run_dir(folder: Path) -> None:
     _LOCKS.append(file)
 
 
-def resumed(cfg: DictConfig, overrides: list[str]) -> tuple[Any, DictConfig]:
+def resumed(cfg: DictConfig, overrides: list[str]) -> tuple[Checkpoint, DictConfig]:
     """The checkpoint, and its configuration with the values (not the groups) given on the command line.
 
     Raises:
@@ -263,7 +268,7 @@ def resumed(cfg: DictConfig, overrides: list[str]) -> tuple[Any, DictConfig]:
     return checkpoint, merged
 
 
-def open_loggers(settings: RunSettings, folder: Path) -> list[Any]:
+def open_loggers(settings: RunSettings, folder: Path) -> list[Logger]:
     """The loggers that ``logger`` names; each is told the configuration."""
     loggers = make_loggers(settings.logger.names, folder, **settings.logger.options)
     log_config(loggers, settings.values)

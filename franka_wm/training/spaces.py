@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from typing import Any
 
 import torch
 
+from franka_wm.envs import Environment
 from franka_wm.envs.config import IMAGES, FrankaConfig
 from franka_wm.envs.discretize import discrete_action_table
 from franka_wm.envs.tasks import make_task
@@ -110,7 +111,7 @@ class Spaces:
         )
 
     @classmethod
-    def of_env(cls, env: Any) -> Spaces:
+    def of_env(cls, env: Environment) -> Spaces:
         """Of an environment that is there."""
         vectors, images = {}, {}
         for key, spec in env.observation_spec.items():
@@ -127,7 +128,7 @@ class Spaces:
             observation_sizes=vectors,
             image_sizes=images,
             action_dim=0 if discrete else action.shape[-1],
-            num_actions=int(action.n) if discrete else 0,
+            num_actions=int(action.n) if discrete else 0,  # type: ignore[attr-defined]
             episode_length=env.config.episode_length,
             reward_bounds=env.reward_bounds,
             terminates=env.terminates,
@@ -139,5 +140,5 @@ def image_names(key: str, config: FrankaConfig) -> list[str]:
     return [key, *(f"{key}_{camera}" for camera in config.cameras[1:])]
 
 
-def _list(keys: Any) -> str:
+def _list(keys: Iterable[str]) -> str:
     return ", ".join(sorted(keys)) or "none"

@@ -7,9 +7,11 @@ can be gained by making them easier.
 from __future__ import annotations
 
 import gc
-from typing import Any
 
 from franka_wm.console import say
+from franka_wm.data.lerobot.windows import RecordedWindows
+from franka_wm.data.replay import WindowReplay
+from franka_wm.envs import Environment
 from franka_wm.seeding import derive_seed
 from franka_wm.training import build
 from franka_wm.training.checkpoint import FIRST_STAGE
@@ -19,7 +21,9 @@ from franka_wm.training.spaces import Spaces
 from franka_wm.training.trainer import Trainer
 
 
-def pretrain(run: Run, env: Any, experience: Any, spaces: Spaces) -> None:
+def pretrain(
+    run: Run, env: Environment | None, experience: WindowReplay | RecordedWindows, spaces: Spaces
+) -> None:
     """The first stage, if the settings ask for one; ``model.encoder_from`` then names its checkpoint.
 
     Experience comes from smooth random motion, or from the recorded data. A run that resumes goes on with the stage in

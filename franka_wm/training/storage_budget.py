@@ -9,6 +9,7 @@ from typing import Any
 
 import torch
 from tensordict import TensorDictBase
+from torchrl.data import ReplayBuffer
 
 from franka_wm.data.memory import free_memory
 from franka_wm.data.stacks import StackStorage, newest
@@ -71,7 +72,7 @@ def check_memory(run: RunSettings, model: torch.nn.Module, spaces: Spaces) -> No
 
 
 def fill(
-    replay: Any, batch: TensorDictBase, run: RunSettings, *, updates: int = 0, restored: bool = False
+    replay: ReplayBuffer, batch: TensorDictBase, run: RunSettings, *, updates: int = 0, restored: bool = False
 ) -> None:
     """Extends an empty replay by its first ``batch``, if it has room for that and for what a run will add.
 
@@ -110,9 +111,9 @@ def fill(
         ) from error
 
 
-def filled_bytes(replay: Any) -> int:
+def filled_bytes(replay: ReplayBuffer) -> int:
     """Bytes that the filled part of a replay of TorchRL's holds."""
-    storage = replay.storage
+    storage: Any = replay.storage
     filled, slots = storage._len_along_dim0, storage._storage.shape[0]
     return storage._storage.bytes() * filled // slots
 

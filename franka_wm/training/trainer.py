@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any
@@ -12,18 +12,23 @@ import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torchrl.collectors import Collector
+from torchrl.record.loggers import Logger
 
 from franka_wm.console import Progress, say
 from franka_wm.data.captured import CapturedSampling
+from franka_wm.data.lerobot.windows import RecordedWindows
+from franka_wm.data.replay import WindowReplay
+from franka_wm.envs import Environment
 from franka_wm.errors import UserError
 from franka_wm.interrupt import interruptible
+from franka_wm.models import WorldModel
 from franka_wm.policies.exploration import ActingPolicy
 from franka_wm.seeding import derive_seed, seeded
-from franka_wm.training.build import explore
+from franka_wm.training.build import arm_of, explore
 from franka_wm.training.checkpoint import Checkpoint, save_checkpoint
 from franka_wm.training.learner import Learner
 from franka_wm.training.loggers import log_numbers
-from franka_wm.training.moment import draws, go_on_drawing, put_back, restorable, same_worlds, worlds_now
+from franka_wm.training.moment import draws, go_on_drawing, put_back, same_worlds, worlds_now
 from franka_wm.training.settings import RunSettings, plain
 from franka_wm.training.spaces import Spaces
 from franka_wm.training.storage_budget import fill, filled_bytes, reason_to_leave_out
@@ -61,26 +66,21 @@ class Trainer:
     def __init__(
         self,
         *,
-        env: Any,
+        env: Environment | None,
         learner: Learner,
-        replay: Any,
+        replay: WindowReplay | RecordedWindows,
         policies: Mapping[str, TensorDictModuleBase],
         actor: str,
         settings: RunSettings,
         folder: Path,
-        loggers: list[Any],
-        evaluate: Any,
+        loggers: list[Logger],
+        evaluate: Callable[[], dict[str, float]],
         spaces: Spaces | None = None,
-        validation: Any = None,
-        diagnose: Callable[[Any, TensorDictBase], tuple[dict[str, float], str | None]] | None = None,
+        validation: RecordedWindows | None = None,
+        diagnose: Callable[[WorldModel, TensorDictBase], tuple[dict[str, float], str | None]] | None = None,
     ):
-        self.env, self.learner, self.replay, self.settings, self.folder = (
-            env,
-            learner,
-            replay,
-            settings,
-            folder,
-        )
+        self.env, self.learner, self.settings, self.folder = env, learner, settings, folder
+        self.replay: Any = replay  # WindowReplay where there are worlds, else RecordedWindows
         self.model = learner.model
         self.actor = actor
         self.loggers = loggers
@@ -97,9 +97,12 @@ class Trainer:
         self._asks_at_once = learner.device.type == "cpu"  # elsewhere asking would wait for the device
         self._draw, self._static = replay.sample, lambda batch: False
         if learner.capture and env is not None:
-            self._draw = sampling = CapturedSampling(replay)
+            self._draw = sampling = CapturedSampling(self.replay)
             self._static = sampling.is_static
-        self.spaces = Spaces.of_env(env) if spaces is None else spaces
+        if spaces is None:
+            assert env is not None, "without worlds the spaces must be said"
+            spaces = Spaces.of_env(env)
+        self.spaces = spaces
         self._vectors = list(self.model.observation_sizes)
         self._keys = self.model.observation_keys
         if settings.export.kind != "none":  # a dataset is for other models, too
@@ -190,7 +193,7 @@ class Trainer:
         seen = {key: torch.cat([one.get(key).flatten(0, 1) for one in data]) for key in self._vectors}
         self.standardize({key: (x.mean(0), x.std(0)) for key, x in seen.items()})
 
-    def standardize(self, statistics: Mapping[str, tuple[torch.Tensor, torch.Tensor]]) -> None:
+    def standardize(self, statistics: Mapping[str, Sequence[torch.Tensor]]) -> None:
         """Lets the model see mean and deviation of its vector observations."""
         if not self.settings.trainer.standardize or self.learner.updates or not self._vectors:
             return  # trained weights know their scale
@@ -215,6 +218,7 @@ class Trainer:
 
     def _collect(self) -> Collector:
         """Starts the collector: it resets all worlds."""
+        assert self.env is not None
         collector = self.settings.collector
         self._collector = Collector(
             self.env,
@@ -421,7 +425,7 @@ class Trainer:
         if worlds is not None and same_worlds(plain(checkpoint.config), self.settings.values):
             put_back(self.env, self._collect(), worlds)
         else:
-            if restorable(self.env) is None:
+            if arm_of(self.env) is None:
                 why = "the simulators of other libraries cannot be put back"
             else:
                 why = "of another configuration" if worlds is not None else "the checkpoint holds none"

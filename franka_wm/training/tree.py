@@ -1,12 +1,13 @@
 """Nested values in two files: their structure as JSON, the tensors among them as safetensors. Nothing is pickled."""
 
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 from safetensors import SafetensorError
 from safetensors.torch import load_file, save_file
 from tensordict import TensorDict
@@ -16,7 +17,7 @@ from franka_wm.errors import UserError
 from franka_wm.untrusted import UntrustedFolder, values_of
 
 
-def write_tree(folder: Path, name: str, tree: Any) -> None:
+def write_tree(folder: Path, name: str, tree: object) -> None:
     """Nested values into `name.json`, the tensors among them into `name.safetensors`.
 
     Args:
@@ -58,7 +59,9 @@ def read_tensors(folder: Path, name: str) -> dict[str, Tensor]:
         ) from error
 
 
-def only_tensors(entries: Any, batch_size: Any, device: Any) -> TensorDict:
+def only_tensors(
+    entries: Mapping[str, Any], batch_size: Sequence[int], device: torch.device | str | None
+) -> TensorDict:
     """Nested values as a TensorDict.
 
     Raises:
@@ -81,7 +84,7 @@ def tree_files(name: str) -> tuple[str, str]:
     return f"{name}.json", f"{name}.safetensors"
 
 
-def _encode(value: Any, where: str, tensors: dict[str, Tensor]) -> Any:
+def _encode(value: object, where: str, tensors: dict[str, Tensor]) -> object:
     """JSON for `value`. What JSON has not (tensors, tuples, dicts with int keys) becomes a tagged list."""
     if value is None or isinstance(value, str | bool | int | float):
         return value
@@ -116,7 +119,7 @@ def _decode(value: Any, tensors: Mapping[str, Tensor]) -> Any:
     return tuple(items) if kind == "tuple" else items
 
 
-def _key(key: Any, where: str) -> str | int:
+def _key(key: object, where: str) -> str | int:
     if isinstance(key, str | int):
         return key
     raise TypeError(f"{where} has the key {key!r}; a checkpoint holds dicts with str and int keys only")
@@ -136,7 +139,7 @@ def save_tensors(tensors: Mapping[str, Tensor], path: Path) -> None:
     save_file(separate, path)
 
 
-def write_json(path: Path, value: Any) -> None:
+def write_json(path: Path, value: object) -> None:
     """One JSON value."""
     # No newline at the end: so every truncation, even by one byte, leaves invalid JSON.
     path.write_text(json.dumps(value, indent=1), encoding="utf-8")

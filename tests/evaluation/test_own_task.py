@@ -11,7 +11,7 @@ from examples.add_a_task import HEIGHT, RaiseTool
 from franka_wm.commands.main import main
 from franka_wm.envs import FrankaConfig, FrankaEnv
 from franka_wm.envs.tasks import Reach, Track
-from franka_wm.evaluation.closed_loop import play_episodes, reaches
+from franka_wm.evaluation.closed_loop import play_episodes, success_distance
 from franka_wm.evaluation.protocol import Evaluation, describe, evaluate_policies, numbers_to_log, thresholds
 from franka_wm.evaluation.results import END, last_row
 from franka_wm.evaluation.robustness import verdict_of_success
@@ -61,7 +61,7 @@ def test_success_and_measures_at_the_true_end(env: FrankaEnv) -> None:
 def test_reach_is_judged_by_distances_as_ever(small_env) -> None:
     """Its own success is to be within success_distance, which is among the thresholds."""
     reach = small_env(6, episode_length=LENGTH, goal_sampling="reachable", success_distance=0.3)
-    assert reaches(reach) and thresholds(reach) == [0.3, 0.05, 0.025, 0.01]
+    assert success_distance(reach) == 0.3 and thresholds(reach) == [0.3, 0.05, 0.025, 0.01]
     evaluation = evaluate_policies(reach, {"noop": NoopPolicy()})
     rows, told = evaluation.episodes["noop"], evaluation.policies["noop"]
     assert torch.equal(rows["success"], (rows["final_distance"] < 0.3).float()) and rows["success"].sum() > 0
@@ -82,7 +82,7 @@ def test_a_subclass_of_reach_that_judges_otherwise_is_judged_by_itself() -> None
 
 
 def test_no_distance_is_shown_anywhere(env: FrankaEnv, found: Evaluation) -> None:
-    assert not reaches(env) and thresholds(env) == []
+    assert success_distance(env) is None and thresholds(env) == []
     for summary_ in found.policies.values():
         assert {"success", "success_once", "return", "measures", "episodes"} <= set(summary_)
         assert "final_distance" not in summary_ and set(summary_["success"]) == {"mean", "low", "high"}

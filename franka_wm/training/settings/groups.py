@@ -23,7 +23,7 @@ MOST_UPDATES = 10**12
 """Of a run: a thousand updates a second for thirty years."""
 
 
-def _is_names(given: Any) -> bool:
+def _is_names(given: object) -> bool:
     return all(isinstance(one, str) for one in (given if isinstance(given, list | tuple) else [given]))
 
 
@@ -112,11 +112,11 @@ class ExportSettings:
     repo_id: str | None = text(None, null="not published")
 
 
-def _is_mapping(given: Any) -> bool:
+def _is_mapping(given: object) -> bool:
     return isinstance(given, Mapping)
 
 
-def _is_size(given: Any) -> bool:
+def _is_size(given: object) -> bool:
     sides = given if isinstance(given, list | tuple) else [given, given]
     return len(sides) == 2 and all(is_whole(side) and side >= 1 for side in sides)
 
@@ -186,7 +186,7 @@ class ModelSettings:
         return cls(**vars(read_first), options=options)
 
     @property
-    def family(self) -> Any:
+    def family(self) -> type[models.WorldModel]:
         """The class."""
         return models.family(self.name)
 
