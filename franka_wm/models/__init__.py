@@ -41,6 +41,11 @@ _FAMILIES: dict[str, tuple[str, str, str]] = {
         "LeWorldModel",
         "LeWorldModel: action-conditioned JEPA trained end to end with SIGReg",
     ),
+    "dino_wm": (
+        "franka_wm.models.dino_wm",
+        "DINOWM",
+        "DINO-WM: transformer dynamics over the patches of a frozen pretrained encoder",
+    ),
     "action_world_model": (
         "franka_wm.models.action_world_model",
         "ActionWorldModel",

@@ -43,6 +43,8 @@ class WorldModel(nn.Module):
     """Whether `loss` takes windows that go on past the end of an episode."""
     replay_keys: tuple[str, ...] = ()
     """Entries that the acting policy writes and `loss` reads."""
+    pretrained: bool = False
+    """Whether it cannot do without a pretrained encoder: `encoder_from`, `huggingface` or a first stage."""
     ranges: ClassVar[Mapping[str, Bounds]] = MappingProxyType({})
     """Option -> values that it may have. `validate` checks them."""
 

@@ -227,10 +227,10 @@ class ViT(nn.Module):
         if cls:
             self.cls_token = nn.Parameter(torch.zeros(1, 1, width))
             nn.init.trunc_normal_(self.cls_token, std=0.02)
-        built = Architecture(
+        self.numbers = Architecture(
             rows, columns, channels, patch_size, tubelet, width, depth, heads, mlp_ratio, int(cls)
         )
-        self.register_buffer("architecture", torch.tensor(built, dtype=torch.int64))
+        self.register_buffer("architecture", torch.tensor(self.numbers, dtype=torch.int64))
         places = sincos_grid(torch.arange(self.grid[0]), torch.arange(self.grid[1]), width)
         self.register_buffer("code", places, persistent=False)
 

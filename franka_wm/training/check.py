@@ -10,6 +10,7 @@ from franka_wm.envs.external import ExternalConfig, check_external
 from franka_wm.envs.franka import check_robot
 from franka_wm.errors import UserError
 from franka_wm.models import WorldModel
+from franka_wm.models.vision import ViT
 from franka_wm.planning import registry
 from franka_wm.training import build
 from franka_wm.training.demos import check_demonstrations
@@ -46,7 +47,14 @@ def check(run: RunSettings) -> None:
     _check_export(run)
     if run.pretrain.kind != "none" and "encoder_from" not in run.model.options:
         raise UserError(
-            f"pretrain: model={run.model.name} takes no pretrained encoder; use action_world_model or tdmpc2_pixels"
+            f"pretrain: model={run.model.name} takes no pretrained encoder; use action_world_model, dino_wm or "
+            "tdmpc2_pixels"
+        )
+    given = (run.model.options.get(key) for key in ("encoder_from", "huggingface"))
+    if run.model.family.pretrained and run.pretrain.kind == "none" and not any(given):
+        raise UserError(
+            f"model={run.model.name} needs a pretrained encoder: model.huggingface=facebook/dinov2-small, "
+            "model.encoder_from=RUN, or pretrain=jepa"
         )
     if run.pretrain.kind != "none":
         _check_first_stage(run)
@@ -151,6 +159,7 @@ def _check_parts(run: RunSettings) -> None:
     if run.is_offline:
         return
     spaces = Spaces.of_config(run.env.arm, discrete=run.is_discrete)
+    run = _with_encoder(run, spaces)
     model = sketch(run, spaces)
     if model is None:
         model = build.make_model(run, spaces)
@@ -166,6 +175,14 @@ def _check_parts(run: RunSettings) -> None:
     if model.has_next:
         build.make_planner(run, spaces.num_actions or spaces.action_dim)
     check_memory(run, model, spaces)
+
+
+def _with_encoder(run: RunSettings, spaces: Spaces) -> RunSettings:
+    """The run with an encoder of the shape that its first stage will have trained."""
+    first = sketch(run.first_stage(), spaces) if run.pretrain.kind != "none" else None
+    if first is None or not isinstance(first.encoder, ViT):
+        return run
+    return run.changed(model={"encoder_architecture": list(first.encoder.numbers)})
 
 
 def sketch(run: RunSettings, spaces: Spaces) -> WorldModel | None:

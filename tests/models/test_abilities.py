@@ -18,6 +18,7 @@ NAMES = {
     "Dreamer": "dreamer",
     "LeWorldModel": "lewm",
     "action world model": "action_world_model",
+    "DINO-WM": "dino_wm",
     "JEPA": "jepa",
 }
 """How the page calls the families."""

@@ -63,6 +63,7 @@ NEEDS = {  # what else an option goes with
         "muzero": ["planner=mcts"],
         "lewm": ["env=reach_goal_image"],
         "action_world_model": ["env=reach_goal_image"],
+        "dino_wm": ["env=reach_goal_image", "pretrain=jepa"],
     },
     "objective": {"goal_image": ["env=reach_goal_image", "model=lewm"]},
 }

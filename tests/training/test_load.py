@@ -104,10 +104,11 @@ def test_every_family_trains_and_comes_back(family: str, train) -> None:
 
 
 @pytest.mark.slow
-def test_two_stages(train) -> None:
+@pytest.mark.parametrize("model", ["action_world_model", "dino_wm"])
+def test_two_stages(train, model: str) -> None:
     """The teacher of the first stage does not move in the second, and the checkpoint does not need it."""
     folder, _, trainer = train(
-        "model=action_world_model", "pretrain=jepa", "pretrain.updates=4", *FAMILIES["action_world_model"]
+        f"model={model}", "pretrain=jepa", "pretrain.updates=4", *FAMILIES["action_world_model"]
     )
     first = franka_wm.load(str(folder / "pretrained"))
     learned = trainer.model.encoder.network.state_dict()
@@ -152,6 +153,17 @@ def test_the_first_stage_leaves_no_replay_behind(settled, tmp_path: Path) -> Non
 def test_a_family_without_an_encoder_to_replace(settled) -> None:
     with pytest.raises(UserError, match="pretrain"):
         check(settled(*SMALL, "pretrain=jepa"))
+
+
+def test_a_family_that_needs_a_pretrained_encoder_has_one_or_is_refused(settled, tmp_path: Path) -> None:
+    task = (*SMALL, "model=dino_wm", *FAMILIES["action_world_model"])
+    with pytest.raises(UserError, match="needs a pretrained encoder"):
+        check(settled(*task))
+    with pytest.raises(UserError, match=r"neither model\.safetensors nor a folder"):
+        check(settled(*task, f"model.encoder_from={tmp_path}"))
+    check(settled(*task, "pretrain=jepa"))
+    with pytest.raises(UserError, match="needs goal_pixels"):
+        check(settled(*task, "pretrain=jepa", "env.observations=[pixels,state]"))
 
 
 def test_no_world_and_no_data(settled) -> None:
