@@ -109,11 +109,11 @@ def test_they_start_on_the_table_apart_and_stay(sized: FrankaEnv) -> None:
     count = int(contacts.nacon.numpy()[0])
     assert contacts.contact.dist.numpy()[:count].min() > -1e-3
     assert sized.statistics()["overflow"] == 0
-    crowd = Scene(objects=tuple(Body(name=f"b{k}", spread=(0.1, 0.2), turn=1.0) for k in range(4)))
-    env = make(32, scene=crowd)
-    places, sizes = env.reset()["objects"].view(32, 4, 13)[..., :2], env.simulation.tensors.sizes
+    crowd = Scene(objects=tuple(Body(name=f"b{k}", spread=(0.1, 0.2), turn=1.0) for k in range(6)))
+    env = make(128, scene=crowd)
+    places, sizes = env.reset()["objects"].view(128, 6, 13)[..., :2], env.simulation.tensors.sizes
     radii = 0.02 * math.sqrt(2) * sizes
-    gaps = torch.cdist(places, places) - radii[:, :, None] - radii[:, None, :] + 9 * torch.eye(4)
+    gaps = torch.cdist(places, places) - radii[:, :, None] - radii[:, None, :] + 9 * torch.eye(6)
     assert gaps.min() > 0.0099
 
 
