@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
 from franka_wm.commands.arguments import verb
 from franka_wm.commands.view import show, view
@@ -18,7 +17,7 @@ AGENT = Path(__file__).parents[1] / "demo_agent"
     others=view.others,
     shown=view.shown,
 )
-def demo(**options: Any) -> None:
+def demo(**options: object) -> None:
     """Show a small trained agent in the browser. Drag the goal, and the planner moves the arm there.
 
     Nothing is trained or downloaded. For an agent of your own: franka-wm view checkpoint=RUN.

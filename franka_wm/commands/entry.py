@@ -23,7 +23,7 @@ INTERRUPTED = 130
 """Exit status after Ctrl-C, as shells expect."""
 
 
-def run_command(main: Callable[[], Any], arguments: list[str] | None = None) -> None:
+def run_command(main: Callable[[], object], arguments: list[str] | None = None) -> None:
     """Runs a Hydra main: chooses the scale by device, and turns bad input into one line and exit status 1.
 
     Args:
@@ -97,11 +97,11 @@ def swept(overrides: list[str]) -> Iterator[list[str]]:
                 yield [*first[:k], choice, *first[k + 1 :]]
 
 
-def one_line_errors(main: Callable[[DictConfig], Any]) -> Callable[[DictConfig], Any]:
+def one_line_errors(main: Callable[[DictConfig], object]) -> Callable[[DictConfig], object]:
     """Inside Hydra's own wrapper, which would print a traceback for what is the user's to mend."""
 
     @functools.wraps(main)
-    def wrapped(cfg: DictConfig) -> Any:
+    def wrapped(cfg: DictConfig) -> object:
         try:
             with one_line_refusals():
                 return main(cfg)

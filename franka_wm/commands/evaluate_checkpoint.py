@@ -94,8 +94,8 @@ def run(options: Options) -> dict[str, Any]:
 
 
 def _look_ahead(
-    agent: Agent, held: diagnose.Held, evaluation: Evaluation, results: dict[str, Any], say: Say
-) -> tuple[Imagined, Any, Any] | None:
+    agent: Agent, held: diagnose.Held, evaluation: Evaluation, results: dict[str, object], say: Say
+) -> tuple[Imagined, object, object] | None:
     say("open-loop predictions …")
     ahead: dict[str, Any]
     try:

@@ -73,7 +73,7 @@ class CapturedSampling:
         """Whether later batches will lie in the memory of this one."""
         return self._graph is not None and batch is self._batch
 
-    def _record(self, data: Any, sampler: WindowSampler) -> torch.cuda.CUDAGraph:
+    def _record(self, data: object, sampler: WindowSampler) -> torch.cuda.CUDAGraph:
         graph = torch.cuda.CUDAGraph()
         with torch.cuda.graph(graph, capture_error_mode="thread_local"):
             self._draw(data, sampler)

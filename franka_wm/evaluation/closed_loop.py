@@ -176,7 +176,7 @@ class _Motion:
         }
 
 
-def summarize(episodes: TensorDictBase, *, thresholds: Sequence[float] = THRESHOLDS) -> dict[str, Any]:
+def summarize(episodes: TensorDictBase, *, thresholds: Sequence[float] = THRESHOLDS) -> dict[str, object]:
     """Means with 95 % intervals: bootstrap for distances, returns and motion, Wilson for rates of success.
 
     Args:

@@ -136,7 +136,7 @@ def probes(held: Held, model: WorldModel) -> dict[str, Any]:
     return probe(held.latents[:, :-1], targets, valid=use) if targets else {}
 
 
-def representation(held: Held, model: WorldModel) -> tuple[dict[str, Any], dict[str, Any]]:
+def representation(held: Held, model: WorldModel) -> tuple[dict[str, object], dict[str, object]]:
     """Spectrum with collapse warning, and the latents along their two main directions for an image."""
     use = held.valid[:, :-1]
     embedded = embedding(model)(held.latents[:, :-1])[use].float()

@@ -31,7 +31,7 @@ def training_diagnostics(model: WorldModel, batch: TensorDictBase) -> dict[str, 
     Changes nothing: neither the model's mode and statistics nor torch's random numbers. Waits for the device.
 
     Args:
-        model: Any family.
+        model: Of any family.
         batch: Windows [B, H], as ``loss`` takes them.
 
     Returns:
@@ -74,7 +74,7 @@ def _value_consistency(
 
 
 @torch.no_grad()
-def planner_health(policy: PlannerPolicy, observation: TensorDictBase) -> dict[str, Any]:
+def planner_health(policy: PlannerPolicy, observation: TensorDictBase) -> dict[str, object]:
     """How the planner searches, on held-out states; computed in float32, whatever precision the policy plans in.
 
     Args:
@@ -125,7 +125,7 @@ def _deterministic(prior: Any, z: Tensor) -> Tensor:
     return prior(z, deterministic=True) if takes else prior(z)
 
 
-def paired_gain(planner: TensorDictBase, prior: TensorDictBase) -> dict[str, Any]:
+def paired_gain(planner: TensorDictBase, prior: TensorDictBase) -> dict[str, object]:
     """What planning really gains: the difference of returns over the same episodes.
 
     Args:

@@ -11,8 +11,8 @@ Science 16 (2001).
 """
 
 import warnings
-from collections.abc import Sequence
-from typing import Any, NamedTuple
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -116,7 +116,7 @@ def wilson(successes: int, n: int, confidence: float = 0.95) -> Interval:
 
 def _bootstrap(
     samples: tuple[NDArray, ...],
-    statistic: Any,
+    statistic: Callable[..., NDArray],
     estimate: float,
     confidence: float,
     resamples: int,

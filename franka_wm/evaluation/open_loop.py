@@ -218,7 +218,7 @@ def cost_ranks(
     return {"across": measured(one, two, three, four), "within": measured(one, two, one, four)}
 
 
-def value_calibration(predicted: Tensor, returns: Tensor, *, bins: int = 10) -> dict[str, Any]:
+def value_calibration(predicted: Tensor, returns: Tensor, *, bins: int = 10) -> dict[str, object]:
     """Predicted values against true discounted returns.
 
     Args:

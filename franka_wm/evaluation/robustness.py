@@ -198,7 +198,7 @@ def _chosen(policies: Mapping[str, object]) -> list[str]:
     return own + [name for name in ("ik", "expert") if name in policies]
 
 
-def _compared(played: TensorDictBase, before: TensorDictBase, near: float | None) -> dict[str, Any]:
+def _compared(played: TensorDictBase, before: TensorDictBase, near: float | None) -> dict[str, object]:
     what, change = ("return", "return_change") if near is None else ("final_distance", "change")
     value, unshifted = played.get(what), before.get(what)
     now, then = played.get("success").bool(), before.get("success").bool()

@@ -12,7 +12,7 @@ from franka_wm.report.style import INK, LIGHT, PAPER, Theme
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-type Bar = float | Mapping[str, Any] | None
+type Bar = float | Mapping[str, object] | None
 """A number, or an interval ``{"mean", "low", "high"}``."""
 
 

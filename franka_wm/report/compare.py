@@ -81,7 +81,7 @@ def unique_names(runs: Sequence[RunFiles]) -> list[str]:
     return ["/".join(path[-depth:]) for path in paths]
 
 
-def flat_config(config: Mapping[str, Any], above: str = "") -> dict[str, Any]:
+def flat_config(config: Mapping[str, object], above: str = "") -> dict[str, object]:
     """``{"env": {"task": "reach"}}`` → ``{"env.task": "reach"}``; lists are values."""
     flat: dict[str, Any] = {}
     for name, value in config.items():
@@ -92,7 +92,7 @@ def flat_config(config: Mapping[str, Any], above: str = "") -> dict[str, Any]:
     return flat
 
 
-def differences(configs: Mapping[str, Mapping[str, Any]]) -> dict[str, dict[str, Any]]:
+def differences(configs: Mapping[str, Mapping[str, object]]) -> dict[str, dict[str, object]]:
     """Entries that are not the same in all runs.
 
     Args:
@@ -245,7 +245,7 @@ def _spectra(runs: Mapping[str, RunFiles]) -> str:
     return cards(chart(spectrum_figure(spectra), "singular values of the latents in every run"))
 
 
-def _differences(different: Mapping[str, Mapping[str, Any]], names: Sequence[str]) -> str:
+def _differences(different: Mapping[str, Mapping[str, object]], names: Sequence[str]) -> str:
     if not different:
         return paragraph("Nothing: the configurations are the same.")
     rows = [

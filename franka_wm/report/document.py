@@ -9,7 +9,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
@@ -210,7 +210,7 @@ def _templates() -> Environment:
     return templates
 
 
-def _part(name: str, *values: Any) -> Markup:
+def _part(name: str, *values: object) -> Markup:
     return getattr(_templates().get_template("parts.html").module, name)(*values)
 
 

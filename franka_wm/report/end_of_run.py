@@ -69,7 +69,7 @@ def report_run(
     Console(width=120).print(terminal(evaluation_tables(found.policies)[0]))
 
 
-def acting(policies: Mapping[str, Any]) -> str:
+def acting(policies: Mapping[str, object]) -> str:
     """The policy that a run is about: the planner, the policy where there is none, else whatever comes first."""
     return next((name for name in ("planner", "policy") if name in policies), next(iter(policies)))
 

@@ -138,7 +138,7 @@ def _read_run(run: Path) -> RunFiles:
     )
 
 
-def read_config(folder: str | Path) -> dict[str, Any]:
+def read_config(folder: str | Path) -> dict[str, object]:
     """The configuration of a run; empty if it has none.
 
     Raises:
@@ -147,7 +147,7 @@ def read_config(folder: str | Path) -> dict[str, Any]:
     return _config(UntrustedFolder(Path(folder))) or {}
 
 
-def but_for_the_seed(config: Mapping[str, Any]) -> str:
+def but_for_the_seed(config: Mapping[str, object]) -> str:
     """The same for repetitions, and for nothing else; empty for an empty configuration."""
     kept = {name: value for name, value in config.items() if name not in SAME_BUT}
     return json.dumps(kept, sort_keys=True, default=str) if kept else ""

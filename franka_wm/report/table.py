@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 # {policy: {"final_distance": interval, "success": {distance: interval}, "return": interval, "episodes": n}},
 # where an interval is {"mean", "low", "high"}; a policy may hold more numbers and intervals. Of tasks whose success is
 # not a distance to a goal there is none, "success" is one interval, and "measures" holds those of the task's own.
-type Evaluation = Mapping[str, Mapping[str, Any]]
+type Evaluation = Mapping[str, Mapping[str, object]]
 
 OUTCOME = ("final_distance", "success", "return", "episodes", "measures")
 
@@ -105,7 +105,7 @@ def markdown(table: Table) -> str:
 # -- numbers ---------------------------------------------------------------------------------------------
 
 
-def data_frame(values: Mapping[str, Any], *, first: str = "policy") -> "DataFrame":
+def data_frame(values: Mapping[str, object], *, first: str = "policy") -> "DataFrame":
     """Any dict of dicts as a pandas table of plain numbers, in SI units as they were measured.
 
     An interval becomes three columns: `name`, `name/low`, `name/high`.
@@ -158,7 +158,9 @@ def _by_distance(path: tuple[str, ...]) -> tuple[float, ...]:
         return (0.0,)
 
 
-def _leaves(values: Mapping[str, Any], above: tuple[str, ...] = ()) -> list[tuple[tuple[str, ...], Any]]:
+def _leaves(
+    values: Mapping[str, object], above: tuple[str, ...] = ()
+) -> list[tuple[tuple[str, ...], object]]:
     """Numbers, texts and intervals with their paths; lists are no leaves of a table."""
     out: list[tuple[tuple[str, ...], Any]] = []
     for name, value in values.items():

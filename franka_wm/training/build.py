@@ -47,7 +47,7 @@ if TYPE_CHECKING:
 
 
 def make_env(
-    run: RunSettings, *, num_envs: int | None = None, seed: int | None = None, **changes: Any
+    run: RunSettings, *, num_envs: int | None = None, seed: int | None = None, **changes: object
 ) -> Environment:
     """The environment that ``run.env`` describes; ``changes`` override fields of its config.
 

@@ -64,11 +64,11 @@ def save_checkpoint(
     folder: str | Path,
     *,
     model: nn.Module,
-    config: Mapping[str, Any] | DictConfig,
+    config: Mapping[str, object] | DictConfig,
     counters: Mapping[str, int | float],
     optimizer: Optimizers | None = None,
     replay: TensorDictBase | None = None,
-    extra: Mapping[str, Any] | None = None,
+    extra: Mapping[str, object] | None = None,
 ) -> Path:
     """Write a checkpoint; an existing one at the same place is replaced, and is whole until it is.
 
@@ -117,10 +117,10 @@ def _write_contents(
     folder: Path,
     model: nn.Module,
     optimizer: Optimizers | None,
-    config: Mapping[str, Any] | DictConfig,
+    config: Mapping[str, object] | DictConfig,
     counters: Mapping[str, int | float],
     replay: TensorDictBase | None,
-    extra: Mapping[str, Any] | None,
+    extra: Mapping[str, object] | None,
 ) -> None:
     save_tensors(_tensor_state(model), folder / "model.safetensors")
     if optimizer is not None:
@@ -381,7 +381,7 @@ def _tensor_state(model: nn.Module) -> dict[str, Tensor]:
     return {name: value for name, value in model.state_dict().items() if isinstance(value, Tensor)}
 
 
-def _rng_state() -> dict[str, Any]:
+def _rng_state() -> dict[str, object]:
     return {
         "torch": torch.get_rng_state(),
         # Asking for it would start CUDA in a process that has not used it.
@@ -391,7 +391,7 @@ def _rng_state() -> dict[str, Any]:
     }
 
 
-def _entries(data: TensorDictBase) -> dict[str, Any]:
+def _entries(data: TensorDictBase) -> dict[str, object]:
     """A TensorDict as nested dicts of tensors."""
     return {
         str(key): _entries(value) if isinstance(value, TensorDictBase) else value

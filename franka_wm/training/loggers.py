@@ -37,7 +37,7 @@ OPTIONS = {
 }
 
 
-def check_loggers(names: Iterable[str], **options: Mapping[str, Any]) -> None:
+def check_loggers(names: Iterable[str], **options: Mapping[str, object]) -> None:
     """Whether `make_loggers` could open these, before anything is built.
 
     Raises:
@@ -58,7 +58,7 @@ def check_loggers(names: Iterable[str], **options: Mapping[str, Any]) -> None:
             )
 
 
-def make_loggers(names: Sequence[str], folder: str | Path, **options: Mapping[str, Any]) -> list[Logger]:
+def make_loggers(names: Sequence[str], folder: str | Path, **options: Mapping[str, object]) -> list[Logger]:
     """Open loggers.
 
     Args:
@@ -109,7 +109,7 @@ def _log_row(logger: Any, numbers: dict[str, float], step: int) -> None:
         logger.log_metrics(numbers, step=step)
 
 
-def log_config(loggers: Iterable[Logger], config: Mapping[str, Any]) -> None:
+def log_config(loggers: Iterable[Logger], config: Mapping[str, object]) -> None:
     """Tell the services what is being run; files have ``config.yaml`` beside them.
 
     Args:

@@ -21,7 +21,7 @@ def same_worlds(saved: Mapping[str, Any], now: Mapping[str, Any]) -> bool:
     return fitting and all(saved[part] == now[part] for part in parts)
 
 
-def worlds_now(env: Environment, collector: Collector | None) -> dict[str, Any] | None:
+def worlds_now(env: Environment, collector: Collector | None) -> dict[str, object] | None:
     """The simulation of all worlds and the root that the collector's next step starts from, plans included.
 
     ``None`` before anything was gathered, and for environments of other libraries.
@@ -75,7 +75,7 @@ def _drawing(policies: Mapping[str, TensorDictModuleBase]) -> dict[str, Drawing]
     }
 
 
-def _nested(data: TensorDictBase) -> dict[str, Any]:
+def _nested(data: TensorDictBase) -> dict[str, object]:
     """A TensorDict as nested dicts of tensors."""
     return {
         str(key): _nested(value) if isinstance(value, TensorDictBase) else value

@@ -375,7 +375,7 @@ class Trainer:
             f"({self.learner.lr:g}) or trainer.grad_clip ({self.learner.grad_clip:g}); {saved}"
         )
 
-    def _moment(self) -> dict[str, Any]:
+    def _moment(self) -> dict[str, object]:
         """Where worlds, policies and recorded windows stand."""
         if self.env is None:
             parts = {"windows": self.replay, "validation": self.validation}

@@ -34,7 +34,7 @@ def write_tree(folder: Path, name: str, tree: object) -> None:
     save_tensors(tensors, folder / f"{name}.safetensors")
 
 
-def read_tree(folder: Path, name: str) -> Any:
+def read_tree(folder: Path, name: str) -> object:
     """What `write_tree` wrote; tensors on the CPU, arrays as lists.
 
     Raises:
@@ -107,7 +107,7 @@ def _encode(value: object, where: str, tensors: dict[str, Tensor]) -> object:
     )
 
 
-def _decode(value: Any, tensors: Mapping[str, Tensor]) -> Any:
+def _decode(value: object, tensors: Mapping[str, Tensor]) -> object:
     if not isinstance(value, list):
         return value
     kind, content = value

@@ -276,7 +276,7 @@ def work() -> None:
     for line in sys.stdin:
         values = json.loads(line)
         try:
-            answer: dict[str, Any] = {"done": kinds[values.pop("kind")](**values).run()}
+            answer: dict[str, object] = {"done": kinds[values.pop("kind")](**values).run()}
         except UserError as error:
             answer = {"error": str(error)}
         print(json.dumps(answer), flush=True)

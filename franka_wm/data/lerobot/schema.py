@@ -281,7 +281,7 @@ def _image_keys(config: FrankaConfig) -> list[str]:
     return out
 
 
-def _vector(size: int, names: Sequence[str]) -> dict[str, Any]:
+def _vector(size: int, names: Sequence[str]) -> dict[str, object]:
     return {"dtype": "float32", "shape": (size,), "names": list(names)}
 
 

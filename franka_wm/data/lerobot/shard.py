@@ -174,7 +174,7 @@ def _table(columns: dict[str, np.ndarray], arrow: Any) -> Any:
 def _write_meta(
     folder: Path,
     schema: Schema,
-    features: dict[str, dict[str, Any]],
+    features: dict[str, dict[str, object]],
     episodes: Sequence[Episode],
     stats: Sequence[dict[str, dict[str, np.ndarray]]],
 ) -> None:
@@ -231,12 +231,12 @@ def _write_meta(
     write_json(folder / STATS_PATH, _lists(aggregate(list(stats))))
 
 
-def write_json(path: Path, value: Any) -> None:
+def write_json(path: Path, value: object) -> None:
     """As LeRobot writes its JSON files."""
     path.write_text(json.dumps(value, indent=4, ensure_ascii=False), encoding="utf-8")
 
 
-def _lists(stats: dict[str, dict[str, np.ndarray]]) -> dict[str, dict[str, Any]]:
+def _lists(stats: dict[str, dict[str, np.ndarray]]) -> dict[str, dict[str, object]]:
     return {name: {stat: value.tolist() for stat, value in one.items()} for name, one in stats.items()}
 
 

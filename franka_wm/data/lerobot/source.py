@@ -187,7 +187,7 @@ def read_source(root: str | Path) -> Source:
     )
 
 
-def _is_feature(name: str, feature: Any) -> bool:
+def _is_feature(name: str, feature: object) -> bool:
     if not isinstance(feature, dict) or not isinstance(feature.get("dtype"), str) or "\0" in name:
         return False
     shape = feature.get("shape")

@@ -4,7 +4,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import warp as wp
 
@@ -53,7 +53,7 @@ def room_for_contacts(config: FrankaConfig) -> int:
     return config.max_contacts
 
 
-def contact_options(config: FrankaConfig) -> dict[str, Any]:
+def contact_options(config: FrankaConfig) -> dict[str, object]:
     """Of Newton's MuJoCo solver, for scenes; see docs/tasks.md for what they hold."""
     contacts, scene = room_for_contacts(config), config.resolved_scene
     meshes = scene is not None and any(one.shape == "mesh" for one in (*scene.objects, *scene.obstacles))
@@ -248,6 +248,6 @@ class Bodies:
             center, half, self._scene.top - SUNK, w.ended, STATISTICS.index("overflow"), w.cut, w.statistics,
         )  # fmt: skip
 
-    def _launch(self, kernel: wp.Kernel, *inputs: Any) -> None:
+    def _launch(self, kernel: wp.Kernel, *inputs: object) -> None:
         """One thread for each world."""
         wp.launch(kernel, self.sim.num_envs, list(inputs), device=self.sim.device)

@@ -6,7 +6,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import newton
 import torch
@@ -55,7 +54,7 @@ def build_model(
             has_shape_collision=False, has_particle_collision=False, density=0.0
         )
         color = (0.16, 0.58, 0.62) if config.resolved_scene else (0.90, 0.22, 0.12)  # unlike the cube's
-        look: dict[str, Any] = {"cfg": ghost, "color": color, "label": GOAL_MARKER}
+        look: dict[str, object] = {"cfg": ghost, "color": color, "label": GOAL_MARKER}
         disc = config.task_class.marker
         if disc is None:
             arm.add_shape_sphere(body=-1, radius=0.025, **look)

@@ -166,7 +166,7 @@ def _harden(builder: newton.ModelBuilder, shape: int) -> None:
     _set(builder, shape, values)
 
 
-def _set(builder: newton.ModelBuilder, index: int, values: dict[str, Any]) -> None:
+def _set(builder: newton.ModelBuilder, index: int, values: dict[str, object]) -> None:
     """MuJoCo's own parameters of one shape or degree of freedom."""
     for name, value in values.items():
         attribute = builder.custom_attributes[name]

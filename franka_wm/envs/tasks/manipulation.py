@@ -6,7 +6,7 @@
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Self
+from typing import TYPE_CHECKING, Self
 
 import torch
 import warp as wp
@@ -157,7 +157,7 @@ class GripperTask(Task):
     def reward_bounds(self) -> tuple[float, float]:
         return -self.config.action_penalty, 1.0
 
-    def launch_reward(self, sim: "Simulation", kernel: wp.Kernel, *further: Any) -> None:
+    def launch_reward(self, sim: "Simulation", kernel: wp.Kernel, *further: object) -> None:
         """Launches a kernel that takes state, joint target and objects after the step, goal, action, whether the reward
         is sparse, the action penalty, ``further``, and writes reward and success; one thread for each world."""
         w, c = sim.warp, self.config
