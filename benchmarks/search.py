@@ -1,6 +1,6 @@
 """Time of a tree search: encode, search with the model, act, for 1, 64, 1024 environments.
 
-python benchmarks/search.py                  50 simulations of PUCT and of Gumbel over 15 moves
+python benchmarks/search.py                  50 simulations of PUCT and of Gumbel over 15 discrete actions
 python benchmarks/search.py --envs 1 --variants puct
 
 On CUDA every search is timed twice: launched operation by operation, and as one captured graph, which is what runs do.
@@ -66,7 +66,9 @@ def main() -> None:
                     }
                 )
                 print(rows[-1], flush=True)
-    publish(f"tree search: {arguments.simulations} simulations, {MOVES} moves", rows, arguments.out)
+    publish(
+        f"tree search: {arguments.simulations} simulations, {MOVES} discrete actions", rows, arguments.out
+    )
 
 
 if __name__ == "__main__":
