@@ -24,7 +24,7 @@ is typed by hand. `benchmarks/results/rows.yaml` declares the rows. `make result
 `a (b – c)` over several seeds is their mean, lowest and highest. For one seed `b – c` is the 95 % interval over its
 episodes: bootstrap for distances and returns, Wilson for rates. Episodes are held out: training never sees their seeds.
 *Doing nothing* and *random smooth* motion are what a policy must beat; *inverse kinematics* knows the true geometry.
-Where actions are discrete, a *search with the same actions* takes its place: the best pair of them, by the true geometry.
+Where actions are discrete, a *search with the same actions* takes its place: the best pair of them by true geometry.
 """
 POLICIES = {
     "planner": "planner",
