@@ -80,6 +80,12 @@ def test_without_training_nothing_changes_and_goals_are_compared_on_patches(dots
     torch.testing.assert_close(model.embed(z), model.encode_goal(window[:, 0]))
     torch.testing.assert_close(model.history.last(z)[:, -2:], window["position"][:, 0])
     assert model.loss(window)["relative_error"] == 1.0
+    with torch.no_grad():
+        model.leave.bias[-2:] = 0.5  # of the state
+    both, actions = torch.stack((z, z)), torch.stack((window["action"][:, 0],) * 2)
+    after = model.next(both, actions)
+    assert after.shape == both.shape
+    torch.testing.assert_close(model.history.last(after)[1, :, -2:], window["position"][:, 0] + 0.5)
 
 
 def test_every_patch_sees_action_and_state_and_no_later_frame(dots):
