@@ -29,6 +29,7 @@ from franka_wm.report.outcome import SHOWN
 from franka_wm.report.run import RunFiles, but_for_the_seed, malformed
 from franka_wm.report.spectra import spectrum_figure
 from franka_wm.report.table import Table, evaluation_tables, is_interval
+from franka_wm.report.tasks import tasks_table
 
 FILE = "compare.html"
 
@@ -50,6 +51,7 @@ def compare_page(runs: Sequence[RunFiles]) -> str:
         different = differences({name: run.config for name, run in named.items()})
         groups = repetitions(named)
         parts = [
+            Section("tasks", "Tasks and families", _tasks(runs)),
             Section("result", "Results", _results(named)),
             Section("curves", "Learning curves", _curves(groups)),
             Section("horizon", "Open loop", _horizons(named)),
@@ -122,6 +124,12 @@ def repetitions(runs: Mapping[str, RunFiles]) -> dict[str, dict[str, RunFiles]]:
 
 
 # -- sections --------------------------------------------------------------------------------------------
+
+
+def _tasks(runs: Sequence[RunFiles]) -> str:
+    found = tasks_table(runs)
+    note = "Success, or return, of the planner (of the policy where there is none): mean over runs (lowest – highest)."
+    return "" if found is None else table(found) + paragraph(note, "note")
 
 
 def _results(runs: Mapping[str, RunFiles]) -> str:

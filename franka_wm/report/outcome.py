@@ -65,7 +65,7 @@ def _protocol(found: Result) -> str:
 
 
 def _success_bars(policies: Mapping[str, Mapping[str, Any]]) -> str:
-    success = _success(policies)
+    success = success_rates(policies)
     if not success:
         return ""
     distances = sorted({d for rates in success.values() for d in rates if d}, key=float, reverse=True)
@@ -119,7 +119,7 @@ def _outcome(values: Mapping[str, Any], who: str) -> list[tuple[str, str, str]]:
     elif _known(returned):
         mean, low, high = (f"{returned[k]:.2f}" for k in ("mean", "low", "high"))
         out.append(("return", mean, f"{low} – {high}, {who}"))
-    rates = _success({who: values}).get(who, {})
+    rates = success_rates({who: values}).get(who, {})
     if rates:
         widest = max(rates, key=lambda d: float(d or 0))
         rate = rates[widest]
@@ -137,7 +137,7 @@ def _known(value: Any) -> bool:
     return is_interval(value) and None not in value.values()
 
 
-def _success(policies: Mapping[str, Mapping[str, Any]]) -> dict[str, dict[str, Any]]:
+def success_rates(policies: Mapping[str, Mapping[str, Any]]) -> dict[str, dict[str, Any]]:
     """policy -> distance [m] -> rate at the end of an episode, an interval; the task's own under an empty text."""
     out = {}
     for policy, values in policies.items():

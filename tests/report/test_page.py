@@ -393,6 +393,16 @@ def test_the_comparison_shows_results_curves_and_what_differs(make_run, tmp_path
     assert "the configurations are the same" in plain.text
 
 
+def test_runs_of_several_families_begin_with_a_table_of_tasks(make_run) -> None:
+    other = make_run("other")
+    config = other / "config.yaml"
+    config.write_text(config.read_text().replace("tdmpc2", "dreamer"))
+    reader = Reader(compare_page([read_run(make_run()), read_run(other)]))
+    assert reader.sections[0] == "tasks"
+    for words in ("dreamer", "reach_fixed", "50 % within 5 cm"):
+        assert words in reader.text
+
+
 def test_comparing_needs_runs(make_run, capsys) -> None:
     assert cli.main(["compare", str(make_run())]) == 1
     assert "at least two runs, got 1" in capsys.readouterr().err

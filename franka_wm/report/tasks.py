@@ -1,0 +1,78 @@
+"""Tasks by families of models: how often the runs of each family succeed at each task."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+
+from franka_wm.report import style
+from franka_wm.report.outcome import SHOWN, success_rates
+from franka_wm.report.run import RunFiles
+from franka_wm.report.table import Table, is_interval
+
+MISSING = "–"
+
+
+def tasks_table(runs: Iterable[RunFiles]) -> Table | None:
+    """One row for each task, one column for each family; None where all runs share both.
+
+    A cell is the mean over runs, and their lowest and highest: success of the planner, or of the policy where no
+    planner was measured; the return where a task does not say what success is. Of several distances the largest counts.
+    """
+    cells: dict[str, dict[str, list[tuple[str, float]]]] = {}
+    for run in runs:
+        found = _outcome(run)
+        if found is not None:
+            cells.setdefault(task_of(run), {}).setdefault(_family(run), []).append(found)
+    families = sorted({family for row in cells.values() for family in row})
+    if len(cells) < 2 and len(families) < 2:
+        return None
+    rows = [
+        [task, *(_cell(row[family]) if family in row else MISSING for family in families)]
+        for task, row in sorted(cells.items())
+    ]
+    return Table(["task", *families], rows)
+
+
+def task_of(run: RunFiles) -> str:
+    """The preset that was typed, else the task of the configuration, with the domain of other libraries' tasks."""
+    env = run.config.get("env")
+    env = env if isinstance(env, Mapping) else {}
+    domain, task = env.get("name"), env.get("task")
+    if domain:
+        return f"{domain} {task}" if task else str(domain)
+    typed = [one.removeprefix("env=") for one in run.overrides if one.startswith("env=")]
+    return typed[-1] if typed else str(task or MISSING)
+
+
+def _family(run: RunFiles) -> str:
+    model = run.config.get("model")
+    return str(model.get("name", MISSING)) if isinstance(model, Mapping) else MISSING
+
+
+def _outcome(run: RunFiles) -> tuple[str, float] | None:
+    """What is measured, and how well it went; None where nothing was."""
+    policy = next((name for name in SHOWN if name in run.policies), None)
+    if policy is None:
+        return None
+    rates = success_rates(run.policies).get(policy, {})
+    if rates:
+        distance = max(rates, key=lambda d: float(d or 0.0))
+        within = f" within {style.centimetres(distance)}" if distance else ""
+        return f"%{within}", 100.0 * rates[distance]["mean"]
+    returned = run.policies[policy].get("return") or {}
+    return ("return", returned["mean"]) if is_interval(returned) else None
+
+
+def _cell(found: list[tuple[str, float]]) -> str:
+    units = sorted({unit for unit, _ in found})
+    if len(units) > 1:
+        return f"measured as {' and '.join(units)}"
+    values = [value for _, value in found]
+    digits = 0 if units[0].startswith("%") else 1
+    mean = f"{sum(values) / len(values):.{digits}f}"
+    spread = (
+        f" ({min(values):.{digits}f} – {max(values):.{digits}f}, {len(values)} runs)"
+        if len(values) > 1
+        else ""
+    )
+    return f"{mean} %{spread}{units[0][1:]}" if units[0].startswith("%") else f"return {mean}{spread}"

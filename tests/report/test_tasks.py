@@ -1,0 +1,69 @@
+"""Tasks by families, of several runs."""
+
+from pathlib import Path
+
+from franka_wm.evaluation.results import Result
+from franka_wm.report.run import RunFiles
+from franka_wm.report.tasks import tasks_table
+
+
+def interval(mean: float) -> dict[str, float]:
+    return {"mean": mean, "low": 0.9 * mean, "high": 1.1 * mean}
+
+
+def run(
+    task: str, family: str, policies: dict, *, env: dict | None = None, typed: str | None = None
+) -> RunFiles:
+    return RunFiles(
+        Path(f"{task}-{family}"),
+        config={"env": env or {"task": task}, "model": {"name": family}},
+        overrides=[] if typed is None else [f"env={typed}"],
+        results=[Result(Path("evaluation.json"), policies=policies)],
+    )
+
+
+def success(rate: float, **more) -> dict:
+    return {"success": interval(rate), "return": interval(3.0), **more}
+
+
+def test_runs_of_one_task_and_family_share_a_cell() -> None:
+    near = {"success": {"0.05": interval(0.5), "0.01": interval(0.1)}, "final_distance": interval(0.02)}
+    table = tasks_table(
+        [
+            run("push", "tdmpc2", {"planner": success(0.9), "policy": success(0.1), "noop": success(0.0)}),
+            run("push", "tdmpc2", {"planner": success(0.8)}),
+            run("push", "dreamer", {"policy": success(0.7), "random": success(1.0)}),
+            run("reach", "tdmpc2", {"planner": near}, typed="reach_fixed"),
+            run(
+                "",
+                "dreamer",
+                {"planner": {"return": interval(812.34)}},
+                env={"name": "walker", "task": "walk"},
+            ),
+            run("push", "lewm", {"noop": success(1.0)}),  # nothing of its own was measured
+            RunFiles(Path("empty")),
+        ]
+    )
+    assert table is not None
+    assert table.header == ["task", "dreamer", "tdmpc2"]
+    assert table.rows == [
+        ["push", "70 %", "85 % (80 – 90, 2 runs)"],
+        ["reach_fixed", "–", "50 % within 5 cm"],
+        ["walker walk", "return 812.3", "–"],
+    ]
+
+
+def test_what_was_measured_differently_is_not_averaged() -> None:
+    table = tasks_table(
+        [
+            run("mine", "a", {"planner": success(0.5)}),
+            run("mine", "a", {"planner": {"return": interval(2.0)}}),
+            run("mine", "b", {"planner": success(0.5)}),
+        ]
+    )
+    assert table is not None and table.rows == [["mine", "measured as % and return", "50 %"]]
+
+
+def test_one_task_of_one_family_needs_no_table() -> None:
+    assert tasks_table([run("push", "a", {"planner": success(0.5)})] * 2) is None
+    assert tasks_table([RunFiles(Path("empty"))]) is None
