@@ -14,7 +14,7 @@ import torch
 from selenium import webdriver
 from selenium.webdriver.chrome.service import Service
 
-from franka_wm.commands.view import parse
+from franka_wm.commands.view import options_of, view
 from franka_wm.live.page import Page
 from franka_wm.live.session import Session
 from franka_wm.live.stage import build
@@ -30,7 +30,7 @@ GOALS = ((0.35, 0.30, 0.55), (0.55, -0.20, 0.35), (0.42, 0.36, 0.60))
 
 def main() -> None:
     torch.manual_seed(0)
-    stage = build(parse([*sys.argv[1:], "device=cpu"]))
+    stage = build(options_of(**view.make_context("view", [*sys.argv[1:], "device=cpu"]).params))
     session = Session(stage.env, stage.policies, policy="planner", seed=4)
     page = Page(session, port=0, title=stage.title)
     options = webdriver.ChromeOptions()

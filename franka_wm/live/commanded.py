@@ -58,6 +58,16 @@ def commanded_path(env: FrankaEnv, plan: Tensor) -> Tensor:
     return env.kinematics.forward(torch.stack(targets, 1))
 
 
+def planned_path(env: FrankaEnv, decided: TensorDictBase) -> Tensor | None:
+    """:func:`commanded_path` of a decision's plan; None where it has no plan, or one of discrete actions."""
+    plan = decided.get("plan", None)
+    if plan is not None and plan.dim() == 4:  # iCEM's holds its mean first, then elites
+        plan = plan[:, 0]
+    if plan is None or not plan.is_floating_point() or plan.shape[2:] != (env.action_dim,):
+        return None
+    return commanded_path(env, plan)
+
+
 class KinematicModel(WorldModel):
     """A world model that nobody trained: the arm's own geometry, as if it followed every command at once.
 

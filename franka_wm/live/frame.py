@@ -14,9 +14,11 @@ class Frame:
         episode: Counts from 0.
         stepped: Whether this is a step's end; otherwise something was set by hand.
         policy: Who acts.
-        bodies: Poses of the moving links (bodies, 7): position [m], quaternion xyzw.
+        bodies: Poses of the moving links and the objects (bodies, 7): position [m], quaternion xyzw.
         tool, goal: (3,) [m].
         path: Tool positions that the plan commands (H + 1, 3) [m]; None where the policy has no plan.
+        contacts: Where things touched at the last step's end (C, 7): point [m], normal, force along it [N]; None where
+            nobody asked, and after something was set by hand.
         reward: Of the last step; 0.0 before the first.
         distance: From tool to goal, at the last step's end, before any reset [m].
         success: Of the last step.
@@ -38,4 +40,5 @@ class Frame:
     success: bool
     decision: float
     recording: int | None
+    contacts: np.ndarray | None = None
     recording_full: bool = False

@@ -18,7 +18,6 @@ from typing import Any
 from urllib.parse import urlsplit
 
 from franka_wm.console import say
-from franka_wm.live.session import FARTHEST
 
 NEARBY = ("127.0.0.1", "localhost", "::1")
 """Names of this machine: what a browser may have asked for."""
@@ -58,6 +57,7 @@ class Gate:
     def __init__(self, complain: Callable[[str], Any] = say):
         self._complain = complain
         self._inputs: dict[str, Check] = {}
+        self._handles: dict[str, Check] = {}
         self._lock = threading.Lock()
         self._said = -math.inf
         self._unsaid = 0
@@ -101,6 +101,10 @@ class Gate:
         self._inputs[control._impl.uuid] = check
         return control
 
+    def allow_drag(self, name: str, check: Check) -> None:
+        """Let clients drag the handle of that name to positions where `check` holds."""
+        self._handles[name] = check
+
     def admits(self, message: Any) -> bool:
         """Whether a decoded message is one that the page's own client sends, with values within bounds."""
         if not isinstance(message, Mapping):
@@ -119,13 +123,13 @@ class Gate:
             return set(values) == {*sizes, *numbers} and all(
                 is_point(values[name], size, 1e6) for name, size in sizes.items()
             ) and all(is_number(values[name], 0, 1e6) for name in numbers)  # fmt: skip
-        if values.get("name") != "/goal":
+        if (check := self._handles.get(str(values.get("name")))) is None:
             return False
         if kind == "TransformControlsUpdateMessage":
             return (
                 set(values) == {"name", "wxyz", "position"}
                 and is_point(values["wxyz"], 4, 2.0)
-                and is_point(values["position"], 3, FARTHEST)
+                and check(values["position"])
             )
         return (
             kind in ("TransformControlsDragStartMessage", "TransformControlsDragEndMessage")

@@ -5,7 +5,7 @@ from __future__ import annotations
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from datetime import datetime
 from pathlib import Path
 from typing import Any
@@ -15,11 +15,12 @@ import numpy as np
 from franka_wm.envs.scene import FLOOR
 from franka_wm.errors import UserError
 from franka_wm.live.frame import Frame
-from franka_wm.live.gate import Gate, is_number
-from franka_wm.live.session import SPEEDS, Session
+from franka_wm.live.gate import Gate, is_number, is_point
+from franka_wm.live.objects import room, rows
+from franka_wm.live.session import FARTHEST, GOAL_NAME, SPEEDS, Session
 from franka_wm.live.shapes import arm_shapes
 from franka_wm.live.sliders import Setting
-from franka_wm.live.viser_scene import ViserScene
+from franka_wm.live.viser_scene import ViserScene, handle_name
 from franka_wm.report.style import BLUE, VERMILION, policy_name
 
 HOST = "127.0.0.1"
@@ -89,7 +90,12 @@ class Page:
             success_distance=arm.config.success_distance,
             floor=FLOOR if arm.config.resolved_scene else 0.0,
             on_goal=session.ask_goal,
+            objects=rows(arm),
+            on_object=self._ask_object,
         )
+        self.gate.allow_drag(GOAL_NAME, lambda point: is_point(point, 3, FARTHEST))
+        for name in session.objects:
+            self.gate.allow_drag(handle_name(name), is_within(room(arm)))
         self._times: deque[float] = deque(maxlen=30)
         most = max(2, round(HISTORY * arm.config.fps))
         self._history: deque[tuple[float, float, float]] = deque(maxlen=most)
@@ -157,6 +163,16 @@ class Page:
         )
         self._allow(keep, lambda value: isinstance(value, bool))
         keep.on_update(lambda event: setattr(session, "keep_goal", bool(event.target.value)))
+        if session.arm.config.resolved_scene is not None:
+            self._contacts = gui.add_checkbox(
+                "contacts",
+                session.show_contacts,
+                hint="Where things touch, and how hard: 10 mm to each side for a newton",
+            )
+            self._allow(self._contacts, lambda value: isinstance(value, bool))
+            self._contacts.on_update(
+                lambda event: self._try(lambda: self.show_contacts(bool(event.target.value)))
+            )
         empty = (np.zeros(1), np.zeros(1))
         self._distance = self._plot("distance to the goal [cm]", empty, VERMILION)
         self._reward = self._plot("reward", empty, BLUE)
@@ -219,6 +235,11 @@ class Page:
             self.session.play()
         self.show(self.session.frame())
 
+    def show_contacts(self, shown: bool) -> None:
+        """Whether contacts are read and drawn."""
+        self.session.show_contacts = shown
+        self.show(self.session.frame())
+
     def toggle_recording(self) -> None:
         """Starts to record, or writes ``live-DATE-TIME…`` into the folder and says where."""
         kind = str(self._kind.value)
@@ -233,6 +254,12 @@ class Page:
             if not self.session.recording:
                 self._record.label, self._kind.disabled = "Record", False
         self._notify("Saved", str(path.resolve()))
+
+    def _ask_object(self, name: str, point: Sequence[float]) -> None:
+        try:
+            self.session.ask_object(name, point)
+        except UserError as error:  # it lies on the floor, and was touched there
+            self.gate.ignore(str(error))
 
     def _try(self, action: Callable[[], Any]) -> None:
         """Does what a browser asked for; what cannot be done is said there."""
@@ -290,6 +317,15 @@ class Page:
 def is_click(value: Any) -> bool:
     """Whether a value is what a pressed button sends."""
     return value is True
+
+
+def is_within(bounds: Sequence[tuple[float, float]]) -> Callable[[Any], bool]:
+    """A check for points whose coordinates are within (least, most) each."""
+    return lambda value: (
+        isinstance(value, (list, tuple))
+        and len(value) == len(bounds)
+        and all(is_number(x, *pair) for x, pair in zip(value, bounds, strict=True))
+    )
 
 
 def is_one_of(choices: Iterable[str]) -> Callable[[Any], bool]:

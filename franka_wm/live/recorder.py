@@ -10,6 +10,7 @@ import numpy as np
 import torch
 from tensordict import TensorDictBase
 
+from franka_wm.console import say
 from franka_wm.envs import FrankaEnv
 from franka_wm.envs.camera import project, whole_arm
 from franka_wm.errors import UserError
@@ -30,6 +31,19 @@ class Recorder:
     def full(self) -> bool:
         """Whether no further step has a place."""
         return len(self) >= self.most
+
+    def take(self, step: TensorDictBase) -> None:
+        """One step: observation, ``action`` and, under ``next``, what followed; nothing where it is full or closed."""
+        if self.closed or self.full:
+            return
+        self._take(step)
+        if self.full:
+            say(
+                f"the recording is full after {len(self):,} steps: further ones are not in it; stop it to save it"
+            )
+
+    def _take(self, step: TensorDictBase) -> None:
+        raise NotImplementedError
 
     def close(self) -> None:
         """Takes no more steps; what there is can be written, and written again where that failed."""
@@ -54,10 +68,8 @@ class VideoRecorder(Recorder):
         """Steps recorded."""
         return len(self.frames)
 
-    def take(self, step: TensorDictBase) -> None:
-        """One image of the present; nothing where it is full or closed. ``step`` is not looked at."""
-        if self.closed or self.full:
-            return
+    def _take(self, step: TensorDictBase) -> None:
+        """One image of the present; ``step`` is not looked at."""
         picture = self.env.render(self.size, num_views=1, config=self.whole).cpu()
         centre = project(self.env.goal[:1], self.whole, self.size).cpu()
         self.frames.append(draw_marker(picture, centre, radius=self.size / 32)[0])
@@ -106,10 +118,7 @@ class DatasetRecorder(Recorder):
         """Steps recorded."""
         return len(self.steps)
 
-    def take(self, step: TensorDictBase) -> None:
-        """One step: observation, ``action`` and, under ``next``, what followed; nothing where it is full or closed."""
-        if self.closed or self.full:
-            return
+    def _take(self, step: TensorDictBase) -> None:
         keys = {*self.schema.sources.values(), *(key for key, _, _ in self.schema.derived.values())}
         flags = ("reward", "done", "terminated", "truncated", "success")
         after = step.get("next").select(*keys, *flags)

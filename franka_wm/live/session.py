@@ -16,13 +16,13 @@ import torch
 from tensordict import TensorDictBase
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
-from franka_wm.console import say
 from franka_wm.envs import FrankaEnv
 from franka_wm.errors import UserError
-from franka_wm.live.commanded import commanded_path
+from franka_wm.live.commanded import planned_path
 from franka_wm.live.frame import Frame
+from franka_wm.live.objects import free_objects, move_object, point_over_table, touching
 from franka_wm.live.recorder import DatasetRecorder, VideoRecorder
-from franka_wm.live.sliders import Setting, planner_settings, rebuilt, work
+from franka_wm.live.sliders import Setting, planner_settings, retuned
 from franka_wm.policies.names import refuse_old_name
 
 SPEEDS = (0.1, 1.0)
@@ -31,6 +31,9 @@ FARTHEST = 5.0
 """Largest coordinate of a goal [m]: many times the arm's reach."""
 BUDGET = 1.0
 """Longest decision that a planner's settings may lead to [s]: while it plans, nothing else is heard."""
+
+GOAL_NAME = "/goal"
+"""What is asked to move, if it is not an object: names of objects have no /."""
 
 PREFERRED = ("planner", "expert", "ik", "noop")
 """Which policy starts, the first one that there is."""
@@ -68,6 +71,8 @@ class Session:
             raise UserError(f"a live session simulates one world, the environment has {self.arm.num_envs}")
         self.policies = dict(policies)
         self.keep_goal, self.seed = keep_goal, seed
+        self.show_contacts = False
+        self._touching = False  # whether what the solver holds of contacts is of the present state
         self._speed = 1.0
         self.error: Exception | None = None
         self._lock = threading.RLock()
@@ -80,7 +85,7 @@ class Session:
         self._reward = self._decision = 0.0
         self._success = False
         self._pinned: torch.Tensor | None = None
-        self._asked: torch.Tensor | None = None
+        self._asked: dict[str, list[float]] = {}
         self._path: torch.Tensor | None = None
         self._policy = policy or next((name for name in PREFERRED if name in self.policies), "")
         self._check_policy(self._policy)
@@ -99,17 +104,18 @@ class Session:
             decided = self.policies[self._policy](self._now)
             self._synchronize()
             self._decision = time.perf_counter() - began
-            self._path = self._planned(decided)
+            self._path = planned_path(self.arm, decided)
             done, self._now = self.env.step_and_maybe_reset(decided)
             after = done["next"]
             self._reward = float(after["reward"])
             self._success = bool(after["success"])
             self._distance = float(self.arm.simulation.tensors.next_true_state[0, 17:20].norm())
             self._steps += 1
+            self._touching = self.arm.config.resolved_scene is not None
             if bool(after["done"]):
                 self._begin_episode()
             if self._recorder is not None:
-                self._record(self._recorder, done)
+                self._recorder.take(done)
             frame = self._frame(stepped=True)
         return self._tell(frame)
 
@@ -147,7 +153,29 @@ class Session:
         Raises:
             UserError: As for :meth:`set_goal`, at once.
         """
-        self._asked = self._checked(goal)
+        self._asked[GOAL_NAME] = self._checked(goal).tolist()
+
+    def move_object(self, name: str, point: Sequence[float]) -> Frame:
+        """Puts a free object to a point (x, y, z) [m], at rest and turned as it is; the episode goes on from there.
+
+        Success is judged at the end of the next step.
+
+        Raises:
+            UserError: There is no such object, or the point is not over the table.
+        """
+        with self._lock:
+            self._observe(move_object(self.arm, name, point))
+            self._touching = False
+            frame = self._frame()
+        return self._tell(frame)
+
+    def ask_object(self, name: str, point: Sequence[float]) -> None:
+        """:meth:`move_object` by the thread, as soon as it can; of several points only the last one counts.
+
+        Raises:
+            UserError: As for :meth:`move_object`, at once.
+        """
+        self._asked[name] = point_over_table(self.arm, name, point)
 
     def set_policy(self, name: str) -> Frame:
         """From the next step on, ``name`` acts; what another one remembered is dropped.
@@ -172,18 +200,7 @@ class Session:
         with self._lock:
             if self.planner is None:
                 raise UserError("this session has no planner; give a checkpoint")
-            for setting in self.settings:
-                if not setting.low <= changes.get(setting.name, setting.value) <= setting.high:
-                    raise UserError(
-                        f"{setting.name}={changes[setting.name]:g}: must be from {setting.low:g} to {setting.high:g}"
-                    )
-            other = rebuilt(self.planner, **changes)
-            more = work(other) / work(self.planner)
-            if more > 1 and (expected := more * self._planning_time()) > BUDGET:
-                raise UserError(
-                    f"a decision would take about {expected:.1f} s, and at most {BUDGET:g} s is allowed here; "
-                    "first make another setting smaller"
-                )
+            other = retuned(self.planner, changes, seconds=self._planning_time, budget=BUDGET)
             self.policies["planner"].planner = other
             self._forget()
 
@@ -216,6 +233,11 @@ class Session:
     def settings(self) -> list[Setting]:
         """The planner's settings that can be moved."""
         return planner_settings(self.planner)
+
+    @property
+    def objects(self) -> tuple[str, ...]:
+        """Names of what :meth:`move_object` moves."""
+        return free_objects(self.arm)
 
     @property
     def playing(self) -> bool:
@@ -339,9 +361,9 @@ class Session:
         due = time.perf_counter()
         try:
             while not self._stopping.is_set():
-                goal, self._asked = self._asked, None
-                if goal is not None:
-                    self.set_goal(goal.tolist())
+                for what in list(self._asked):
+                    point = self._asked.pop(what)
+                    self.set_goal(point) if what == GOAL_NAME else self.move_object(what, point)
                 if not self._playing.wait(timeout=0.03):
                     due = time.perf_counter()
                     continue
@@ -370,25 +392,19 @@ class Session:
             hint = "; that one needs a checkpoint of a family that has it" if learned else ""
             raise UserError(f"policy={name!r}: choose from {', '.join(self.policies)}{hint}")
 
-    def _record(self, recorder: VideoRecorder | DatasetRecorder, step: TensorDictBase) -> None:
-        before = recorder.full
-        recorder.take(step)
-        if recorder.full and not before:
-            say(
-                f"the recording is full after {len(recorder):,} steps: further ones are not in it; "
-                f"stop it to save it"
-            )
-
     def _begin_episode(self) -> None:
         self._episode += 1
-        self._path = None
+        self._path, self._touching = None, False
         if self.keep_goal and self._pinned is not None:
             self._place_goal(self._pinned)
         else:
             self._pinned = None
 
     def _place_goal(self, goal: torch.Tensor) -> None:
-        observed = self.arm.set_goal(goal)
+        self._observe(self.arm.set_goal(goal))
+
+    def _observe(self, observed: TensorDictBase) -> None:
+        """Takes what the arm observes after something was set by hand."""
         for key in self.arm.observation_spec:
             if key not in ("is_init", "success"):
                 self._now.set(key, observed[key])
@@ -397,14 +413,6 @@ class Session:
         """Drops what policies carry from step to step: plans and contexts."""
         self._now = self._now.select(*self._observed)
         self._path = None
-
-    def _planned(self, decided: TensorDictBase) -> torch.Tensor | None:
-        plan = decided.get("plan", None)
-        if plan is not None and plan.dim() == 4:  # iCEM's holds its mean first, then elites
-            plan = plan[:, 0]
-        if plan is None or not plan.is_floating_point() or plan.shape[2:] != (self.arm.action_dim,):
-            return None  # no plan, or one of discrete actions
-        return commanded_path(self.arm, plan)
 
     def _synchronize(self) -> None:
         if self.arm.device.type == "cuda":
@@ -424,6 +432,7 @@ class Session:
             distance=self._distance,
             success=self._success,
             decision=self._decision,
+            contacts=touching(self.arm) if self.show_contacts and self._touching else None,
             recording=None if self._recorder is None else len(self._recorder),
             recording_full=self._recorder is not None and self._recorder.full,
         )

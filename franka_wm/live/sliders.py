@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import inspect
 import math
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -42,6 +43,35 @@ def planner_settings(planner: Any) -> list[Setting]:
             low = max(low, *(part for part in parts if isinstance(part, int)))
         out.append(Setting(name, value, min(low, value), max(high, value), step))
     return out
+
+
+def retuned(
+    planner: Any, changes: Mapping[str, float], *, seconds: Callable[[], float], budget: float
+) -> Any:
+    """:func:`rebuilt` within the sliders and a budget.
+
+    Args:
+        planner: The present one.
+        changes: Setting → value.
+        seconds: Measures a decision of the present planner [s].
+        budget: Longest decision that the settings may lead to [s].
+
+    Raises:
+        UserError: Also for a value outside of its slider, or a decision that would take longer than the budget.
+    """
+    for setting in planner_settings(planner):
+        if not setting.low <= changes.get(setting.name, setting.value) <= setting.high:
+            raise UserError(
+                f"{setting.name}={changes[setting.name]:g}: must be from {setting.low:g} to {setting.high:g}"
+            )
+    other = rebuilt(planner, **changes)
+    more = work(other) / work(planner)
+    if more > 1 and (expected := more * seconds()) > budget:
+        raise UserError(
+            f"a decision would take about {expected:.1f} s, and at most {budget:g} s is allowed here; "
+            "first make another setting smaller"
+        )
+    return other
 
 
 def rebuilt(planner: Any, **changes: Any) -> Any:

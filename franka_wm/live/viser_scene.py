@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from franka_wm.live.session import GOAL_NAME
 from franka_wm.live.shapes import Shape, wxyz
 
 if TYPE_CHECKING:
@@ -24,7 +26,11 @@ PORTRAIT = 0.75
 
 SKY, GROUND, CELL, SECTION = (236, 240, 245), (206, 211, 218), (186, 192, 201), (160, 167, 177)
 GOAL, REACHED, PATH, TRAIL = (213, 94, 0), (0, 158, 115), (0, 114, 178), (150, 156, 166)
+CONTACT = (204, 0, 119)
 TRAIL_STEPS = 60
+METRES_PER_NEWTON, LONGEST_FORCE = 0.01, 0.2
+"""Length of the line that stands for a force, to each side of its point [m/N], and its most [m]. On both sides, or what
+touches would hide it."""
 DARKEST = 44
 """Of a shape's red, green and blue: in black, shading shows no form."""
 
@@ -39,6 +45,8 @@ class ViserScene:
         success_distance: Radius of the goal's outer sphere [m].
         floor: Height of the ground [m].
         on_goal: Called with (x, y, z) [m] while the goal is dragged in a browser; must return at once.
+        objects: Name → row of the body poses of what can be dragged as well.
+        on_object: Called with a name and (x, y, z) [m] while an object is dragged; must return at once.
     """
 
     def __init__(
@@ -50,11 +58,14 @@ class ViserScene:
         success_distance: float,
         floor: float = 0.0,
         on_goal: Callable[[tuple[float, float, float]], None],
+        objects: Mapping[str, int] = MappingProxyType({}),
+        on_object: Callable[[str, tuple[float, float, float]], None] = lambda name, point: None,
     ):
-        self._server, self._on_goal = server, on_goal
-        self._dragged = False
+        self._server, self._on_goal, self._on_object = server, on_goal, on_object
+        self._dragged: set[str] = set()
         self._trail: deque[np.ndarray] = deque(maxlen=TRAIL_STEPS)
         self._lines: dict[str, Any] = {}
+        self._touching: list[Any] = []
         self._reached: bool | None = None
         self._stage(floor)
         self.links = [server.scene.add_frame(f"/arm/link{i + 1}", show_axes=False) for i in range(bodies)]
@@ -69,7 +80,7 @@ class ViserScene:
                 wxyz=shape.wxyz,
             )
         self.goal = server.scene.add_transform_controls(
-            "/goal", scale=0.16, line_width=3.0, disable_rotations=True, depth_test=False
+            GOAL_NAME, scale=0.16, line_width=3.0, disable_rotations=True, depth_test=False
         )
         self._ball = server.scene.add_icosphere("/goal/ball", radius=0.018, color=GOAL, subdivisions=4)
         self._halo = server.scene.add_icosphere(
@@ -82,6 +93,12 @@ class ViserScene:
             receive_shadow=False,
         )
         self.goal.on_update(self._drag)
+        self.objects = {}
+        for name, row in objects.items():
+            self.objects[row] = handle = server.scene.add_transform_controls(
+                handle_name(name), scale=0.09, line_width=2.0, disable_rotations=True, depth_test=False
+            )
+            handle.on_update(self._drag)
         server.on_client_connect(_aim)
 
     def _stage(self, floor: float) -> None:
@@ -121,12 +138,17 @@ class ViserScene:
         with self._server.atomic():
             for link, pose in zip(self.links, frame.bodies, strict=True):
                 link.position, link.wxyz = pose[:3], wxyz(pose[3:])
-            if not self._dragged:  # what is dragged is where the hand has it, not where it was a step ago
+            # What is dragged is where the hand has it, not where it was a step ago.
+            if GOAL_NAME not in self._dragged:
                 self.goal.position = frame.goal
+            for row, handle in self.objects.items():
+                if handle.name not in self._dragged:
+                    handle.position = frame.bodies[row, :3]
             if frame.success is not self._reached:
                 self._reached = frame.success
                 self._ball.color = self._halo.color = REACHED if frame.success else GOAL
             self._draw_paths(frame)
+            self._draw_contacts(frame.contacts)
 
     def _draw_paths(self, frame: Frame) -> None:
         if not frame.stepped and self._trail and np.linalg.norm(self._trail[-1] - frame.tool) > 1e-4:
@@ -155,10 +177,41 @@ class ViserScene:
         # Another number of points: viser replaces the node of this name.
         self._lines[name] = self._server.scene.add_line_segments(name, segments, colour, thickness=thickness)
 
+    def _draw_contacts(self, contacts: np.ndarray | None) -> None:
+        """Points, and a line along each force: (C, 7), or none."""
+        if contacts is None or not len(contacts):
+            old, self._touching = self._touching, []
+            for handle in old:
+                handle.remove()
+            return
+        points, normals, forces = contacts[:, :3], contacts[:, 3:6], contacts[:, 6:]
+        reach = normals * np.clip(forces * METRES_PER_NEWTON, 0.0, LONGEST_FORCE)
+        segments = np.stack([points - reach, points + reach], 1).astype(np.float32)
+        colours = np.broadcast_to(np.array(CONTACT, dtype=np.uint8), points.shape)
+        scene = self._server.scene  # another number of points: viser replaces the nodes of these names
+        self._touching = [
+            scene.add_point_cloud(
+                "/contacts/points", points.astype(np.float32), colours, point_size=0.008, point_shape="circle"
+            ),
+            scene.add_line_segments("/contacts/forces", segments, CONTACT, thickness=0.004),
+        ]
+
     async def _drag(self, event: Any) -> None:  # async: viser then keeps the order of start, updates and end
-        self._dragged = event.phase != "end"
+        name = event.target.name
         x, y, z = (float(v) for v in event.target.position)
-        self._on_goal((x, y, max(z, 0.02)))
+        if name == GOAL_NAME:
+            self._on_goal((x, y, max(z, 0.02)))
+        else:
+            self._on_object(name.removeprefix(handle_name("")), (x, y, z))
+        if event.phase == "end":
+            self._dragged.discard(name)
+        else:
+            self._dragged.add(name)
+
+
+def handle_name(name: str) -> str:
+    """Of the handle that drags an object."""
+    return f"/objects/{name}"
 
 
 def _aim(client: viser.ClientHandle) -> None:
