@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import click
 
 from franka_wm.commands.arguments import verb, whole, word
@@ -28,7 +26,6 @@ def export(source: str, out: str, format: str, workers: int) -> None:
     The checkpoint must have been saved with its replay (trainer.checkpoint_replay=true). Only whole episodes are
     written; how many partial ones the buffer holds is said.
     """
-    from omegaconf import OmegaConf
 
     from franka_wm.data.lerobot.export import arm_config, export_replay, tell
     from franka_wm.training.checkpoint import latest_checkpoint, load_checkpoint
@@ -39,7 +36,7 @@ def export(source: str, out: str, format: str, workers: int) -> None:
         raise UserError(
             f"export: {checkpoint.folder} was saved without its replay; train with trainer.checkpoint_replay=true"
         )
-    resolved: Any = OmegaConf.to_container(checkpoint.config, resolve=True)
+    resolved = checkpoint.config
     with announced(f"writing {data.numel()} steps"):
         done = export_replay(
             data,

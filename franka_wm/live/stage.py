@@ -106,9 +106,9 @@ def check_arm(checkpoint: str) -> None:
     Raises:
         UserError: It does not, or there is none.
     """
-    env = find_checkpoint(checkpoint).config.env
-    if env.kind != "franka":
-        what = "recorded data alone" if env.kind == "none" else f"another environment ({env.kind})"
+    kind = find_checkpoint(checkpoint).config["env"]["kind"]
+    if kind != "franka":
+        what = "recorded data alone" if kind == "none" else f"another environment ({kind})"
         raise UserError(f"view: {checkpoint}: was trained on {what}; the live page shows the arm only")
 
 

@@ -28,7 +28,6 @@ from typing import Any
 import numpy as np
 import torch
 from omegaconf import DictConfig, OmegaConf
-from omegaconf.errors import OmegaConfBaseException
 from safetensors import SafetensorError
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor, nn
@@ -64,7 +63,7 @@ def save_checkpoint(
     folder: str | Path,
     *,
     model: nn.Module,
-    config: Mapping[str, object] | DictConfig,
+    config: Mapping[str, object],
     counters: Mapping[str, int | float],
     optimizer: Optimizers | None = None,
     replay: TensorDictBase | None = None,
@@ -77,7 +76,7 @@ def save_checkpoint(
     Args:
         folder: where the checkpoint will be. Missing parents are made.
         model: on any device; a compiled module is saved as the module it wraps.
-        config: resolved before it is written; a missing or unresolvable value is an error.
+        config: plain values, nested.
         counters: numbers by name, such as `env_steps` and `updates`.
         optimizer: one optimizer, or several by name.
         replay: the filled part of the buffer, tensors only, any batch dimensions.
@@ -117,7 +116,7 @@ def _write_contents(
     folder: Path,
     model: nn.Module,
     optimizer: Optimizers | None,
-    config: Mapping[str, object] | DictConfig,
+    config: Mapping[str, object],
     counters: Mapping[str, int | float],
     replay: TensorDictBase | None,
     extra: Mapping[str, object] | None,
@@ -130,7 +129,7 @@ def _write_contents(
         write_tree(folder, "replay", {"batch_size": list(replay.batch_size), "entries": _entries(replay)})
     if extra is not None:
         write_tree(folder, "extra", extra)
-    OmegaConf.save(_resolved(config), folder / "config.yaml")
+    OmegaConf.save(OmegaConf.create(dict(config)), folder / "config.yaml")
     write_json(folder / "counters.json", {name: _plain_number(name, n) for name, n in counters.items()})
 
     write_manifest(folder, type(model).__name__)
@@ -163,12 +162,12 @@ class Checkpoint:
 
     Attributes:
         folder: where it was read from.
-        config: the resolved configuration.
+        config: the resolved configuration, plain.
         counters: the numbers that were saved.
     """
 
     folder: Path
-    config: DictConfig
+    config: dict[str, Any]
     counters: dict[str, int | float]
     _manifest: Manifest
 
@@ -289,7 +288,7 @@ def load_checkpoint(folder: str | Path) -> Checkpoint:
     return Checkpoint(path, _read_config(path), _read_counters(path), manifest)
 
 
-def _read_config(path: Path) -> DictConfig:
+def _read_config(path: Path) -> dict[str, Any]:
     written = UntrustedFolder(path).yaml("config.yaml")  # of a size that can be, and without aliases
     if not isinstance(written, dict):
         raise UserError(
@@ -305,8 +304,8 @@ def _read_config(path: Path) -> DictConfig:
         config = OmegaConf.load(path / "config.yaml")
         assert isinstance(config, DictConfig)
         use_present_names(config)
-        OmegaConf.to_container(config, throw_on_missing=True)
-    return config
+        plain: Any = OmegaConf.to_container(config, throw_on_missing=True)
+    return plain
 
 
 def _read_counters(path: Path) -> dict[str, int | float]:
@@ -397,26 +396,6 @@ def _entries(data: TensorDictBase) -> dict[str, object]:
         str(key): _entries(value) if isinstance(value, TensorDictBase) else value
         for key, value in data.items()
     }
-
-
-def _resolved(config: Mapping[str, Any] | DictConfig) -> DictConfig:
-    try:
-        node = config if isinstance(config, DictConfig) else OmegaConf.create(dict(config))
-        plain = OmegaConf.to_container(node, resolve=True, throw_on_missing=True)
-        resolved = OmegaConf.create(_without_paths(plain))
-        assert isinstance(resolved, DictConfig)
-        return resolved
-    except OmegaConfBaseException as error:
-        raise UserError(f"the configuration cannot be resolved: {error}") from error
-
-
-def _without_paths(value: Any) -> Any:
-    """YAML would need a tag that names a Python class for a path."""
-    if isinstance(value, dict):
-        return {k: _without_paths(v) for k, v in value.items()}
-    if isinstance(value, list):
-        return [_without_paths(v) for v in value]
-    return str(value) if isinstance(value, Path) else value
 
 
 def _plain_number(name: str, value: int | float) -> int | float:

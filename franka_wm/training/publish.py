@@ -66,7 +66,7 @@ def stage_model(checkpoint: Path, place: Path, *, repo_id: str, license: str) ->
     for name in kept:
         if name in manifest.files:
             shutil.copyfile(opened.folder / name, place / name)
-    config = without_paths(OmegaConf.to_container(opened.config), clear=True)
+    config = without_paths(opened.config, clear=True)
     if "resume" in config:
         config["resume"] = None
     OmegaConf.save(OmegaConf.create(config), place / "config.yaml")

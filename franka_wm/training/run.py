@@ -250,8 +250,7 @@ def resumed(cfg: DictConfig, overrides: list[str]) -> tuple[Checkpoint, DictConf
     """
     checkpoint = load_checkpoint(latest_checkpoint(str(cfg.resume)))
     saved = checkpoint.config
-    if "whole_run" in saved:  # the checkpoint is a first stage's
-        saved = OmegaConf.create(OmegaConf.to_container(saved.whole_run))
+    saved = saved.get("whole_run") or saved  # of a first stage's checkpoint
     changes = []
     for override in overrides:
         name = override.split("=", 1)[0].lstrip("+~")
@@ -262,7 +261,7 @@ def resumed(cfg: DictConfig, overrides: list[str]) -> tuple[Checkpoint, DictConf
                 f"{override}: a run that resumes keeps its {name}; leave it out, or change single values ({name}.key=…)"
             )
         changes.append(override.lstrip("+"))
-    merged = OmegaConf.merge(saved, OmegaConf.from_dotlist(changes))
+    merged = OmegaConf.merge(OmegaConf.create(saved), OmegaConf.from_dotlist(changes))
     assert isinstance(merged, DictConfig)
     merged.resume = str(cfg.resume)
     return checkpoint, merged

@@ -29,7 +29,7 @@ from franka_wm.training.checkpoint import Checkpoint, save_checkpoint
 from franka_wm.training.learner import Learner
 from franka_wm.training.loggers import log_numbers
 from franka_wm.training.moment import draws, go_on_drawing, put_back, same_worlds, worlds_now
-from franka_wm.training.settings import RunSettings, plain
+from franka_wm.training.settings import RunSettings
 from franka_wm.training.spaces import Spaces
 from franka_wm.training.storage_budget import fill, filled_bytes, reason_to_leave_out
 from franka_wm.training.tree import damaged
@@ -422,7 +422,7 @@ class Trainer:
             return
         assert self._acting is not None
         worlds = moment.get("worlds")
-        if worlds is not None and same_worlds(plain(checkpoint.config), self.settings.values):
+        if worlds is not None and same_worlds(checkpoint.config, self.settings.values):
             put_back(self.env, self._collect(), worlds)
         else:
             if arm_of(self.env) is None:

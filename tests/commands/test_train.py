@@ -156,7 +156,9 @@ def test_going_on(run, tmp_path: Path) -> None:
     assert history[: len(before.extra()["rows"])] == before.extra()["rows"]
     assert before.replay().numel() == 8 * 25 and after.replay().numel() == 8 * 35
     assert (tmp_path / "more" / "evaluation.json").exists()
-    assert after.config.model == before.config.model  # of the checkpoint, not of the scale of this machine
+    assert (
+        after.config["model"] == before.config["model"]
+    )  # of the checkpoint, not of the scale of this machine
 
 
 def test_ctrl_c(tmp_path: Path) -> None:

@@ -91,7 +91,7 @@ def test_a_run(make: Make) -> None:
     assert {"loss", "train/episodes", "updates_per_s", "time_s"} <= set(row)
     checkpoint = load_checkpoint(latest_checkpoint(trainer.folder))
     # The range of values is saved: another reward does not change it when the weights come back.
-    assert checkpoint.config.model.value_high == trainer.model.two_hot.high < 4.0
+    assert checkpoint.config["model"]["value_high"] == trainer.model.two_hot.high < 4.0
     assert checkpoint.counters["updates"] == 20 and checkpoint.counters["env_steps"] == trainer.env_steps
 
 
