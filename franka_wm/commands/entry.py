@@ -98,7 +98,7 @@ def swept(overrides: list[str]) -> Iterator[list[str]]:
 
 
 def one_line_errors(main: Callable[[DictConfig], object]) -> Callable[[DictConfig], object]:
-    """Inside Hydra's own wrapper, which would print a traceback for what is the user's to mend."""
+    """Inside Hydra's own wrapper, which would print a traceback where the input is wrong."""
 
     @functools.wraps(main)
     def wrapped(cfg: DictConfig) -> object:
@@ -109,7 +109,7 @@ def one_line_errors(main: Callable[[DictConfig], object]) -> Callable[[DictConfi
             fail(str(error))
         except KeyboardInterrupt:
             print(
-                "stopped; what was saved is in the run's folder: python train.py resume=FOLDER",
+                "stopped; what was saved is in the run's folder: franka-wm train resume=FOLDER",
                 file=sys.stderr,
             )
             sys.exit(INTERRUPTED)

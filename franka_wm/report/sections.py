@@ -282,7 +282,7 @@ def reproduce(run: RunFiles) -> str:
     place = shlex.quote(str(_near(run.folder)))
     lines = []
     if run.overrides:
-        lines += ["# train it again", f"python train.py {shlex.join(run.overrides)}", ""]
+        lines += ["# train it again", f"franka-wm train {shlex.join(run.overrides)}", ""]
     if run.counters:
         lines += [
             "# evaluate it, also in shifted worlds",
@@ -292,7 +292,7 @@ def reproduce(run: RunFiles) -> str:
     if run.counters:
         lines += ["# watch it", f"franka-wm view checkpoint={place}", ""]
     if run.counters and run.overrides:
-        lines += ["# go on with it", f"python train.py resume={place}", ""]
+        lines += ["# go on with it", f"franka-wm train resume={place}", ""]
     lines += ["# this page", f"franka-wm report {place}"]
     return commands(lines)
 

@@ -163,7 +163,7 @@ class Run:
     def stop(self) -> NoReturn:
         """The last line of a run that was interrupted and has saved; exits with 130."""
         close_loggers(self.loggers)
-        say(f"stopped; go on with: python train.py resume={self.folder}")
+        say(f"stopped; go on with: franka-wm train resume={self.folder}")
         sys.exit(INTERRUPTED)
 
     def close(self) -> None:

@@ -19,7 +19,7 @@ from franka_wm.data.lerobot.terminal import TERMINAL_FOLDER
 from franka_wm.errors import UserError
 from franka_wm.untrusted import linked_json, values_of
 
-IMAGE = f"{OWN_FOLDER}/picture.png"
+IMAGE = f"{OWN_FOLDER}/episode.gif"
 _CITATION = """```bibtex
 @software{franka_wm,
   title  = {franka_wm: latent world models of a simulated Franka arm},
@@ -96,7 +96,7 @@ def dataset_card(root: Path, *, repo_id: str, license: str) -> str:
         configs=[{"config_name": "default", "data_files": "data/*/*.parquet"}],
     )
     units = {name: UNITS.get(name, "") for name in info["features"]} if provenance is not None else {}
-    image = f"\n![Frames of one episode]({IMAGE})\n" if (root / IMAGE).is_file() else ""
+    image = f"\n![One episode]({IMAGE})\n" if (root / IMAGE).is_file() else ""
     table = "\n".join(
         f"| `{name}` | {one['dtype']} | {tuple(one['shape'])} | {units.get(name, '')} | {_names(one.get('names'))} |"
         for name, one in info["features"].items()
@@ -122,7 +122,7 @@ dataset = LeRobotDataset("{repo_id}")
 ```
 
 ```bash
-python train.py dataset=lerobot dataset.repo_id={repo_id}   # a world model, with franka_wm
+franka-wm train dataset=lerobot trainer=offline dataset.repo_id={repo_id}   # a world model
 ```
 
 ## What a row holds
@@ -155,16 +155,18 @@ def _names(names: Any) -> str:
     return ", ".join(names) if len(names) <= 7 else f"{names[0]}, … {names[-1]} ({len(names)})"
 
 
-def make_image(root: Path, out: Path, *, frames: int = 6) -> None:
-    """Frames of the first episode, side by side, as PNG; nothing without images.
+def make_image(root: Path, out: Path, *, frames: int = 60, side: int = 320) -> None:
+    """The first episode as an endless animation (.gif) at its own pace; nothing without images.
 
     Args:
         root: The dataset.
         out: Where the image goes.
-        frames: How many.
+        frames: At most so many, evenly spaced.
+        side: Larger images are thinned out to at most this width and height [px].
     """
-    from franka_wm.data.lerobot.png import encode_png
-    from franka_wm.files import atomic_write
+    import torch
+
+    from franka_wm.video import write_gif
 
     source = read_source(root)
     kinds = {
@@ -177,10 +179,10 @@ def make_image(root: Path, out: Path, *, frames: int = 6) -> None:
     name, kind = next(iter(kinds.items()))
     with values_of(str(root), "copy or download the dataset again"):
         episode = _first_episode(source, name, kind)
-    chosen = episode[np.linspace(0, len(episode) - 1, min(frames, len(episode))).round().astype(int)]
+    every, thin = -(-len(episode) // frames), -(-max(episode.shape[1:3]) // side)
+    shown = torch.from_numpy(np.ascontiguousarray(episode[::every, ::thin, ::thin]))
     out.parent.mkdir(parents=True, exist_ok=True)
-    with atomic_write(out) as path:
-        path.write_bytes(encode_png(np.concatenate(list(chosen), axis=1)))
+    write_gif(shown, out, max(1, round(source.fps / every)))
 
 
 def _first_episode(source: Source, name: str, kind: str) -> np.ndarray:

@@ -103,7 +103,7 @@ def test_a_dataset_goes_with_our_card_and_tag(hub, publish, dataset) -> None:
     shown = (
         "license: cc-by-4.0",
         "observation.images.front",
-        "picture.png",
+        "episode.gif",
         "@software",
         "terminal",
         "LeRobot",
