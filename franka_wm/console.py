@@ -74,6 +74,14 @@ def log_to(path: Path) -> None:
     _log.write(text)
 
 
+def log_anew() -> None:
+    """What is printed from now on belongs to another run, whose file is not known yet."""
+    global _log
+    if _log is not None:
+        _log.close()
+        _log = io.StringIO()
+
+
 def duration(seconds: float) -> str:
     """``75`` → ``1:15``; ``4000`` → ``1:06:40``."""
     whole = max(0, round(seconds))

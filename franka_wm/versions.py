@@ -13,6 +13,9 @@ from franka_wm import source
 from franka_wm.files import atomic_write
 from franka_wm.version import __version__
 
+FINISHED = "finished.json"
+"""What a run's folder holds once the run has ended, and not while it goes on."""
+
 PACKAGES = ("torch", "torchrl", "tensordict", "newton", "warp-lang", "mujoco-warp", "lerobot", "numpy")
 
 
@@ -67,7 +70,7 @@ def write_finished(folder: str | Path) -> Path:
     """
     started = json.loads((Path(folder) / "versions.json").read_text())["started"]
     taken = (_now() - datetime.fromisoformat(started)).total_seconds()
-    return _write(Path(folder) / "finished.json", {"seconds": round(taken), "source": source.source()})
+    return _write(Path(folder) / FINISHED, {"seconds": round(taken), "source": source.source()})
 
 
 def hardware(device: Any) -> str:

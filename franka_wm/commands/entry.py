@@ -16,8 +16,12 @@ from omegaconf.errors import OmegaConfBaseException
 
 from franka_wm import conf
 from franka_wm.commands.overrides import compose, explain
+from franka_wm.commands.sweep import Sweep, jobs, names
 from franka_wm.console import say, terminal_log
 from franka_wm.errors import REFUSALS, FrankaError, machine_refused
+
+_sweep: Sweep | None = None
+"""That of this process; jobs in processes of other launchers have none, and fail as a single run does."""
 
 INTERRUPTED = 130
 """Exit status after Ctrl-C, as shells expect."""
@@ -47,7 +51,8 @@ def one_line_refusals() -> Iterator[None]:
 
 
 def _run(main: Callable[[], Any], arguments: list[str]) -> None:
-    asked = hydra_flags(arguments)
+    global _sweep
+    _sweep, asked = None, hydra_flags(arguments)
     flags = [a for a in arguments if a not in asked.overrides]
     overrides = list(asked.overrides)
     elsewhere = asked.config_dir or asked.config_name or asked.config_path or asked.experimental_rerun
@@ -57,11 +62,16 @@ def _run(main: Callable[[], Any], arguments: list[str]) -> None:
     only_shows = asked.help or asked.hydra_help or asked.shell_completion or asked.info
     if not (elsewhere or only_shows):
         overrides = with_scale(overrides, sys.stderr if asked.cfg else sys.stdout)
+        if asked.multirun:
+            _sweep = Sweep(check_sweep(overrides))
         problem = None if asked.cfg or asked.multirun else check_command(overrides)
         if problem is not None:
             fail(problem)
     sys.argv[1:] = [*flags, *overrides]
     main()
+    problem = None if _sweep is None else _sweep.outcome()
+    if problem is not None:
+        fail(problem)
 
 
 def hydra_flags(arguments: list[str]) -> Any:
@@ -103,6 +113,8 @@ def one_line_errors(main: Callable[[DictConfig], object]) -> Callable[[DictConfi
     @functools.wraps(main)
     def wrapped(cfg: DictConfig) -> object:
         try:
+            if _sweep is not None:
+                return _sweep.run(main, cfg)
             with one_line_refusals():
                 return main(cfg)
         except FrankaError as error:
@@ -154,9 +166,26 @@ def with_scale(arguments: list[str], stream: TextIO | None = None, *, quiet: boo
     return [a for a in arguments if a != given] + [f"scale={scale}"]
 
 
-def check_command(arguments: list[str]) -> str | None:
-    """What is wrong with the overrides or the folder they write to, in one line; ``None`` if nothing is."""
-    from franka_wm.training.run import check_once, import_plugins, occupied, resumed, unwritable
+def check_sweep(overrides: list[str]) -> list[str]:
+    """Checks every job of a sweep, and its folder, before the first one begins; their names."""
+    try:
+        found = jobs(overrides)
+    except FrankaError as error:
+        fail(str(error))
+    for name, job in zip(names(found), found, strict=True):
+        problem = check_command(job.overrides, job.folder)
+        if problem is not None:
+            fail(f"{name}: {problem}")
+    return names(found)
+
+
+def check_command(arguments: list[str], folder: Path | None = None) -> str | None:
+    """What is wrong with the overrides or the folder they write to, in one line; ``None`` if nothing is.
+
+    Args:
+        folder: That of a sweep's job, which may go on with what it finds there.
+    """
+    from franka_wm.training.run import check_once, import_plugins, left_by, occupied, resumed, unwritable
     from franka_wm.training.settings import RunSettings
 
     try:
@@ -165,7 +194,11 @@ def check_command(arguments: list[str]) -> str | None:
         if cfg.resume is not None:
             _, cfg = resumed(cfg, arguments)
         check_once(RunSettings.of(cfg, saved=cfg.resume is not None))
+        if folder is not None and cfg.resume is None:
+            left_by(folder, cfg)
+            return unwritable(folder, "hydra.sweep.dir")
     except FrankaError as error:
         return str(error)
     chosen = next((a.split("=", 1)[1] for a in arguments if a.startswith("hydra.run.dir=")), "outputs")
-    return unwritable(Path(chosen)) or occupied(Path(chosen), cfg.resume)
+    place = folder or Path(chosen)
+    return unwritable(place) or occupied(place, cfg.resume)

@@ -14,6 +14,7 @@ from typing import IO, NoReturn
 
 import torch
 from hydra.core.hydra_config import HydraConfig
+from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 from tensordict import TensorDictBase
 from torchrl.record.loggers import Logger
@@ -31,9 +32,10 @@ from franka_wm.training.check import check
 from franka_wm.training.checkpoint import Checkpoint, latest_checkpoint, load_checkpoint
 from franka_wm.training.demos import open_demonstrations
 from franka_wm.training.loggers import close_loggers, log_config, log_video, make_loggers
-from franka_wm.training.settings import RunSettings
+from franka_wm.training.settings import RunSettings, plain
 from franka_wm.training.spaces import Spaces
-from franka_wm.versions import write_finished, write_versions
+from franka_wm.untrusted import UntrustedFolder
+from franka_wm.versions import FINISHED, write_finished, write_versions
 
 INTERRUPTED = 130
 """Exit status after Ctrl-C, as shells expect."""
@@ -60,18 +62,18 @@ def import_plugins(names: Iterable[str]) -> None:
             ) from error
 
 
-def unwritable(folder: Path) -> str | None:
+def unwritable(folder: Path, option: str = "hydra.run.dir") -> str | None:
     """Why ``folder`` cannot be made or written, in one line; ``None`` if it can. Leaves nothing behind."""
     place = folder.absolute()
     while not place.exists():
         place = place.parent
     if not place.is_dir():
-        return f"hydra.run.dir={folder}: {place} is not a folder; choose another place for the results"
+        return f"{option}={folder}: {place} is not a folder; choose another place for the results"
     try:  # asking for permission is not enough: root has it everywhere
         with tempfile.TemporaryDirectory(dir=place) as probe:
             Path(probe, "probe").write_bytes(bytes(SMALL_FILES))
     except OSError as error:
-        return f"hydra.run.dir={folder}: {place} is not writable ({error.strerror}); choose another place"
+        return f"{option}={folder}: {place} is not writable ({error.strerror}); choose another place"
     return None
 
 
@@ -91,6 +93,35 @@ def occupied(folder: Path, resume: str | None) -> str | None:
         f"hydra.run.dir={folder}: a run has left its weights there ({found}); go on with it by resume={folder}, or "
         "choose another folder"
     )
+
+
+def left_by(folder: Path, cfg: DictConfig) -> str | None:
+    """What a job of a sweep finds of itself: ``"finished"``, ``"begun"`` with weights to go on from, or ``None``.
+
+    Raises:
+        UserError: The weights there are those of other settings.
+    """
+    try:
+        latest_checkpoint(folder)
+    except UserError:  # there is none
+        return None
+    there = _leaves(UntrustedFolder(folder).yaml("config.yaml"))
+    here = _leaves(plain(cfg))
+    other = next((k for k in {**here, **there} if k != "resume" and here.get(k) != there.get(k)), None)
+    if other is not None:
+        raise UserError(
+            f"{folder} holds a run of other settings: {other} is {there.get(other)} there and {here.get(other)} here; "
+            "choose another folder with hydra.sweep.dir=…"
+        )
+    return "finished" if (folder / FINISHED).is_file() else "begun"
+
+
+def _leaves(values: object, name: str = "") -> dict[str, object]:
+    """``{"env.fps": 20, …}`` of nested values."""
+    if not isinstance(values, dict) or not values:
+        return {name: values}
+    nested = [_leaves(value, f"{name}.{key}" if name else str(key)) for key, value in values.items()]
+    return {key: value for one in nested for key, value in one.items()}
 
 
 @dataclass
@@ -189,10 +220,12 @@ def start(cfg: DictConfig) -> Run:
         UserError: One line, before anything is built or written.
     """
     folder = Path(HydraConfig.get().runtime.output_dir)
-    checkpoint = None
+    checkpoint, again = None, False
     import_plugins(cfg.plugins)  # those of the command line: what a checkpoint names is never imported
     if cfg.resume is not None:
-        checkpoint, cfg = resumed(cfg, list(HydraConfig.get().overrides.task))
+        told = HydraConfig.get()
+        again = told.mode == RunMode.MULTIRUN and cfg.resume == str(folder)  # see `left_by`
+        checkpoint, cfg = resumed(cfg, [] if again else list(told.overrides.task))
     settings = RunSettings.of(cfg, saved=checkpoint is not None)
     if settings != _checked:
         check(settings)
@@ -205,8 +238,10 @@ def start(cfg: DictConfig) -> Run:
     problem = occupied(folder, settings.resume)  # also of a sweep, whose folders only Hydra knows
     if problem is not None:
         raise UserError(problem)
+    (folder / FINISHED).unlink(missing_ok=True)
     log_to(folder / "train.log")
-    OmegaConf.save(OmegaConf.create(dict(settings.values)), folder / "config.yaml")
+    if not again:
+        OmegaConf.save(OmegaConf.create(dict(settings.values)), folder / "config.yaml")
     write_versions(folder, device)
     say(f"device {device}   seed {settings.seed}   results in {folder}")
     return Run(settings, folder, checkpoint, open_loggers(settings, folder))

@@ -1,0 +1,131 @@
+"""``train.py --multirun``: its jobs are checked before the first begins, go on where they stopped, and fail alone."""
+
+from __future__ import annotations
+
+import gc
+import sys
+import traceback
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from hydra.core.hydra_config import HydraConfig
+from omegaconf import DictConfig
+
+from franka_wm import conf
+from franka_wm.console import log_anew, say
+from franka_wm.errors import REFUSALS, FrankaError, UserError, machine_refused
+
+
+@dataclass(frozen=True)
+class Job:
+    """One run of a sweep: its overrides, those for Hydra too, and its folder."""
+
+    overrides: list[str]
+    folder: Path
+
+
+def jobs(overrides: list[str]) -> list[Job]:
+    """The runs that Hydra will make of a command line, by its own rules; none where another sweeper decides.
+
+    Raises:
+        UserError: Two of them would write into one folder.
+    """
+    import hydra
+    from hydra._internal.core_plugins.basic_sweeper import BasicSweeper
+    from hydra.core.global_hydra import GlobalHydra
+    from hydra.core.override_parser.overrides_parser import OverridesParser
+
+    if any(one.startswith("hydra/sweeper=") for one in overrides):
+        return []
+    found: list[Job] = []
+    before = HydraConfig.instance().cfg
+    try:
+        with hydra.initialize_config_dir(str(conf.FOLDER), version_base="1.3"):
+            parser = OverridesParser.create(config_loader=GlobalHydra.instance().config_loader())
+            for own in BasicSweeper.split_arguments(parser.parse_overrides(overrides), None)[0]:
+                number = [f"hydra.job.num={len(found)}", f"hydra.job.id={len(found)}"]
+                cfg = hydra.compose("config", overrides=[*own, *number], return_hydra_config=True)
+                HydraConfig.instance().set_config(cfg)
+                found.append(Job(own, Path(str(cfg.hydra.sweep.dir), str(cfg.hydra.sweep.subdir))))
+    finally:
+        HydraConfig.instance().cfg = before
+        GlobalHydra.instance().clear()
+    folders = [job.folder for job in found]
+    for k, folder in enumerate(folders):
+        if folder in folders[:k]:
+            raise UserError(
+                f"jobs {folders.index(folder)} and {k} would both write into {folder}; "
+                "put ${hydra.job.num} into hydra.sweep.subdir"
+            )
+    return found
+
+
+def names(found: list[Job]) -> list[str]:
+    """What jobs are called: by their number, and by that in which they differ."""
+    common = set.intersection(*(set(job.overrides) for job in found)) if found else set()
+    own = [" ".join(one for one in job.overrides if one not in common) for job in found]
+    return [f"job {k} ({one})" if one else f"job {k}" for k, one in enumerate(own)]
+
+
+@dataclass
+class Sweep:
+    """What becomes of the jobs that this process runs; ``names`` are those of all that are known beforehand."""
+
+    names: list[str]
+    folder: str = ""
+    ran: int = 0
+    failed: list[str] = field(default_factory=list)
+
+    def run(self, main: Callable[[DictConfig], object], cfg: DictConfig) -> None:
+        """One job: skipped if it is done, gone on with if it was begun; if it fails, the others go on all the same.
+
+        Raises:
+            KeyboardInterrupt, SystemExit: Ctrl-C, which ends the sweep.
+        """
+        from franka_wm.training.run import left_by
+
+        told = HydraConfig.get()
+        number, folder = int(told.job.num), Path(told.runtime.output_dir)
+        name = self.names[number] if number < len(self.names) else f"job {number}"
+        self.folder = str(told.sweep.dir)
+        self.ran += 1
+        try:
+            left = None if cfg.resume is not None else left_by(folder, cfg)
+            if left == "finished":
+                say(f"{name} was finished before: {folder}")
+                return
+            if left is not None:
+                say(f"{name} goes on where it stopped")
+                cfg.resume = str(folder)
+            main(cfg)
+        except (KeyboardInterrupt, SystemExit):  # the latter is how a run ends that has saved after Ctrl-C
+            say(f"the sweep is stopped; {self.advice}")
+            raise
+        except Exception as error:
+            self.failed.append(f"{name}: {_in_words(error)}")
+            print(f"error: {self.failed[-1]}", file=sys.stderr, flush=True)
+        finally:
+            log_anew()
+            gc.collect()  # the next one needs the memory
+
+    @property
+    def advice(self) -> str:
+        """How to go on."""
+        return f"the same command with hydra.sweep.dir={self.folder} runs what is missing"
+
+    def outcome(self) -> str | None:
+        """In one line, which jobs failed, and why; ``None`` if none did."""
+        if not self.failed:
+            return None
+        reasons = "; ".join(self.failed)
+        return str(FrankaError(f"{len(self.failed)} of {self.ran} jobs failed: {reasons}; {self.advice}"))
+
+
+def _in_words(error: Exception) -> str:
+    if isinstance(error, FrankaError):
+        return str(error)
+    refused = machine_refused(error) if isinstance(error, REFUSALS) else None
+    if refused is None:  # a mistake of ours, or of a plugin
+        traceback.print_exc()
+    return refused or str(FrankaError(f"{type(error).__name__}: {error}"))

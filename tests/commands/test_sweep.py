@@ -1,0 +1,101 @@
+"""``python train.py --multirun``: what is refused before the first job, what a failure and Ctrl-C end, going on."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import time
+from pathlib import Path
+
+import pytest
+
+from forks import TRAIN, Fork, script, train_in_fork
+from franka_wm.training.checkpoint import latest_checkpoint, load_checkpoint
+
+SMOKE = [
+    "env=reach",
+    "scale=smoke",
+    "device=cpu",
+    "env.episode_length=12",
+    "env.substeps=1",
+    "trainer.updates=4",
+]
+SMALL = ["evaluation.episodes=2", "evaluation.video_episodes=0", "logger.names=[csv]"]
+BREAKS = "trainer.lr=1e30,1e-3"
+
+
+def sweep(place: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
+    return train_in_fork(
+        "--multirun", *SMOKE, *SMALL, *arguments, f"hydra.sweep.dir={place / 'sweep'}", cwd=place
+    )
+
+
+def state(place: Path) -> dict[Path, int]:
+    return {path: 0 if path.is_dir() else path.stat().st_mtime_ns for path in place.rglob("*")}
+
+
+@pytest.fixture(scope="module")
+def swept(tmp_path_factory) -> tuple[Path, subprocess.CompletedProcess[str]]:
+    """A sweep whose first job breaks: its folder, and what it said."""
+    place = tmp_path_factory.mktemp("sweep")
+    return place, sweep(place, BREAKS)
+
+
+def test_a_job_that_fails_does_not_end_the_others(swept) -> None:
+    place, done = swept
+    assert done.returncode == 1 and "Traceback" not in done.stderr, done.stderr
+    first, last = done.stderr.strip().splitlines()
+    assert first.startswith("error: job 0 (trainer.lr=1e+30): training broke: ")
+    assert last.startswith("error: 1 of 2 jobs failed: job 0 (trainer.lr=1e+30): training broke: ")
+    assert last.endswith(f"the same command with hydra.sweep.dir={place}/sweep runs what is missing")
+    assert (place / "sweep/1-reach/finished.json").is_file()
+    logs = [(place / "sweep" / job / "train.log").read_text() for job in ("0-reach", "1-reach")]
+    assert first in logs[0] and "training broke" not in logs[1]
+
+
+def test_the_same_sweep_again_runs_what_is_missing(swept) -> None:
+    """What is done is left alone, what was begun goes on, what failed is tried again."""
+    place, _ = swept
+    job = place / "sweep" / "1-reach"
+    (job / "finished.json").unlink()
+    done = sweep(place, BREAKS)
+    assert "job 1 (trainer.lr=0.001) goes on where it stopped" in done.stdout, done.stdout + done.stderr
+    assert done.returncode == 1 and "error: 1 of 2 jobs failed: job 0" in done.stderr
+    assert (job / "finished.json").is_file()
+    assert load_checkpoint(latest_checkpoint(job)).config.resume == str(job)
+    weights = state(job / "checkpoints")
+    done = sweep(place, BREAKS)
+    assert f"job 1 (trainer.lr=0.001) was finished before: {job}" in done.stdout, done.stdout + done.stderr
+    assert done.returncode == 1 and state(job / "checkpoints") == weights
+
+
+def test_a_job_is_refused_before_anything_is_written(swept, tmp_path: Path) -> None:
+    """Where a run of other settings is, what the settings refuse, and two jobs in one folder."""
+    place, _ = swept
+    before = state(place)
+    done = sweep(place, BREAKS, "seed=3")
+    assert done.returncode == 1 and state(place) == before
+    assert done.stderr.startswith("error: job 1 (trainer.lr=0.001): ") and done.stderr.count("\n") == 1
+    assert "1-reach holds a run of other settings: seed is 0 there and 3 here" in done.stderr
+
+    done = sweep(tmp_path, "planner.num_elites=8,0")
+    assert done.stderr.startswith("error: job 1 (planner.num_elites=0): planner.num_elites=0: ")
+    done = sweep(tmp_path, "seed=0,1", "hydra.sweep.subdir=one")
+    assert "jobs 0 and 1 would both write into" in done.stderr and done.stderr.count("\n") == 1
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_ctrl_c_ends_the_sweep(tmp_path: Path) -> None:
+    command = [*SMOKE, *SMALL, "trainer.updates=1000000", "trainer.log_every=0.2", "seed=0,1"]
+    work = script(TRAIN, "--multirun", *command, f"hydra.sweep.dir={tmp_path}/sweep")
+    fork = Fork(work, cwd=tmp_path, log=tmp_path / "log")
+    ends = time.monotonic() + 120
+    while "\nupdates" not in fork.said()[0] and time.monotonic() < ends:
+        time.sleep(0.05)
+    os.kill(fork.pid, signal.SIGINT)
+    done = fork.wait(60)
+    assert done.returncode == 130 and "Traceback" not in done.stderr, done.stdout + done.stderr
+    assert f"hydra.sweep.dir={tmp_path}/sweep runs what is missing" in done.stdout
+    assert latest_checkpoint(tmp_path / "sweep" / "0-reach")
+    assert not (tmp_path / "sweep" / "1-reach").exists()
