@@ -8,7 +8,7 @@ from pathlib import Path
 
 from omegaconf import OmegaConf
 
-from franka_wm.data.lerobot.card import model_card
+from franka_wm.data.lerobot.card import FILM, model_card
 from franka_wm.data.lerobot.hub import check_repo_id
 from franka_wm.data.lerobot.paths import shortened, without_paths
 from franka_wm.data.lerobot.publish import README, publish_staged
@@ -79,6 +79,8 @@ def stage_model(checkpoint: Path, place: Path, *, repo_id: str, license: str) ->
         _copy_json(source, place / "evaluation.json")
     if (text := files.text(f"{written}evaluation.md")) is not None:
         (place / "evaluation.md").write_text(shortened(text), encoding="utf-8")
+    if film := files.path(FILM):
+        shutil.copyfile(film, place / FILM)
     card = model_card(place, repo_id=repo_id, license=license)
     (place / README).write_text(card, encoding="utf-8")
     return place

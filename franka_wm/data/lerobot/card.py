@@ -29,6 +29,8 @@ _CITATION = """```bibtex
 ```"""
 
 
+FILM = "video.mp4"
+"""Of a published model's episodes, in its folder."""
 VISUALIZER = "https://huggingface.co/spaces/lerobot/visualize_dataset?path="
 """LeRobot's page that plays the episodes of a public dataset."""
 
@@ -225,6 +227,9 @@ def model_card(folder: Path, *, repo_id: str, license: str) -> str:
     counters = linked_json(folder / "counters.json")
     evaluation = folder / "evaluation.md"
     table = evaluation.read_text(encoding="utf-8") if evaluation.is_file() else "Not evaluated."
+    if (folder / FILM).is_file():
+        place = f"https://huggingface.co/{repo_id}/resolve/main/{FILM}"
+        table = f'<video src="{place}" autoplay loop muted controls></video>\n\n{table}'
     head = ModelCardData(
         license=license,
         library_name="franka_wm",

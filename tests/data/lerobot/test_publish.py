@@ -15,6 +15,7 @@ import pytest
 import torch
 from huggingface_hub import DatasetCard
 from omegaconf import OmegaConf
+from PIL import Image
 
 from franka_wm.data.lerobot import card as cards
 from franka_wm.data.lerobot.card import IMAGE
@@ -132,6 +133,8 @@ def test_a_dry_run_sends_nothing_and_writes_the_card(hub, publish, dataset, tmp_
         assert text in done.stdout
     place = tmp_path / "outputs" / "publish" / "user--arm"
     assert set(contents(place)) == {"README.md", IMAGE}
+    with Image.open(place / IMAGE) as moving:
+        assert moving.n_frames > 1
     card = (place / "README.md").read_text()
     loaded = DatasetCard(card)
     assert (loaded.data.license, loaded.data.task_categories) == ("apache-2.0", ["robotics"])
@@ -327,6 +330,7 @@ def run_folder(tmp_path):
         extra={"spaces": {"action_dim": 2}},
     )
     (tmp_path / "run" / "evaluation.md").write_text("| policy | distance |\n|---|---|\n| planner | 1 cm |\n")
+    (tmp_path / "run" / "video.mp4").write_bytes(b"a film")
     return tmp_path / "run", model
 
 
@@ -346,8 +350,13 @@ def test_a_model_goes_without_what_only_training_needs(hub, publish, run_folder,
         "extra.safetensors",
         "manifest.json",
         "model.safetensors",
+        "video.mp4",
     }
     assert "planner | 1 cm" in repo["files"]["README.md"].decode()
+    assert (
+        'src="https://huggingface.co/user/model/resolve/main/video.mp4"'
+        in repo["files"]["README.md"].decode()
+    )
     assert b"someone" not in b"".join(repo["files"].values())
     assert "a simulated Franka arm" in repo["files"]["README.md"].decode()
     there = tmp_path / "there"
