@@ -78,7 +78,7 @@ COEFFICIENT = Bounds(least=0, most=1e6)
 
 
 LARGEST = 3e38
-"""Of all finite numbers: what float32 holds."""
+"""Largest finite number: what float32 holds."""
 
 
 def is_whole(value: Any) -> TypeGuard[int]:
@@ -165,7 +165,7 @@ def read[T](cls: type[T], values: Any, prefix: str) -> T:
     Args:
         cls: A dataclass whose fields are options of this module.
         values: Name → value; a name that is missing has the field's default.
-        prefix: Of the options' names, for messages.
+        prefix: Prefix of the options' names, for messages.
 
     Raises:
         UserError: No mapping, an unknown or missing name, or a value of another type or out of range.
@@ -208,8 +208,8 @@ def check_arguments(
     Args:
         cls: A class, whose bases' constructors count as well, or a function that makes one.
         values: Name → value. Names that are no parameters are not looked at: see :func:`check_names`.
-        prefix: Of the options' names, for messages.
-        bounds: Of parameters that are numbers.
+        prefix: Prefix of the options' names, for messages.
+        bounds: Bounds of parameters that are numbers.
 
     Raises:
         UserError: A value of another type, or out of bounds.

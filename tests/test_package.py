@@ -146,3 +146,11 @@ def test_the_wheel_takes_every_file_of_the_package() -> None:
     patterns = [*project["tool"]["setuptools"]["package-data"]["*"], "*.py"]
     files = [path for path in (ROOT / "franka_wm").rglob("*") if path.is_file() and path.suffix != ".pyc"]
     assert not [str(path) for path in files if not any(path.match(one) for one in patterns)]
+
+
+def test_docstrings_begin_with_a_noun_or_a_verb() -> None:
+    """Not ``seed: Of the run.``: a reader of one line must know what it is."""
+    begins = re.compile(r'"""Of |^\s+\w+(, \w+)*: Of ')
+    files = sorted((Path(franka_wm.__file__).parent).rglob("*.py"))
+    lines = [(file, line) for file in files for line in file.read_text(encoding="utf-8").splitlines()]
+    assert not [f"{file.name}: {line.strip()}" for file, line in lines if begins.search(line)]

@@ -95,13 +95,13 @@ def open_source(
     """Build the worlds and the policy.
 
     Args:
-        name: Of the policy, or where an agent is.
+        name: Name of the policy, or place of an agent.
         checkpoint: The agent, if ``name`` is one of its parts.
-        overrides: Of the configuration of train.py; of an agent's, ``env.KEY=VALUE``, ``seed`` and ``device`` alone.
+        overrides: Changes of train.py's configuration; of an agent's, ``env.KEY=VALUE``, ``seed`` and ``device`` alone.
         episodes: How many will be played.
         num_envs: Worlds at once.
-        format: Of the dataset's images.
-        noise: Of the expert's actions.
+        format: Format of the dataset's images.
+        noise: Noise of the expert's actions.
 
     Raises:
         UserError: One line, for what cannot be built.

@@ -25,7 +25,7 @@ class Hindsight:
         relabel: The task's, see `franka_wm.envs.tasks.Task.relabel`.
         achieved: Name and columns of the observation that holds the place reached [m].
         reads: Observations that `relabel` and `achieved` need.
-        share: Of the windows of a batch, in [0, 1].
+        share: Share of the windows of a batch, in [0, 1].
         episode_length: Steps of an episode, at most: how far to look ahead.
     """
 
@@ -55,7 +55,7 @@ class Hindsight:
         Args:
             batch: Windows (B, H) that were read from `data`.
             data: The storage, (time, worlds).
-            time, world: Of each step of the windows, (B, H).
+            time, world: Time and world of each step of the windows, (B, H).
             newest: Time of the step that was written last.
         """
         capacity, device = data.shape[0], time.device

@@ -159,7 +159,7 @@ class WindowReplay(ReplayBuffer):
     Args:
         hindsight: Relabels each batch in place; ``None``: batches are as they were gathered.
         demonstrations: Replace windows in place; ``None``: batches are of this buffer alone.
-        options: Of TorchRL's buffer.
+        options: Options of TorchRL's buffer.
     """
 
     def __init__(

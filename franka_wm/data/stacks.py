@@ -17,7 +17,7 @@ from torchrl.data import LazyTensorStorage
 from franka_wm.errors import UserError
 
 CHANNELS = 3
-"""Of one image; stacks are of colours alone."""
+"""Channels of one image; stacks are of colours alone."""
 
 BOUNDARY = "is_init"
 """Key of the flag that marks the first step of an episode."""
@@ -70,7 +70,7 @@ class StackStorage(LazyTensorStorage):
         """Steps with their stacks; no operation waits for the device.
 
         Args:
-            time, world: Of each step, of equal shape; none of the oldest ``frame_stack - 1`` times that are kept.
+            time, world: Indices of steps, of equal shape; none of the oldest ``frame_stack - 1`` times that are kept.
         """
         data: Any = self._storage
         batch = data[time, world]

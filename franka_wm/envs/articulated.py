@@ -37,14 +37,14 @@ class Articulated(Solid):
         size: Length (front to back), width, height of the case, with its front [m].
         handle: Distance of the bar's middle from the front, thickness and height of the bar [m].
         travel: How far it opens: metres of a drawer, radians of a door.
-        mass: Of what moves [kg].
+        mass: Mass of what moves [kg].
         joint_friction: Dry friction of the joint, N of a drawer, N·m of a door.
         joint_damping: N·s/m of a drawer, N·m·s/rad of a door.
         at: Middle of where the case stands, (x, y) [m].
         angle: Where its front looks to, around the vertical axis [rad].
         spread: Half-width of the uniform draw around ``at`` in x and y [m].
         turn: Half-width of the draw around ``angle`` [rad].
-        color: Of what moves; the case has :attr:`case_color`.
+        color: Colour of what moves; the case has :attr:`case_color`.
     """
 
     kind: str = "drawer"
@@ -215,7 +215,7 @@ class Articulated(Solid):
         ]
 
     def corners(self, x: float, y: float, angle: float) -> list[tuple[float, float]]:
-        """Of the case where it stands so [m]."""
+        """Corners of the case where it stands so [m]."""
         cos, sin = math.cos(angle), math.sin(angle)
         a, b = 0.5 * self.size[0], 0.5 * self.size[1]
         return [

@@ -84,7 +84,7 @@ class FrankaConfig:
         home: Joint angles at the start, before noise [rad]. ``None``: the task's.
         reward: ``"dense"`` (−tanh distance), ``"sparse"`` (1 where solved, else 0) or ``"normalized"`` (the part
             of the episode's initial distance that has been closed, at least −1); all minus the action penalty.
-        track_radius, track_period: Of the circle [m] and of one turn [s], for ``task="track"``.
+        track_radius, track_period: Radius of the circle [m] and time of one turn [s], for ``task="track"``.
         cameras: Which of ``("front", "side", "wrist")`` the image observations come from. The first one's keys
             are ``pixels``, ``depth``, …; another's ``pixels_wrist``, …. ``side`` is ``front`` a quarter turn
             around the base's vertical axis: it sees the depth that the front camera cannot.

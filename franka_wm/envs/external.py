@@ -34,8 +34,8 @@ class ExternalConfig:
 
     Attributes:
         kind: ``gym`` or ``dm_control``.
-        name: Of Gymnasium's environment, or the suite's domain.
-        task: Of the suite's domain; not for Gymnasium.
+        name: Name of Gymnasium's environment, or the suite's domain.
+        task: Task of the suite's domain; not for Gymnasium.
         episode_length: Steps after which an episode is truncated, action repeats counted once.
         frame_skip: Simulator steps for each action; rewards are summed.
         observations: Key that models read → the wrapper's keys, concatenated in this order. Empty: every vector, in
@@ -66,7 +66,7 @@ class ExternalEnv(TransformedEnv):
     Args:
         config: Which environment.
         num_envs: Copies, N.
-        seed: Of all copies.
+        seed: Seed of all copies.
         device: Where the TensorDicts live; the simulators stay on the CPU.
 
     Raises:

@@ -86,7 +86,7 @@ class FrankaEnv(EnvBase):
         config: The arm and its task; :class:`FrankaConfig` lists every field.
         num_envs: Number of worlds, N ≥ 1.
         device: ``None`` or ``"auto"`` (GPU where there is one), ``"cpu"``, ``"cuda"``, ``"cuda:K"``.
-        seed: Of all randomness. ``None``: one that no other instance has (:func:`own_seed`), so that the
+        seed: Seed of all randomness. ``None``: one that no other instance has (:func:`own_seed`), so that the
             environments of a ``SerialEnv`` or ``ParallelEnv`` play different episodes.
         urdf_path: A robot of your own.
         task: A task of your own (:class:`~franka_wm.envs.tasks.Task`); the config's if not given.
@@ -427,7 +427,7 @@ class FrankaEnv(EnvBase):
 
         Args:
             actions: (N, T, 7).
-            seed: Of the reset.
+            seed: Seed of the reset.
 
         Returns:
             ``state`` (N, T + 1, 20), ``joint_q`` (N, T + 1, 7), ``tool`` (N, T + 1, 3), ``reward`` (N, T, 1),

@@ -138,7 +138,7 @@ class FrankaVectorEnv(gymnasium.vector.VectorEnv):
         """Starts new episodes.
 
         Args:
-            seed: Of all worlds: world k draws from (seed, k). A list (s, s + 1, …, s + N − 1), which is what
+            seed: Seed of all worlds: world k draws from (seed, k). A list (s, s + 1, …, s + N − 1), which is what
                 Gymnasium makes of a number s, is taken as s; worlds have no seeds of their own.
             options: ``reset_mask`` (N,) bool resets those worlds only. Other keys are ignored.
         """

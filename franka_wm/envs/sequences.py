@@ -31,7 +31,7 @@ def smooth_actions(
     Args:
         num_sequences, length, action_dim: Shape of the result.
         smoothness: s in [0, 1); 0 is white noise.
-        device: Of the result.
+        device: Device of the result.
         generator: Source of randomness.
 
     Returns:
@@ -72,8 +72,8 @@ def franka_sequences(
         env: The arm. Images come if it observes ``pixels``.
         n_sequences: Sequences wanted, n ≥ 1.
         length: Frames of each, T ≥ 2; at most ``episode_length + 1``.
-        seed: Of actions, poses and goals.
-        smoothness: Of the actions, in [0, 1): see :func:`smooth_actions`.
+        seed: Seed of actions, poses and goals.
+        smoothness: Smoothness of the actions, in [0, 1): see :func:`smooth_actions`.
         max_attempts: Gives up after so many times the batches that would do if none were discarded.
 
     Returns:

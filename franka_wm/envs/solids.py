@@ -46,11 +46,11 @@ class Solid:
     """A shape that is touched and seen.
 
     Attributes:
-        name: Of letters, digits and _; each only once in a scene.
+        name: Letters, digits and _; each only once in a scene.
         shape: ``box``, ``cylinder``, ``sphere``, ``capsule``, ``socket`` or ``mesh``; round ones stand upright.
         size: As :data:`SIZES` says [m]; of a mesh that of the box around it, whose middle is the solid's place.
-        file: Of a mesh: a closed surface (OBJ, STL or PLY), its z up. It is drawn; its convex hull is touched.
-        scale: Of a mesh: metres per unit of the file, one number or one along each of x, y and z.
+        file: File of a mesh: a closed surface (OBJ, STL or PLY), its z up. It is drawn; its convex hull is touched.
+        scale: Scale of a mesh: metres per unit of the file, one number or one along each of x, y and z.
         friction: Coefficient of sliding friction; of two solids that touch, the larger one counts. The fingers' is 1.
         color: Red, green, blue, from 0 to 1.
     """
@@ -115,7 +115,7 @@ class Solid:
 
     @property
     def surface(self) -> Surface:
-        """Of a mesh."""
+        """Surface of a mesh."""
         assert self.file is not None and isinstance(self.scale, tuple)  # seen to at the start
         return read_surface(self.file, self.scale)
 
@@ -148,7 +148,7 @@ class Solid:
 
     @property
     def radius(self) -> float:
-        """Of the upright cylinder that holds it [m]."""
+        """Radius of the upright cylinder that holds it [m]."""
         if self.shape == "socket":
             return 0.5 * math.hypot(self.size[0], self.size[0])
         return 0.5 * math.hypot(*self.size[:2]) if self.shape in ("box", "mesh") else self.size[0]

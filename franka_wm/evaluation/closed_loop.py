@@ -68,7 +68,7 @@ def play_episodes(
     Args:
         env: Its number of worlds is the number of episodes.
         policy: Run without exploration, its model in evaluation mode.
-        seed: Of the episodes' poses and goals.
+        seed: Seed of the episodes' poses and goals.
         episodes: Fewer than there are worlds: the first ones. Nothing is decided for the others.
         video: Called before every step, to take an image; after the last one the worlds have been reset.
 
@@ -223,7 +223,7 @@ def decision_times(
     The device is waited for before and after each decision; the environment's own step is not counted.
 
     Args:
-        seed: Of the episodes.
+        seed: Seed of the episodes.
         decisions: How many to measure.
         warm_up: How many before that, not measured.
 

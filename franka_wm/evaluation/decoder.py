@@ -83,8 +83,8 @@ def train_decoder(
         latents: (n, D).
         images: (n, S, S, 3) uint8, S as in :data:`SIZES`.
         steps: Updates; 600 take some 10 to 20 s on two CPU cores at 64 × 64.
-        batch_size, lr: Of Adam, with a cosine to 0.
-        seed: Of weights and batches.
+        batch_size, lr: Batch size and learning rate of Adam, with a cosine to 0.
+        seed: Seed of weights and batches.
 
     Returns:
         In evaluation mode.
@@ -154,7 +154,7 @@ def imagined_beside_real(
 
     Args:
         model: With ``next``, and ``embed`` where the family has it: the decoder reads what it gives.
-        decoder: Of :func:`train_decoder`.
+        decoder: Decoder of :func:`train_decoder`.
         latent: (Z), at the first image.
         actions: (H, A), or (H) discrete ones, that were taken.
         images: (H + 1, S, S, 3) uint8, what happened.

@@ -52,7 +52,7 @@ EPISODES = 48
 """Held-out episodes of the diagnostics, at most; half of them random, half the model's own."""
 
 SHOWN = 48
-"""Of how many of them images are taken."""
+"""Number of them whose images are taken."""
 
 HORIZON = 10
 POINTS = 600

@@ -31,7 +31,7 @@ def training_diagnostics(model: WorldModel, batch: TensorDictBase) -> dict[str, 
     Changes nothing: neither the model's mode and statistics nor torch's random numbers. Waits for the device.
 
     Args:
-        model: Of any family.
+        model: Model of any family.
         batch: Windows [B, H], as ``loss`` takes them.
 
     Returns:
@@ -129,7 +129,7 @@ def paired_gain(planner: TensorDictBase, prior: TensorDictBase) -> dict[str, obj
     """What planning really gains: the difference of returns over the same episodes.
 
     Args:
-        planner, prior: Of :func:`~franka_wm.evaluation.closed_loop.play_episodes` with the same seeds.
+        planner, prior: Episodes of :func:`~franka_wm.evaluation.closed_loop.play_episodes` with the same seeds.
 
     Returns:
         ``return``: mean difference with its 95 % bootstrap interval over pairs; for the arm also

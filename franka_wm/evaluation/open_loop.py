@@ -118,7 +118,7 @@ def grouped_spearman(
         x, y: (n,), n ≥ 4.
         groups: (n, 2) the episodes, from 0, that the two states of each pair are from.
         resamples: How many.
-        seed: Of the draw.
+        seed: Seed of the draw.
 
     Returns:
         In [−1, 1]; NaN where one of them never varies. Pairs of a single episode have no spread: low = mean = high.
@@ -192,8 +192,8 @@ def cost_ranks(
         positions: (E, T, 3), the tool [m].
         embed: What costs are measured on.
         valid: (E, T) bool, which states to use.
-        pairs: Of each kind.
-        seed: Of the draw.
+        pairs: Number of pairs of each kind.
+        seed: Seed of the draw.
 
     Returns:
         ``across``: pairs from anywhere; ``within``: pairs of one episode, which share its goal, as the states that
@@ -224,7 +224,7 @@ def value_calibration(predicted: Tensor, returns: Tensor, *, bins: int = 10) -> 
     Args:
         predicted: (n,).
         returns: (n,), true.
-        bins: Of equal count along the prediction, for the curve.
+        bins: Number of bins of equal count along the prediction, for the curve.
 
     Returns:
         ``slope`` and ``intercept`` of the line return = slope · value + intercept: 1 and 0 for an exact value;

@@ -143,7 +143,7 @@ def probe(
         targets: Name → (E, T, K).
         valid: (E, T) bool, which steps to use; all if not given.
         neighbours: k of the nearest-neighbour probe.
-        seed: Of the split of episodes.
+        seed: Seed of the split of episodes.
 
     Returns:
         Name → ``ridge`` and ``neighbours``, both R² on the test episodes; ``None`` where the target does not vary.

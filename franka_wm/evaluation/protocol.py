@@ -54,7 +54,7 @@ class Evaluation:
     Attributes:
         policies: Name → summary, the content of ``evaluation.json``; the same twice on a CPU.
         episodes: Name → one row per episode, to compare policies pair by pair.
-        seeds: Of the episodes.
+        seeds: Seeds of the episodes.
         seconds: Name → median time of a decision for all worlds at once [s]; depends on the machine.
         worlds: How many that is.
         protocol: How it was measured, of a run: what :func:`protocol` says.
@@ -144,11 +144,11 @@ def protocol(
     """How it was measured, for whoever reads the numbers later: ``protocol`` of ``evaluation.json``.
 
     Args:
-        settings: Of the run.
+        settings: Settings of the run.
         env: Evaluation worlds.
         evaluation: What was found.
         by: Who measured: :data:`~franka_wm.evaluation.results.END` or :data:`~franka_wm.evaluation.results.COMMAND`.
-        counters: Of the training: ``updates``, ``env_steps``, ``seconds``.
+        counters: Counters of the training: ``updates``, ``env_steps``, ``seconds``.
     """
     distance = success_distance(env)
     return {
@@ -225,8 +225,8 @@ def evaluate_run(
     """The end of a run: every policy over the same held-out episodes, and ``evaluation.json`` in the run's folder.
 
     Args:
-        settings: Of the run.
-        folder: Of the run.
+        settings: Settings of the run.
+        folder: Folder of the run.
         env: Evaluation worlds; as many episodes.
         policies: By name.
         counters: ``updates``, ``env_steps``, ``seconds`` of the training.

@@ -83,7 +83,7 @@ def robustness(
     Poses and goals depend on the seed alone, so every episode is compared with itself in the unshifted world.
 
     Args:
-        agent: Of :func:`franka_wm.training.load.load_agent`; of the arm.
+        agent: Agent of :func:`franka_wm.training.load.load_agent`; of the arm.
         episodes: Worlds, at least 2.
         shifts: By name; those that change images alone are left out for models that read none.
         policies: Names; the planner (or the policy where there is none) and ``ik``, which shows what the shift

@@ -73,11 +73,11 @@ def gather_episodes(
     Args:
         env: E worlds.
         policy: Run without exploration, its model in evaluation mode.
-        seed: Of the episodes and of all random numbers: the same call gives the same numbers on a CPU.
+        seed: Seed of the episodes and of all random numbers: the same call gives the same numbers on a CPU.
         steps: T, at most an episode's length; that if not given.
         keys: Observations to keep.
         image_size: Side of the images to render [px].
-        images: Of how many worlds, the first ones; the arm only.
+        images: Number of worlds whose images are kept, the first ones; the arm only.
 
     Returns:
         Batch size (E, T). Root: ``keys``, ``action``, ``is_init``, ``valid`` (E, T) bool (step of the first

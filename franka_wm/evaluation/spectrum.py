@@ -123,7 +123,7 @@ def collapse_warning(statistics: Mapping[str, float]) -> str | None:
     line (``effective_rank`` below :data:`FEW_DIRECTIONS`, of at least 4 dimensions).
 
     Args:
-        statistics: Of :func:`latent_statistics`, or those of
+        statistics: Statistics of :func:`latent_statistics`, or those of
             :func:`franka_wm.evaluation.health.training_diagnostics`, whose keys begin with ``latent/``.
     """
 

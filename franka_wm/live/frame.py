@@ -19,9 +19,9 @@ class Frame:
         path: Tool positions that the plan commands (H + 1, 3) [m]; None where the policy has no plan.
         contacts: Where things touched at the last step's end (C, 7): point [m], normal, force along it [N]; None where
             nobody asked, and after something was set by hand.
-        reward: Of the last step; 0.0 before the first.
+        reward: Reward of the last step; 0.0 before the first.
         distance: From tool to goal, at the last step's end, before any reset [m].
-        success: Of the last step.
+        success: Success of the last step.
         decision: Time that the policy took for the last step [s].
         recording: Steps recorded so far; None where nothing is recorded.
         recording_full: Whether the recording has come to its end by itself: further steps are not in it.

@@ -67,8 +67,8 @@ def move_object(arm: FrankaEnv, name: str, point: Sequence[float]) -> TensorDict
 
     Args:
         arm: One world.
-        name: Of the object.
-        point: Of its centre (x, y, z) [m]; where it would sink into the table, it is put onto it.
+        name: Name of the object.
+        point: Place of its centre (x, y, z) [m]; where it would sink into the table, it is put onto it.
 
     Returns:
         What the world observes now, as a reset does.

@@ -95,7 +95,7 @@ class DatasetRecorder(Recorder):
 
     Args:
         env: The world, with its transforms.
-        seed: Of the session.
+        seed: Seed of the session.
         policy: Who acts at the start, for the dataset's provenance.
         format: How images are stored; see :data:`~franka_wm.data.lerobot.schema.FORMATS`.
         most: Steps after which it is full.

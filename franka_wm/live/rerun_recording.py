@@ -52,7 +52,7 @@ def record_episode(
         policies: By name.
         path: Ends in .rrd; its folder is made.
         policy: Who acts; see :class:`~franka_wm.live.session.Session`.
-        seed: Of the pose and the goal.
+        seed: Seed of the pose and the goal.
         steps: How many; the episode's length if not given. The recording ends with the episode, whose last step
             is not in it where the environment restarts by itself; a longer `episode_length` avoids that.
 

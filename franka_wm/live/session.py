@@ -49,7 +49,7 @@ class Session:
         env: One world: :class:`~franka_wm.envs.FrankaEnv`, or transforms around one.
         policies: By name; TensorDict modules that write ``action``.
         policy: Who acts first; ``planner``, ``ik`` or ``noop``, whichever there is, if not given.
-        seed: Of poses and goals.
+        seed: Seed of poses and goals.
         keep_goal: Whether a goal set by hand outlives the episode.
 
     Raises:

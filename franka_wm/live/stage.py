@@ -45,10 +45,10 @@ class Options:
     Attributes:
         checkpoint: A run's folder, a checkpoint, or ``hf:user/name``; ``None``: the arm without an agent.
         policy: Who acts first.
-        port: Of the page on this machine; 0 takes a free one.
+        port: Port of the page on this machine; 0 takes a free one.
         out: Where recordings go.
         seconds: Ends after so long.
-        seed, device: Of the world.
+        seed, device: Seed and device of the world.
         rerun: File for the Rerun viewer instead of a page.
         env: Fields of the environment's configuration to change.
     """

@@ -32,7 +32,7 @@ METRES_PER_NEWTON, LONGEST_FORCE = 0.01, 0.2
 """Length of the line that stands for a force, to each side of its point [m/N], and its most [m]. On both sides, or what
 touches would hide it."""
 DARKEST = 44
-"""Of a shape's red, green and blue: in black, shading shows no form."""
+"""Least red, green and blue of a shape: in black, shading shows no form."""
 
 
 class ViserScene:
@@ -210,7 +210,7 @@ class ViserScene:
 
 
 def handle_name(name: str) -> str:
-    """Of the handle that drags an object."""
+    """Name of the handle that drags an object."""
     return f"/objects/{name}"
 
 

@@ -117,7 +117,7 @@ def divergence(p: Tensor, q: Tensor) -> Tensor:
 
 
 EPS = 1e-4
-"""Of the normalisations, as published."""
+"""Epsilon of the normalisations, as published."""
 
 
 class BlockLinear(nn.Module):

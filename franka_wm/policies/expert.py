@@ -17,12 +17,12 @@ from franka_wm.policies.scripted import ScriptedPolicy
 from franka_wm.seeding import restore_generator
 
 FAST, SLOW = 0.5, 0.15
-"""Of the hand [m/s]: on its way, and within :data:`NEAR` of where it shall be."""
+"""Speed of the hand [m/s]: on its way, and within :data:`NEAR` of where it shall be."""
 NEAR = 0.04
 QUIET = 0.25
 """Nearer than this to where the hand shall be its noise fades [m]: on the way it strays, but grasps with care."""
 TURN = 2.0
-"""Of the hand around the vertical axis [rad/s]."""
+"""Speed of the hand around the vertical axis [rad/s]."""
 
 
 class ExpertPolicy(ScriptedPolicy):

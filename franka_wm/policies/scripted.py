@@ -44,7 +44,7 @@ class SmoothRandomPolicy(ScriptedPolicy):
     """First-order autoregressive random actions in [−1, 1], started anew where an episode starts.
 
     Args:
-        action_dim: Of the environment.
+        action_dim: Size of the environment's actions.
         smoothness: Correlation of successive actions, in [0, 1).
         generator: Source of randomness.
     """

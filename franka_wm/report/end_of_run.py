@@ -40,8 +40,8 @@ def report_run(
     Writes ``evaluation.md``, ``curves.png`` and, of the arm, ``video.mp4`` and ``last_frame.png`` into ``folder``.
 
     Args:
-        settings: Of the run.
-        folder: Of the run; :func:`~franka_wm.evaluation.protocol.evaluate_run` has written its results there.
+        settings: Settings of the run.
+        folder: Folder of the run; :func:`~franka_wm.evaluation.protocol.evaluate_run` has written its results there.
         env: Evaluation worlds.
         policies: By name.
         found: What they reached.

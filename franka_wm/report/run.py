@@ -60,7 +60,7 @@ class RunFiles:
 
     @property
     def policies(self) -> Mapping[str, Mapping[str, Any]]:
-        """Of the result that is shown: name -> numbers and intervals."""
+        """Policies of the result that is shown: name -> numbers and intervals."""
         return self.results[0].policies if self.results else {}
 
     @property

@@ -37,7 +37,7 @@ class Learner:
         precision: ``float32``, or ``bfloat16``: the loss runs under autocast, weights and optimiser stay float32.
         schedule: ``constant``, or ``cosine``: down to zero at ``total_updates``.
         warmup: Updates over which the learning rate rises from zero.
-        total_updates: Of the run; needed by ``cosine``.
+        total_updates: Updates of the whole run; needed by ``cosine``.
     """
 
     EAGER_UPDATES = 4

@@ -33,11 +33,11 @@ class Agent:
     """What a checkpoint holds, ready to act.
 
     Attributes:
-        folder: Of the checkpoint.
+        folder: Folder of the checkpoint.
         settings: Those it was trained with; ``device`` is the one in use now.
         env: Evaluation worlds.
         model: In evaluation mode.
-        planner: Of the family; ``None`` where the model has no dynamics.
+        planner: Planner of the family; ``None`` where the model has no dynamics.
         policies: By name, as :func:`franka_wm.training.build.make_policies` makes them.
         counters: ``updates``, ``env_steps``, ``seconds``.
     """
@@ -66,7 +66,7 @@ def load_agent(
         num_envs: Evaluation worlds; the configuration's ``evaluation.episodes`` if not given.
         device: ``auto``, ``cpu``, ``cuda``, ``cuda:K``.
         env_changes: Fields of the environment's configuration to change.
-        seed: Of the environment and the policies; the run's if not given.
+        seed: Seed of the environment and the policies; the run's if not given.
 
     Raises:
         UserError: One line: no checkpoint, a damaged one, or one whose environment cannot be built here.

@@ -85,7 +85,7 @@ class Spaces:
 
     @classmethod
     def of_config(cls, config: FrankaConfig, *, discrete: bool = False) -> Spaces:
-        """Of the arm, before it is built."""
+        """Spaces of the arm, before it is built."""
         image_keys = [key for key in config.observations if key in IMAGES]
         names = {key: image_names(key, config) for key in image_keys}
         channels = {"depth": 1, "segmentation": 1, "pixels": 3 * config.frame_stack}
@@ -112,7 +112,7 @@ class Spaces:
 
     @classmethod
     def of_env(cls, env: Environment) -> Spaces:
-        """Of an environment that is there."""
+        """Spaces of an environment that is there."""
         vectors, images = {}, {}
         for key, spec in env.observation_spec.items():
             shape = spec.shape[1:]

@@ -33,7 +33,7 @@ def pretrain(
         run: Gets the second stage's settings, which start from what was learned here, and from no checkpoint.
         env: The training worlds; ``None`` on recorded data.
         experience: Recorded windows; not used where there are worlds.
-        spaces: Of observations and actions.
+        spaces: Sizes of observations and actions.
     """
     settings = run.settings
     begun = run.checkpoint if run.checkpoint is not None and "whole_run" in run.checkpoint.config else None

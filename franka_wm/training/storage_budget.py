@@ -29,7 +29,7 @@ SPARE = 5e8
 
 
 PER_WORLD = 1e4
-"""Of a simulated world at the very least [bytes]."""
+"""Memory of a simulated world at the very least [bytes]."""
 
 
 def check_memory(run: RunSettings, model: torch.nn.Module, spaces: Spaces) -> None:
@@ -122,8 +122,8 @@ def reason_to_leave_out(size: int, folder: Path, *, last: bool, wanted: bool | N
     """Why a checkpoint in ``folder`` is written without ``size`` bytes of experience, in a line; ``None``: it is not.
 
     Args:
-        size: Of the experience [bytes].
-        folder: Of the run; need not exist yet.
+        size: Size of the experience [bytes].
+        folder: Folder of the run; need not exist yet.
         last: Whether the run ends with this checkpoint.
         wanted: ``trainer.checkpoint_replay``; ``None``: unless there is much of it.
     """

@@ -53,8 +53,8 @@ class Trainer:
         replay: Receives (worlds, time) batches, gives windows; or recorded windows.
         policies: By name, for the training worlds alone; ``random`` gathers the first steps, ``actor`` the rest.
         actor: Which of them acts.
-        settings: Of the run; saved with every checkpoint.
-        folder: Of the run.
+        settings: Settings of the run; saved with every checkpoint.
+        folder: Folder of the run.
         loggers: TorchRL loggers.
         evaluate: Called now and then with nothing, returns numbers to log. What it and ``diagnose`` draw at random
             comes from generators of their own: they do not change what is learned.

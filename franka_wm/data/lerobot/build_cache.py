@@ -19,7 +19,7 @@ from franka_wm.data.lerobot.source import Source, unique_files
 from franka_wm.errors import UserError
 
 VERSION = 1
-"""Of the form of a cache: another one is built anew."""
+"""Version of a cache's form: a cache of another one is built anew."""
 ROWS_PER_JOB = 2048
 
 

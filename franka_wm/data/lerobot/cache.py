@@ -53,7 +53,7 @@ class Cache:
 
     @property
     def nbytes(self) -> int:
-        """Of all arrays."""
+        """Size of all arrays [bytes]."""
         return sum(array.nbytes for array in self.arrays.values())
 
 

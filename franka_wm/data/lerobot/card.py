@@ -30,7 +30,7 @@ _CITATION = """```bibtex
 
 
 FILM = "video.mp4"
-"""Of a published model's episodes, in its folder."""
+"""Video of a published model's episodes, in its folder."""
 VISUALIZER = "https://huggingface.co/spaces/lerobot/visualize_dataset?path="
 """LeRobot's page that plays the episodes of a public dataset."""
 
@@ -44,7 +44,7 @@ UNITS = {
     "objects": "m, quaternions, m/s, rad/s",
     "timestamp": "s",
 }
-"""Of the features that have one, in datasets of this project."""
+"""Unit of each feature that has one, in datasets of this project."""
 
 
 def _project() -> str:

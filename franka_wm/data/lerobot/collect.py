@@ -33,8 +33,8 @@ class Source:
         env: The worlds.
         policy: Writes ``action``.
         config: The resolved configuration, plain.
-        name: Of the policy, for the dataset's provenance.
-        seed: Of the run.
+        name: Name of the policy, for the dataset's provenance.
+        seed: Seed of the run.
     """
 
     env: Any
@@ -66,7 +66,7 @@ def gather(
             already; the feature ``seed`` says it.
         out, workers, shard_frames, resume: As for :class:`~franka_wm.data.lerobot.writer.DatasetWriter`.
         episodes: In all.
-        format: Of images.
+        format: Format of images.
         success_only: Keep only episodes that end in success.
         every: Seconds between lines of progress.
 

@@ -133,7 +133,7 @@ class VideoJob:
     Attributes:
         path: The file.
         feature: Its feature.
-        fps: Of the dataset.
+        fps: Frames per second of the dataset.
         episodes: Those in this file.
         begins: When each starts in the file [s].
         targets: [(array's name, height, width)].

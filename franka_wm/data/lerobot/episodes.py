@@ -61,7 +61,7 @@ class EpisodeCutter:
 
     Args:
         schema: What is kept.
-        seed: Of the run: the first number of the feature ``seed``.
+        seed: Seed of the run: the first number of the feature ``seed``.
         first_episode: (worlds,) numbers of the episodes that the first batch starts with; 0 if not given.
         discrete: Table (number of actions, A) that an integer action is a row of; for continuous actions ``None``.
     """
@@ -198,8 +198,8 @@ def cut_replay(
         data: (worlds, time), oldest step first: observations, ``action``, ``is_init`` and, under ``next``,
             observations, ``reward``, ``terminated``, and ``success`` if the schema has it.
         schema: What is kept.
-        seed: Of the run.
-        episode_length: Of the environment.
+        seed: Seed of the run.
+        episode_length: Steps of the environment's episodes.
         discrete: As for :class:`EpisodeCutter`.
 
     Returns:

@@ -80,7 +80,7 @@ def export_replay(
             observations, ``reward``, ``terminated``.
         config: The environment's.
         out, format, workers: As for :class:`~franka_wm.data.lerobot.writer.DatasetWriter`.
-        seed: Of the run.
+        seed: Seed of the run.
         policy, settings: Who acted, and the resolved configuration, for the provenance.
 
     Raises:
@@ -135,7 +135,7 @@ def export_run(settings: Mapping[str, Any], data: TensorDictBase | None, *, fold
         settings: The run's resolved configuration, plain; ``export`` has ``kind`` (none, lerobot), ``out`` (``None``:
             ``dataset`` in the run's folder), ``format``, ``workers`` and ``repo_id`` (published there if given).
         data: The replay, oldest step first; ``None`` if there is none.
-        folder: Of the run.
+        folder: Folder of the run.
     """
     wanted = settings["export"]
     if wanted["kind"] == "none":

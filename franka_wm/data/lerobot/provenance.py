@@ -23,7 +23,7 @@ def describe(
 
     Args:
         policy: Who acted.
-        seed: Of the run.
+        seed: Seed of the run.
         config: The resolved configuration, plain values.
         command: What was typed; this process's command line if not given.
         more: Anything else, plain values.

@@ -43,7 +43,7 @@ def publish_dataset(
             place of a README.md that is there.
         repo_id: ``user/name``.
         private: Whether only you can see it.
-        license: Of the data.
+        license: License of the data.
         update: Allow a repository that exists; files in it that the dataset has not are removed.
         dry_run: Only say what would go, and write the card.
 
@@ -78,7 +78,7 @@ def publish_staged(
     Args:
         stage: Puts what is sent into an empty folder.
         repo_id, private, update, dry_run: As for :func:`publish_dataset`.
-        kind: Of the repository.
+        kind: Kind of the repository.
         note: Said before anything is sent.
     """
     from franka_wm.console import announced, say

@@ -139,7 +139,7 @@ class Schema:
         return [key for key in self.features if key not in self.images]
 
     def numpy_dtype(self, feature: str) -> np.dtype:
-        """Of one frame's value in memory."""
+        """Type of one frame's value in memory."""
         return np.dtype("uint8" if feature in self.images else self.features[feature]["dtype"])
 
     def to_dict(self) -> dict[str, Any]:

@@ -134,7 +134,7 @@ def _write_rows(path: Path, features: dict[str, Any], columns: Sequence[dict[str
 
 
 def arrow_schema(features: dict[str, Any]) -> Any:
-    """Of the data files, with the note that tells ``datasets`` what is an image."""
+    """Schema of the data files, with the note that tells ``datasets`` what is an image."""
     import pyarrow as pa
 
     fields, notes = [], {}

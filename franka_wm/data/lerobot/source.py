@@ -22,9 +22,9 @@ DEFAULT_DATA_PATH = "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
 DEFAULT_VIDEO_PATH = "videos/{video_key}/chunk-{chunk_index:03d}/file-{file_index:03d}.mp4"
 
 LONGEST_PATH = 255
-"""Of the templates of paths [characters]."""
+"""Longest template of a path [characters]."""
 MOST_EPISODES, MOST_ROWS, MOST_NUMBERS = 10**8, 10**10, 10**8
-"""Of a dataset; of numbers, in one cell: whatever says more is no dataset, and sizes are taken from it."""
+"""Largest dataset, and most numbers in one cell: whatever says more is no dataset, and sizes are taken from it."""
 
 
 @dataclass(frozen=True, eq=False)

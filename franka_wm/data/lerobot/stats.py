@@ -15,7 +15,7 @@ QUANTILES = {"q01": 0.01, "q10": 0.10, "q50": 0.50, "q90": 0.90, "q99": 0.99}
 
 
 def vector_stats(array: np.ndarray) -> dict[str, np.ndarray]:
-    """Of (T,) or (T, D): each (1,) or (D,)."""
+    """Statistics of (T,) or (T, D): each (1,) or (D,)."""
     values = array.reshape(len(array), -1)
     values = values.astype(np.result_type(values.dtype, np.float32), copy=False)
     ordered = np.sort(values, axis=0)
@@ -31,7 +31,7 @@ def vector_stats(array: np.ndarray) -> dict[str, np.ndarray]:
 
 
 def image_stats(images: np.ndarray) -> dict[str, np.ndarray]:
-    """Of (T, H, W, 3) uint8: each (3, 1, 1), for values in [0, 1]. Frames are sampled as LeRobot samples them."""
+    """Statistics of (T, H, W, 3) uint8: each (3, 1, 1), in [0, 1]. Frames are sampled as LeRobot samples them."""
     from PIL import Image
 
     count = max(min(len(images), 100), min(int(len(images) ** 0.75), 10_000))
@@ -63,7 +63,7 @@ def episode_stats(columns: Mapping[str, np.ndarray]) -> dict[str, dict[str, np.n
 
 
 def aggregate(stats: Sequence[Mapping[str, Mapping[str, np.ndarray]]]) -> dict[str, dict[str, np.ndarray]]:
-    """Of several episodes or datasets, from those of each: as LeRobot's ``aggregate_stats``.
+    """Statistics of several episodes or datasets, from those of each: as LeRobot's ``aggregate_stats``.
 
     Mean and deviation are those of all values together; quantiles are means of quantiles, weighted by count.
     """

@@ -54,7 +54,7 @@ class Recording:
 
 
 class Moments(NamedTuple):
-    """Of a vector's components, (size,) float32 each."""
+    """Moments of a vector's components, (size,) float32 each."""
 
     mean: Tensor
     std: Tensor
@@ -84,7 +84,7 @@ class RecordedWindows:
         window: Transitions per window, H.
         batch_size: Windows per sample, B.
         split: ``"train"``, ``"validation"`` or ``"all"``.
-        validation_fraction: Of each dataset's episodes, in [0, 1); at least one if it is above 0.
+        validation_fraction: Share of each dataset's episodes, in [0, 1); at least one if it is above 0.
         seed: Draws the validation episodes and the windows.
         frame_stack: Images in each observation under ``pixels`` and ``pixels_…``: the present one and those before
             it in its episode, oldest first along the channels, the first one repeated (as ``env.frame_stack``).

@@ -52,7 +52,7 @@ class DatasetWriter:
     Args:
         out: The dataset's folder; appears when :meth:`finish` returns.
         schema: What an episode holds.
-        provenance: Of this session (:func:`~franka_wm.data.lerobot.provenance.describe`).
+        provenance: Provenance of this session (:func:`~franka_wm.data.lerobot.provenance.describe`).
         workers: Writing processes; 0 writes in this one, which needs no time to start and gathers nothing meanwhile.
         shard_frames: Steps in a shard; by their size if not given. A kill loses the shards that are not finished.
         resume: Go on with what is in ``OUT.writing``, and add to ``OUT`` if it is there.

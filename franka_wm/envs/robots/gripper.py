@@ -15,13 +15,13 @@ from franka_wm.envs.constants import MOST_OPEN, NUM_FINGERS, NUM_JOINTS
 from franka_wm.errors import UserError
 
 STIFFNESS = 50.0
-"""Of a finger's servo, per newton of its largest force [1/m]: the fingers squeeze a 4 cm cube with all of it."""
+"""Stiffness of a finger's servo, per newton of its largest force [1/m]: a 4 cm cube is squeezed with all of it."""
 DAMPING = 40.0
-"""Of a finger's servo at 20 N [N·s/m]; it goes with the root of the force."""
+"""Damping of a finger's servo at 20 N [N·s/m]; it goes with the root of the force."""
 ARMATURE = 0.5
-"""Of a finger [kg]: what drives it is geared down. With less, heavy objects are lost."""
+"""Armature of a finger [kg]: what drives it is geared down. With less, heavy objects are lost."""
 FRICTION = 1.0
-"""Of pads and palm."""
+"""Friction of pads and palm."""
 
 PAD, PAD_AWAY, PAD_ALONG = (0.010, 0.009, 0.0275), 0.010, 0.027
 """Half sides of a finger's box [m]; its centre in the finger's frame: away from the other one, and along it."""
@@ -62,7 +62,7 @@ def drive(builder: newton.ModelBuilder, config: FrankaConfig) -> None:
 
 
 def speed_limit(builder: newton.ModelBuilder) -> float:
-    """Of a finger [m/s]."""
+    """Speed limit of a finger [m/s]."""
     return float(builder.joint_velocity_limit[NUM_JOINTS])
 
 

@@ -17,7 +17,7 @@ from franka_wm.envs.robots import Robot, add_robot, arm_builder
 from franka_wm.errors import UserError
 
 FRICTION = 0.4
-"""Of all links."""
+"""Friction of all links."""
 NEIGHBOURS = 2
 """Links that are so many joints apart, or fewer, never touch: what is drawn of them overlaps where they bend."""
 

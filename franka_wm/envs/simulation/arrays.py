@@ -40,10 +40,10 @@ class Arrays[T]:
             reset.
         true_state, next_true_state: (N, S) without observation noise; the same memory where there is none.
         true_objects, next_true_objects: The same of ``objects``.
-        reward, success: Of the last step, (N, 1) float and bool: what a task writes.
-        terminated, truncated, done: Of the last step, (N, 1) bool.
+        reward, success: Reward and success of the last step, (N, 1) float and bool: what a task writes.
+        terminated, truncated, done: Whether the last step ended the episode, (N, 1) bool.
         step_count: (N, 1) int32, steps done in the episode.
-        episode_return, episode_success: Of the episode so far, (N, 1): sum of rewards; any success.
+        episode_return, episode_success: Sum of rewards, and any success, of the episode so far, (N, 1).
         ended: (N,) bool: the episode is over, and the next one has not begun.
         statistics: (N, 7) float64, see :data:`STATISTICS`.
         task_goal: (N, 3) the goal of the episode [m], which ``goal`` and ``state`` observe.

@@ -54,7 +54,7 @@ def room_for_contacts(config: FrankaConfig) -> int:
 
 
 def contact_options(config: FrankaConfig) -> dict[str, object]:
-    """Of Newton's MuJoCo solver, for scenes; see docs/tasks.md for what they hold."""
+    """Options of Newton's MuJoCo solver, for scenes; see docs/tasks.md for what they hold."""
     contacts, scene = room_for_contacts(config), config.resolved_scene
     meshes = scene is not None and any(one.shape == "mesh" for one in (*scene.objects, *scene.obstacles))
     return {

@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from franka_wm.envs.simulation import Simulation
 
 SHARE = 0.9
-"""Of its travel, where the config says no other opening."""
+"""Share of its travel to open it by, where the config says no other opening."""
 
 
 @wp.kernel(enable_backward=False)

@@ -187,7 +187,7 @@ class GripperTask(Task):
         Args:
             sim, mask: As given.
             tool: Where the tool is, from the object's centre [m].
-            opening: Of each finger [m]; the object's width if not given.
+            opening: Opening of each finger [m]; the object's width if not given.
             turned: Whether the hand is turned as the object is.
             like: Number of the object that it is turned like, up to quarter turns; as at the start if not given.
         """
@@ -318,7 +318,7 @@ class Aim:
 
 
 GAIN, CLOSE = 0.4, 0.04
-"""Of what a held object is off by, such a share in a step, where that is less [m]: more would make the arm swing."""
+"""Share, in each step, of what a held object is off by, where that is less [m]: more would make the arm swing."""
 
 
 def moved(place: torch.Tensor, x: float = 0.0, y: float = 0.0, z: float = 0.0) -> torch.Tensor:
@@ -346,7 +346,7 @@ def fetch(
 
     Args:
         sight: What is seen.
-        number: Of the object.
+        number: Number of the object.
         to: (N, 3) where its centre shall be [m].
         above: Height over the object in which the hand gets into place [m].
         grip: Where to grasp it: so far over its centre [m].

@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from franka_wm.envs.simulation import Simulation
 
 THICK, CLEARANCE = 0.030, 0.003
-"""Of the peg; between it and the hole on each side [m]."""
+"""Thickness of the peg, and gap between it and the hole on each side [m]."""
 DEEP, GRIP = wp.constant(0.015), wp.constant(0.015)
 """How deep the peg must be in the hole, at least; how far over its middle it is grasped [m]."""
 

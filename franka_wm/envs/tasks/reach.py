@@ -163,7 +163,7 @@ class Reach(Task):
 
     @property
     def reward_bounds(self) -> tuple[float, float] | None:
-        """Of :func:`reach_reward`; ``None`` where a subclass pays otherwise."""
+        """Bounds of :func:`reach_reward`; ``None`` where a subclass pays otherwise."""
         if type(self).reward_and_success is not Reach.reward_and_success:
             return None
         least, largest = {"dense": (-1.0, 0.0), "sparse": (0.0, 1.0), "normalized": (-1.0, 1.0)}[

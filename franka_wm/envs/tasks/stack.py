@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from franka_wm.envs.simulation import Simulation
 
 EDGE = 0.04
-"""Of both cubes [m]."""
+"""Edge of both cubes [m]."""
 ASIDE, OFF = 0.5 * EDGE + 0.005, 0.005
 """How far the upper cube may be off, sideways and in height [m]."""
 AWAY = 0.10

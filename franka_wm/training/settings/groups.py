@@ -20,7 +20,7 @@ from franka_wm.training.learner import SCHEDULES
 
 MODELS_OWN = "the model's own"
 MOST_UPDATES = 10**12
-"""Of a run: a thousand updates a second for thirty years."""
+"""Most updates of a run: a thousand a second for thirty years."""
 
 
 def _is_names(given: object) -> bool:
