@@ -147,7 +147,7 @@ class HighQualityRenderer:
         self._passes = passes
         self._position, self._pitch, self._yaw = np.array([1.0, 0.0, 0.5]), 0.0, 180.0
         self._closed = False
-        self._pictures: list[torch.Tensor] = []
+        self._images: list[torch.Tensor] = []
         if backend == "usd":
             self.output_path = _usd_target(output_path)
             # In the same folder, so that the rename is atomic; its own name, so that no cached layer is reused.
@@ -198,7 +198,7 @@ class HighQualityRenderer:
             self._log(state)
             self._write_usd_camera(self.num_frames)
         else:
-            self._pictures.append(self._trace(state))
+            self._images.append(self._trace(state))
         self.num_frames += 1
 
     @property
@@ -208,9 +208,9 @@ class HighQualityRenderer:
             raise UserError(
                 "backend='usd' has no frames: it writes a file; use backend='rtx', or env.render()"
             )
-        if not self._pictures:
+        if not self._images:
             return torch.zeros((0, 3, self.size[1], self.size[0]), dtype=torch.uint8)
-        return torch.stack(self._pictures)
+        return torch.stack(self._images)
 
     def close(self) -> Path | None:
         """Ends the recording; again does nothing more.

@@ -126,14 +126,14 @@ def decoder_error(decoder: Decoder, latents: Tensor, images: Tensor) -> dict[str
         images: (n, S, S, 3) uint8.
 
     Returns:
-        ``error``, and ``mean_picture``, the error of always drawing the training images' mean.
+        ``error``, and ``mean_image``, the error of always drawing the training images' mean.
     """
     truth = images.to(latents.device).permute(0, 3, 1, 2).float() / 255
     with torch.no_grad():
         drawn = torch.cat([decoder(part) for part in latents.split(256)])
     return {
         "error": float((drawn - truth).square().mean()),
-        "mean_picture": float((decoder.background - truth).square().mean()),
+        "mean_image": float((decoder.background - truth).square().mean()),
     }
 
 

@@ -70,9 +70,9 @@ class VideoRecorder(Recorder):
 
     def _take(self, step: TensorDictBase) -> None:
         """One image of the present; ``step`` is not looked at."""
-        picture = self.env.render(self.size, num_views=1, config=self.whole).cpu()
+        image = self.env.render(self.size, num_views=1, config=self.whole).cpu()
         centre = project(self.env.goal[:1], self.whole, self.size).cpu()
-        self.frames.append(draw_marker(picture, centre, radius=self.size / 32)[0])
+        self.frames.append(draw_marker(image, centre, radius=self.size / 32)[0])
 
     def write(self, path: str | Path) -> Path:
         """Writes the .mp4 at the environment's own rate, however fast it was simulated.

@@ -91,11 +91,11 @@ def record_episode(
 def _layout(rr: Any, pixels: bool) -> Any:
     import rerun.blueprint as rrb
 
-    pictures = [rrb.Spatial2DView(origin="camera", name="camera")] if pixels else []
+    images = [rrb.Spatial2DView(origin="camera", name="camera")] if pixels else []
     plots = [rrb.TimeSeriesView(origin=name, name=name) for name in ("distance", "reward", "joints")]
     arm = rrb.Spatial3DView(origin="/", name="arm")
     return rrb.Blueprint(
-        rrb.Horizontal(arm, rrb.Vertical(*pictures, *plots), column_shares=[2, 1]), collapse_panels=True
+        rrb.Horizontal(arm, rrb.Vertical(*images, *plots), column_shares=[2, 1]), collapse_panels=True
     )
 
 

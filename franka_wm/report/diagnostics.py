@@ -128,7 +128,7 @@ def findings(results: Mapping[str, Any]) -> dict[str, str]:
         out["… across episodes"] = interval(ahead["rank_correlation_across_episodes"])
     if "decoder" in ahead:
         errors = ahead["decoder"]
-        share = errors["error"] / max(errors["mean_picture"], 1e-12)
+        share = errors["error"] / max(errors["mean_image"], 1e-12)
         out["decoder's error / that of the mean image"] = number(share)
     if value:
         line = f"return = {number(value['slope'])} · value + {number(value['intercept'])}".replace(

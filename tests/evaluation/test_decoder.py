@@ -34,15 +34,15 @@ def trained() -> tuple[Decoder, torch.Tensor]:
 def test_it_reconstructs_pictures_that_it_has_not_seen(trained) -> None:
     decoder, z = trained
     errors = decoder_error(decoder, z, square_at(z))
-    assert errors["error"] < 0.5 * errors["mean_picture"]
+    assert errors["error"] < 0.5 * errors["mean_image"]
 
 
-def test_latents_that_say_nothing_give_the_mean_picture() -> None:
+def test_latents_that_say_nothing_give_the_mean_image() -> None:
     generator = torch.Generator().manual_seed(1)
     z, where = torch.randn(300, 4, generator=generator), torch.rand(300, 2, generator=generator)
     decoder = train_decoder(z[:200], square_at(where[:200]), steps=60)
     errors = decoder_error(decoder, z[200:], square_at(where[200:]))
-    assert errors["error"] > 0.9 * errors["mean_picture"]
+    assert errors["error"] > 0.9 * errors["mean_image"]
 
 
 def test_imagined_beside_real(trained, point_model) -> None:
