@@ -137,6 +137,7 @@ def _simple(
     number(cfg, "collector.num_envs")
     from franka_wm.commands.entry import with_scale
     from franka_wm.envs import FrankaConfig, FrankaEnv
+    from franka_wm.training.storage_budget import check_worlds
 
     cfg = compose(with_scale(list(overrides), quiet=True))
     worlds = num_envs or min(number(cfg, "collector.num_envs"), episodes)
@@ -159,6 +160,7 @@ def _simple(
     values["observations"] = [*values["observations"], *added]
     config = FrankaConfig.from_mapping(values)
     schema_for(config, format=format)  # refuses what cannot be stored before anything is built
+    check_worlds("num_envs", worlds, cfg.device)
     with announced(f"building {worlds} worlds; a machine's first start compiles kernels for a minute or two"):
         env = FrankaEnv(config, num_envs=worlds, device=cfg.device, seed=seed, urdf_path=urdf_path)
     cfg.env.observations = values["observations"]
@@ -219,7 +221,9 @@ def _agent(part: str, checkpoint: str, overrides: Sequence[str], worlds: int) ->
         ]
     from franka_wm.data.lerobot.collect import Source
     from franka_wm.training.load import load_agent
+    from franka_wm.training.storage_budget import check_worlds
 
+    check_worlds("num_envs", worlds, device)
     with announced(f"loading {checkpoint}"):
         agent = load_agent(checkpoint, num_envs=worlds, device=device, env_changes=changes, seed=seed)
     part = part or ("planner" if "planner" in agent.policies else "policy")

@@ -32,6 +32,21 @@ PER_WORLD = 1e4
 """Memory of a simulated world at the very least [bytes]."""
 
 
+def check_worlds(option: str, worlds: int, device: torch.device | str) -> None:
+    """Refuse worlds that cannot fit into the memory that is free, before the first is built.
+
+    Raises:
+        UserError: It names the option.
+    """
+    device = resolve_device(device)
+    free = free_memory(device)
+    if free is not None and worlds * PER_WORLD > free:
+        raise UserError(
+            f"{option}={worlds}: at least {worlds * PER_WORLD / 1e9:.1f} GB do not fit into the {free / 1e9:.1f} GB "
+            f"that are free on {device}; lower it"
+        )
+
+
 def check_memory(run: RunSettings, model: torch.nn.Module, spaces: Spaces) -> None:
     """Refuse what cannot fit into the memory that is free, before anything of it is built.
 
@@ -52,6 +67,11 @@ def check_memory(run: RunSettings, model: torch.nn.Module, spaces: Spaces) -> No
     step = 4 * sum(spaces.observation_sizes.values()) + sum(map(math.prod, spaces.image_sizes.values()))
     planned = math.prod(run.planner.options.get(name, 1) for name in ("num_samples", "horizon"))
     steps = c.num_envs * run.planned_steps() if device.type != "cuda" else r.capacity
+    if device.type == "cpu":
+        try:  # memory is used as steps come, but some systems refuse what is larger than all of it
+            torch.empty(step * r.capacity, dtype=torch.uint8)
+        except (RuntimeError, TypeError) as error:  # the latter beyond 64 bits
+            raise UserError(_not_allocated(r.capacity, step, device)) from error
     film = min(e.video_episodes, e.episodes) * run.env.episode_length * 3 * e.video_size**2
     parts = {
         "the model and its optimiser (model, size)": 16 * sum(x.numel() for x in model.parameters()),
@@ -105,10 +125,14 @@ def fill(
     except RuntimeError as error:  # some systems refuse what is larger than all memory, used or not
         if not isinstance(error, torch.OutOfMemoryError) and "can't allocate memory" not in str(error):
             raise
-        raise UserError(
-            f"replay.capacity={run.replay.capacity}: {per_step * run.replay.capacity / 1e9:.1f} GB cannot be allocated "
-            f"on {device}; use a smaller replay.capacity"
-        ) from error
+        raise UserError(_not_allocated(run.replay.capacity, per_step, device)) from error
+
+
+def _not_allocated(capacity: int, per_step: float, device: torch.device) -> str:
+    return (
+        f"replay.capacity={capacity}: {per_step * capacity / 1e9:.1f} GB cannot be allocated on {device}; "
+        "use a smaller replay.capacity"
+    )
 
 
 def filled_bytes(replay: ReplayBuffer) -> int:

@@ -257,6 +257,8 @@ def test_bad_values_that_only_a_part_knows(overrides: list[str], named: str, ref
         "env.goal_sampling=fixed env.goal=[3,0,0]",
         "trainer.lr=-1",
         "logger.names=[carrier_pigeon]",
+        "replay.capacity=1000000000000",
+        "replay.capacity=1000000000000000000",
     ],
 )
 def test_a_refusal_leaves_nothing_behind(override: str, refuse, tmp_path: Path) -> None:

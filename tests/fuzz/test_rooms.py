@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import json
+import subprocess
+import sys
 from collections.abc import Callable
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -46,6 +49,14 @@ def test_whatever_is_changed_ends_well_or_in_one_line(name: str, ended: Callable
 def test_what_once_failed(name: str, ended: Callable[[str], Any]) -> None:
     bad = ended(name)["kept"]
     assert not bad, "\n".join(f"{name}: {text}" for name, text in bad.items())
+
+
+def test_the_long_run_begins() -> None:
+    """`python tests/fuzz`, whose path pytest does not set."""
+    done = subprocess.run(
+        [sys.executable, str(Path(__file__).parent), "--help"], capture_output=True, text=True
+    )
+    assert done.returncode == 0 and "run_folder" in done.stdout, done.stderr
 
 
 def test_a_fork_tells_hangs_memory_and_tracebacks_apart() -> None:

@@ -174,6 +174,10 @@ def test_ctrl_c_leaves_a_dataset(tmp_path, load) -> None:
         (["out=x", "env.fps=29.97"], "whole frames"),
         (["out=x", "env.observations=[depth]"], "depth has no place"),
         (["out=x", "policy=expert"], "policy=expert: task=reach has none; env=lift has one"),
+        (
+            ["out=x", "episodes=1000000000", "num_envs=1000000000", "device=cpu"],
+            "num_envs=1000000000: at least 10000.0 GB do not fit",
+        ),
         (["out=x", "rubbish"], "'rubbish': write options as name=value"),
     ],
 )
