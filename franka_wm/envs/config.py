@@ -350,6 +350,12 @@ class FrankaConfig:
             )
         if self.max_contacts is not None:
             self._check_whole("max_contacts", 1, 10_000, "contacts of a world")
+            least, enough = self.resolved_scene.contacts(self.collisions) if self.resolved_scene else (0, 0)
+            if self.max_contacts < least:
+                raise UserError(
+                    f"max_contacts={self.max_contacts}: this scene needs at least {least} (4 under each object, 8 for "
+                    f"the hand); {enough} are enough, which null means"
+                )
         if self.task_class.gripper and not self.has_gripper:
             raise UserError(f"gripper=false: task={self.task} needs the gripper; leave it at null")
         if self.resolved_scene and not self.has_gripper:

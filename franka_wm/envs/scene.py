@@ -95,6 +95,24 @@ class Scene:
             raise UserError(f"scene: no object {name!r}; there are {', '.join(names) or 'none'}")
         return names.index(name)
 
+    def contacts(self, collisions: str) -> tuple[int, int]:
+        """Contacts per world: the least with which everything stands still, and enough for what may happen.
+
+        The hand rammed into a table and a cube makes 14. All worlds share one pool of this many each, so a crowded
+        world takes from others' share before anything is lost.
+
+        Args:
+            collisions: What of the robot touches the scene, as in the environment's config.
+        """
+        objects, obstacles, joints = len(self.objects), len(self.obstacles), len(self.articulated)
+        least = 8 + 4 * objects
+        enough = (
+            8 + 16 * (objects + joints) + 4 * obstacles + 2 * objects * (objects - 1) + 8 * objects * joints
+        )
+        if collisions == "hand":
+            return least, enough
+        return least + 8, enough + 32 + 8 * (objects + obstacles + joints)
+
     def check_sizes(self, width: float) -> None:
         """Refuses a scene whose objects cannot have sizes from 1 − width to 1 + width of what it says.
 

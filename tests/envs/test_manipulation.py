@@ -343,7 +343,7 @@ def test_what_cannot_be_is_said_in_one_line(changes: dict, said: str) -> None:
 
 def test_too_little_room_for_contacts_is_refused() -> None:
     with pytest.raises(UserError, match="needs at least 12"):
-        make(1, max_contacts=5)
+        FrankaConfig(**PRESET, max_contacts=5)
 
 
 def test_the_expert_says_what_it_needs() -> None:

@@ -12,7 +12,6 @@ from franka_wm.envs.config import FrankaConfig
 from franka_wm.envs.kernels import articulated, goals
 from franka_wm.envs.kernels import bodies as kernels
 from franka_wm.envs.simulation.arrays import STATISTICS
-from franka_wm.errors import UserError
 
 if TYPE_CHECKING:
     from franka_wm.envs.simulation.simulator import Simulation
@@ -27,36 +26,12 @@ SUNK = 0.02
 """An object that is this far below the table's top has left it [m]."""
 
 
-def room_for_contacts(config: FrankaConfig) -> int:
-    """Contacts per world for which there is room: what the config says, or enough for the scene.
-
-    The hand rammed into a table and a cube makes 14. All worlds share one pool of this many each, so a crowded world
-    takes from others' share before anything is lost.
-
-    Raises:
-        UserError: The config allows fewer than the scene needs to stand still.
-    """
-    scene = config.resolved_scene
-    assert scene is not None
-    objects, obstacles, joints = len(scene.objects), len(scene.obstacles), len(scene.articulated)
-    least = 8 + 4 * objects
-    wanted = 8 + 16 * (objects + joints) + 4 * obstacles + 2 * objects * (objects - 1) + 8 * objects * joints
-    if config.collisions != "hand":
-        least, wanted = least + 8, wanted + 32 + 8 * (objects + obstacles + joints)
-    if config.max_contacts is None:
-        return wanted
-    if config.max_contacts < least:
-        raise UserError(
-            f"max_contacts={config.max_contacts}: this scene needs at least {least} (4 under each object, 8 for the "
-            f"hand); {wanted} are enough, which null means"
-        )
-    return config.max_contacts
-
-
 def contact_options(config: FrankaConfig) -> dict[str, object]:
     """Options of Newton's MuJoCo solver, for scenes; see docs/tasks.md for what they hold."""
-    contacts, scene = room_for_contacts(config), config.resolved_scene
-    meshes = scene is not None and any(one.shape == "mesh" for one in (*scene.objects, *scene.obstacles))
+    scene = config.resolved_scene
+    assert scene is not None
+    contacts = config.max_contacts or scene.contacts(config.collisions)[1]
+    meshes = any(one.shape == "mesh" for one in (*scene.objects, *scene.obstacles))
     return {
         "enable_multiccd": meshes or None,  # one contact of a mesh and a box is too few to stand on
         "use_mujoco_contacts": True,
