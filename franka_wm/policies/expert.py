@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-
 import torch
 from tensordict import TensorDictBase
 
@@ -13,8 +11,7 @@ from franka_wm.envs.kinematics import Kinematics
 from franka_wm.envs.tasks import Task
 from franka_wm.envs.tasks.manipulation import Aim, Sight
 from franka_wm.errors import UserError
-from franka_wm.policies.scripted import ScriptedPolicy
-from franka_wm.seeding import restore_generator
+from franka_wm.policies.scripted import DrawingPolicy
 
 FAST, SLOW = 0.5, 0.15
 """Speed of the hand [m/s]: on its way, and within :data:`NEAR` of where it shall be."""
@@ -25,7 +22,7 @@ TURN = 2.0
 """Speed of the hand around the vertical axis [rad/s]."""
 
 
-class ExpertPolicy(ScriptedPolicy):
+class ExpertPolicy(DrawingPolicy):
     """What a task can show: its own plan (``Task.expert``) from the true positions of all objects.
 
     The hand points down and moves straight, at up to 0.5 m/s; joint targets follow by inverse kinematics from those
@@ -53,7 +50,7 @@ class ExpertPolicy(ScriptedPolicy):
         noise: float = 0.0,
         generator: torch.Generator | None = None,
     ):
-        super().__init__()
+        super().__init__(generator)
         if task.expert is None:
             raise UserError(
                 f"policy=expert: task={config.task} has none; a task says it with a method expert"
@@ -66,7 +63,7 @@ class ExpertPolicy(ScriptedPolicy):
         if config.action_mode == "ee_delta":
             raise UserError("policy=expert: drives joints; use env.action_mode=joint_delta or joint_position")
         self.task, self.kinematics, self.config = task, kinematics, config
-        self.noise, self.generator = noise, generator
+        self.noise = noise
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         k, c = self.kinematics, self.config
@@ -99,12 +96,3 @@ class ExpertPolicy(ScriptedPolicy):
         tool = tool + way * (pace / distance).clamp_max(1.0)
         turn = torch.remainder(aim.yaw - yaw + torch.pi, 2 * torch.pi) - torch.pi
         return k.solve_upright(tool, yaw + turn.clamp(-TURN / fps, TURN / fps), target)
-
-    def get_state(self) -> dict[str, torch.Tensor | None]:
-        """Where the generator stands."""
-        return {"generator": None if self.generator is None else self.generator.get_state()}
-
-    def set_state(self, state: Mapping[str, torch.Tensor | None], device: torch.device | str = "cpu") -> bool:
-        """Goes on from what :meth:`get_state` gave; ``False`` where the generator is of another kind of device."""
-        known = state["generator"]
-        return self.generator is None or known is None or restore_generator(self.generator, known)

@@ -24,6 +24,31 @@ class ScriptedPolicy(TensorDictModuleBase):
     out_keys: Any = ["action"]  # pyright: ignore[reportIncompatibleVariableOverride]
 
 
+class DrawingPolicy(ScriptedPolicy):
+    """A scripted policy that draws at random: where it stands can be kept, and put back.
+
+    Args:
+        generator: Source of randomness; torch's own if not given.
+    """
+
+    def __init__(self, generator: torch.Generator | None):
+        super().__init__()
+        self.generator = generator
+
+    def get_state(self) -> dict[str, torch.Tensor | None]:
+        """What the next actions depend on besides the observation."""
+        return {"generator": None if self.generator is None else self.generator.get_state()}
+
+    def set_state(self, state: Mapping[str, torch.Tensor | None], device: torch.device | str = "cpu") -> bool:
+        """Goes on from what :meth:`get_state` gave; actions are on ``device``.
+
+        Returns:
+            ``False`` where the generator's state is another kind of device's.
+        """
+        known = state["generator"]
+        return self.generator is None or known is None or restore_generator(self.generator, known)
+
+
 class NoopPolicy(ScriptedPolicy):
     """Does nothing: action 0. What every agent must beat."""
 
@@ -40,7 +65,7 @@ class NoopPolicy(ScriptedPolicy):
         )
 
 
-class SmoothRandomPolicy(ScriptedPolicy):
+class SmoothRandomPolicy(DrawingPolicy):
     """First-order autoregressive random actions in [−1, 1], started anew where an episode starts.
 
     Args:
@@ -58,12 +83,11 @@ class SmoothRandomPolicy(ScriptedPolicy):
         smoothness: float = 0.7,
         generator: torch.Generator | None = None,
     ):
-        super().__init__()
+        super().__init__(generator)
         if not 0.0 <= smoothness < 1.0:
             raise UserError(f"smoothness={smoothness}: must be at least 0 and below 1")
         self.action_dim = action_dim
         self.smoothness = smoothness
-        self.generator = generator
         self._present: torch.Tensor | None = None
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
@@ -78,15 +102,12 @@ class SmoothRandomPolicy(ScriptedPolicy):
         return tensordict.set("action", self._present.clamp(-1.0, 1.0))
 
     def get_state(self) -> dict[str, torch.Tensor | None]:
-        """What the next actions depend on: the last one, and where the generator stands."""
-        generator = None if self.generator is None else self.generator.get_state()
-        return {"generator": generator, "present": self._present}
+        return super().get_state() | {"present": self._present}
 
     def set_state(self, state: Mapping[str, torch.Tensor | None], device: torch.device | str = "cpu") -> bool:
-        """Goes on from what :meth:`get_state` gave; actions are on ``device``. ``False``: as in :func:`_go_on`."""
         present = state["present"]
         self._present = None if present is None else present.to(device)
-        return _go_on(self.generator, state["generator"])
+        return super().set_state(state, device)
 
 
 class IKPolicy(ScriptedPolicy):
@@ -198,7 +219,7 @@ class DiscretePolicy(ScriptedPolicy):
         return tensordict.set("action", distance.argmin(-1))
 
 
-class RandomDiscretePolicy(ScriptedPolicy):
+class RandomDiscretePolicy(DrawingPolicy):
     """An action drawn uniformly, in every step: int64 (N,).
 
     Args:
@@ -209,9 +230,8 @@ class RandomDiscretePolicy(ScriptedPolicy):
     in_keys = ["is_init"]
 
     def __init__(self, num_actions: int, *, generator: torch.Generator | None = None):
-        super().__init__()
+        super().__init__(generator)
         self.num_actions = num_actions
-        self.generator = generator
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         is_init = tensordict.get("is_init")
@@ -219,16 +239,3 @@ class RandomDiscretePolicy(ScriptedPolicy):
             self.num_actions, is_init.shape[:-1], device=is_init.device, generator=self.generator
         )
         return tensordict.set("action", action)
-
-    def get_state(self) -> dict[str, torch.Tensor | None]:
-        """Where the generator stands."""
-        return {"generator": None if self.generator is None else self.generator.get_state()}
-
-    def set_state(self, state: Mapping[str, torch.Tensor | None], device: torch.device | str = "cpu") -> bool:
-        """Goes on from what :meth:`get_state` gave. ``False``: as in :func:`_go_on`."""
-        return _go_on(self.generator, state["generator"])
-
-
-def _go_on(generator: torch.Generator | None, state: torch.Tensor | None) -> bool:
-    """Puts a policy's generator back; ``False`` where its state is another kind of device's."""
-    return generator is None or state is None or restore_generator(generator, state)
