@@ -14,10 +14,11 @@ if TYPE_CHECKING:
     from franka_wm.envs.external import ExternalEnv
     from franka_wm.envs.franka import FrankaEnv
     from franka_wm.envs.high_quality import HighQualityRenderer, which_backends
+    from franka_wm.envs.multitask import MultiTaskEnv
     from franka_wm.envs.sequences import franka_sequences, smooth_actions
     from franka_wm.envs.transformed import TransformedFrankaEnv
 
-type Environment = FrankaEnv | TransformedFrankaEnv | ExternalEnv
+type Environment = FrankaEnv | TransformedFrankaEnv | MultiTaskEnv | ExternalEnv
 """What may be trained in. Only for annotations."""
 
 __all__ = [
@@ -25,6 +26,7 @@ __all__ = [
     "FrankaConfig",
     "FrankaEnv",
     "HighQualityRenderer",
+    "MultiTaskEnv",
     "Randomization",
     "TransformedFrankaEnv",
     "discrete_action_table",
@@ -39,6 +41,7 @@ _WHERE = {
     "DiscreteActions": "discretize",
     "FrankaEnv": "franka",
     "HighQualityRenderer": "high_quality",
+    "MultiTaskEnv": "multitask",
     "TransformedFrankaEnv": "transformed",
     "discrete_action_table": "discretize",
     "franka_sequences": "sequences",

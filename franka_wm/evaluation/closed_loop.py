@@ -12,7 +12,7 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor, nn
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
-from franka_wm.envs import Environment, FrankaEnv
+from franka_wm.envs import Environment, FrankaEnv, MultiTaskEnv
 from franka_wm.evaluation.intervals import bootstrap_mean, wilson
 from franka_wm.training.build import arm_of
 
@@ -78,7 +78,8 @@ def play_episodes(
 
         * ``success`` at the end and ``success_once`` at any step, as the task judges, 0 or 1;
         * ``final_distance`` and ``closest_distance``, tool to goal [m], where success is to be near the goal;
-        * ``measures``, by name, at the end: the task's own (:meth:`~franka_wm.envs.tasks.Task.measures`);
+        * ``measures``, by name, at the end: the task's own (:meth:`~franka_wm.envs.tasks.Task.measures`); of several
+          tasks at once the success of each, NaN in the worlds of others;
         * ``path_length`` of the tool [m];
         * ``action_change``: mean over steps and components of the squared change of the action as the servo
           gets it, in units of the action;
@@ -86,7 +87,9 @@ def play_episodes(
     """
     n, device = env.num_envs, env.device
     arm = arm_of(env)
-    motion = None if arm is None else _Motion(arm)
+    motion: _Motion | _Tasks | None = None if arm is None else _Motion(arm)
+    if isinstance(env, MultiTaskEnv):
+        motion = _Tasks(env)
     total, length = torch.zeros(n, device=device), torch.zeros(n, device=device)
     running = torch.ones(n, dtype=torch.bool, device=device)
     count = n if episodes is None else min(episodes, n)
@@ -107,7 +110,9 @@ def play_episodes(
                 motion.see(running, after)
             running &= ~after.get("done").squeeze(-1)
             tensordict = following
-            if arm is None and not bool(running.any()):  # lives on the host: nothing waits for a device here
+            if motion is None and not bool(
+                running.any()
+            ):  # lives on the host: nothing waits for a device here
                 break
     out = {"return": total, "length": length}
     played = TensorDict(out if motion is None else motion.summary(length) | out, batch_size=[n])
@@ -123,6 +128,29 @@ def _decide_for_some(policy: Policy, tensordict: TensorDictBase, count: int) -> 
         every[:count] = some
         tensordict.set(key, every)
     return tensordict
+
+
+class _Tasks:
+    """How each task judges its own worlds' first episodes, where worlds have several tasks."""
+
+    def __init__(self, env: MultiTaskEnv):
+        self.names, self.one_hot = list(env.envs), env.one_hot.bool()
+        self.success, self.once = torch.zeros(2, env.num_envs, dtype=torch.bool, device=env.device)
+
+    def start(self) -> None: ...
+
+    def see(self, running: Tensor, after: TensorDictBase) -> None:
+        """After a step; ``running`` are the worlds whose first episode it belongs to."""
+        succeeds = after.get("success").squeeze(-1)
+        self.success = torch.where(running, succeeds, self.success)
+        self.once |= running & succeeds
+
+    def summary(self, length: Tensor) -> dict[str, Any]:
+        own = {
+            f"success {name}": torch.where(self.one_hot[:, k], self.success.float(), torch.nan)
+            for k, name in enumerate(self.names)
+        }
+        return {"success": self.success.float(), "success_once": self.once.float(), "measures": own}
 
 
 class _Motion:
@@ -202,7 +230,12 @@ def summarize(episodes: TensorDictBase, *, thresholds: Sequence[float] = THRESHO
         return {name: wilson(int(present[name].sum()), count).as_dict()} if name in present else {}
 
     own = present.get("measures", {})
-    own = {str(name): bootstrap_mean(own[name]).as_dict() for name in own.keys()}  # noqa: SIM118
+    own = {str(name): own[name][~own[name].isnan()] for name in own.keys()}  # noqa: SIM118
+    own = {
+        name: (wilson(int(x.sum()), len(x)) if name.startswith("success ") else bootstrap_mean(x)).as_dict()
+        for name, x in own.items()
+        if len(x)
+    }
     return {
         **means("final_distance"),
         **rates("success", "final_distance"),

@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import torch
 from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModuleBase
 
 from franka_wm.envs.config import FrankaConfig
 from franka_wm.envs.constants import MOST_OPEN, NUM_JOINTS
 from franka_wm.envs.kinematics import Kinematics
+from franka_wm.envs.multitask import MultiTaskEnv
 from franka_wm.envs.tasks import Task
 from franka_wm.envs.tasks.manipulation import Aim, Sight
 from franka_wm.errors import UserError
-from franka_wm.policies.scripted import DrawingPolicy
+from franka_wm.policies.scripted import DrawingPolicy, ScriptedPolicy
 
 FAST, SLOW = 0.5, 0.15
 """Speed of the hand [m/s]: on its way, and within :data:`NEAR` of where it shall be."""
@@ -96,3 +100,22 @@ class ExpertPolicy(DrawingPolicy):
         tool = tool + way * (pace / distance).clamp_max(1.0)
         turn = torch.remainder(aim.yaw - yaw + torch.pi, 2 * torch.pi) - torch.pi
         return k.solve_upright(tool, yaw + turn.clamp(-TURN / fps, TURN / fps), target)
+
+
+class TaskwisePolicy(ScriptedPolicy):
+    """Of several tasks at once: each task's worlds act by a policy of their own.
+
+    Args:
+        env: The worlds.
+        policies: Task -> policy, which sees what that task's worlds observe.
+    """
+
+    def __init__(self, env: MultiTaskEnv, policies: Mapping[str, TensorDictModuleBase]):
+        super().__init__()
+        self.split, self.join, self.policies = env.split, env.join, dict(policies)
+        self.in_keys = list(dict.fromkeys(key for one in policies.values() for key in one.in_keys))
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        seen = self.split(tensordict)
+        actions = {name: policy(seen[name]).get("action") for name, policy in self.policies.items()}
+        return tensordict.set("action", self.join(actions))

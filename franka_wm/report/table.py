@@ -172,8 +172,17 @@ def _leaves(
     return out
 
 
+def _unit(path: tuple[str, ...]) -> tuple[str, float, int] | None:
+    """Title, factor and digits of what is known; ``success TASK`` among the measures is a rate."""
+    if path[0] == "measures" and path[-1].startswith("success "):
+        return f"{path[-1]} [%]", 100, 0
+    return TITLES.get(path[0])
+
+
 def _title(path: tuple[str, ...]) -> str:
-    title, _, _ = TITLES.get(path[0], ("", 1, 0))
+    title, _, _ = _unit(path) or ("", 1, 0)
+    if path[0] == "measures" and title:
+        return title
     if "{}" in title and len(path) == 2 and _is_number(path[1]):
         return title.format(centimetres(path[1]))
     if title and len(path) == 1:
@@ -189,7 +198,7 @@ def _text(path: tuple[str, ...], value: Any, digits: int) -> str:
         return value
     if isinstance(value, bool):
         return "yes" if value else "no"
-    known = TITLES.get(path[0])
+    known = _unit(path)
     numbers = [value[part] for part in ("mean", "low", "high")] if isinstance(value, Mapping) else [value]
     if any(number is None for number in numbers):
         return "–"

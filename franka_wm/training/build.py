@@ -21,13 +21,15 @@ from franka_wm.device import resolve_device
 from franka_wm.envs import Environment, FrankaEnv, TransformedFrankaEnv
 from franka_wm.envs.discretize import DiscreteActions
 from franka_wm.envs.external import ExternalConfig, ExternalEnv
+from franka_wm.envs.multitask import MultiTaskEnv
+from franka_wm.envs.multitask_config import MultiTaskConfig
 from franka_wm.errors import UserError
 from franka_wm.planning import registry
 from franka_wm.planning.base import Planner
 from franka_wm.planning.mcts import MCTS
 from franka_wm.planning.objectives import Objective
 from franka_wm.policies import ExploringPolicy, ModelPolicy, PlannerPolicy, SearchPolicy
-from franka_wm.policies.expert import ExpertPolicy
+from franka_wm.policies.expert import ExpertPolicy, TaskwisePolicy
 from franka_wm.policies.scripted import (
     DiscreteIKPolicy,
     DiscretePolicy,
@@ -57,6 +59,8 @@ def make_env(
     described = run.env.changed(**changes)
     worlds = run.collector.num_envs if num_envs is None else num_envs
     start = derive_seed("training", run.seed) if seed is None else seed
+    if isinstance(described.config, MultiTaskConfig):
+        return MultiTaskEnv(described.config, num_envs=worlds, device=run.device, seed=start)
     if isinstance(described.config, ExternalConfig):
         return ExternalEnv(described.config, num_envs=worlds, device=resolve_device(run.device), seed=start)
     config = described.arm
@@ -233,7 +237,10 @@ def make_policies(
 def make_scripted_policies(
     env: Environment, *, seed: int = 0, smoothness: float = 0.7
 ) -> dict[str, TensorDictModuleBase]:
-    """Policies that need no model: ``noop``, ``random`` and, for the arm, ``ik``; with a gripper ``expert``."""
+    """Policies that need no model: ``noop``, ``random`` and, for the arm, ``ik``; with a gripper ``expert``.
+
+    Of several tasks at once ``expert`` is each task's own, or ``ik``.
+    """
     generator = torch.Generator(device=env.device).manual_seed(seed)
     discrete = not env.action_spec.dtype.is_floating_point
     arm = arm_of(env)
@@ -244,6 +251,11 @@ def make_scripted_policies(
         "noop": NoopPolicy(size),
         "random": SmoothRandomPolicy(size, smoothness=smoothness, generator=generator),
     }
+    if isinstance(env, MultiTaskEnv):
+        own = {name: make_scripted_policies(one) for name, one in env.envs.items()}
+        able = {name: found[by] for name, found in own.items() for by in ("ik", "expert") if by in found}
+        if len(able) == len(own):
+            scripted["expert"] = TaskwisePolicy(env, able)
     if arm is None:
         return scripted
     if discrete:

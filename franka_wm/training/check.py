@@ -8,6 +8,7 @@ from franka_wm import models
 from franka_wm.device import resolve_device
 from franka_wm.envs.external import ExternalConfig, check_external
 from franka_wm.envs.franka import check_robot
+from franka_wm.envs.multitask_config import MultiTaskConfig
 from franka_wm.errors import UserError
 from franka_wm.models import WorldModel
 from franka_wm.models.vision import ViT
@@ -153,6 +154,17 @@ def _check_parts(run: RunSettings) -> None:
     """Builds what costs little, where the environment's sizes are known before it is."""
     if isinstance(run.env.config, ExternalConfig):
         check_external(run.env.config)
+    if isinstance(run.env.config, MultiTaskConfig):
+        counts = {
+            "collector.num_envs": run.collector.num_envs,
+            "evaluation.episodes": run.evaluation.episodes,
+        }
+        for option, count in counts.items():
+            if count < len(run.env.config.tasks):
+                raise UserError(
+                    f"{option}={count}: env=multitask has {len(run.env.config.tasks)} tasks, each needs a world; "
+                    "raise it, or leave tasks out: '~env.tasks.NAME'"
+                )
     if not run.is_arm:
         return
     check_robot(run.env.arm, run.env.urdf_path)

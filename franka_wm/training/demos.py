@@ -68,6 +68,10 @@ def check_demonstrations(run: RunSettings) -> None:
     """
     if run.replay.demos is None:
         return
+    if run.env.kind == "multitask":
+        raise UserError(
+            "replay.demos: demonstrations are of one task, env=multitask has several; leave it at null"
+        )
     from franka_wm.data.lerobot.opening import read_datasets
     from franka_wm.data.lerobot.provenance import read_provenance
 

@@ -10,7 +10,7 @@ from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torchrl.collectors import Collector
 
-from franka_wm.envs import Environment
+from franka_wm.envs import Environment, FrankaEnv, MultiTaskEnv
 from franka_wm.training.build import arm_of
 
 
@@ -21,24 +21,30 @@ def same_worlds(saved: Mapping[str, Any], now: Mapping[str, Any]) -> bool:
     return fitting and all(saved[part] == now[part] for part in parts)
 
 
+def restorable(env: Environment) -> FrankaEnv | MultiTaskEnv | None:
+    """Where the states of worlds can be taken and put back; ``None``: another library's simulators."""
+    return env if isinstance(env, MultiTaskEnv) else arm_of(env)
+
+
 def worlds_now(env: Environment, collector: Collector | None) -> dict[str, object] | None:
     """The simulation of all worlds and the root that the collector's next step starts from, plans included.
 
     ``None`` before anything was gathered, and for environments of other libraries.
     """
-    arm = arm_of(env)
-    if arm is None or collector is None:
+    worlds = restorable(env)
+    if worlds is None or collector is None:
         return None
     # TorchRL keeps this to itself; its own state_dict leaves it out.
-    return {"state": _nested(arm.get_state()), "carry": _nested(collector._carrier)}
+    return {"state": _nested(worlds.get_state()), "carry": _nested(collector._carrier)}
 
 
 def put_back(env: Environment, collector: Collector, worlds: Mapping[str, Any]) -> None:
     """Undoes whatever happened to worlds and collector since :func:`worlds_now`, in this process or another."""
-    arm = arm_of(env)
-    assert arm is not None
-    arm.set_state(TensorDict(worlds["state"], batch_size=arm.batch_size, device=arm.device))
-    carry = TensorDict(worlds["carry"], batch_size=arm.batch_size, device=arm.device)
+    there = restorable(env)
+    assert there is not None
+    size = [] if isinstance(there, MultiTaskEnv) else there.batch_size
+    there.set_state(TensorDict(worlds["state"], batch_size=size, device=there.device))
+    carry = TensorDict(worlds["carry"], batch_size=there.batch_size, device=there.device)
     collector._carrier = carry.clear_device_() if collector._carrier.device is None else carry
 
 

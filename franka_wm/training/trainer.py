@@ -24,11 +24,11 @@ from franka_wm.interrupt import interruptible
 from franka_wm.models import WorldModel
 from franka_wm.policies.exploration import ActingPolicy
 from franka_wm.seeding import derive_seed, seeded
-from franka_wm.training.build import arm_of, explore
+from franka_wm.training.build import explore
 from franka_wm.training.checkpoint import Checkpoint, save_checkpoint
 from franka_wm.training.learner import Learner
 from franka_wm.training.loggers import log_numbers
-from franka_wm.training.moment import draws, go_on_drawing, put_back, same_worlds, worlds_now
+from franka_wm.training.moment import draws, go_on_drawing, put_back, restorable, same_worlds, worlds_now
 from franka_wm.training.settings import RunSettings
 from franka_wm.training.spaces import Spaces
 from franka_wm.training.storage_budget import fill, filled_bytes, reason_to_leave_out
@@ -425,7 +425,7 @@ class Trainer:
         if worlds is not None and same_worlds(checkpoint.config, self.settings.values):
             put_back(self.env, self._collect(), worlds)
         else:
-            if arm_of(self.env) is None:
+            if restorable(self.env) is None:
                 why = "the simulators of other libraries cannot be put back"
             else:
                 why = "of another configuration" if worlds is not None else "the checkpoint holds none"

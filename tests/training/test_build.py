@@ -33,7 +33,7 @@ def test_every_group_is_there() -> None:
     assert {"laptop", "gpu", "smoke"} <= set(options("scale"))
 
 
-OTHERS = ("gym", "dm_control", "none")
+OTHERS = ("gym", "dm_control", "none", "multitask")
 """Environments that are not the arm."""
 
 
@@ -47,6 +47,21 @@ def test_every_environment_preset(name: str, settled) -> None:
         assert config.goal_sampling == "fixed" and config.episode_length == 20
     elif name != "franka":
         assert config.goal_sampling == "reachable"
+
+
+def test_several_tasks_at_once_need_a_world_each(settled) -> None:
+    cfg = settled("env=multitask")
+    check(cfg)
+    assert len(cfg.env.config.tasks) == 8 and cfg.env.episode_length == 150 and not cfg.is_arm
+    fewer = settled("env=multitask", "~env.tasks.peg", "env.tasks.push.episode_length=33")
+    assert "peg" not in fewer.env.config.tasks and fewer.env.config.tasks["push"].episode_length == 33
+    longer = cfg.env.changed(episode_length=200).config
+    assert {one.episode_length for one in longer.tasks.values()} == {200}
+    with pytest.raises(UserError, match="demonstrations are of one task"):
+        check(settled("env=multitask", "replay.demos=anywhere"))
+    for option in ("collector.num_envs", "evaluation.episodes"):
+        with pytest.raises(UserError, match=f"{option}=7: env=multitask has 8 tasks"):
+            check(settled("env=multitask", f"{option}=7", "evaluation.during_episodes=7"))
 
 
 @pytest.mark.parametrize("name", options("scale"))

@@ -42,6 +42,13 @@ KINDS = {
         "env.randomization.observation_noise=0.01",
     ),
     "recurrent": ("model=dreamer", "collector.noise=0.4", "collector.planner_worlds=1"),
+    "tasks": (
+        "env=multitask",
+        *(f"~env.tasks.{name}" for name in ("track", "push", "pick", "stack", "drawer", "peg")),
+        "env.tasks.reach.substeps=1",
+        "env.tasks.lift.substeps=1",
+        "env.tasks.lift.episode_length=8",
+    ),
     "memory": ("model=lewm", "env=reach_goal_image", "env.image_size=32", "planner=icem", "collector.policy=planner"),
 }  # fmt: skip
 
@@ -57,6 +64,8 @@ def make(kind: str, settled, tiny: list[str], tmp_path_factory) -> Callable[...,
     asked = KINDS[kind]
     given = {one.split("=", 1)[0] for one in asked}
     sizes = [one for one in tiny if one.split("=", 1)[0] not in given]
+    if kind == "tasks":  # each has options of its own
+        sizes = [one for one in sizes if not one.startswith("env.")]
     if kind in ("moves", "memory"):
         sizes = [one for one in sizes if not one.startswith("planner.")]
     cfg = settled(

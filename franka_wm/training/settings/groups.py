@@ -12,6 +12,7 @@ from typing import Any
 from franka_wm import models
 from franka_wm.envs.config import FrankaConfig
 from franka_wm.envs.external import ExternalConfig, external_config
+from franka_wm.envs.multitask_config import MultiTaskConfig, multi_task_config
 from franka_wm.errors import UserError
 from franka_wm.options import choice, flag, is_whole, read, real, several, text, value, whole, whole_rule
 from franka_wm.policies.names import POLICIES
@@ -220,10 +221,10 @@ class PlannerSettings:
 
 @dataclass(frozen=True)
 class EnvSettings:
-    """The environment: ``franka`` with its config, another library's with its own, or ``none``."""
+    """The environment: ``franka`` or ``multitask`` with its config, another library's with its own, or ``none``."""
 
     kind: str
-    config: FrankaConfig | ExternalConfig | None
+    config: FrankaConfig | MultiTaskConfig | ExternalConfig | None
     urdf_path: str | None = None
     frame_stack: int = 1
     values: Mapping[str, Any] = field(default_factory=dict)
@@ -241,10 +242,14 @@ class EnvSettings:
             frames = values.get("frame_stack", 1)
             whole_rule(least=1).check("env.frame_stack", frames)
             return cls(kind, None, None, frames, values)
+        if kind == "multitask":
+            return cls(kind, multi_task_config(values), values=values)
         return cls(str(kind), external_config(values), values=values)
 
     def changed(self, **changes: Any) -> EnvSettings:
-        """The same with other values of its fields."""
+        """The same with other values of its fields, where there are several tasks in each of them."""
+        if changes and isinstance(self.config, MultiTaskConfig):
+            changes = {"tasks": {name: {**one, **changes} for name, one in self.values["tasks"].items()}}
         return EnvSettings.of({**self.values, **changes}) if changes else self
 
     @property
@@ -263,7 +268,7 @@ class EnvSettings:
         """The arm's task, or the name of another library's environment."""
         if isinstance(self.config, FrankaConfig):
             return self.config.task
-        return "none" if self.config is None else self.config.name
+        return self.config.name if isinstance(self.config, ExternalConfig) else self.kind
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,160 @@
+"""Several tasks at once: every world is as it would be alone, and each task is judged by itself."""
+
+import pytest
+import torch
+from tensordict import TensorDict
+from torchrl.collectors import Collector
+from torchrl.envs import RewardSum, TransformedEnv
+from torchrl.envs.utils import check_env_specs
+
+from franka_wm import conf
+from franka_wm.envs import FrankaEnv, MultiTaskEnv
+from franka_wm.envs.multitask_config import MultiTaskConfig, multi_task_config
+from franka_wm.errors import UserError
+from franka_wm.evaluation.closed_loop import play_episodes, summarize
+from franka_wm.report.table import evaluation_tables
+from franka_wm.seeding import derive_seed
+from franka_wm.training import build
+from franka_wm.training.settings import RunSettings
+
+STEPS = 9
+SHORT = {"reach": 4, "push": 6}
+
+
+@pytest.fixture(scope="module")
+def config() -> MultiTaskConfig:
+    values = RunSettings.of(conf.compose("env=multitask")).env.values["tasks"]
+    tasks = {name: {**values[name], "substeps": 1, "episode_length": steps} for name, steps in SHORT.items()}
+    return multi_task_config({"kind": "multitask", "tasks": tasks})
+
+
+@pytest.fixture(scope="module")
+def env(config) -> MultiTaskEnv:
+    return MultiTaskEnv(config, num_envs=5, device="cpu", seed=3)
+
+
+def actions() -> torch.Tensor:
+    return torch.rand(STEPS, 5, 8, generator=torch.Generator().manual_seed(0)) * 2 - 1
+
+
+def play(env, given: torch.Tensor) -> tuple[TensorDict, TensorDict]:
+    """Roots, and what came next, of steps with automatic resets: batch size (steps, worlds)."""
+    now, roots, after = env.reset(), [], []
+    for action in given:
+        roots.append(now.select(*env.observation_spec.keys()))
+        step, now = env.step_and_maybe_reset(now.set("action", action))
+        after.append(step["next"].clone())
+    return torch.stack(roots), torch.stack(after)  # type: ignore[return-value]
+
+
+def test_every_world_is_as_it_would_be_alone(env, config) -> None:
+    env.set_seed(3)
+    roots, after = play(env, actions())
+    assert env.sizes == {"state": 28, "joint_target": 8, "objects": 13, "goal": 3} and env.action_dim == 8
+    assert torch.equal(roots["task"][0], torch.eye(2)[[0, 1, 0, 1, 0]])
+    for k, (name, one) in enumerate(config.tasks.items()):
+        alone = FrankaEnv(one, num_envs=len(range(k, 5, 2)), device="cpu", seed=derive_seed("task", 3, name))
+        own_roots, own_after = play(alone, actions()[:, k::2, : alone.action_dim])
+        for together, apart in ((roots[:, k::2], own_roots), (after[:, k::2], own_after)):
+            for key in apart.keys():  # noqa: SIM118
+                found, size = together[key], apart[key].shape[-1]
+                assert torch.equal(found[..., :size], apart[key]), (name, key)
+                assert not found[..., size:].any(), (name, key)
+    assert not after["objects"][:, 0::2].any()  # reach has none
+    ends = after["done"][..., 0].nonzero().tolist()
+    assert [3, 0] in ends and [5, 1] in ends and [3, 1] not in ends  # each task at its own time
+
+
+def test_it_is_an_environment_of_torchrls(env) -> None:
+    check_env_specs(env)
+    collector = Collector(
+        TransformedEnv(env, RewardSum()), env.rand_action, frames_per_batch=5 * 12, total_frames=5 * 12
+    )
+    data = next(iter(collector))
+    collector.shutdown()
+    for world in range(5):
+        total = 0.0
+        for t in range(12):
+            total += float(data["next", "reward"][world, t])
+            assert abs(float(data["next", "episode_reward"][world, t]) - total) < 1e-4
+            if data["next", "done"][world, t]:
+                total = 0.0
+
+
+def test_statistics_tell_tasks_apart(env) -> None:
+    env.set_seed(3)
+    env.statistics()
+    _, after = play(env, actions())
+    found = env.statistics()
+    done = after["done"][..., 0]
+    assert found["episodes"] == int(done.sum()) == 3 * 2 + 2
+    lengths = [4] * 6 + [6] * 2
+    assert found["length"] == pytest.approx(sum(lengths) / 8)
+    assert {"success/reach", "success/push"} <= set(found)
+    assert "return" not in env.statistics()  # nothing has ended since
+
+
+def test_worlds_go_on_from_a_state(env) -> None:
+    env.set_seed(3)
+    play(env, actions()[:2])
+    state = env.get_state()
+    first = [env.step(TensorDict({"action": a}, [5]))["next"].clone() for a in actions()[2:4]]
+    env.set_state(state)
+    for a, expected in zip(actions()[2:4], first, strict=True):
+        found = env.step(TensorDict({"action": a}, [5]))["next"]
+        assert all(torch.equal(found[key], expected[key]) for key in ("state", "objects", "reward"))
+    with pytest.raises(UserError, match="these worlds are of reach, push"):
+        env.set_state(state.exclude("push"))
+
+
+def test_each_task_has_its_expert(env) -> None:
+    policies = build.make_scripted_policies(env)
+    assert set(policies) == {"noop", "random", "expert"}
+    now = env.reset()
+    acted = policies["expert"](now.clone())["action"]
+    for k, (name, one) in enumerate(env.envs.items()):
+        own = build.make_scripted_policies(one)
+        alone = own.get("expert", own.get("ik"))(env.split(now)[name])["action"]
+        assert torch.equal(acted[k::2, : alone.shape[-1]], alone)
+
+
+def test_success_of_a_task_counts_its_own_worlds_alone(env, monkeypatch) -> None:
+    step = env._step
+
+    def succeeding(tensordict):
+        out = step(tensordict)
+        return out.set("success", env.one_hot[:, 1:2].bool() & (torch.arange(5).unsqueeze(-1) > 1))
+
+    monkeypatch.setattr(env, "_step", succeeding)
+    played = play_episodes(env, lambda td: td.set("action", torch.zeros(5, 8)), seed=1)
+    own = played["measures"]
+    assert torch.equal(own["success push"].isnan(), env.one_hot[:, 0].bool())
+    assert own["success push"][[1, 3]].tolist() == [0.0, 1.0]
+    assert own["success reach"][[0, 2, 4]].tolist() == [0.0, 0.0, 0.0]
+    found = summarize(played)
+    assert found["success"]["mean"] == pytest.approx(0.2) and found["measures"]["success push"]["mean"] == 0.5
+    assert found["measures"]["success push"]["low"] > 0.05  # Wilson's interval of one in two
+    table, _ = evaluation_tables({"planner": found})
+    assert "success push [%]" in table.header
+    assert table.rows[0][table.header.index("success push [%]")].startswith("50 (")
+
+
+@pytest.mark.parametrize(
+    ("values", "said"),
+    [
+        ({"tasks": {}}, "must name at least one task"),
+        ({"tasks": [1]}, "must be tasks by name"),
+        ({"tasks": {"a": {"kind": "gym"}}}, r"env\.tasks\.a: must be a preset of the arm"),
+        ({"tasks": {"a": {"kind": "franka", "observations": ["pixels"]}}}, "observe vectors alone"),
+        ({"tasks": {"a": {"kind": "franka", "substeps": 0}}}, r"env\.tasks\.a: .*substeps"),
+        ({"tasks": {"a": {"kind": "franka"}}, "fps": 3}, r"options of one task are env\.tasks\.NAME\.fps"),
+    ],
+)
+def test_what_does_not_fit_is_one_line(values, said) -> None:
+    with pytest.raises(UserError, match=said):
+        multi_task_config({"kind": "multitask", **values})
+
+
+def test_fewer_worlds_than_tasks(config) -> None:
+    with pytest.raises(UserError, match="2 tasks need at least as many worlds"):
+        MultiTaskEnv(config, num_envs=1, device="cpu")
