@@ -2,10 +2,11 @@ import pytest
 import torch
 from tensordict import TensorDict
 
-from franka_wm.models import make
+from franka_wm.models import lewm, make
 from franka_wm.models.history import FrameHistory
 from franka_wm.models.lewm import LeWorldModel
 from franka_wm.models.transformer import CausalTransformer, block_causal_mask, hide_invalid
+from franka_wm.models.windows import check_windows, window_of
 
 
 @pytest.fixture(autouse=True)
@@ -190,6 +191,12 @@ def test_planning_does_not_depend_on_the_rest_of_the_batch_in_any_mode(dots):
     assert not torch.equal(model.projector.norm.running_mean, running)
 
 
+def test_windows_are_counted(dots):
+    assert check_windows(dots.windows(5, 2)) == (5, 2)
+    with pytest.raises(ValueError, match=r"batch size \[B, H\], got \[5\]"):
+        check_windows(dots.windows(5, 2)[:, 0])
+
+
 def test_the_loss_is_what_it_says(dots):
     model = small(sigreg_coef=0.5)
     torch.manual_seed(3)
@@ -210,6 +217,26 @@ def test_the_loss_is_what_it_says(dots):
     torch.testing.assert_close(2 * read, doubled)
     total = extra["loss_prediction"] + 0.09 * extra["loss_sigreg"] + sum(extra[part] for part in parts)
     torch.testing.assert_close(extra["loss"].detach(), total)
+
+
+def test_each_part_of_the_loss_sees_its_own_frames(dots, monkeypatch):
+    model = small(infonce_coef=0.5, inverse_coef=0.25, history=3).eval()
+    batch, seen = dots.windows(6, 3), {}
+    sigreg, inverse = model._sigreg, model._inverse_loss
+    monkeypatch.setattr(model, "_sigreg", lambda frames: seen.update(sigreg=frames) or sigreg(frames))
+    monkeypatch.setattr(
+        model, "_inverse_loss", lambda *given: seen.update(inverse=inverse(*given)) or seen["inverse"]
+    )
+    monkeypatch.setattr(lewm, "info_nce", lambda *given: seen.update(pairs=given) or torch.tensor(8.0))
+    losses = model.loss(batch)
+    frames = model.encode_frame(window_of(batch, ["pixels"]))
+    torch.testing.assert_close(seen["sigreg"], frames.transpose(0, 1))  # time leads
+    predicted, came = seen["pairs"]
+    torch.testing.assert_close(came, frames[:, -1])
+    z = model.history.gather(frames, batch["action"])[:, 2]
+    torch.testing.assert_close(predicted, model.history.last(model.next(z, batch["action"][:, 2])))
+    assert losses["loss_infonce"] == 4.0
+    torch.testing.assert_close(losses["loss_inverse"], 0.25 * seen["inverse"].detach())
 
 
 @pytest.mark.parametrize("rollout", [2, 3, 9])
