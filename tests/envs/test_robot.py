@@ -14,6 +14,7 @@ from scipy.spatial.transform import Rotation
 from franka_wm.envs import FrankaConfig, FrankaEnv
 from franka_wm.envs.config import HOME
 from franka_wm.envs.kinematics import Kinematics
+from franka_wm.envs.robots.gripper import PAD, PAD_ALONG, PAD_AWAY
 from franka_wm.errors import UserError
 
 
@@ -231,3 +232,22 @@ def test_urdf_that_cannot_be_used(tmp_path, content: str | None) -> None:
     with pytest.raises(UserError) as caught:
         FrankaEnv(FrankaConfig(robot="urdf", observations=("state",)), device="cpu", urdf_path=path)
     assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("finger", ["fr3_leftfinger", "fr3_rightfinger"])
+def test_fingers_are_drawn_where_they_touch(finger: str, urdf: ET.Element) -> None:
+    """A white finger and a dark pad, in the box that is felt; the pad's face is the box's."""
+    link = next(e for e in urdf.iter("link") if e.get("name") == finger)
+    felt = np.array(
+        [[-PAD[0], PAD_AWAY - PAD[1], PAD_ALONG - PAD[2]], [PAD[0], PAD_AWAY + PAD[1], PAD_ALONG + PAD[2]]]
+    )
+    faces = {}
+    for visual in link.findall("visual"):
+        centre, sides = (
+            numbers(visual.find("origin").get("xyz")),
+            numbers(visual.find("geometry/box").get("size")),
+        )
+        assert (centre - sides / 2 >= felt[0] - 1e-9).all() and (centre + sides / 2 <= felt[1] + 1e-9).all()
+        faces[visual.find("material").get("name")] = centre[1] - sides[1] / 2
+    assert set(faces) == {"white", "dark"}
+    assert faces["dark"] == pytest.approx(felt[0, 1]) and faces["white"] > faces["dark"]
