@@ -142,14 +142,15 @@ class UntrustedFolder:
             if not path.is_dir() and self.path(name) is not None:
                 yield name
 
-    def check_links(self) -> None:
-        """Refuse every link below the folder that leaves it.
+    def check_links(self, below: str | Path = "") -> None:
+        """Refuse every link in the folder, or in the folder `below` in it, that leaves the former.
 
         Raises:
             UserError: it names the first one.
         """
-        for path in sorted(self.root.rglob("*")):
-            self._inside(path.relative_to(self.root))
+        for path in sorted((self.root / below).rglob("*")):
+            if path.is_symlink():
+                self._inside(path.relative_to(self.root))
 
 
 def linked_json(path: Path) -> dict[str, Any]:

@@ -12,6 +12,7 @@ from pathlib import Path
 import pytest
 
 from franka_wm.commands import main as cli
+from franka_wm.data.lerobot.source import read_source
 from franka_wm.errors import UserError
 from franka_wm.untrusted import MOST_JSON, MOST_YAML, UntrustedFolder, check_image, check_video
 
@@ -88,6 +89,27 @@ def test_links_that_leave_the_folder_are_refused(name: str, whole_folder: bool, 
         link.unlink(missing_ok=True)
         link.symlink_to(secret)
     refused(run, "is a link to", capsys)
+
+
+@pytest.mark.parametrize("name", ["meta/info.json", "data/chunk-000/file-000.parquet", "videos"])
+def test_links_out_of_a_dataset_are_refused(name: str, tmp_path: Path) -> None:
+    """But for those of the Hub's cache, which lead to its own files of the same repository."""
+    kept = tmp_path / "datasets--a--b" / "blobs" / "1"
+    for root, target, says in (
+        (tmp_path / "set", kept, "is a link to"),
+        (tmp_path / "datasets--a--b" / "snapshots" / "0", kept, "fps is missing"),
+        (tmp_path / "datasets--a--b" / "snapshots" / "1", tmp_path / "secret", "is a link to"),
+    ):
+        for path in (root / "meta" / "info.json", root / name):
+            path.parent.mkdir(parents=True, exist_ok=True)
+        kept.parent.mkdir(parents=True, exist_ok=True)
+        kept.write_text('{"codebase_version": "v3.0", "features": {}}')
+        (tmp_path / "secret").write_text(kept.read_text())
+        (root / "meta" / "info.json").write_text(kept.read_text())
+        (root / name).unlink(missing_ok=True)
+        (root / name).symlink_to(target)
+        with pytest.raises(UserError, match=says):
+            read_source(root)
 
 
 def test_links_within_the_folder_are_followed(run: Path) -> None:

@@ -35,7 +35,10 @@ def run_command(main: Callable[[], object], arguments: list[str] | None = None) 
         arguments: After the program's name; the command line's if not given.
     """
     with terminal_log(), one_line_refusals():
-        _run(main, sys.argv[1:] if arguments is None else arguments)
+        try:
+            _run(main, sys.argv[1:] if arguments is None else arguments)
+        except KeyboardInterrupt:  # before a run begins
+            sys.exit(INTERRUPTED)
 
 
 @contextmanager

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 import franka_wm
-from franka_wm.commands import bench, listing
+from franka_wm.commands import bench, entry, listing
 from franka_wm.commands import main as cli
 from light import Answer, answers
 
@@ -248,3 +248,15 @@ def test_list_into_a_closed_pipe_leaves_no_traceback() -> None:
     done = subprocess.run(["bash", "-c", command], capture_output=True, text=True, check=False)
     assert "Traceback" not in done.stderr
     assert "BrokenPipe" not in done.stderr
+
+
+def test_ctrl_c_before_a_run_begins(monkeypatch, capsys) -> None:
+    """`train.py`: while the configuration is composed, or libraries are loaded."""
+
+    def interrupted(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(entry, "check_command", interrupted)
+    with pytest.raises(SystemExit) as caught:
+        entry.run_command(lambda: None, ["scale=smoke"])
+    assert caught.value.code == 130 and capsys.readouterr().err == ""

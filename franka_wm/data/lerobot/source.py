@@ -16,7 +16,7 @@ import numpy as np
 
 from franka_wm.errors import UserError
 from franka_wm.options import is_real, is_whole
-from franka_wm.untrusted import linked_bytes, linked_json
+from franka_wm.untrusted import UntrustedFolder, linked_bytes, linked_json
 
 DEFAULT_DATA_PATH = "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
 DEFAULT_VIDEO_PATH = "videos/{video_key}/chunk-{chunk_index:03d}/file-{file_index:03d}.mp4"
@@ -128,7 +128,8 @@ def read_source(root: str | Path) -> Source:
     """Reads the metadata of the dataset in the folder ``root``.
 
     Raises:
-        UserError: If there is none, it is of another version, holds no episodes, or was not finished.
+        UserError: If there is none, it is of another version, holds no episodes, was not finished, or links to files
+            elsewhere.
     """
     root = Path(root).expanduser()
     info_path = root / "meta" / "info.json"
@@ -138,6 +139,9 @@ def read_source(root: str | Path) -> Source:
         raise UserError(
             f"dataset.root={root}: no LeRobot dataset, meta/info.json is missing; give the folder that holds meta/"
         )
+    # A snapshot in the Hub's cache is a folder of links to where the cache keeps the files of the repository.
+    home = root.absolute().parents[1] if root.absolute().parent.name == "snapshots" else root.absolute()
+    UntrustedFolder(home).check_links(root.absolute().relative_to(home))
     info = linked_json(info_path)
     for name in ("codebase_version", "features", "fps"):
         if name not in info:
