@@ -103,7 +103,7 @@ class ExpertPolicy(DrawingPolicy):
 
 
 class TaskwisePolicy(ScriptedPolicy):
-    """Of several tasks at once: each task's worlds act by a policy of their own.
+    """Policy of several tasks at once: each task's worlds act by one of their own.
 
     Args:
         env: The worlds.
