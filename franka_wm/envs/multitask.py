@@ -204,6 +204,14 @@ class MultiTaskEnv(EnvBase):
             raise UserError(
                 f"set_state: of {', '.join(map(str, state.keys()))}; these worlds are of {', '.join(self.envs)}"
             )
+        sizes = {name: state.get(name).batch_size for name in self.envs}
+        wrong = [
+            name for name, env in self.envs.items() if sizes[name] not in (env.batch_size, torch.Size([]))
+        ]
+        if wrong:
+            raise UserError(
+                f"set_state: {wrong[0]} has another number of worlds; take it from get_state() of this one"
+            )
         for name, env in self.envs.items():
             entries = dict(state.get(name).items())
             env.set_state(TensorDict(entries, batch_size=env.batch_size, device=env.device))

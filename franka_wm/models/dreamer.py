@@ -288,7 +288,8 @@ class Dreamer(WorldModel):
 
         # Actor and critic, in imagination and on what was recorded.
         imagined, actions = self._imagine(z.detach().flatten(0, 1))
-        returns, value, weight = self._imagined_returns(imagined)
+        begun = torch.cat((torch.ones_like(reward[:1]), (~terminated).to(reward.dtype)))
+        returns, value, weight = self._imagined_returns(imagined, begun.flatten(0, 1))
         if self.training:
             self.scale.update(returns)
         policy_loss, entropy = self._policy_loss(imagined[:-1], actions, returns, value, weight)
@@ -388,8 +389,12 @@ class Dreamer(WorldModel):
         return torch.stack(states), torch.stack(actions)
 
     @torch.no_grad()
-    def _imagined_returns(self, imagined: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """λ-returns, values and weights (K, N, 1) of states (K+1, N, Z): the discounted chance to get there."""
+    def _imagined_returns(self, imagined: Tensor, begun: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """λ-returns, values and weights (K, N, 1) of states (K+1, N, Z): the discounted chance to get there.
+
+        Args:
+            begun: (N, 1), 0 where the first state had ended its episode.
+        """
         reward, value = self.two_hot.decode(self.reward_head(imagined[1:])), self.value(imagined)
         going_on = torch.ones_like(reward)
         if self.termination_head is not None:
@@ -397,7 +402,7 @@ class Dreamer(WorldModel):
         returns = lambda_returns(
             reward, going_on, value[1:], discount=self.discount, decay=self.return_lambda
         )
-        weight = torch.cat((torch.ones_like(reward[:1]), self.discount * going_on[:-1])).cumprod(0)
+        weight = torch.cat((begun.unsqueeze(0), self.discount * going_on[:-1])).cumprod(0)
         return returns, value[:-1], weight
 
     def _policy_loss(

@@ -253,7 +253,12 @@ def make_scripted_policies(
     }
     if isinstance(env, MultiTaskEnv):
         own = {name: make_scripted_policies(one) for name, one in env.envs.items()}
-        able = {name: found[by] for name, found in own.items() for by in ("ik", "expert") if by in found}
+        able = {
+            name: found[by]
+            for name, found in own.items()
+            for by in ("ik", "expert")
+            if by in found and {*found[by].in_keys} <= {*env.envs[name].observation_spec.keys()}
+        }
         if len(able) == len(own):
             scripted["expert"] = TaskwisePolicy(env, able)
     if arm is None:
@@ -403,7 +408,7 @@ def make_replay_buffer(
         stacked=("pixels", *(f"pixels_{camera}" for camera in cameras)) if run.env.frame_stack > 1 else (),
         hindsight=hindsight,
         demonstrations=demonstrations,
-        episode_length=run.env.episode_length,
+        episode_length=run.env.shortest_episode,
     )
 
 

@@ -66,10 +66,12 @@ def check(run: RunSettings) -> None:
 def _check_windows(run: RunSettings) -> None:
     """Whether windows fit into episodes, into the replay, and into what is gathered before the first update."""
     run.model.family.validate(run.model.options, window=run.window)
-    if run.env.kind != "none" and run.env.episode_length < run.window and not run.crosses_episodes:
+    shortest = run.env.shortest_episode
+    if run.env.kind != "none" and shortest < run.window and not run.crosses_episodes:
+        whose = "the shortest env.tasks.NAME" if run.env.kind == "multitask" else "env"
         raise UserError(
-            f"env.episode_length={run.env.episode_length} is shorter than replay.window={run.window}; "
-            "no window would fit into an episode"
+            f"{whose}.episode_length={shortest} is shorter than replay.window={run.window}; "
+            f"no window would fit into an episode: use replay.window={shortest} or less"
         )
     before = run.env.frame_stack - 1  # steps whose images a window's first stack needs
     asked_for = f"windows have {run.window} steps" + (
@@ -158,9 +160,10 @@ def _check_parts(run: RunSettings) -> None:
         counts = {
             "collector.num_envs": run.collector.num_envs,
             "evaluation.episodes": run.evaluation.episodes,
+            "evaluation.during_episodes": run.evaluation.during_episodes,
         }
         for option, count in counts.items():
-            if count < len(run.env.config.tasks):
+            if count is not None and count < len(run.env.config.tasks):
                 raise UserError(
                     f"{option}={count}: env=multitask has {len(run.env.config.tasks)} tasks, each needs a world; "
                     "raise it, or leave tasks out: '~env.tasks.NAME'"

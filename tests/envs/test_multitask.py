@@ -65,6 +65,21 @@ def test_every_world_is_as_it_would_be_alone(env, config) -> None:
     assert [3, 0] in ends and [5, 1] in ends and [3, 1] not in ends  # each task at its own time
 
 
+def test_a_reset_by_mask_touches_the_worlds_that_it_names(env) -> None:
+    env.set_seed(3)
+    play(env, actions()[:2])
+    before = env.step(TensorDict({"action": actions()[2]}, [5]))["next"]
+    mask = torch.tensor([False, False, False, True, True]).unsqueeze(-1)
+    after = env._reset(TensorDict({"_reset": mask}, [5]))
+    assert torch.equal(after["is_init"], mask)
+    changed = (after["state"] != before["state"]).any(-1, keepdim=True)
+    assert torch.equal(changed, mask)
+    first = env.reset(seed=7)["state"].clone()
+    assert torch.equal(env.reset(seed=7)["state"], first) and not torch.equal(
+        env.reset(seed=8)["state"], first
+    )
+
+
 def test_it_is_an_environment_of_torchrls(env) -> None:
     check_env_specs(env)
     collector = Collector(
@@ -105,6 +120,8 @@ def test_worlds_go_on_from_a_state(env) -> None:
         assert all(torch.equal(found[key], expected[key]) for key in ("state", "objects", "reward"))
     with pytest.raises(UserError, match="these worlds are of reach, push"):
         env.set_state(state.exclude("push"))
+    with pytest.raises(UserError, match="push has another number of worlds"):
+        env.set_state(state.clone().set("push", state["push"][:1]))
 
 
 def test_each_task_has_its_expert(env) -> None:

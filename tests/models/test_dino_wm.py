@@ -7,6 +7,7 @@ from tensordict import TensorDict
 from franka_wm.errors import UserError
 from franka_wm.models import make
 from franka_wm.models.dino_wm import DINOWM
+from franka_wm.models.windows import window_of
 
 DINO = dict(model_type="dinov2", hidden_size=16, num_hidden_layers=1, num_attention_heads=2, image_size=28)
 DINO |= dict(patch_size=7, mlp_ratio=2)
@@ -124,6 +125,14 @@ def test_the_loss_is_the_squared_error_of_the_next_patches_and_state(dots):
     torch.testing.assert_close(losses["loss_prediction"], patches)
     torch.testing.assert_close(losses["loss_state"], state)
     torch.testing.assert_close(losses["loss"], patches + state)
+    # Windows longer than the history are cut into all runs of its length.
+    window = dots.windows(4, 4)
+    frames = model.encode_frame(window_of(window, model.observation_keys))
+    runs = []
+    for start in (0, 1):
+        part, actions = frames[:, start : start + 4], window["action"][:, start : start + 3]
+        runs.append((model._predict(part[:, :-1], actions, None) - part[:, 1:])[..., :f].square().mean())
+    torch.testing.assert_close(model.loss(window)["loss_prediction"], torch.stack(runs).mean())
 
 
 def test_it_learns_where_the_dot_goes(dots):

@@ -277,13 +277,16 @@ def test_imagined_returns_stop_where_the_model_expects_an_end():
     with torch.no_grad():
         model.termination_head[-1].weight.zero_()
         model.termination_head[-1].bias.fill_(50.0)  # every state is an end
-    returns, value, weight = model._imagined_returns(states)
+    begun = torch.ones(6, 1)
+    returns, value, weight = model._imagined_returns(states, begun)
     torch.testing.assert_close(returns, reward)
     torch.testing.assert_close(value, model.value(states[:-1]))
     assert torch.equal(weight[0], torch.ones(6, 1)) and weight[1:].max() < 1e-10
     with torch.no_grad():
         model.termination_head[-1].bias.fill_(-50.0)
-    returns, _, weight = model._imagined_returns(states)
+    begun[2] = 0.0  # that state had ended its episode: nothing is learned from what would follow
+    returns, _, weight = model._imagined_returns(states, begun)
+    assert not weight[:, 2].any()
     expected = model.value(states[-1])
     for t in (3, 2, 1, 0):
         expected = reward[t] + 0.9 * expected
@@ -308,6 +311,36 @@ def test_the_actor_takes_up_what_paid_more_than_expected():
     keen = small(entropy_coef=2.0)
     bonus, entropy = keen._policy_loss(z, actions, value, value, torch.full((1, 400, 1), 0.5))
     torch.testing.assert_close(bonus, -0.5 * 2.0 * entropy)  # entropy alone is rewarded
+
+
+def test_what_had_ended_begins_no_imagined_trajectory(monkeypatch):
+    model, seen = randomise(small(terminates=True)), []
+    batch = windows(batch=5, horizon=3)
+    batch["next", "terminated"][1, -1] = True
+    returns = model._imagined_returns
+    monkeypatch.setattr(model, "_imagined_returns", lambda z, begun: seen.append(begun) or returns(z, begun))
+    model.loss(batch)
+    expected = torch.ones(4, 5)
+    expected[3, 1] = 0.0
+    assert torch.equal(seen[0].view(4, 5), expected)
+
+
+def test_advantages_are_divided_by_the_running_range_of_returns():
+    model = randomise(small(entropy_coef=0.0))
+    batch = windows(batch=5, horizon=3)
+    model.eval().loss(batch)
+    assert model.scale.value == 1.0
+    with torch.no_grad():
+        model.critic[-1].weight.normal_(std=5.0)
+    model.train().loss(batch)
+    assert model.scale.value > 1.0  # moved in training mode alone
+    z, actions = torch.randn(2, 6, model.latent_dim), torch.randn(2, 6, 2)
+    returns, value, weight = torch.randn(2, 6, 1), torch.randn(2, 6, 1), torch.ones(2, 6, 1)
+    losses = []
+    for scale in (1.0, 4.0):
+        model.scale.value.fill_(scale)
+        losses.append(model._policy_loss(z, actions, returns, value, weight)[0])
+    torch.testing.assert_close(losses[0], 4.0 * losses[1])
 
 
 def test_no_value_is_bootstrapped_past_a_recorded_termination(monkeypatch):
@@ -362,6 +395,8 @@ def test_statistics_standardise_what_is_encoded_and_reconstructed():
     other.set_observation_statistics(torch.zeros(5), torch.ones(5))
     ones = observation.apply(torch.ones_like)
     torch.testing.assert_close(model.encode(observation), other.encode(ones))
+    z = torch.randn(1, model.latent_dim)
+    torch.testing.assert_close(model._reconstruction(z, observation), other._reconstruction(z, ones))
 
 
 @pytest.mark.gpu

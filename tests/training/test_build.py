@@ -59,9 +59,13 @@ def test_several_tasks_at_once_need_a_world_each(settled) -> None:
     assert {one.episode_length for one in longer.tasks.values()} == {200}
     with pytest.raises(UserError, match="demonstrations are of one task"):
         check(settled("env=multitask", "replay.demos=anywhere"))
-    for option in ("collector.num_envs", "evaluation.episodes"):
+    for option in ("collector.num_envs", "evaluation.episodes", "evaluation.during_episodes"):
         with pytest.raises(UserError, match=f"{option}=7: env=multitask has 8 tasks"):
-            check(settled("env=multitask", f"{option}=7", "evaluation.during_episodes=7"))
+            check(settled("env=multitask", f"{option}=7"))
+    with pytest.raises(
+        UserError, match=r"the shortest env\.tasks\.NAME\.episode_length=2 .* use replay\.window=2"
+    ):
+        check(settled("env=multitask", "env.tasks.lift.episode_length=2"))
 
 
 @pytest.mark.parametrize("name", options("scale"))

@@ -264,6 +264,13 @@ class EnvSettings:
         return 0 if self.config is None else self.config.episode_length
 
     @property
+    def shortest_episode(self) -> int:
+        """Steps, at most, of the task with the shortest episodes; 0 without an environment."""
+        if isinstance(self.config, MultiTaskConfig):
+            return min(one.episode_length for one in self.config.tasks.values())
+        return self.episode_length
+
+    @property
     def label(self) -> str:
         """The arm's task, or the name of another library's environment."""
         if isinstance(self.config, FrankaConfig):
