@@ -12,7 +12,7 @@ import pytest
 import torch
 from hydra.core.override_parser.overrides_parser import OverridesParser
 
-from forks import run_in_fork, script
+from forks import script, spare
 
 ROOT = Path(__file__).resolve().parents[2]
 GROUPS = ("*.md", "docs/*.md", "docs/models/*.md", "docs/reference/*.md", ".github/*.md")
@@ -77,7 +77,7 @@ def test_readme_collects(tmp_path: Path) -> None:
     (code,) = blocks("README.md", "python")
     assert code.count("1024") >= 3
     (tmp_path / "script.py").write_text(code.replace("1024", "2"))
-    done = run_in_fork(script(tmp_path / "script.py"), tmp_path)
+    done = spare().fork(script(tmp_path / "script.py"), tmp_path)  # of a process without threads
     assert (done.returncode, done.stderr) == (0, "")
     lines = done.stdout.splitlines()
     assert len(lines) == 10 and all("torch.Size([2, 16, 64, 64, 3])" in line for line in lines)
