@@ -109,6 +109,7 @@ class MultiTaskEnv(EnvBase):
             parts.append(env._step(TensorDict({"action": own}, env.batch_size, device=env.device)))
         return TensorDict(self._together(parts), batch_size=self.batch_size, device=self.device)
 
+    # It asks for `config.auto_reset`, `restarting` and `_present` alone.
     _step_and_maybe_reset = FrankaEnv._step_and_maybe_reset  # pyright: ignore[reportAssignmentType]
 
     @contextmanager

@@ -74,12 +74,12 @@ def play_episodes(
 
     Returns:
         Batch size (N,), or (episodes,), all float32, of each world's first episode up to its true last observation.
-        ``return`` and ``length`` of any environment. Of the arm also:
+        ``return`` and ``length`` of any environment. Of several tasks at once also ``success``, ``success_once``, and
+        ``task_success`` by task, NaN in the worlds of others. Of the arm also:
 
         * ``success`` at the end and ``success_once`` at any step, as the task judges, 0 or 1;
         * ``final_distance`` and ``closest_distance``, tool to goal [m], where success is to be near the goal;
-        * ``measures``, by name, at the end: the task's own (:meth:`~franka_wm.envs.tasks.Task.measures`); of several
-          tasks at once the success of each, NaN in the worlds of others;
+        * ``measures``, by name, at the end: the task's own (:meth:`~franka_wm.envs.tasks.Task.measures`);
         * ``path_length`` of the tool [m];
         * ``action_change``: mean over steps and components of the squared change of the action as the servo
           gets it, in units of the action;
@@ -147,10 +147,10 @@ class _Tasks:
 
     def summary(self, length: Tensor) -> dict[str, Any]:
         own = {
-            f"success {name}": torch.where(self.one_hot[:, k], self.success.float(), torch.nan)
+            name: torch.where(self.one_hot[:, k], self.success.float(), torch.nan)
             for k, name in enumerate(self.names)
         }
-        return {"success": self.success.float(), "success_once": self.once.float(), "measures": own}
+        return {"success": self.success.float(), "success_once": self.once.float(), "task_success": own}
 
 
 class _Motion:
@@ -213,9 +213,9 @@ def summarize(episodes: TensorDictBase, *, thresholds: Sequence[float] = THRESHO
 
     Returns:
         What there is: ``final_distance`` [m]; ``success`` at the end and ``success_once`` at any step, by threshold
-        where there are distances, else one rate each, as the task judges; ``return``; ``measures`` of the task's own,
-        by name; ``path_length``, ``action_change``, ``jerk``, ``length``, each with its interval; and ``episodes``,
-        the count.
+        where there are distances, else one rate each, as the task judges; ``task_success`` by task; ``return``;
+        ``measures`` of the task's own, by name; ``path_length``, ``action_change``, ``jerk``, ``length``, each with its
+        interval; and ``episodes``, the count.
     """
     present = {str(name): episodes.get(name).cpu() for name in episodes.keys()}  # noqa: SIM118
     count = episodes.numel()
@@ -230,15 +230,14 @@ def summarize(episodes: TensorDictBase, *, thresholds: Sequence[float] = THRESHO
         return {name: wilson(int(present[name].sum()), count).as_dict()} if name in present else {}
 
     own = present.get("measures", {})
-    own = {str(name): own[name][~own[name].isnan()] for name in own.keys()}  # noqa: SIM118
-    own = {
-        name: (wilson(int(x.sum()), len(x)) if name.startswith("success ") else bootstrap_mean(x)).as_dict()
-        for name, x in own.items()
-        if len(x)
-    }
+    own = {str(name): bootstrap_mean(own[name]).as_dict() for name in own.keys()}  # noqa: SIM118
+    tasks = present.get("task_success", {})
+    tasks = {str(name): tasks[name][~tasks[name].isnan()] for name in tasks.keys()}  # noqa: SIM118
+    tasks = {name: wilson(int(x.sum()), len(x)).as_dict() for name, x in tasks.items() if len(x)}
     return {
         **means("final_distance"),
         **rates("success", "final_distance"),
+        **({"task_success": tasks} if tasks else {}),
         **rates("success_once", "closest_distance"),
         **means("return"),
         **({"measures": own} if own else {}),

@@ -115,8 +115,8 @@ def point(
         success_distance: of the several that count as success, the task's own [m].
 
     Returns:
-        ``eval/POLICY/QUANTITY``: ``final_distance`` [m], ``success``, ``return`` and the task's own measures; what
-        there is.
+        ``eval/POLICY/QUANTITY``: ``final_distance`` [m], ``success``, ``return``, of several tasks at once
+        ``success_TASK``, and the task's own measures; what there is.
     """
     numbers = {}
     for name, summary in policies.items():
@@ -125,6 +125,7 @@ def point(
             "final_distance": summary.get("final_distance"),
             "success": success if "mean" in success else success.get(f"{success_distance or 0:g}"),
             "return": summary.get("return"),
+            **{f"success_{loggable(key)}": one for key, one in (summary.get("task_success") or {}).items()},
             **{loggable(key): value for key, value in (summary.get("measures") or {}).items()},
         }
         numbers |= {f"eval/{name}/{key}": value["mean"] for key, value in found.items() if value is not None}

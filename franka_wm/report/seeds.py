@@ -67,12 +67,8 @@ def _columns(summary: Mapping[str, Any]) -> list[tuple[str, tuple[str, ...], flo
         rates = [(f"within {centimetres(d)} [%]", ("success", d), 100.0, 0) for d in within]
         return [("final distance [cm]", ("final_distance",), 100.0, 2), *rates]
     rates = [("success [%]", ("success",), 100.0, 0)] if success else []
-    own = [
-        (f"{name} [%]", ("measures", name), 100.0, 0)
-        if name.startswith("success ")
-        else (name, ("measures", name), 1.0, 3)
-        for name in summary.get("measures") or {}
-    ]
+    rates += [(f"{name} [%]", ("task_success", name), 100.0, 0) for name in summary.get("task_success") or {}]
+    own = [(name, ("measures", name), 1.0, 3) for name in summary.get("measures") or {}]
     return [*rates, ("return", ("return",), 1.0, 2), *own]
 
 

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 # not a distance to a goal there is none, "success" is one interval, and "measures" holds those of the task's own.
 type Evaluation = Mapping[str, Mapping[str, object]]
 
-OUTCOME = ("final_distance", "success", "return", "episodes", "measures")
+OUTCOME = ("final_distance", "success", "task_success", "return", "episodes", "measures")
 
 # key -> (title, factor to that unit, digits). Keys of rates by distance have the distance after them.
 TITLES: dict[str, tuple[str, float, int]] = {
@@ -173,15 +173,13 @@ def _leaves(
 
 
 def _unit(path: tuple[str, ...]) -> tuple[str, float, int] | None:
-    """Title, factor and digits of what is known; ``success TASK`` among the measures is a rate."""
-    if path[0] == "measures" and path[-1].startswith("success "):
-        return f"{path[-1]} [%]", 100, 0
-    return TITLES.get(path[0])
+    """Title, factor and digits of what is known."""
+    return (f"{path[1]} [%]", 100, 0) if path[0] == "task_success" else TITLES.get(path[0])
 
 
 def _title(path: tuple[str, ...]) -> str:
     title, _, _ = _unit(path) or ("", 1, 0)
-    if path[0] == "measures" and title:
+    if path[0] == "task_success":
         return title
     if "{}" in title and len(path) == 2 and _is_number(path[1]):
         return title.format(centimetres(path[1]))

@@ -12,6 +12,8 @@ from franka_wm.envs import FrankaEnv, MultiTaskEnv
 from franka_wm.envs.multitask_config import MultiTaskConfig, multi_task_config
 from franka_wm.errors import UserError
 from franka_wm.evaluation.closed_loop import play_episodes, summarize
+from franka_wm.evaluation.results import point
+from franka_wm.report.seeds import seeds_table
 from franka_wm.report.table import evaluation_tables
 from franka_wm.seeding import derive_seed
 from franka_wm.training import build
@@ -144,16 +146,18 @@ def test_success_of_a_task_counts_its_own_worlds_alone(env, monkeypatch) -> None
 
     monkeypatch.setattr(env, "_step", succeeding)
     played = play_episodes(env, lambda td: td.set("action", torch.zeros(5, 8)), seed=1)
-    own = played["measures"]
-    assert torch.equal(own["success push"].isnan(), env.one_hot[:, 0].bool())
-    assert own["success push"][[1, 3]].tolist() == [0.0, 1.0]
-    assert own["success reach"][[0, 2, 4]].tolist() == [0.0, 0.0, 0.0]
+    own = played["task_success"]
+    assert torch.equal(own["push"].isnan(), env.one_hot[:, 0].bool())
+    assert own["push"][[1, 3]].tolist() == [0.0, 1.0]
+    assert own["reach"][[0, 2, 4]].tolist() == [0.0, 0.0, 0.0]
     found = summarize(played)
-    assert found["success"]["mean"] == pytest.approx(0.2) and found["measures"]["success push"]["mean"] == 0.5
-    assert found["measures"]["success push"]["low"] > 0.05  # Wilson's interval of one in two
+    assert found["success"]["mean"] == pytest.approx(0.2) and found["task_success"]["push"]["mean"] == 0.5
+    assert found["task_success"]["push"]["low"] > 0.05  # Wilson's interval of one in two
     table, _ = evaluation_tables({"planner": found})
-    assert "success push [%]" in table.header
-    assert table.rows[0][table.header.index("success push [%]")].startswith("50 (")
+    assert table.header[:4] == ["policy", "success [%]", "reach [%]", "push [%]"]
+    assert table.rows[0][3].startswith("50 (")
+    assert point({"planner": found})["eval/planner/success_push"] == 0.5
+    assert "| policy | success [%] | reach [%] | push [%] | return |" in seeds_table([{"planner": found}])
 
 
 @pytest.mark.parametrize(
