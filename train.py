@@ -17,6 +17,7 @@ from franka_wm.commands.entry import one_line_errors, run_command
 @one_line_errors
 def main(cfg: DictConfig) -> None:
     """One run: build, pretrain if asked to, fit, evaluate, report, export."""
+    from franka_wm import processes
     from franka_wm.console import say
     from franka_wm.evaluation.health import diagnose_training
     from franka_wm.evaluation.protocol import during_training, evaluate_run
@@ -24,6 +25,7 @@ def main(cfg: DictConfig) -> None:
     from franka_wm.report.page import write_page
     from franka_wm.training import build
     from franka_wm.training.learner import Learner
+    from franka_wm.training.resume import restore
     from franka_wm.training.run import start
     from franka_wm.training.stages import pretrain
     from franka_wm.training.trainer import Trainer
@@ -50,10 +52,12 @@ def main(cfg: DictConfig) -> None:
         diagnose=diagnose_training,
     )
     if run.checkpoint is not None:
-        trainer.restore(run.checkpoint)
+        restore(trainer, run.checkpoint)
     trainer.fit()
     if trainer.interrupted:
         run.stop()
+    if not processes.is_first():
+        return  # the first one speaks for all
     if eval_env is not None:
         found = evaluate_run(run.settings, run.folder, eval_env, eval_policies, counters=trainer.counters)
         report_run(

@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import hashlib
 import random
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from typing import Any
 
 import numpy as np
 import torch
 from torch import nn
+
+from franka_wm import processes
 
 
 def derive_seed(purpose: str, seed: int, *parts: int | str) -> int:
@@ -71,3 +73,29 @@ def restore_generator(generator: torch.Generator, state: torch.Tensor) -> bool:
         return False
     generator.set_state(state)
     return True
+
+
+def random_state() -> dict[str, object]:
+    """The global generators of torch (CPU and CUDA), NumPy and Python; of several processes, each has one GPU."""
+    return {
+        "torch": torch.get_rng_state(),
+        # Asking for it would start CUDA in a process that has not used it.
+        "cuda": [torch.cuda.get_rng_state(k) for k in _own_gpus()] if torch.cuda.is_initialized() else [],
+        "numpy": np.random.get_state(legacy=True),
+        "python": random.getstate(),
+    }
+
+
+def restore_random_state(state: Mapping[str, Any]) -> None:
+    """Puts the generators where :func:`random_state` found them; those of the GPUs that are there."""
+    random.setstate(state["python"])
+    np.random.set_state(state["numpy"])
+    torch.set_rng_state(state["torch"])
+    if torch.cuda.is_available():
+        for device, one in zip(_own_gpus(), state["cuda"], strict=False):
+            torch.cuda.set_rng_state(one, device)
+
+
+def _own_gpus() -> list[int]:
+    several = processes.count() > 1
+    return [torch.cuda.current_device()] if several else list(range(torch.cuda.device_count()))

@@ -3,18 +3,21 @@
 from __future__ import annotations
 
 import functools
+import os
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, NoReturn, TextIO
 
+from hydra.core.hydra_config import HydraConfig
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.errors import OverrideParseException
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from franka_wm import conf
+from franka_wm.commands import several
 from franka_wm.commands.overrides import compose, explain
 from franka_wm.commands.sweep import Sweep, jobs, names
 from franka_wm.console import say, terminal_log
@@ -63,6 +66,14 @@ def _run(main: Callable[[], Any], arguments: list[str]) -> None:
         for one in swept(overrides) if asked.multirun else [overrides]:
             check_overrides(one)
     only_shows = asked.help or asked.hydra_help or asked.shell_completion or asked.info
+    joins = several.started_by_torchrun() and not only_shows
+    if joins:
+        if elsewhere or asked.multirun:
+            fail("several processes learn one model of this package's configuration: leave out Hydra's flags")
+        try:
+            overrides = several.enter(overrides)
+        except FrankaError as error:
+            fail(str(error))
     if not (elsewhere or only_shows):
         overrides = with_scale(overrides, sys.stderr if asked.cfg else sys.stdout)
         if asked.multirun:
@@ -70,11 +81,32 @@ def _run(main: Callable[[], Any], arguments: list[str]) -> None:
         problem = None if asked.cfg or asked.multirun else check_command(overrides)
         if problem is not None:
             fail(problem)
+        if not (joins or asked.cfg) and _launched(flags, overrides, asked.multirun):
+            return
     sys.argv[1:] = [*flags, *overrides]
     main()
+    if joins:
+        from franka_wm import processes
+
+        processes.leave()
     problem = None if _sweep is None else _sweep.outcome()
     if problem is not None:
         fail(problem)
+
+
+def _launched(flags: list[str], overrides: list[str], multirun: bool) -> bool:
+    """Runs a command that asks for several processes, which is not the business of this one; whether it does."""
+    if multirun:
+        if any(one.lstrip("+").startswith("gpus=") and one != "gpus=1" for one in overrides):
+            fail("gpus with --multirun: jobs of a sweep have one GPU each; leave one of the two out")
+        return False
+    try:
+        gpus, device = several.wanted(overrides)
+        if gpus > 1:
+            several.launch(flags, overrides, gpus, device)
+    except FrankaError as error:
+        fail(str(error))
+    return gpus > 1
 
 
 def hydra_flags(arguments: list[str]) -> Any:
@@ -118,6 +150,8 @@ def one_line_errors(main: Callable[[DictConfig], object]) -> Callable[[DictConfi
         try:
             if _sweep is not None:
                 return _sweep.run(main, cfg)
+            if several.started_by_torchrun():
+                several.go_on(cfg, Path(HydraConfig.get().runtime.output_dir))
             with one_line_refusals():
                 return main(cfg)
         except FrankaError as error:
@@ -145,7 +179,10 @@ def check_overrides(arguments: list[str]) -> None:
 
 def fail(message: str) -> NoReturn:
     """Says what is wrong and exits with status 1."""
-    print(f"error: {message}", file=sys.stderr, flush=True)
+    if several.speaks():
+        print(f"error: {several.named(message)}", file=sys.stderr, flush=True)
+    if several.started_by_torchrun():
+        os._exit(1)  # nothing is left to be written, and threads that talk to lost processes do not end
     sys.exit(1)
 
 
@@ -188,6 +225,7 @@ def check_command(arguments: list[str], folder: Path | None = None) -> str | Non
     Args:
         folder: That of a sweep's job, which may go on with what it finds there.
     """
+    from franka_wm import processes
     from franka_wm.training.run import check_once, import_plugins, left_by, occupied, resumed, unwritable
     from franka_wm.training.settings import RunSettings
 
@@ -204,4 +242,5 @@ def check_command(arguments: list[str], folder: Path | None = None) -> str | Non
         return str(error)
     chosen = next((a.split("=", 1)[1] for a in arguments if a.startswith("hydra.run.dir=")), "outputs")
     place = folder or Path(chosen)
-    return unwritable(place) or occupied(place, cfg.resume)
+    problem = unwritable(place)
+    return problem if processes.restarted() else problem or occupied(place, cfg.resume)

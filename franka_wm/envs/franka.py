@@ -88,6 +88,7 @@ class FrankaEnv(EnvBase):
         device: ``None`` or ``"auto"`` (GPU where there is one), ``"cpu"``, ``"cuda"``, ``"cuda:K"``.
         seed: Seed of all randomness. ``None``: one that no other instance has (:func:`own_seed`), so that the
             environments of a ``SerialEnv`` or ``ParallelEnv`` play different episodes.
+        first_world: Number of the first world: environments of one seed then divide its worlds among them.
         urdf_path: A robot of your own.
         task: A task of your own (:class:`~franka_wm.envs.tasks.Task`); the config's if not given.
 
@@ -109,6 +110,7 @@ class FrankaEnv(EnvBase):
         num_envs: int = 1,
         device: torch.device | str | None = None,
         seed: int | None = None,
+        first_world: int = 0,
         urdf_path: str | Path | None = None,
         task: Task | None = None,
     ):
@@ -125,20 +127,17 @@ class FrankaEnv(EnvBase):
         started = time.perf_counter()
         seed = own_seed() if seed is None else seed
         log.info("building %d worlds on %s with seed %d", num_envs, device, seed)
-        self.simulation = Simulation(config, num_envs, str(device), seed=seed, urdf_path=urdf_path, task=task)
-        self.kinematics = self.simulation.kinematics
-        log.info(
-            "built in %.1f s; the first reset and step compile what is not cached yet",
-            time.perf_counter() - started,
+        self.simulation = Simulation(
+            config, num_envs, str(device), seed=seed, first_world=first_world, urdf_path=urdf_path, task=task
         )
+        self.kinematics = self.simulation.kinematics
+        seconds = time.perf_counter() - started
+        log.info("built in %.1f s; the first reset and step compile what is not cached yet", seconds)
         self._restart = False  # whether the step under way begins the next episode of finished worlds
         self._stack = FrameStack(config.frame_stack) if config.frame_stack > 1 else None
-        self._stacked = [
-            key for key in self.simulation.renderer.images if self._stack and key.startswith("pixels")
-        ]
-        self.observation_spec = observation_spec(
-            config, list(self.simulation.renderer.images), self.kinematics, num_envs, device
-        )
+        images = self.simulation.renderer.images
+        self._stacked = [key for key in images if self._stack and key.startswith("pixels")]
+        self.observation_spec = observation_spec(config, list(images), self.kinematics, num_envs, device)
         self._observed = [key for key in self.observation_spec if key not in ("success", "is_init")]
         self.action_spec = Bounded(-1.0, 1.0, shape=(num_envs, config.action_dim), device=device)
         self.reward_spec = Unbounded(shape=(num_envs, 1), device=device)

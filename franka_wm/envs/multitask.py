@@ -35,7 +35,7 @@ class MultiTaskEnv(EnvBase):
     Args:
         config: The tasks.
         num_envs: Number of worlds, N ≥ K.
-        device, seed: As for :class:`FrankaEnv`.
+        device, seed, first_world: As for :class:`FrankaEnv`; the first world is of the first task.
 
     Raises:
         UserError: Fewer worlds than tasks, or a task that cannot be built.
@@ -50,11 +50,14 @@ class MultiTaskEnv(EnvBase):
         num_envs: int,
         device: torch.device | str | None = None,
         seed: int | None = None,
+        first_world: int = 0,
     ):
         check_whole("num_envs", num_envs)
         count = len(config.tasks)
         if num_envs < count:
             raise UserError(f"num_envs={num_envs}: {count} tasks need at least as many worlds")
+        if first_world % count:
+            raise UserError(f"first_world={first_world}: must be a multiple of the {count} tasks")
         device = resolve_device(device)
         super().__init__(device=device, batch_size=torch.Size([num_envs]))
         self.config, self.num_envs = config, num_envs
@@ -65,6 +68,7 @@ class MultiTaskEnv(EnvBase):
                 num_envs=len(range(k, num_envs, count)),
                 device=device,
                 seed=derive_seed("task", seed, name),
+                first_world=first_world // count,
             )
             for k, (name, one) in enumerate(config.tasks.items())
         }

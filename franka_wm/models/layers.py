@@ -13,6 +13,8 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
+from franka_wm import processes
+
 WEIGHT_STD = 0.02  # truncated-normal initialisation of every linear weight, as published
 
 
@@ -368,7 +370,8 @@ class GaussianPolicy(nn.Module):
     def imitation_error(self, z: Tensor, action: Tensor, shown: Tensor) -> Tensor:
         """Mean squared error (,) of the mode against actions (..., action_dim) where `shown` (..., 1); 0 if nowhere."""
         error = (self(z, deterministic=True) - action).square().mean(-1, keepdim=True)
-        return (error * shown).sum() / shown.sum().clamp_min(1)
+        count = processes.mean(shown.sum(dtype=error.dtype))
+        return (error * shown).sum() / count.clamp_min(1 / processes.count())
 
 
 class RunningScale(nn.Module):
@@ -388,7 +391,7 @@ class RunningScale(nn.Module):
     @torch.no_grad()
     def update(self, x: Tensor) -> None:
         """Move the scale by `tau` towards the 5-95 percentile range of `x` (any shape)."""
-        ordered = x.detach().flatten().sort().values
+        ordered = processes.gather(x.detach().flatten()).sort().values
         span = _percentile(ordered, 0.95) - _percentile(ordered, 0.05)
         self.value.lerp_(span.clamp_min(1.0).to(self.value.dtype), self.tau)
 

@@ -6,31 +6,15 @@ All of it is computed in float32, on the device, with static shapes.
 from typing import Literal
 
 import torch
-from torch import Tensor, distributed, nn
+from torch import Tensor, nn
 from torch.nn import functional as F
+
+from franka_wm import processes
 
 COLLAPSE = ("ema", "sigreg", "vicreg", "none")
 """Names of the guards against collapse that a family may offer."""
 
 CollapseName = Literal["ema", "sigreg", "vicreg", "none"]
-
-
-def _processes() -> int:
-    ready = distributed.is_available() and distributed.is_initialized()
-    return distributed.get_world_size() if ready else 1
-
-
-def mean_over_processes(x: Tensor) -> Tensor:
-    """Mean of `x` over all processes where torch.distributed is initialised; `x` itself otherwise.
-
-    The gradient is that of the own part, as if it were the whole mean: averaged over processes, as data
-    parallel training does, this is the gradient of the global statistic.
-    """
-    if _processes() == 1:
-        return x
-    total = x.detach().clone()
-    distributed.all_reduce(total)
-    return x + (total / _processes() - x.detach())
 
 
 class SIGReg(nn.Module):
@@ -79,26 +63,30 @@ class SIGReg(nn.Module):
         with torch.autocast(x.device.type, enabled=False):
             x = x.float()
             directions = torch.randn(x.shape[-1], self.directions, device=x.device)
-            if _processes() > 1:
-                distributed.broadcast(directions, 0)
+            directions = processes.broadcast(directions)
             angle = (x @ F.normalize(directions, dim=0)).unsqueeze(-1) * self.knot  # (..., n, M, knots)
-            cos = mean_over_processes(angle.cos().mean(-3))
-            sin = mean_over_processes(angle.sin().mean(-3))
+            cos = processes.mean(angle.cos().mean(-3))
+            sin = processes.mean(angle.sin().mean(-3))
             error = (cos - self.gaussian).square() + sin.square()
-            return (error @ self.weight).mean() * (x.shape[-2] * _processes())
+            return (error @ self.weight).mean() * (x.shape[-2] * processes.count())
 
 
 def variance_loss(x: Tensor, *, target: float = 1.0, eps: float = 1e-4) -> Tensor:
     """VICReg's hinge on the standard deviation of each feature over n samples (..., n, D) -> ()."""
-    std = (x.float().var(dim=-2) + eps).sqrt()
+    centred, samples = _centred(x.float())
+    std = (processes.mean(centred.square().sum(-2)) / samples + eps).sqrt()
     return F.relu(target - std).mean()
+
+
+def _centred(x: Tensor) -> tuple[Tensor, float]:
+    """Samples (..., n, D) minus their mean over all processes, and what to divide the mean of sums by: n - 1 alone."""
+    return x - processes.mean(x.mean(dim=-2, keepdim=True)), x.shape[-2] - 1 / processes.count()
 
 
 def covariance_loss(x: Tensor) -> Tensor:
     """VICReg's squared covariances off the diagonal, summed and divided by D: (..., n, D) -> ()."""
-    x = x.float()
-    x = x - x.mean(dim=-2, keepdim=True)
-    covariance = x.mT @ x / (x.shape[-2] - 1)
+    x, samples = _centred(x.float())
+    covariance = processes.mean(x.mT @ x) / samples
     off = covariance.square().sum((-2, -1)) - covariance.diagonal(dim1=-2, dim2=-1).square().sum(-1)
     return (off / x.shape[-1]).mean()
 
@@ -127,7 +115,8 @@ def info_nce(queries: Tensor, keys: Tensor, *, temperature: float = 0.1) -> Tens
     if not temperature > 0.0:
         raise ValueError(f"temperature must be positive, got {temperature}")
     with torch.autocast(queries.device.type, enabled=False):
-        logits = F.normalize(queries.float(), dim=-1) @ F.normalize(keys.float(), dim=-1).mT / temperature
+        queries, keys = (processes.gather(F.normalize(x.float(), dim=-1)) for x in (queries, keys))
+        logits = queries @ keys.mT / temperature
         own = torch.arange(logits.shape[0], device=logits.device)
         return 0.5 * (F.cross_entropy(logits, own) + F.cross_entropy(logits.mT, own))
 
@@ -218,6 +207,8 @@ class BatchNorm(nn.Module):
 
     def forward(self, x: Tensor, *, batch_statistics: bool) -> Tensor:
         flat = x.reshape(-1, x.shape[-1])
+        if batch_statistics and processes.count() > 1:
+            return self._of_all(flat).reshape(x.shape)
         y = F.batch_norm(
             flat,
             self.running_mean,
@@ -229,6 +220,18 @@ class BatchNorm(nn.Module):
             eps=self.eps,
         )
         return y.reshape(x.shape)
+
+    def _of_all(self, flat: Tensor) -> Tensor:
+        """The same over the batches (n, D) of all processes."""
+        wide = flat.float()
+        mean = processes.mean(wide.mean(0))
+        var = processes.mean((wide - mean).square().mean(0))
+        with torch.no_grad():
+            samples = len(flat) * processes.count()
+            self.running_mean.lerp_(mean, self.momentum)
+            self.running_var.lerp_(var * (samples / (samples - 1)), self.momentum)
+        y = (wide - mean) * (var + self.eps).rsqrt() * self.weight + self.bias
+        return y.to(flat.dtype)
 
 
 # -- measuring collapse -----------------------------------------------------------------------------------

@@ -11,7 +11,7 @@ import torch
 from tensordict.nn import TensorDictModuleBase
 from torchrl.envs import EnvBase, TransformedEnv
 
-from franka_wm import models, planning
+from franka_wm import models, planning, processes
 from franka_wm.console import say
 from franka_wm.data.demonstrations import Demonstrations
 from franka_wm.data.hindsight import Hindsight
@@ -49,22 +49,36 @@ if TYPE_CHECKING:
 
 
 def make_env(
-    run: RunSettings, *, num_envs: int | None = None, seed: int | None = None, **changes: object
+    run: RunSettings,
+    *,
+    num_envs: int | None = None,
+    seed: int | None = None,
+    first_world: int = 0,
+    **changes: object,
 ) -> Environment:
     """The environment that ``run.env`` describes; ``changes`` override fields of its config.
 
     For a model of discrete actions the arm takes numbers of rows of a table. Its episodes are those of training
-    unless ``seed`` says otherwise.
+    unless ``seed`` says otherwise. Worlds of other libraries are told apart by the seed alone, not by ``first_world``.
     """
     described = run.env.changed(**changes)
     worlds = run.collector.num_envs if num_envs is None else num_envs
     start = derive_seed("training", run.seed) if seed is None else seed
     if isinstance(described.config, MultiTaskConfig):
-        return MultiTaskEnv(described.config, num_envs=worlds, device=run.device, seed=start)
+        return MultiTaskEnv(
+            described.config, num_envs=worlds, device=run.device, seed=start, first_world=first_world
+        )
     if isinstance(described.config, ExternalConfig):
         return ExternalEnv(described.config, num_envs=worlds, device=resolve_device(run.device), seed=start)
     config = described.arm
-    env = FrankaEnv(config, num_envs=worlds, device=run.device, seed=start, urdf_path=described.urdf_path)
+    env = FrankaEnv(
+        config,
+        num_envs=worlds,
+        device=run.device,
+        seed=start,
+        first_world=first_world,
+        urdf_path=described.urdf_path,
+    )
     return TransformedFrankaEnv(env, DiscreteActions(config.action_dim)) if run.is_discrete else env
 
 
@@ -302,7 +316,9 @@ def make_agent_policies(
         model,
         planner,
         env,
-        seed=derive_seed("policies", run.seed, purpose),
+        seed=derive_seed(
+            "policies", run.seed, purpose, *(processes.parts() if purpose == "training" else ())
+        ),
         smoothness=run.collector.smoothness,
         objective=make_objective(run, model),
         capture=None if run.trainer.capture else run.trainer.capture,  # true asks for what CUDA does anyway

@@ -8,6 +8,7 @@
     rng.json                likewise: torch (CPU, CUDA), NumPy, Python
     replay.json             likewise: the filled part of the replay buffer
     extra.json              likewise: whatever else the caller wants back
+    replay1.json, …         of a run of several processes: the parts of process 1 and those that follow
 
 **Replacing a checkpoint.** A folder cannot replace a non-empty folder in one system call, so it takes three
 steps: write and sync `NAME.writing`; rename `NAME` to `NAME.old`; rename `NAME.writing` to `NAME`. A kill
@@ -17,15 +18,13 @@ reads. `NAME.old` is removed only while a whole `NAME` exists.
 
 import json
 import os
-import random
 import shutil
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch
 from omegaconf import DictConfig, OmegaConf
 from safetensors import SafetensorError
@@ -35,6 +34,7 @@ from torch import Tensor, nn
 from franka_wm.conf import use_present_names
 from franka_wm.errors import UserError
 from franka_wm.options import is_real
+from franka_wm.seeding import random_state, restore_random_state
 from franka_wm.training.manifest import MANIFEST, Manifest, read_manifest, saved_at, sync, write_manifest
 from franka_wm.training.optimizer_state import Optimizers, load_optimizer_state, optimizer_state
 from franka_wm.training.tree import (
@@ -52,7 +52,8 @@ from franka_wm.untrusted import UntrustedFolder
 FIRST_STAGE = "pretrained"
 """Folder of the first stage, in that of its run."""
 
-_WRITING = ".writing"
+WRITING = ".writing"
+"""What the name of a checkpoint ends in until it is whole."""
 _OLD = ".old"
 
 
@@ -68,6 +69,7 @@ def save_checkpoint(
     optimizer: Optimizers | None = None,
     replay: TensorDictBase | None = None,
     extra: Mapping[str, object] | None = None,
+    others: Callable[[], None] = lambda: None,
 ) -> Path:
     """Write a checkpoint; an existing one at the same place is replaced, and is whole until it is.
 
@@ -82,6 +84,7 @@ def save_checkpoint(
         replay: the filled part of the buffer, tensors only, any batch dimensions.
         extra: nested dicts, lists and tuples of numbers, strings, None and tensors (a `torch.Generator`'s
             state, say).
+        others: called when only the parts of other processes are missing, see :mod:`franka_wm.training.shards`.
 
     Returns:
         The folder, absolute.
@@ -92,8 +95,8 @@ def save_checkpoint(
         TypeError: a value that cannot be stored without pickle.
     """
     target = Path(folder).resolve()
-    writing = _sibling(target, _WRITING)
-    with _explained(target):
+    writing = _sibling(target, WRITING)
+    with explained(target):
         # Renaming would fail only after everything has been written; this is the place to say it.
         if (target.exists() and not target.is_dir()) or (
             target.is_dir() and not (target / MANIFEST).exists() and any(target.iterdir())
@@ -105,6 +108,8 @@ def save_checkpoint(
         writing.mkdir()
         try:
             _write_contents(writing, _unwrap(model), optimizer, config, counters, replay, extra)
+            others()
+            write_manifest(writing, type(_unwrap(model)).__name__)
             _swap_in(writing, target)
         except Exception:
             shutil.rmtree(writing, ignore_errors=True)
@@ -124,15 +129,13 @@ def _write_contents(
     save_tensors(_tensor_state(model), folder / "model.safetensors")
     if optimizer is not None:
         write_tree(folder, "optimizer", optimizer_state(optimizer))
-    write_tree(folder, "rng", _rng_state())
+    write_tree(folder, "rng", random_state())
     if replay is not None:
-        write_tree(folder, "replay", {"batch_size": list(replay.batch_size), "entries": _entries(replay)})
+        write_tree(folder, "replay", replay_tree(replay))
     if extra is not None:
         write_tree(folder, "extra", extra)
     OmegaConf.save(OmegaConf.create(dict(config)), folder / "config.yaml")
     write_json(folder / "counters.json", {name: _plain_number(name, n) for name, n in counters.items()})
-
-    write_manifest(folder, type(model).__name__)
 
 
 def _swap_in(writing: Path, target: Path) -> None:
@@ -228,34 +231,51 @@ class Checkpoint:
         with damaged(self.folder, "optimizer.json"):
             load_optimizer_state(saved, optimizer, f"checkpoint {self.folder}")
 
-    def restore_rng(self) -> None:
+    @property
+    def processes(self) -> int:
+        """How many processes have saved it."""
+        return max(1, sum(name.startswith("rng") and name.endswith(".json") for name in self._manifest.files))
+
+    def restore_rng(self, rank: int = 0) -> None:
         """Set torch's (CPU and CUDA), NumPy's and Python's global generators to their saved states.
 
-        CUDA states are restored for the devices that are there.
+        CUDA states are restored for the devices that are there; of several processes, each has one.
         """
-        state = self._tree("rng")
+        state = self._tree(_part("rng", rank))
         with damaged(self.folder, "rng.json"):
-            random.setstate(state["python"])
-            np.random.set_state(state["numpy"])
-            torch.set_rng_state(state["torch"])
-            if torch.cuda.is_available():
-                for device, one in enumerate(state["cuda"][: torch.cuda.device_count()]):
-                    torch.cuda.set_rng_state(one, device)
+            restore_random_state(state)
 
-    def replay(self, device: torch.device | str | None = None) -> TensorDict | None:
+    def replay(self, device: torch.device | str | None = None, rank: int | None = None) -> TensorDict | None:
         """The saved replay, with its batch dimensions, on `device` (the CPU if None); None if none was saved.
+
+        Args:
+            rank: only what this process had; None: of all of them, one behind the other.
 
         Raises:
             UserError: its file is damaged.
         """
+        found = [self._replay(k) for k in (range(self.processes) if rank is None else [rank])]
+        whole = [one for one in found if one is not None]
+        if len(whole) < len(found):
+            return None
+        joined: TensorDict = whole[0] if len(whole) == 1 else torch.cat(whole)  # pyright: ignore[reportAssignmentType, reportArgumentType]
+        return joined.to(device or "cpu")
+
+    def _replay(self, rank: int) -> TensorDict | None:
         # By far the largest file, and evaluation never opens it: its checksum waits until here.
-        for name in tree_files("replay"):
-            self._manifest.check_sum(self.folder, name)
-        saved = self._tree("replay")
+        name = _part("replay", rank)
+        for file in tree_files(name):
+            self._manifest.check_sum(self.folder, file)
+        saved = self._tree(name)
         if saved is None:
             return None
-        with damaged(self.folder, "replay.json"):
-            return only_tensors(saved["entries"], saved["batch_size"], device or "cpu")
+        with damaged(self.folder, f"{name}.json"):
+            return only_tensors(saved["entries"], saved["batch_size"], "cpu")
+
+    def moment(self, rank: int = 0) -> dict[str, Any]:
+        """Where worlds, policies and samplers of a process stood; empty if that was not saved."""
+        saved = (self.extra() or {}).get("moment") if rank == 0 else self._tree(f"moment{rank}")
+        return saved or {}
 
     def extra(self) -> dict[str, Any] | None:
         """What was saved as `extra`, tensors on the CPU; None if nothing was."""
@@ -283,7 +303,7 @@ def load_checkpoint(folder: str | Path) -> Checkpoint:
     for name in manifest.files:
         manifest.check_size(path, name)
     for name in manifest.files:
-        if name not in tree_files("replay"):
+        if not name.startswith("replay"):
             manifest.check_sum(path, name)
     return Checkpoint(path, _read_config(path), _read_counters(path), manifest)
 
@@ -345,7 +365,7 @@ def _found(places: Sequence[Path]) -> list[tuple[int, Path]]:
     """Time of saving and name of every checkpoint in some folders."""
     inside = [entry for place in places if place.is_dir() for entry in place.iterdir() if entry.is_dir()]
     # A NAME.old that lost its NAME to a kill stands for NAME.
-    names = {p.with_name(p.name.removesuffix(_OLD)) for p in inside if not p.name.endswith(_WRITING)}
+    names = {p.with_name(p.name.removesuffix(_OLD)) for p in inside if not p.name.endswith(WRITING)}
     return [(saved_at(whole), name) for name in names if (whole := _find(name)) is not None]
 
 
@@ -380,14 +400,13 @@ def _tensor_state(model: nn.Module) -> dict[str, Tensor]:
     return {name: value for name, value in model.state_dict().items() if isinstance(value, Tensor)}
 
 
-def _rng_state() -> dict[str, object]:
-    return {
-        "torch": torch.get_rng_state(),
-        # Asking for it would start CUDA in a process that has not used it.
-        "cuda": torch.cuda.get_rng_state_all() if torch.cuda.is_initialized() else [],
-        "numpy": np.random.get_state(legacy=True),
-        "python": random.getstate(),
-    }
+def _part(name: str, rank: int) -> str:
+    return name if rank == 0 else f"{name}{rank}"
+
+
+def replay_tree(replay: TensorDictBase) -> dict[str, object]:
+    """Experience as nested values."""
+    return {"batch_size": list(replay.batch_size), "entries": _entries(replay)}
 
 
 def _entries(data: TensorDictBase) -> dict[str, object]:
@@ -418,7 +437,7 @@ def _find(folder: Path) -> Path | None:
 
 
 @contextmanager
-def _explained(target: Path) -> Iterator[None]:
+def explained(target: Path) -> Iterator[None]:
     """Turn what the file system refuses into one line for the user."""
     try:
         yield

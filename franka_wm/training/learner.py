@@ -9,6 +9,7 @@ import torch
 from tensordict import TensorDictBase
 from torch import nn
 
+from franka_wm import processes
 from franka_wm.errors import UserError
 
 if TYPE_CHECKING:
@@ -27,6 +28,8 @@ class Learner:
 
     On CUDA, the first updates run eagerly, then the whole update (loss, backward, gradient clipping, Adam,
     target networks) is captured once and replayed; only the batch is copied into fixed tensors.
+
+    Under several processes each has a part of the batch; their gradients are averaged inside the update.
 
     Args:
         model: On its device.
@@ -73,6 +76,10 @@ class Learner:
                 "capture=true needs device=cuda; leave it at null to capture where it is possible"
             )
         self.lr, self.grad_clip = lr, grad_clip
+        with torch.no_grad():
+            for x in model.state_dict().values():
+                if isinstance(x, torch.Tensor):
+                    processes.broadcast(x)
         groups = model.parameter_groups(lr)
         self._clip_groups: dict[str, list[nn.Parameter]] = {}
         for group in groups:
@@ -156,10 +163,10 @@ class Learner:
                 group["lr"] = rate * factor
 
     def metrics(self) -> dict[str, float]:
-        """Means of losses and gradient norms since the last call; one host sync."""
+        """Means of losses and gradient norms since the last call, over all processes; one host sync."""
         if self._sums is None or not self._summed:
             return {}
-        values = (self._sums / self._summed).tolist()
+        values = processes.mean(self._sums / self._summed).tolist()
         self._sums.zero_()
         self._summed = 0
         return dict(zip(self._names, values, strict=True))
@@ -177,6 +184,7 @@ class Learner:
         with torch.autocast(self.device.type, torch.bfloat16, enabled=low, cache_enabled=False):
             losses = self._loss(batch)
         losses.get("loss").backward()
+        processes.average_gradients(p for group in self._clip_groups.values() for p in group)
         values = {name: value for name, value in losses.items()}
         for name, parameters in self._clip_groups.items():
             values[f"grad_norm_{name}"] = nn.utils.clip_grad_norm_(parameters, self.grad_clip, foreach=True)
@@ -194,6 +202,7 @@ class Learner:
         self._batch = batch if static else batch.clone()
         self.optimizer.zero_grad(set_to_none=True)
         graph = torch.cuda.CUDAGraph()
-        with torch.cuda.graph(graph):
+        # NCCL has a thread of its own, which looks after it meanwhile.
+        with torch.cuda.graph(graph, capture_error_mode="thread_local"):
             self._eager(self._batch)
         self._graph = graph

@@ -19,6 +19,7 @@ from omegaconf import DictConfig, OmegaConf
 from tensordict import TensorDictBase
 from torchrl.record.loggers import Logger
 
+from franka_wm import processes
 from franka_wm.console import announced, log_to, say
 from franka_wm.data.lerobot.export import export_run
 from franka_wm.data.lerobot.windows import RecordedWindows
@@ -138,24 +139,28 @@ class Run:
     def build_environments(self) -> tuple[Environment | None, Environment | None]:
         """The training worlds and the evaluation worlds, compiled and ready; ``None`` where there are none.
 
-        A run on recorded data trains in no world; without an environment (``env=none``) none evaluates it either.
+        A run on recorded data trains in no world; without an environment (``env=none``) none evaluates it either. Of
+        several processes the first one alone evaluates.
         """
         if self.settings.env.kind == "none":
             return None, None
         gathers = not self.settings.is_offline
         worlds = f"{self.settings.evaluation.episodes} evaluation worlds"
         if gathers:
-            worlds = f"{self.settings.collector.num_envs} training and {worlds}"
+            worlds = f"{self.settings.values['collector']['num_envs']} training and {worlds}"
         compiling = "on a machine's first start this compiles kernels for a minute or two"
         with announced(f"building {worlds}" + (f"; {compiling}" if self.settings.is_arm else "")):
-            eval_env = build.make_evaluation_env(self.settings)
-            env = build.make_env(self.settings) if gathers else None
+            eval_env = build.make_evaluation_env(self.settings) if processes.is_first() else None
+            own = processes.rank() * self.settings.collector.num_envs
+            env = build.make_env(self.settings, first_world=own) if gathers else None
+            apart = () if self.settings.env.kind in ("franka", "multitask") else processes.parts()
             for one in (env, eval_env):
                 if one is not None:
                     with seeded(0):  # how many worlds there are must not decide what a run draws later
                         one.step_and_maybe_reset(one.rand_action(one.reset()))
                     one.statistics()
-                    one.set_seed(derive_seed("training" if one is env else "evaluation", self.settings.seed))
+                    of = "training" if one is env else "evaluation"
+                    one.set_seed(derive_seed(of, self.settings.seed, *(apart if one is env else ())))
         return env, eval_env
 
     def build_experience(self, env: Environment | None) -> tuple[WindowReplay | RecordedWindows, Spaces]:
@@ -195,6 +200,7 @@ class Run:
         """The last line of a run that was interrupted and has saved; exits with 130."""
         close_loggers(self.loggers)
         say(f"stopped; go on with: franka-wm train resume={self.folder}")
+        processes.leave()
         sys.exit(INTERRUPTED)
 
     def close(self) -> None:
@@ -224,7 +230,8 @@ def start(cfg: DictConfig) -> Run:
     import_plugins(cfg.plugins)  # those of the command line: what a checkpoint names is never imported
     if cfg.resume is not None:
         told = HydraConfig.get()
-        again = told.mode == RunMode.MULTIRUN and cfg.resume == str(folder)  # see `left_by`
+        again = told.mode == RunMode.MULTIRUN or processes.restarted()
+        again = again and cfg.resume == str(folder)  # see `left_by`
         checkpoint, cfg = resumed(cfg, [] if again else list(told.overrides.task))
     settings = RunSettings.of(cfg, saved=checkpoint is not None)
     if settings != _checked:
@@ -234,6 +241,8 @@ def start(cfg: DictConfig) -> Run:
     torch.manual_seed(derive_seed("weights", settings.seed))
     if device.type == "cuda":
         torch.set_float32_matmul_precision("high")
+    if not processes.is_first():
+        return Run(settings, folder, checkpoint)  # the first one writes
     lock_run_dir(folder)
     problem = occupied(folder, settings.resume)  # also of a sweep, whose folders only Hydra knows
     if problem is not None:
@@ -291,7 +300,7 @@ def resumed(cfg: DictConfig, overrides: list[str]) -> tuple[Checkpoint, DictConf
         name = override.split("=", 1)[0].lstrip("+~")
         if name in ("resume", "scale", "plugins"):
             continue
-        if "." not in name and name not in ("seed", "device"):
+        if "." not in name and name not in ("seed", "device", "gpus"):
             raise FrankaError(
                 f"{override}: a run that resumes keeps its {name}; leave it out, or change single values ({name}.key=…)"
             )

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import gc
 
+from franka_wm import processes
 from franka_wm.console import say
 from franka_wm.data.lerobot.windows import RecordedWindows
 from franka_wm.data.replay import WindowReplay
@@ -16,6 +17,7 @@ from franka_wm.seeding import derive_seed
 from franka_wm.training import build
 from franka_wm.training.checkpoint import FIRST_STAGE
 from franka_wm.training.learner import Learner
+from franka_wm.training.resume import restore
 from franka_wm.training.run import Run
 from franka_wm.training.spaces import Spaces
 from franka_wm.training.trainer import Trainer
@@ -46,7 +48,7 @@ def pretrain(
     if env is not None:
         policies = build.make_scripted_policies(
             env,
-            seed=derive_seed("policies", settings.seed, FIRST_STAGE),
+            seed=derive_seed("policies", settings.seed, FIRST_STAGE, *processes.parts()),
             smoothness=settings.collector.smoothness,
         )
     trainer = Trainer(
@@ -63,7 +65,7 @@ def pretrain(
         validation=run.validation,
     )
     if begun is not None:
-        trainer.restore(begun)
+        restore(trainer, begun)
         run.checkpoint = None
     trainer.fit()
     if trainer.interrupted:

@@ -14,6 +14,7 @@ from tensordict.nn import TensorDictModuleBase
 from torchrl.collectors import Collector
 from torchrl.record.loggers import Logger
 
+from franka_wm import processes
 from franka_wm.console import Progress, say
 from franka_wm.data.captured import CapturedSampling
 from franka_wm.data.lerobot.windows import RecordedWindows
@@ -25,19 +26,13 @@ from franka_wm.models import WorldModel
 from franka_wm.policies.exploration import ActingPolicy
 from franka_wm.seeding import derive_seed, seeded
 from franka_wm.training.build import explore
-from franka_wm.training.checkpoint import Checkpoint, save_checkpoint
 from franka_wm.training.learner import Learner
 from franka_wm.training.loggers import log_numbers
-from franka_wm.training.moment import draws, go_on_drawing, put_back, restorable, same_worlds, worlds_now
+from franka_wm.training.moment import draws, worlds_now
 from franka_wm.training.settings import RunSettings
+from franka_wm.training.shards import save_together
 from franka_wm.training.spaces import Spaces
 from franka_wm.training.storage_budget import fill, filled_bytes, reason_to_leave_out
-from franka_wm.training.tree import damaged
-
-OTHER_DEVICE = (
-    "the checkpoint is of another kind of device: random numbers start anew; this run will not be the same"
-)
-
 
 EVALUATION_SHARE = 0.1
 """Evaluations while training are left out once they have taken more than this share of the training's time, unless
@@ -46,6 +41,9 @@ EVALUATION_SHARE = 0.1
 
 class Trainer:
     """Gathers experience and learns from it, in turns.
+
+    Under several processes each has worlds, experience and a part of every batch of its own; they turn together, and
+    the first one evaluates and speaks for all.
 
     Args:
         env: The training worlds; ``None`` on recorded data.
@@ -80,6 +78,8 @@ class Trainer:
         diagnose: Callable[[WorldModel, TensorDictBase], tuple[dict[str, float], str | None]] | None = None,
     ):
         self.env, self.learner, self.settings, self.folder = env, learner, settings, folder
+        if processes.count() > 1:  # the same weights, but not the same draws
+            torch.manual_seed(derive_seed("process", settings.seed, processes.rank()))
         self.replay: Any = replay  # WindowReplay where there are worlds, else RecordedWindows
         self.model = learner.model
         self.actor = actor
@@ -112,10 +112,10 @@ class Trainer:
         self.demonstrations = getattr(replay, "demonstrations", None)
         self._extra = list(self.model.replay_keys)
         # What the acting policy writes for the loss, a random one does not: then the actor fills the replay, too.
-        self._acting = None
+        self.acting = None
         if policies:
             exploring = {actor: explore(settings.collector, policies, actor)}
-            self._acting = ActingPolicy({**policies, **exploring}, actor if self._extra else "random")
+            self.acting = ActingPolicy({**policies, **exploring}, actor if self._extra else "random")
         self._collector: Collector | None = None
         self._experience: Iterator[TensorDictBase] | None = None
 
@@ -131,16 +131,17 @@ class Trainer:
         saved = time.perf_counter()
         every = self.settings.evaluation_period
         ahead = sorted(steps for steps in self.settings.evaluation.at_steps if steps > self.env_steps)
+        stopping = False
         anew = self.env is not None and not len(self.replay) and (updates < total or not updates)
         with interruptible() as stop:
             if self.env is None:
                 self.standardize(self.replay.statistics())
             else:
-                assert self._acting is not None
+                assert self.acting is not None
                 if anew:
                     self.seed()
-                self._acting.use(self.actor)
-            while self.learner.updates < total and not stop():
+                self.acting.use(self.actor)
+            while self.learner.updates < total and not stopping:
                 before = self.learner.updates
                 done = before % trainer.updates_per_batch  # by a run that ended amid a batch's updates
                 shown = self.settings.replay.demo_updates if self.demonstrations else 0
@@ -157,12 +158,20 @@ class Trainer:
                 self.seconds = time.perf_counter() - started
                 now = time.perf_counter()
                 last = self.learner.updates >= total
-                if progress.due() or last:
-                    self.log(progress)
                 reached = bool(ahead) and self.env_steps >= ahead[0]
                 ahead = [steps for steps in ahead if steps > self.env_steps]
                 passed = self.learner.updates // every > before // every
-                if (reached or (passed and not self._too_long())) and not last:
+                stopping, due, evaluates, saves = processes.agree(
+                    [stop()],
+                    [
+                        progress.due() or last,
+                        (reached or (passed and not self._too_long())) and not last,
+                        now - saved >= trainer.checkpoint_every and not last,
+                    ],
+                )
+                if due:
+                    self.log(progress)
+                if evaluates:
                     self.require_finite()
                     with self.aside("evaluation"):
                         numbers = self.evaluate()
@@ -171,10 +180,11 @@ class Trainer:
                     spent = time.perf_counter() - now
                     self._evaluated += spent
                     started += spent  # seconds count training, not evaluation
-                if now - saved >= trainer.checkpoint_every and not last:
+                    [stopping] = processes.agree([stop()], [])
+                if saves:
                     self.save(last=False)
                     saved = time.perf_counter()
-            self.interrupted = stop()
+            self.interrupted = stopping
             if ahead:
                 say(f"  evaluation.at_steps={ahead}: not evaluated, the run ends at {self.env_steps} steps")
             self.save()
@@ -191,7 +201,8 @@ class Trainer:
         if self.demonstrations is not None:
             data.append(self.demonstrations.transitions)
         seen = {key: torch.cat([one.get(key).flatten(0, 1) for one in data]) for key in self._vectors}
-        self.standardize({key: (x.mean(0), x.std(0)) for key, x in seen.items()})
+        own = {key: (x.mean(0), x.std(0), len(x)) for key, x in seen.items()}
+        self.standardize({key: processes.pooled(*moments) for key, moments in own.items()})
 
     def standardize(self, statistics: Mapping[str, Sequence[torch.Tensor]]) -> None:
         """Lets the model see mean and deviation of its vector observations."""
@@ -204,10 +215,10 @@ class Trainer:
     def gather(self) -> None:
         """One batch of the collector into the replay."""
         if self._experience is None:
-            self._collect()
+            self.collect()
         assert self._experience is not None
         batch = next(self._experience)
-        self.env_steps += batch.numel()
+        self.env_steps += batch.numel() * processes.count()
         keys = [*self._keys, "action", "is_init", *self._extra]
         after = [("next", key) for key in (*self._keys, "reward", "terminated")]
         batch = batch.select(*keys, *after)
@@ -216,13 +227,13 @@ class Trainer:
         else:
             self.replay.extend(batch)
 
-    def _collect(self) -> Collector:
+    def collect(self) -> Collector:
         """Starts the collector: it resets all worlds."""
         assert self.env is not None
         collector = self.settings.collector
         self._collector = Collector(
             self.env,
-            self._acting,
+            self.acting,
             frames_per_batch=collector.steps_per_batch * self.env.num_envs,
             total_frames=-1,
             track_traj_ids=False,
@@ -258,7 +269,7 @@ class Trainer:
         self.require_finite()
         if self.env is not None:
             self.replay.sampler.check()
-            episodes = self.env.statistics()
+            episodes = _of_all(processes.objects(self.env.statistics()))
             row = {f"train/{name}": value for name, value in episodes.items()}
             if episodes["episodes"]:
                 text = f"return {episodes['return']:.2f}"
@@ -297,7 +308,7 @@ class Trainer:
         losses = [self.model.loss(self.validation.sample()) for _ in range(batches)]
         self.model.train(training)
         means = {name: torch.stack([one.get(name) for one in losses]).mean() for name in losses[0].keys()}  # noqa: SIM118
-        return {f"validation/{name}": float(value) for name, value in means.items()}
+        return {f"validation/{name}": float(processes.mean(value)) for name, value in means.items()}
 
     def record(self, numbers: Mapping[str, float], *, say_it: bool = False) -> None:
         """Adds a row to the history and the loggers."""
@@ -315,6 +326,7 @@ class Trainer:
             UserError: Training broke; what was saved before stays.
         """
         self.require_finite(weights=True)
+        processes.require_same(self.model.state_dict())
         replay = None
         wanted = self.settings.trainer.checkpoint_replay
         # A first stage that is done leaves its weights; the second gathers what it needs itself.
@@ -322,20 +334,25 @@ class Trainer:
             "whole_run" not in self.settings.values or self.learner.updates < self.settings.trainer.updates
         )
         if self.env is not None and wanted is not False and len(self.replay) and needed:
-            why = reason_to_leave_out(filled_bytes(self.replay), self.folder, last=last, wanted=wanted)
+            size = filled_bytes(self.replay) * processes.count()
+            # Disks of several hosts may have other room: the first process decides.
+            why = processes.objects(reason_to_leave_out(size, self.folder, last=last, wanted=wanted))[0]
             replay = self.experience() if why is None else None
             if why is not None and (last or not self._said):
                 say(f"  {why}")
                 self._said = True
-        return save_checkpoint(
-            self.folder / "checkpoints" / "latest",
+        latest = self.folder / "checkpoints" / "latest"
+        save_together(
+            latest,
             model=self.model,
             optimizer=self.learner.optimizer,
             config=self._config(),
             counters=self.counters,
             replay=replay,
-            extra={"rows": self.rows, "spaces": self.spaces.as_dict(), "moment": self._moment()},
+            extra={"rows": self.rows, "spaces": self.spaces.as_dict()},
+            moment=self.moment(),
         )
+        return latest
 
     @property
     def counters(self) -> dict[str, float]:
@@ -375,65 +392,13 @@ class Trainer:
             f"({self.learner.lr:g}) or trainer.grad_clip ({self.learner.grad_clip:g}); {saved}"
         )
 
-    def _moment(self) -> dict[str, object]:
+    def moment(self) -> dict[str, object]:
         """Where worlds, policies and recorded windows stand."""
         if self.env is None:
             parts = {"windows": self.replay, "validation": self.validation}
             return {name: part.get_state() for name, part in parts.items() if part is not None}
-        assert self._acting is not None
-        return {"worlds": worlds_now(self.env, self._collector), "policies": draws(self._acting.policies)}
-
-    def restore(self, checkpoint: Checkpoint) -> None:
-        """Goes on from a checkpoint as if there had been no interruption, on the CPU to the bit.
-
-        Weights, optimiser, counters, history, experience, worlds, plans, policies, recorded windows and all random
-        numbers are put back. What cannot be is said in a line: experience that the checkpoint was too large for, and
-        worlds of other libraries or of a changed configuration, which start new episodes.
-        """
-        with damaged(checkpoint.folder):
-            checkpoint.load_model(self.model)
-            checkpoint.load_optimizer(self.learner.optimizer)
-            self.learner.use_rates()
-            self.learner.updates = int(checkpoint.counters["updates"])
-            self.env_steps, self.seconds = (
-                int(checkpoint.counters["env_steps"]),
-                checkpoint.counters["seconds"],
-            )
-            extra = checkpoint.extra() or {}
-            self.rows = list(extra.get("rows", []))
-            experience = None if self.env is None else checkpoint.replay(self.env.device)
-            if experience is not None:
-                assert self.env is not None
-                gathered = self.env.fake_tensordict()
-                for key, saved in experience.items(True, True):
-                    if saved.dtype != gathered.get(key, saved).dtype:
-                        raise ValueError(f"experience of {key} is {saved.dtype}")
-                fill(self.replay, experience, self.settings, updates=self.learner.updates, restored=True)
-            elif self.env is not None and self.learner.updates < self.settings.trainer.updates:
-                say("  the checkpoint holds no experience: this run gathers anew and will not be the same")
-            self._restore_moment(checkpoint, extra.get("moment", {}))
-            checkpoint.restore_rng()  # the last: whatever is built draws
-
-    def _restore_moment(self, checkpoint: Checkpoint, moment: Mapping[str, Any]) -> None:
-        if self.env is None:
-            for name, part in {"windows": self.replay, "validation": self.validation}.items():
-                if part is not None and name in moment and not part.set_state(moment[name]):
-                    say(f"  {OTHER_DEVICE}")
-            return
-        assert self._acting is not None
-        worlds = moment.get("worlds")
-        if worlds is not None and same_worlds(checkpoint.config, self.settings.values):
-            put_back(self.env, self._collect(), worlds)
-        else:
-            if restorable(self.env) is None:
-                why = "the simulators of other libraries cannot be put back"
-            else:
-                why = "of another configuration" if worlds is not None else "the checkpoint holds none"
-            say(f"  worlds: {why}; they start new episodes, and this run will not be the same")
-            # Not those that the first run has seen already.
-            self.env.set_seed(derive_seed("training", self.settings.seed, "resumed", self.env_steps))
-        if not go_on_drawing(self._acting.policies, moment.get("policies", {}), self.env.device):
-            say(f"  {OTHER_DEVICE}")
+        assert self.acting is not None
+        return {"worlds": worlds_now(self.env, self._collector), "policies": draws(self.acting.policies)}
 
     def experience(self) -> TensorDictBase | None:
         """The filled part of the replay, (worlds, time), in the order in which it was gathered."""
@@ -445,3 +410,17 @@ class Trainer:
         if full and cursor:
             return torch.cat([data[:, cursor:], data[:, :cursor]], 1)  # pyright: ignore[reportReturnType]
         return data
+
+
+def _of_all(found: Sequence[Mapping[str, float]]) -> dict[str, float]:
+    """Statistics of all processes' episodes: counts are summed, the others are means over episodes."""
+    if len(found) == 1:
+        return dict(found[0])
+    out = {}
+    for name in dict.fromkeys(name for one in found for name in one):
+        having = [(one[name], one["episodes"]) for one in found if name in one]
+        if name in ("episodes", "nonfinite", "overflow"):
+            out[name] = sum(value for value, _ in having)
+        else:
+            out[name] = sum(value * n for value, n in having) / max(1.0, sum(n for _, n in having))
+    return out

@@ -98,8 +98,8 @@ def test_seeds_of_a_whole_run(train, monkeypatch, tmp_path: Path) -> None:
 
 def test_seeds_of_the_worlds_of_a_configuration(cfg: RunSettings) -> None:
     """Also of those that are built alone, to look at a checkpoint."""
-    assert build.make_env(cfg, num_envs=1).simulation.tensors.seed.item() == derive_seed("training", 5)
-    assert build.make_evaluation_env(cfg, num_envs=1).simulation.tensors.seed.item() == evaluation_seed(5)
+    assert build.make_env(cfg, num_envs=1).simulation.tensors.seed[0].item() == derive_seed("training", 5)
+    assert build.make_evaluation_env(cfg, num_envs=1).simulation.tensors.seed[0].item() == evaluation_seed(5)
 
 
 def test_policies_draw_from_the_purpose_they_serve(cfg: RunSettings, worlds) -> None:

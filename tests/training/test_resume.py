@@ -22,6 +22,7 @@ from franka_wm.training import build
 from franka_wm.training.checkpoint import Checkpoint, latest_checkpoint, load_checkpoint
 from franka_wm.training.learner import Learner
 from franka_wm.training.moment import draws
+from franka_wm.training.resume import restore
 from franka_wm.training.trainer import Trainer
 
 HALF = 15  # amid the updates of a batch, which has 10
@@ -99,7 +100,7 @@ def make(kind: str, settled, tiny: list[str], tmp_path_factory) -> Callable[...,
 def everything(trainer: Trainer) -> dict[str, Any]:
     """All that the next step depends on, as tensors and numbers by name."""
     experience = trainer.experience()
-    assert experience is not None and trainer._acting is not None and trainer._collector is not None
+    assert experience is not None and trainer.acting is not None and trainer._collector is not None
     arm = getattr(trainer.env, "base_env", trainer.env)
     parts = {
         "weights": trainer.model.state_dict(),
@@ -107,7 +108,7 @@ def everything(trainer: Trainer) -> dict[str, Any]:
         "experience": experience,
         "worlds": arm.get_state(),
         "carry": trainer._collector._carrier,
-        "policies": draws(trainer._acting.policies),
+        "policies": draws(trainer.acting.policies),
         "generators": [torch.get_rng_state(), list(np.random.get_state())[1:], random.getstate()],
         "counters": [trainer.env_steps, trainer.learner.updates],
     }
@@ -145,7 +146,7 @@ def test_two_halves_are_a_whole(make: Callable[..., Trainer]) -> None:
     second = make("second", seed=99)  # other weights, worlds, policies and generators
     second.env.rollout(3)
     second.settings = second.settings.changed(seed=0)
-    second.restore(load_checkpoint(latest_checkpoint(first.folder)))
+    restore(second, load_checkpoint(latest_checkpoint(first.folder)))
     assert differing(everything(second), halfway) == []
     got = play(second)
     assert {name.split("/")[1] for name in got} >= {"weights", "optimizer", "worlds", "carry", "policies"}
@@ -169,7 +170,7 @@ def test_a_signal_changes_nothing(make: Callable[..., Trainer]) -> None:
     assert first.interrupted and first.learner.updates == 20
     second = make("second", seed=98)
     second.settings = second.settings.changed(seed=0)
-    second.restore(load_checkpoint(latest_checkpoint(first.folder)))
+    restore(second, load_checkpoint(latest_checkpoint(first.folder)))
     assert differing(play(second), expected) == []
 
 
@@ -345,7 +346,7 @@ def test_more_updates_and_another_rate(make: Callable[..., Trainer]) -> None:
     longer = make("longer", seed=0, updates=20)
     longer.learner.rates = [2e-3 for _ in longer.learner.rates]
     longer.learner._scheduled = False
-    longer.restore(load_checkpoint(latest_checkpoint(first.folder)))
+    restore(longer, load_checkpoint(latest_checkpoint(first.folder)))
     assert [group["lr"] for group in longer.learner.optimizer.param_groups] == longer.learner.rates
     longer.fit()
     assert longer.learner.updates == 20
@@ -356,12 +357,12 @@ def test_other_worlds_start_new_episodes_and_say_so(make: Callable[..., Trainer]
     first.fit()
     other = make("other", seed=0, updates=20)
     other.settings = other.settings.changed(env={"success_distance": 0.2})
-    other.restore(load_checkpoint(latest_checkpoint(first.folder)))
+    restore(other, load_checkpoint(latest_checkpoint(first.folder)))
     said = capsys.readouterr().out
     assert "of another configuration; they start new episodes" in said
     arm = getattr(other.env, "base_env", other.env)
     assert arm.get_state()["episode"].eq(-1).all()
-    assert arm.simulation.tensors.seed.item() != first.settings.seed
+    assert arm.simulation.tensors.seed[0].item() != first.settings.seed
 
 
 def test_other_simulators_start_new_episodes_and_say_so(train, tmp_path: Path, capsys) -> None:

@@ -18,6 +18,7 @@ from franka_wm.errors import UserError
 from franka_wm.training import build, storage_budget
 from franka_wm.training.checkpoint import latest_checkpoint, load_checkpoint
 from franka_wm.training.learner import Learner
+from franka_wm.training.resume import restore
 from franka_wm.training.run import Run
 from franka_wm.training.settings import RunSettings
 from franka_wm.training.trainer import Trainer
@@ -151,7 +152,7 @@ def test_going_on(make: Make, updates: int) -> None:
     if updates == 110:
         assert first.env_steps > CAPACITY * N
     second = make("second", updates=updates + 10)
-    second.restore(load_checkpoint(latest_checkpoint(first.folder)))
+    restore(second, load_checkpoint(latest_checkpoint(first.folder)))
     assert second.learner.updates == updates and second.env_steps == first.env_steps
     assert second.rows == first.rows and second.seconds == pytest.approx(first.seconds)
     for key, value in first.model.state_dict().items():
@@ -176,7 +177,7 @@ def test_going_on_without_the_experience_keeps_the_scale_of_observations(make: M
     first = make("first", checkpoint_replay=False)
     first.fit()
     second = make("second", updates=25, checkpoint_replay=False)
-    second.restore(load_checkpoint(latest_checkpoint(first.folder)))
+    restore(second, load_checkpoint(latest_checkpoint(first.folder)))
     assert len(second.replay) == 0
     calls = []
     second.model.set_observation_statistics = lambda mean, std: calls.append(mean)
@@ -241,7 +242,7 @@ def test_evaluation_at_environment_steps(make: Make, capsys) -> None:
 
     resumed = make("resumed", updates=60, evaluate=lambda: {"eval/policy/success": 0.5})
     resumed.settings = resumed.settings.changed(evaluation={"at_steps": [17 * N, 33 * N, 999 * N]})
-    resumed.restore(load_checkpoint(latest_checkpoint(trainer.folder)))
+    restore(resumed, load_checkpoint(latest_checkpoint(trainer.folder)))
     resumed.fit()
     assert f"at_steps=[{999 * N}]: not evaluated" in capsys.readouterr().out
     rows = [row for row in resumed.rows[len(trainer.rows) :] if "eval/policy/success" in row]
@@ -306,8 +307,8 @@ def test_policies_take_turns(make: Make) -> None:
     """Smooth random motion first, then the actor."""
     trainer = make(updates=10)
     used = []
-    forward = trainer._acting.forward
-    trainer._acting.forward = lambda td: (used.append(trainer._acting.name), forward(td))[1]  # type: ignore[method-assign]
+    forward = trainer.acting.forward
+    trainer.acting.forward = lambda td: (used.append(trainer.acting.name), forward(td))[1]  # type: ignore[method-assign]
     trainer.fit()
     acted = used[-15:]
     assert acted == ["random"] * 10 + ["policy"] * 5

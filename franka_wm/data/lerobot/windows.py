@@ -12,6 +12,7 @@ import torch
 from tensordict import TensorDict
 from torch import Tensor
 
+from franka_wm import processes
 from franka_wm.data.lerobot.cache import Cache
 from franka_wm.data.lerobot.mapping import FeatureMap
 from franka_wm.data.stacks import CHANNELS
@@ -189,10 +190,14 @@ class RecordedWindows:
         return self.recording.action_high
 
     def sample(self, batch_size: int | None = None) -> TensorDict:
-        """A batch of uniformly drawn windows, [B, H]; no wait for the device where the data lies on it."""
+        """A batch of uniformly drawn windows, [B, H]; no wait for the device where the data lies on it.
+
+        Several processes draw one batch together, by the same numbers, and each takes its part.
+        """
         count = self.batch_size if batch_size is None else batch_size
-        draw = torch.randint(self._count, (count,), device=self._home, generator=self._generator)
-        return self.windows(draw)
+        whole = (processes.count() * count,)
+        draw = torch.randint(self._count, whole, device=self._home, generator=self._generator)
+        return self.windows(draw.chunk(processes.count())[processes.rank()])
 
     def get_state(self) -> Tensor:
         """Where the generator of :meth:`sample` stands, on the CPU."""

@@ -38,7 +38,7 @@ def place_cases(
     world = wp.tid()
     if not mask[world]:
         return
-    rng = episode_rng(seed[0], world, episode[world], 9)
+    rng = episode_rng(seed[0], seed[1] + world, episode[world], 9)
     for m in range(middle.shape[0]):
         rest_q[world, FINGERS + 7 * count + m] = 0.0
         found = bool(False)

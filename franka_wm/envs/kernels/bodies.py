@@ -103,7 +103,7 @@ def place(
         rest_qd[world, j] = 0.0
     for k in range(history.shape[1]):
         history[world, k, history.shape[2] - 1] = 1.0  # what a late action leaves in force
-    rng = episode_rng(seed[0], world, episode[world], 8)
+    rng = episode_rng(seed[0], seed[1] + world, episode[world], 8)
     for b in range(turn.shape[0]):
         at = FINGERS + 7 * b
         wide = radius[b] * sizes[world, b]

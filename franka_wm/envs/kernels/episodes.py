@@ -93,7 +93,7 @@ def reset_pose(
         return
     number = episode[world] + 1
     episode[world] = number
-    rng = episode_rng(seed[0], world, number, 0)
+    rng = episode_rng(seed[0], seed[1] + world, number, 0)
     for j in range(JOINTS):
         angle = wp.clamp(home[j] + wp.randf(rng, -noise, noise), lower[j], upper[j])
         joint_q[world, j] = angle

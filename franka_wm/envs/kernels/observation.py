@@ -50,7 +50,7 @@ def blur_state(
 ):
     """``state`` as seen: noise on joint angles and, ten times as much, on velocities."""
     world = wp.tid()
-    rng = wp.rand_init(int(episode_rng(seed[0], world, episode[world], 3)), step_count[world, 0])
+    rng = wp.rand_init(int(episode_rng(seed[0], seed[1] + world, episode[world], 3)), step_count[world, 0])
     for i in range(state.shape[1]):
         value = state[world, i]
         if i < JOINTS:
@@ -72,7 +72,7 @@ def blur_objects(
 ):
     """``objects`` as seen: noise on the positions of the first so many ``bodies``."""
     world = wp.tid()
-    rng = wp.rand_init(int(episode_rng(seed[0], world, episode[world], 12)), step_count[world, 0])
+    rng = wp.rand_init(int(episode_rng(seed[0], seed[1] + world, episode[world], 12)), step_count[world, 0])
     for i in range(objects.shape[1]):
         value = objects[world, i]
         if i < EACH * bodies and i % EACH < 3:

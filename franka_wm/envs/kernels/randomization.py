@@ -40,7 +40,7 @@ def draw_looks(
     world = wp.tid()
     if not mask[world]:
         return
-    rng = episode_rng(seed[0], world, episode[world], 4)
+    rng = episode_rng(seed[0], seed[1] + world, episode[world], 4)
     level[world] = 1.0 + wp.randf(rng, -brightness, brightness)
     e = (
         eye
@@ -92,7 +92,7 @@ def draw_dynamics(
     world = wp.tid()
     if not mask[world]:
         return
-    rng = episode_rng(seed[0], world, episode[world], 5)
+    rng = episode_rng(seed[0], seed[1] + world, episode[world], 5)
     for j in range(wp.min(ke.shape[1], JOINTS)):  # the arm's joints
         ke[world, j] = plain_ke[world, j] * (1.0 + wp.randf(rng, -gains, gains))
         kd[world, j] = plain_kd[world, j] * (1.0 + wp.randf(rng, -gains, gains))
@@ -124,7 +124,7 @@ def draw_sizes(
     """
     world = wp.tid()
     if mask[world]:
-        rng = episode_rng(seed[0], world, episode[world], 12)
+        rng = episode_rng(seed[0], seed[1] + world, episode[world], 12)
         for k in range(sizes.shape[1]):
             f = 1.0 + wp.randf(rng, -width, width)
             sizes[world, k] = f
@@ -179,7 +179,7 @@ def draw_frictions(
     """Friction of all that is touched in the masked worlds' new episodes."""
     world = wp.tid()
     if mask[world]:
-        rng = episode_rng(seed[0], world, episode[world], 10)
+        rng = episode_rng(seed[0], seed[1] + world, episode[world], 10)
         for g in range(plain.shape[1]):
             friction[world, g] = plain[world, g] * (1.0 + wp.randf(rng, -width, width))
 
@@ -199,7 +199,7 @@ def draw_grip(
     """How hard both fingers squeeze in the masked worlds' new episodes."""
     world = wp.tid()
     if mask[world]:
-        rng = episode_rng(seed[0], world, episode[world], 11)
+        rng = episode_rng(seed[0], seed[1] + world, episode[world], 11)
         f = 1.0 + wp.randf(rng, -width, width)
         for j in range(JOINTS, JOINTS + FINGERS):
             ke[world, j] = plain_ke[world, j] * f
@@ -213,6 +213,6 @@ def draw_uniform(
     """Numbers in [0, 1) for the tasks of the masked worlds' new episodes."""
     world = wp.tid()
     if mask[world]:
-        rng = episode_rng(seed[0], world, episode[world], 7)
+        rng = episode_rng(seed[0], seed[1] + world, episode[world], 7)
         for k in range(draws.shape[1]):
             draws[world, k] = wp.randf(rng)

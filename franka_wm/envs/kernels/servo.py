@@ -31,7 +31,7 @@ def perceive_action(
     slots = history.shape[1]
     now = step_count[world, 0] % slots
     then = (step_count[world, 0] + slots - delay[world]) % slots
-    rng = wp.rand_init(int(episode_rng(seed[0], world, episode[world], 2)), step_count[world, 0])
+    rng = wp.rand_init(int(episode_rng(seed[0], seed[1] + world, episode[world], 2)), step_count[world, 0])
     for j in range(action.shape[1]):
         history[world, now, j] = action[world, j]
         value = history[world, then, j]

@@ -61,7 +61,7 @@ class Arrays[T]:
         broken: (N,) bool: the last step was no longer finite.
         overflow: (N,) int32, MuJoCo's bits of the last step: contacts were lost for want of room.
         cut: (N,) bool: the last step ended the episode before its time: lost contacts, or a lost object.
-        seed: (1,) int32; with world and ``episode`` it decides all randomness.
+        seed: (2,) int32: the seed and the number of the first world; with ``episode`` they decide all randomness.
         episode: (N,) int32, number of the episode, from 0.
         reset_mask: (N + 1,) bool: which worlds begin their next episode; the last entry is Newton's global world.
         mask: (N,) bool: the worlds' part of it.
@@ -147,6 +147,7 @@ def allocate(
     control: newton.Control,
     *,
     seed: int,
+    first_world: int,
     draws: int,
 ) -> tuple[Arrays[torch.Tensor], Arrays[wp.array]]:
     """The arrays of all worlds in torch and in Warp; those of Newton's state and control are views of these."""
@@ -215,7 +216,7 @@ def allocate(
         broken=flags(n),
         overflow=zeros(n, dtype=torch.int32),
         cut=flags(n),
-        seed=torch.full((1,), as_int32(seed), dtype=torch.int32, device=device),
+        seed=torch.tensor([as_int32(seed), first_world], dtype=torch.int32, device=device),
         episode=torch.full((n,), -1, dtype=torch.int32, device=device),
         reset_mask=reset_mask,
         mask=reset_mask[:n],

@@ -43,6 +43,7 @@ class Simulation:
         num_envs: Number of worlds, N.
         device: ``"cpu"`` or ``"cuda:k"``.
         seed: Decides, with world and episode number, all randomness.
+        first_world: Number of the first world; the others follow.
         urdf_path: Overrides the robot that the config names.
         task: What is asked of the arm; the config's if not given.
 
@@ -61,6 +62,7 @@ class Simulation:
         device: str,
         *,
         seed: int = 0,
+        first_world: int = 0,
         urdf_path: str | Path | None = None,
         task: Task | None = None,
     ):
@@ -78,7 +80,13 @@ class Simulation:
         self.task = make_task(config) if task is None else task
         draws = self.task.num_draws
         self.tensors, self.warp = allocate(
-            config, self.model, self.newton_state, self.control, seed=seed, draws=draws
+            config,
+            self.model,
+            self.newton_state,
+            self.control,
+            seed=seed,
+            first_world=first_world,
+            draws=draws,
         )
         self.bodies = Bodies(self) if config.has_gripper else None
         self.randomizer = Randomizer(self)
@@ -115,7 +123,7 @@ class Simulation:
 
     def set_seed(self, seed: int) -> None:
         """The next reset of each world is its episode 0 of this seed."""
-        self.tensors.seed.fill_(as_int32(seed))
+        self.tensors.seed[0] = as_int32(seed)
         self.tensors.episode.fill_(-1)
 
     def statistics(self, *, clear: bool = True) -> dict[str, float]:

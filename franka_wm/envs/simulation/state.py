@@ -55,7 +55,7 @@ def memory(sim: Simulation) -> dict[str, torch.Tensor]:
 def read(sim: Simulation) -> dict[str, torch.Tensor]:
     """A copy of :func:`memory` and of the seed, each (N, …)."""
     state = {name: tensor.clone() for name, tensor in memory(sim).items()}
-    state["seed"] = sim.tensors.seed.expand(sim.num_envs).clone()
+    state["seed"] = sim.tensors.seed[:1].expand(sim.num_envs).clone()
     return state
 
 
@@ -67,7 +67,7 @@ def write(sim: Simulation, state: Mapping[str, torch.Tensor]) -> None:
     """
     there = memory(sim)
     state = {"ended": torch.zeros_like(there["ended"])} | dict(state)  # states of version 0.1.0 have none
-    expected = there | {"seed": sim.tensors.seed.expand(sim.num_envs)}
+    expected = there | {"seed": sim.tensors.seed[:1].expand(sim.num_envs)}
     for name, tensor in expected.items():
         if name not in state or state[name].shape != tensor.shape or state[name].dtype != tensor.dtype:
             found = f"{tuple(state[name].shape)} {state[name].dtype}" if name in state else "nothing"
@@ -77,5 +77,5 @@ def write(sim: Simulation, state: Mapping[str, torch.Tensor]) -> None:
             )
     for name, tensor in there.items():
         tensor.copy_(state[name])
-    sim.tensors.seed.copy_(state["seed"][:1])
+    sim.tensors.seed[:1] = state["seed"][:1]
     sim.randomizer.apply()

@@ -90,7 +90,7 @@ def reachable_goal(
     world = wp.tid()
     if not mask[world]:
         return
-    rng = episode_rng(seed[0], world, episode[world], 1)
+    rng = episode_rng(seed[0], seed[1] + world, episode[world], 1)
     found = bool(False)
     for _attempt in range(32):
         if not found:

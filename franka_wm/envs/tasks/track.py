@@ -34,7 +34,7 @@ def circle_goal(
     world = wp.tid()
     if everywhere or mask[world]:
         if not everywhere:  # a new episode; kept, so that a state can be continued in another world
-            rng = episode_rng(seed[0], world, episode[world], 6)
+            rng = episode_rng(seed[0], seed[1] + world, episode[world], 6)
             phase[world] = wp.randf(rng, 0.0, 2.0 * wp.pi)
         angle = phase[world] + 2.0 * wp.pi * float(step_count[world, 0] + ahead) * dt / period
         goal[world, 0] = center[world, 0]

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from typing import Any, Literal
 
 from omegaconf import DictConfig, OmegaConf
 
+from franka_wm import processes
 from franka_wm.console import say
 from franka_wm.errors import UserError
 from franka_wm.options import is_whole, read, unknown
@@ -56,12 +57,15 @@ class RunSettings:
         seed: All random numbers come from it.
         device: ``auto``, ``cpu``, ``cuda``, ``cuda:K``.
         resume: The run or the checkpoint that it goes on from.
+        gpus: How many processes learn together, one for each GPU. In each of them worlds, batch and capacity are its
+            part of what ``values`` holds for all.
     """
 
     values: Mapping[str, Any]
     seed: int
     device: str
     resume: str | None
+    gpus: int
     env: EnvSettings
     model: ModelSettings
     planner: PlannerSettings
@@ -108,17 +112,25 @@ class RunSettings:
         names = loggers.pop("names", ())
         if not isinstance(names, list | tuple):
             raise UserError(f"logger.names={names!r}: must be a list such as [csv,tensorboard]")
-        return cls(
+        gpus = values.get("gpus", 1)  # earlier versions had one
+        if not is_whole(gpus) or gpus < 1:
+            raise UserError(f"gpus={gpus!r}: must be a whole number of at least 1")
+        settings = cls(
             values=values,
             seed=values["seed"],
             device=values["device"],
             resume=values.get("resume"),
+            gpus=gpus,
             env=EnvSettings.of(values["env"]),
             model=ModelSettings.of(values["model"]),
             planner=PlannerSettings.of(values["planner"]),
             logger=LoggerSettings(tuple(names), loggers),
             **groups,
         )
+        shared = settings._shared(gpus)  # refused here, wherever the run will be
+        if processes.count() == 1:
+            return settings
+        return shared if shared.device == "cpu" else replace(shared, device=str(processes.own_gpu()))
 
     def changed(self, **changes: Any) -> RunSettings:
         """The same with other values: ``changed(seed=3, model={"encoder_from": …})``; groups are merged."""
@@ -139,6 +151,24 @@ class RunSettings:
                 "export": {**self.values["export"], "kind": "none"},
             },
             saved=True,
+        )
+
+    def _shared(self, parts: int) -> RunSettings:
+        """What one of so many processes has of the whole run."""
+        c, r = self.collector, self.replay
+        divided = {"collector.num_envs": c.num_envs, "replay.batch_size": r.batch_size}
+        divided["collector.planner_worlds"] = c.planner_worlds
+        for name, value in divided.items():
+            if value % parts:
+                raise UserError(f"{name}={value}: {parts} GPUs cannot share it; use a multiple of {parts}")
+        if parts > 1 and self.export.kind != "none":
+            raise UserError(
+                f"export={self.export.kind}: needs gpus=1; franka-wm collect records with the trained agent"
+            )
+        return replace(
+            self,
+            collector=replace(c, num_envs=c.num_envs // parts, planner_worlds=c.planner_worlds // parts),
+            replay=replace(r, batch_size=r.batch_size // parts, capacity=r.capacity // parts),
         )
 
     # -- what follows from several options ------------------------------------------------------------------

@@ -1,0 +1,159 @@
+"""How much faster is one job on several GPUs of a host? Each GPU has the same work: worlds, batch, replay.
+
+    python benchmarks/scale.py                                    all cases on 1, 2, … GPUs
+    python benchmarks/scale.py --cases "TD-MPC2" --gpus 1 2       some of them
+    python benchmarks/scale.py --device cpu --scale smoke --gpus 1 2
+
+*environment* is the simulator alone, one process for each GPU. The others are whole training by ``train.py gpus=N``:
+gathering, resets, sampling, updates and the averaging of gradients; the first third of the updates is warm-up.
+"""
+
+from __future__ import annotations
+
+import argparse
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+from typing import Any
+
+import torch
+from common import publish
+
+from franka_wm import conf
+from franka_wm.training.checkpoint import latest_checkpoint, load_checkpoint
+
+ROOT = Path(__file__).resolve().parents[1]
+
+TRAINING = {
+    "TD-MPC2": ["env=reach"],
+    "TD-MPC2, images": [
+        "env=reach_fixed_pixels",
+        "model=tdmpc2_pixels",
+        "env.frame_stack=3",
+        "replay.capacity=600000",
+    ],
+    "LeWorldModel": ["env=reach_goal_image", "model=lewm"],
+}
+"""Case -> arguments of train.py."""
+
+QUIET = [
+    "evaluation.during=[]",
+    "evaluation.episodes=8",
+    "trainer.checkpoint_replay=false",
+    "trainer.log_every=1",
+]
+
+
+def environment(gpus: int, device: str, worlds: int, seconds: float) -> float:
+    """Steps of all worlds per second, with images, of one process for each GPU."""
+    command = [sys.executable, __file__, "--worlds", str(worlds), "--seconds", str(seconds)]
+    places = ["cpu" if device == "cpu" else f"cuda:{k}" for k in range(gpus)]
+    workers = [
+        subprocess.Popen(
+            [*command, "--worker", place], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+        )
+        for place in places
+    ]
+    for one in workers:  # built and warm
+        assert one.stdout is not None and one.stdout.readline() == "ready\n", "a worker has ended"
+    for one in workers:
+        assert one.stdin is not None
+        one.stdin.write("go\n")
+        one.stdin.flush()
+    return sum(float(one.communicate()[0]) for one in workers)
+
+
+def worker(device: str, worlds: int, seconds: float) -> None:
+    """One process of :func:`environment`."""
+    from franka_wm.envs import FrankaConfig, FrankaEnv
+
+    env = FrankaEnv(FrankaConfig(observations=("pixels", "state")), num_envs=worlds, device=device)
+    tensordict = env.reset()
+    action = torch.rand(worlds, env.action_dim, device=env.device) * 2 - 1
+
+    def steps(seconds: float) -> float:
+        nonlocal tensordict
+        started, done = time.perf_counter(), 0
+        while time.perf_counter() - started < seconds:
+            for _ in range(20):
+                _, tensordict = env.step_and_maybe_reset(tensordict.set("action", action))
+                tensordict.pop("next", None)
+            if env.device.type == "cuda":
+                torch.cuda.synchronize(env.device)
+            done += 20 * worlds
+        return done / (time.perf_counter() - started)
+
+    steps(2.0)
+    print("ready", flush=True)
+    sys.stdin.readline()
+    print(steps(seconds), flush=True)
+
+
+def training(arguments: list[str], gpus: int, updates: int) -> tuple[float, int]:
+    """Updates per second of a whole job in which each GPU has the work of the configuration, and its batch."""
+    alone = conf.compose(*arguments)
+    grown = {
+        "collector.num_envs": alone.collector.num_envs,
+        "collector.planner_worlds": alone.collector.planner_worlds,
+        "replay.batch_size": alone.replay.batch_size,
+        "replay.capacity": alone.replay.capacity,
+    }
+    with tempfile.TemporaryDirectory() as folder:
+        command = [sys.executable, str(ROOT / "train.py"), *arguments, *QUIET]
+        command += [f"{name}={value * gpus}" for name, value in grown.items()]
+        command += [f"gpus={gpus}", f"trainer.updates={updates}", f"hydra.run.dir={folder}/run"]
+        done = subprocess.run(command, capture_output=True, text=True, cwd=ROOT)
+        if done.returncode:
+            raise SystemExit(f"{' '.join(command)}\n{done.stdout[-2000:]}\n{done.stderr[-4000:]}")
+        rows = (load_checkpoint(latest_checkpoint(f"{folder}/run")).extra() or {})["rows"]
+    later = [row for row in rows if "updates_per_s" in row and row["updates"] >= updates / 3]
+    first, last = later[0], later[-1]
+    return (last["updates"] - first["updates"]) / (last["time_s"] - first["time_s"]), grown[
+        "replay.batch_size"
+    ] * gpus
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument(
+        "--cases", nargs="+", default=["environment", *TRAINING], choices=["environment", *TRAINING]
+    )
+    parser.add_argument("--gpus", nargs="+", type=int, help="1, 2, 4, … as many as there are, if not given")
+    parser.add_argument("--updates", type=int, default=6000)
+    parser.add_argument("--worlds", type=int, default=4096, help="of the environment alone, on each GPU")
+    parser.add_argument("--seconds", type=float, default=5.0)
+    parser.add_argument("--device", default="cuda", choices=["cuda", "cpu"])
+    parser.add_argument("--scale", default="gpu")
+    parser.add_argument("--out", help="JSON file")
+    parser.add_argument("--worker", help=argparse.SUPPRESS)
+    args = parser.parse_args()
+    if args.worker:
+        return worker(args.worker, args.worlds, args.seconds)
+    there = torch.cuda.device_count() if args.device == "cuda" else 2
+    numbers = args.gpus or [n for n in (1, 2, 4, 8) if n <= there]
+    rows: list[dict[str, Any]] = []
+    for case in args.cases:
+        alone = 0.0
+        for gpus in numbers:
+            row: dict[str, Any] = {"case": case, "GPUs": gpus}
+            if case == "environment":
+                done = environment(gpus, args.device, args.worlds, args.seconds)
+                row |= {"updates/s": float("nan"), "windows/s": float("nan"), "env steps/s": done}
+            else:
+                arguments = [*TRAINING[case], f"scale={args.scale}", f"device={args.device}"]
+                updates, batch = training(arguments, gpus, args.updates)
+                done = updates * batch
+                row |= {"updates/s": updates, "windows/s": done, "env steps/s": float("nan")}
+            alone = alone or done / gpus
+            row["times one GPU"] = done / alone
+            rows.append(row)
+            print(row, flush=True)
+    publish("scale", rows, args.out)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,175 @@
+"""``gpus=N``: one job of N processes, one for each GPU, which torchrun starts; and what each of them does first."""
+
+from __future__ import annotations
+
+import logging
+import os
+import signal
+import sys
+import tempfile
+import uuid
+from pathlib import Path
+
+from omegaconf import DictConfig
+
+from franka_wm import conf
+from franka_wm.commands.overrides import compose
+from franka_wm.console import say
+from franka_wm.errors import UserError
+from franka_wm.versions import PACKAGES, versions
+
+INTERRUPTED = 130
+
+
+def started_by_torchrun() -> bool:
+    """Whether this process is one of several that torchrun has started; asked before torch is imported."""
+    return "TORCHELASTIC_RUN_ID" in os.environ and int(os.environ.get("WORLD_SIZE", "1")) > 1
+
+
+def wanted(overrides: list[str]) -> tuple[int, str]:
+    """How many processes a checked command line asks for, and on which device; a run that resumes keeps its own."""
+    from franka_wm.training.run import resumed
+
+    cfg = compose(overrides)
+    if cfg.resume is not None:
+        _, cfg = resumed(cfg, overrides)
+    return int(cfg.get("gpus", 1)), str(cfg.device)
+
+
+def launch(flags: list[str], overrides: list[str], gpus: int, device: str) -> None:
+    """Starts so many processes of this command on this host, and waits for them.
+
+    Args:
+        flags: Hydra's.
+        overrides: Checked.
+        gpus: How many.
+        device: The configuration's.
+
+    Raises:
+        UserError: This host has fewer GPUs, or a process was killed.
+        SystemExit: With the status of the first process that ended otherwise than well.
+    """
+    _require_gpus(gpus, device)
+    from torch.distributed.elastic.multiprocessing.api import DefaultLogsSpecs, SignalException
+    from torch.distributed.elastic.multiprocessing.errors import ChildFailedError
+    from torch.distributed.launcher.api import LaunchConfig, elastic_launch
+
+    logging.getLogger("torch.distributed").setLevel(logging.CRITICAL)  # ours say what happened
+    folder = run_folder(overrides)
+    fixed = [one for one in overrides if not one.startswith("hydra.run.dir=")]
+    os.environ.setdefault("OMP_NUM_THREADS", str(max(1, (os.cpu_count() or 1) // gpus)))
+    places = [str(conf.FOLDER.parents[1]), *filter(None, [os.environ.get("PYTHONPATH")])]
+    os.environ["PYTHONPATH"] = os.pathsep.join(places)
+    command = ["-m", "franka_wm", "train", *flags, *fixed, f"hydra.run.dir={folder}"]
+    try:
+        with tempfile.TemporaryDirectory(prefix="franka_wm-") as logs:
+            config = LaunchConfig(
+                min_nodes=1,
+                max_nodes=1,
+                nproc_per_node=gpus,
+                run_id=uuid.uuid4().hex,
+                rdzv_backend="c10d",
+                rdzv_endpoint="localhost:0",
+                local_addr="localhost",
+                max_restarts=0,
+                logs_specs=DefaultLogsSpecs(log_dir=logs),
+            )
+            elastic_launch(config, sys.executable)(*command)
+    except SignalException as stopped:  # the processes have saved, and said so
+        sys.exit(INTERRUPTED if stopped.sigval == signal.SIGINT else 128 + stopped.sigval)
+    except ChildFailedError as error:
+        rank, failure = min(error.failures.items(), key=lambda one: one[1].timestamp)
+        if failure.exitcode >= 0:  # it has said why
+            sys.exit(failure.exitcode)
+        raise UserError(
+            f"process {rank} of the run (pid {failure.pid}) was ended by {failure.signal_name()}, the others with it; "
+            f"go on from the last checkpoint: franka-wm train resume={folder}"
+        ) from None
+
+
+def _require_gpus(gpus: int, device: str) -> None:
+    if device == "cpu":
+        return
+    import torch
+
+    there = torch.cuda.device_count() if torch.cuda.is_available() else 0
+    if device not in ("auto", "cuda"):
+        raise UserError(
+            f"device={device} with gpus={gpus}: each process has a GPU of its own; use device=cuda"
+        )
+    if there < gpus:
+        raise UserError(
+            f"gpus={gpus}: this machine has {there} usable CUDA devices; use fewer, or so many processes on the CPU "
+            "with device=cpu"
+        )
+
+
+def run_folder(overrides: list[str]) -> Path:
+    """Where a run of this command line will write; with the present time in it, another one each time."""
+    import hydra
+    from hydra.core.global_hydra import GlobalHydra
+    from hydra.core.hydra_config import HydraConfig
+
+    before = HydraConfig.instance().cfg
+    try:
+        with hydra.initialize_config_dir(str(conf.FOLDER), version_base="1.3"):
+            cfg = hydra.compose("config", overrides=overrides, return_hydra_config=True)
+            HydraConfig.instance().set_config(cfg)
+            return Path(str(cfg.hydra.run.dir)).absolute()
+    finally:
+        HydraConfig.instance().cfg = before
+        GlobalHydra.instance().clear()
+
+
+def enter(overrides: list[str]) -> list[str]:
+    """Meets the other processes of the job; the overrides of this one.
+
+    All write into one folder, the first one's. All but the first one are silent, unless they end first.
+
+    Raises:
+        UserError: Versions or options differ between processes, or this host has too few GPUs.
+    """
+    import torch
+
+    from franka_wm import processes
+
+    if os.environ["RANK"] != "0":
+        sys.stdout = open(os.devnull, "w")  # noqa: SIM115  # as long as the process
+    processes.join(cuda=wanted(overrides)[1] != "cpu" and torch.cuda.is_available())
+    own = [one for one in overrides if not one.startswith(("hydra.run.dir=", "gpus="))]
+    decisive = ("franka_wm", "python", "commit", *PACKAGES)
+    same = {"options": " ".join(own)} | {k: v for k, v in versions().items() if k in decisive}
+    for rank, theirs in enumerate(processes.objects(same)):
+        for name, value in theirs.items():
+            if value != same.get(name):
+                raise UserError(
+                    f"process {processes.rank()} has {name} {same.get(name)}, process {rank} {value}; start all of a "
+                    "job with the same command in the same environment"
+                )
+    folder = processes.objects(str(run_folder(overrides)))[0]
+    own += [f"gpus={processes.count()}", f"hydra.run.dir={folder}"]
+    return own if processes.is_first() else [*own, "hydra.output_subdir=null"]
+
+
+def go_on(cfg: DictConfig, folder: Path) -> None:
+    """After torchrun has started a job anew: from what it had saved, if anything."""
+    from franka_wm import processes
+    from franka_wm.training.run import left_by
+
+    if processes.count() > 1 and processes.restarted() and cfg.resume is None and left_by(folder, cfg):
+        say(f"started anew: going on from {folder}")
+        cfg.resume = str(folder)
+
+
+def speaks() -> bool:
+    """Whether this process may say why it ends: alone, or as the first one of several to end."""
+    if not started_by_torchrun():
+        return True
+    from franka_wm import processes
+
+    return processes.speaks_first()
+
+
+def named(message: str) -> str:
+    """A line of an error, with the process that says it."""
+    return f"process {os.environ['RANK']}: {message}" if os.environ.get("RANK", "0") != "0" else message

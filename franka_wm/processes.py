@@ -1,0 +1,244 @@
+"""Several processes that learn one model, one for each GPU, started by torchrun; alone, all of this does nothing.
+
+Statistics of a batch, averages of gradients and decisions of the loop go through here, so that n processes with a part
+of the batch each learn what one process learns from all of it. Tensors on a GPU are reduced by NCCL, also inside a
+captured CUDA graph; those on the CPU by gloo.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterable, Sequence
+from datetime import timedelta
+from typing import Any
+
+import torch
+from torch import Tensor, distributed
+
+from franka_wm.errors import UserError
+
+TIMEOUT = timedelta(minutes=30)
+"""How long a process waits for another one that lives: the first one evaluates alone, and compiles kernels."""
+
+
+def restarted() -> bool:
+    """Whether torchrun has started the job anew, after one of its processes had died."""
+    return _anew
+
+
+_anew = False
+
+
+def count() -> int:
+    """How many processes learn together."""
+    return distributed.get_world_size() if _joined() else 1
+
+
+def rank() -> int:
+    """The number of this process, from 0."""
+    return distributed.get_rank() if _joined() else 0
+
+
+def parts() -> tuple[int, ...]:
+    """What tells the seeds of several processes apart; nothing where there is one."""
+    return (rank(),) if count() > 1 else ()
+
+
+def is_first() -> bool:
+    """Whether this process is the one that speaks, evaluates and writes for all."""
+    return rank() == 0
+
+
+def join(*, cuda: bool) -> None:
+    """Meets the other processes that torchrun has started, and takes this one's GPU of the host.
+
+    Raises:
+        UserError: This host has fewer GPUs than processes.
+    """
+    global _anew
+    local = int(os.environ["LOCAL_RANK"])
+    if cuda:
+        there = torch.cuda.device_count()
+        if local >= there:
+            raise UserError(
+                f"gpus={os.environ['WORLD_SIZE']}: process {os.environ['RANK']} would need GPU {local} of this host, "
+                f"which has {there}; use fewer, or device=cpu"
+            )
+        torch.cuda.set_device(local)
+    backend = "cpu:gloo,cuda:nccl" if cuda else "gloo"
+    _together(lambda: distributed.init_process_group(backend, timeout=TIMEOUT))
+    # Of several hosts, that whose process died alone counts it.
+    [_anew] = agree([int(os.environ.get("TORCHELASTIC_RESTART_COUNT", "0")) > 0], [])
+
+
+def leave() -> None:
+    """Parts from the other processes; once more does nothing."""
+    if _joined():
+        distributed.destroy_process_group()
+
+
+def own_gpu() -> torch.device:
+    """The GPU of this host that is this process's."""
+    return torch.device("cuda", int(os.environ["LOCAL_RANK"]))
+
+
+def speaks_first() -> bool:
+    """Whether no process of the job has said before why it ends; the first to ask is told so, once."""
+    if not _joined():
+        return os.environ.get("RANK", "0") == "0"
+    store = distributed.distributed_c10d._get_default_store()
+    try:
+        return store.add(f"ends {os.environ.get('TORCHELASTIC_RESTART_COUNT', 0)}", 1) == 1
+    except RuntimeError:  # the one who keeps the store is gone: then nobody else can have heard
+        return True
+
+
+# -- statistics of all processes' batches ------------------------------------------------------------------------
+
+
+def mean(x: Tensor) -> Tensor:
+    """Mean of `x` over all processes; the gradient goes back to every one of them."""
+    return x if count() == 1 else _applied(_Mean, x)  # pyright: ignore[reportCallIssue]
+
+
+@torch.compiler.disable
+def _applied(function: type[torch.autograd.Function], x: Tensor) -> Tensor:
+    """Outside of what ``torch.compile`` makes of a loss."""
+    return function.apply(x)  # pyright: ignore[reportReturnType]
+
+
+class _Mean(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, x: Tensor) -> Tensor:
+        return _averaged(x)
+
+    @staticmethod
+    def backward(ctx: Any, *grads: Tensor) -> Tensor:
+        return _averaged(grads[0])
+
+
+def gather(x: Tensor) -> Tensor:
+    """`x` (n, …) of every process, one behind the other; the gradient goes back to every one of them."""
+    return x if count() == 1 else _applied(_Gather, x)  # pyright: ignore[reportCallIssue]
+
+
+class _Gather(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, x: Tensor) -> Tensor:
+        x = x.detach().contiguous()
+        parts = [torch.empty_like(x) for _ in range(count())]
+        _together(lambda: distributed.all_gather(parts, x))
+        return torch.cat(parts)
+
+    @staticmethod
+    def backward(ctx: Any, *grads: Tensor) -> Tensor:
+        total = grads[0].contiguous().clone()
+        _together(lambda: distributed.all_reduce(total))
+        return total.chunk(count())[rank()]
+
+
+def broadcast(x: Tensor) -> Tensor:
+    """`x` of the first process, in place."""
+    if count() > 1:
+        _together(torch.compiler.disable(lambda: distributed.broadcast(x, 0)))
+    return x
+
+
+@torch.no_grad()
+def average_gradients(parameters: Iterable[Tensor]) -> None:
+    """Averages the gradients of all processes, in one large message."""
+    if count() == 1:
+        return
+    grads = [p.grad for p in parameters if p.grad is not None]
+    flat = _averaged(torch.cat([g.flatten() for g in grads]))
+    parts = [part.view_as(g) for part, g in zip(flat.split([g.numel() for g in grads]), grads, strict=True)]
+    torch._foreach_copy_(grads, parts)  # pyright: ignore[reportPrivateImportUsage]
+
+
+def pooled(mean: Tensor, std: Tensor, count_each: int) -> tuple[Tensor, Tensor]:
+    """Mean and unbiased deviation of all processes' samples, from those of each, of `count_each` samples."""
+    means, deviations = gather(mean.unsqueeze(0)), gather(std.unsqueeze(0))
+    whole, n = means.mean(0), len(means)
+    squares = (count_each - 1) * deviations.square().sum(0) + count_each * (means - whole).square().sum(0)
+    return whole, (squares / max(1, n * count_each - 1)).sqrt()
+
+
+# -- the loop ----------------------------------------------------------------------------------------------------
+
+
+def agree(any_of: Sequence[bool], first_of: Sequence[bool]) -> list[bool]:
+    """Decisions that all processes take alike: true if it is true for any of them, then: for the first one.
+
+    What depends on clocks and signals differs between processes; waiting for one that went another way would never end.
+    """
+    mine = [*any_of, *(one and is_first() for one in first_of)]
+    if count() == 1:
+        return mine
+    flags = torch.tensor(mine, dtype=torch.int32)
+    _together(lambda: distributed.all_reduce(flags, distributed.ReduceOp.MAX))
+    return flags.bool().tolist()
+
+
+def objects(mine: object) -> list[Any]:
+    """Something small of every process, in their order."""
+    found: list[Any] = [None] * count()
+    if count() == 1:
+        return [mine]
+    _together(lambda: distributed.all_gather_object(found, mine))
+    return found
+
+
+def wait() -> None:
+    """Until all processes are here."""
+    if count() > 1:
+        agree([False], [])
+
+
+def require_same(tensors: dict[str, Tensor]) -> None:
+    """Checks that the weights of all processes are the same, bit for bit; waits for the device.
+
+    Raises:
+        UserError: They are not; names the first that differ.
+    """
+    if count() == 1:
+        return
+    sums = torch.stack([_bits(x).sum() for x in tensors.values()]).cpu()
+    found = objects(sums)
+    for other, theirs in enumerate(found):
+        different = [
+            name for name, same in zip(tensors, (theirs == found[0]).tolist(), strict=True) if not same
+        ]
+        if different:
+            raise UserError(
+                f"the weights of process {other} are no longer those of process 0 (first {different[0]}, "
+                f"{len(different)} in all); go on from the last checkpoint, and report it with the command"
+            )
+
+
+def _bits(x: Tensor) -> Tensor:
+    """The bits of a tensor as whole numbers, each with a weight of its own, so that exchanges are seen."""
+    whole = x.detach().reshape(-1).view(torch.uint8).to(torch.int64)
+    return whole * (torch.arange(whole.numel(), device=x.device) % 8191 + 1)
+
+
+def _joined() -> bool:
+    return distributed.is_available() and distributed.is_initialized()
+
+
+def _averaged(x: Tensor) -> Tensor:
+    total = x.detach().clone(memory_format=torch.contiguous_format)
+    _together(lambda: distributed.all_reduce(total))
+    return total / count()
+
+
+def _together(what: Any) -> None:
+    try:
+        what()
+    except RuntimeError as error:
+        if isinstance(error, torch.OutOfMemoryError):
+            raise
+        why = str(error).splitlines()[0][:120]
+        raise UserError(
+            f"process {os.environ.get('RANK', 0)} has lost another one of this run ({why}); what was saved is whole: "
+            "go on with resume=FOLDER"
+        ) from error

@@ -1,0 +1,85 @@
+"""Going on from a checkpoint as if there had been no interruption."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import torch
+
+from franka_wm import processes
+from franka_wm.console import say
+from franka_wm.seeding import derive_seed
+from franka_wm.training.checkpoint import Checkpoint
+from franka_wm.training.moment import go_on_drawing, put_back, restorable, same_worlds
+from franka_wm.training.shards import own_experience, own_moment
+from franka_wm.training.storage_budget import fill
+from franka_wm.training.trainer import Trainer
+from franka_wm.training.tree import damaged
+
+OTHER_DEVICE = (
+    "the checkpoint is of another kind of device: random numbers start anew; this run will not be the same"
+)
+
+
+def restore(trainer: Trainer, checkpoint: Checkpoint) -> None:
+    """Goes on from a checkpoint as if there had been no interruption, on the CPU to the bit.
+
+    Weights, optimiser, counters, history, experience, worlds, plans, policies, recorded windows and all random
+    numbers are put back. What cannot be is said in a line: experience that the checkpoint was too large for, and
+    worlds of other libraries or of a changed configuration, which start new episodes.
+
+    Of another number of processes worlds and experience are divided anew; random numbers of policies and losses start
+    anew.
+    """
+    env, learner, settings = trainer.env, trainer.learner, trainer.settings
+    with damaged(checkpoint.folder):
+        checkpoint.load_model(trainer.model)
+        checkpoint.load_optimizer(learner.optimizer)
+        learner.use_rates()
+        learner.updates = int(checkpoint.counters["updates"])
+        trainer.env_steps = int(checkpoint.counters["env_steps"])
+        trainer.seconds = checkpoint.counters["seconds"]
+        trainer.rows = list((checkpoint.extra() or {}).get("rows", []))
+        experience = None if env is None else own_experience(checkpoint, env.device)
+        if experience is not None:
+            assert env is not None
+            gathered = env.fake_tensordict()
+            for key, saved in experience.items(True, True):
+                if saved.dtype != gathered.get(key, saved).dtype:
+                    raise ValueError(f"experience of {key} is {saved.dtype}")
+            fill(trainer.replay, experience, settings, updates=learner.updates, restored=True)
+        elif env is not None and learner.updates < settings.trainer.updates:
+            say("  the checkpoint holds no experience: this run gathers anew and will not be the same")
+        _restore_moment(trainer, checkpoint, own_moment(checkpoint))
+        if checkpoint.processes == processes.count():
+            checkpoint.restore_rng(processes.rank())  # the last: whatever is built draws
+        else:
+            say(
+                f"  the checkpoint is of {checkpoint.processes} processes, here are {processes.count()}: random "
+                "numbers start anew; this run will not be the same"
+            )
+            torch.manual_seed(derive_seed("process", settings.seed, processes.rank(), learner.updates))
+
+
+def _restore_moment(trainer: Trainer, checkpoint: Checkpoint, moment: Mapping[str, Any]) -> None:
+    env = trainer.env
+    if env is None:
+        for name, part in {"windows": trainer.replay, "validation": trainer.validation}.items():
+            if part is not None and name in moment and not part.set_state(moment[name]):
+                say(f"  {OTHER_DEVICE}")
+        return
+    assert trainer.acting is not None
+    worlds = moment.get("worlds")
+    if worlds is not None and same_worlds(checkpoint.config, trainer.settings.values):
+        put_back(env, trainer.collect(), worlds)
+    else:
+        if restorable(env) is None:
+            why = "the simulators of other libraries cannot be put back"
+        else:
+            why = "of another configuration" if worlds is not None else "the checkpoint holds none"
+        say(f"  worlds: {why}; they start new episodes, and this run will not be the same")
+        # Not those that the first run has seen already.
+        env.set_seed(derive_seed("training", trainer.settings.seed, "resumed", trainer.env_steps))
+    if not go_on_drawing(trainer.acting.policies, moment.get("policies", {}), env.device):
+        say(f"  {OTHER_DEVICE}")

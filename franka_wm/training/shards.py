@@ -1,0 +1,90 @@
+"""Checkpoints of several processes: each writes its experience, and where its worlds and generators stand."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor
+
+from franka_wm import processes
+from franka_wm.seeding import random_state
+from franka_wm.training.checkpoint import WRITING, Checkpoint, explained, replay_tree, save_checkpoint
+from franka_wm.training.tree import write_tree
+
+
+def save_together(
+    folder: Path, *, replay: TensorDictBase | None, moment: Mapping[str, object], **common: Any
+) -> None:
+    """One checkpoint of all processes, whole or not at all; every one of them calls this.
+
+    Args:
+        folder: Where it will be.
+        replay, moment: This process's own.
+        common: What is the same in all of them, and what the first one alone knows: as for
+            :func:`~franka_wm.training.checkpoint.save_checkpoint`.
+    """
+
+    def others() -> None:
+        processes.wait()  # the folder is there
+        processes.wait()  # their parts are
+
+    if processes.is_first():
+        extra = {**common.pop("extra"), "moment": moment}
+        save_checkpoint(folder, replay=replay, extra=extra, others=others, **common)
+    else:
+        processes.wait()
+        add_part(folder, processes.rank(), replay=replay, moment=moment)
+        processes.wait()
+    processes.wait()  # it is whole
+
+
+def add_part(folder: Path, rank: int, *, replay: TensorDictBase | None, moment: Mapping[str, object]) -> None:
+    """Adds what process ``rank`` > 0 has of its own to the checkpoint that the first one is writing.
+
+    Raises:
+        UserError: The folder cannot be written.
+    """
+    target = folder.resolve()
+    writing = target.with_name(target.name + WRITING)
+    with explained(target):
+        write_tree(writing, f"rng{rank}", random_state())
+        write_tree(writing, f"moment{rank}", moment)
+        if replay is not None:
+            write_tree(writing, f"replay{rank}", replay_tree(replay))
+
+
+def own_experience(checkpoint: Checkpoint, device: torch.device) -> TensorDictBase | None:
+    """This process's worlds of a checkpoint's experience, (worlds, time), whatever number of processes has saved it."""
+    if checkpoint.processes == processes.count():
+        return checkpoint.replay(device, processes.rank())
+    whole = checkpoint.replay("cpu")
+    return None if whole is None else whole.chunk(processes.count())[processes.rank()].to(device)
+
+
+def own_moment(checkpoint: Checkpoint) -> dict[str, Any]:
+    """Where this process's worlds and policies stood; of another number of processes its worlds alone."""
+    moments = [checkpoint.moment(k) for k in range(checkpoint.processes)]
+    if checkpoint.processes == processes.count():
+        return moments[processes.rank()]
+    worlds = [one.get("worlds") for one in moments]
+    if any(one is None for one in worlds):  # recorded data: all processes draw from one sequence
+        return {name: value for name, value in moments[0].items() if name in ("windows", "validation")}
+    return {"worlds": _own(_joined(worlds))}
+
+
+def _joined(trees: list[Any]) -> Any:
+    """Nested values of all processes, their worlds one behind the other."""
+    first = trees[0]
+    if isinstance(first, Tensor):
+        return torch.cat(trees)
+    return {name: _joined([one[name] for one in trees]) for name in first}
+
+
+def _own(tree: Any) -> Any:
+    if isinstance(tree, Tensor):
+        return tree.chunk(processes.count())[processes.rank()]
+    return {name: _own(value) for name, value in tree.items()}

@@ -1,0 +1,250 @@
+"""Jobs of two processes by the command line: what they save, how they go on, and what ends them."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import signal
+import socket
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+import torch
+from tensordict import TensorDict
+
+from franka_wm.envs import FrankaConfig, FrankaEnv
+from franka_wm.evaluation.protocol import evaluate_agent
+from franka_wm.training.checkpoint import Checkpoint, latest_checkpoint, load_checkpoint
+from franka_wm.training.load import load_agent
+
+ROOT = Path(__file__).resolve().parents[2]
+SMOKE = [
+    "env=reach", "scale=smoke", "device=cpu", "env.episode_length=12", "evaluation.episodes=4", "evaluation.during=[]",
+    "logger=none",
+]  # fmt: skip
+TORCHRUN = ["-m", "torch.distributed.run"]
+pytestmark = [pytest.mark.slow]
+
+
+def begin(folder: Path, *overrides: str, before: tuple[str, ...] = (), log: str = "log") -> subprocess.Popen:
+    """A job in the background; what it says is in ``FOLDER.log``."""
+    out = folder.with_suffix(f".{log}").open("w")
+    kept = [] if any("resume=" in one for one in overrides) else SMOKE  # a run that resumes has its own
+    command = [sys.executable, *before, str(ROOT / "train.py"), *kept, *overrides, f"hydra.run.dir={folder}"]
+    environment = {**os.environ, "OMP_NUM_THREADS": "1", "TORCH_DISABLE_SHARE_RDZV_TCP_STORE": "1"}
+    return subprocess.Popen(command, stdout=out, stderr=subprocess.STDOUT, env=environment)
+
+
+def finished(job: subprocess.Popen, folder: Path, *, status: int = 0, log: str = "log") -> str:
+    """What a job has said, when it has ended with this status."""
+    code = job.wait(timeout=240)
+    said = folder.with_suffix(f".{log}").read_text()
+    assert code == status, said
+    return said
+
+
+def workers(folder: Path) -> dict[int, int]:
+    """Rank -> process number of a job that writes into a folder."""
+    found = {}
+    for place in Path("/proc").glob("[0-9]*"):
+        try:
+            if f"hydra.run.dir={folder}".encode() in (place / "cmdline").read_bytes():
+                environment = dict(
+                    one.split(b"=", 1) for one in (place / "environ").read_bytes().split(b"\0") if b"=" in one
+                )
+                if b"RANK" in environment:
+                    found[int(environment[b"RANK"])] = int(place.name)
+        except OSError:  # it has ended
+            continue
+    return found
+
+
+def saved(folder: Path, job: subprocess.Popen) -> None:
+    """Waits for the first checkpoint of a job."""
+    for _ in range(1200):
+        if (folder / "checkpoints" / "latest" / "manifest.json").exists():
+            return
+        assert job.poll() is None, folder.with_suffix(".log").read_text()
+        time.sleep(0.1)
+    raise AssertionError("no checkpoint")
+
+
+def checkpoint(folder: Path) -> Checkpoint:
+    return load_checkpoint(latest_checkpoint(folder))
+
+
+def bits(folder: Path) -> dict[str, bytes]:
+    """What two runs must have in common to the bit: weights, optimiser, experience, worlds and random numbers."""
+    names = [
+        "model",
+        "optimizer",
+        *(f"{name}{k}" for name in ("replay", "rng") for k in ("", 1)),
+        "moment1",
+        "extra",
+    ]
+    place = latest_checkpoint(folder)
+    return {name: (place / f"{name}.safetensors").read_bytes() for name in names}
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory) -> Path:
+    """A run of 40 updates by two processes."""
+    folder = tmp_path_factory.mktemp("jobs") / "whole"
+    job = begin(folder, "gpus=2", "trainer.updates=40")
+    said = finished(job, folder)
+    assert said.count("results in") == 1 and said.count("updates 40/40") == 1  # one speaks
+    return folder
+
+
+def test_a_world_of_the_job_sees_the_same_episodes_wherever_it_is() -> None:
+    config = FrankaConfig(observations=("state",), goal_sampling="reachable", episode_length=3)
+
+    def played(worlds: int, first: int) -> TensorDict:
+        env = FrankaEnv(config, num_envs=worlds, seed=7, first_world=first, device="cpu")
+        actions = torch.linspace(-1, 1, 4 * 7).view(4, 7)[first : first + worlds]
+        return env.rollout(7, lambda td: td.set("action", actions), break_when_any_done=False)
+
+    together, second = played(4, 0), played(2, 2)
+    for key in ("state", "goal"):
+        assert torch.equal(together[key][2:], second[key])
+    assert not torch.equal(together["goal"][:2], second["goal"])
+
+
+def test_the_checkpoint_holds_the_parts_of_all(whole) -> None:
+    found = checkpoint(whole)
+    assert found.processes == 2 and found.config["gpus"] == 2
+    parts = [found.replay(rank=k) for k in range(2)]
+    together = found.replay()
+    assert together is not None and parts[0] is not None and parts[1] is not None
+    assert [len(one) for one in (*parts, together)] == [4, 4, 8]
+    assert torch.equal(together["state"][4:], parts[1]["state"])
+    assert not torch.equal(parts[0]["state"], parts[1]["state"])
+    assert found.counters["env_steps"] == together.numel()  # of the whole job
+    assert not torch.equal(*(torch.as_tensor(found._tree(name)["torch"]) for name in ("rng", "rng1")))
+
+
+def test_the_table_is_that_of_one_process(whole) -> None:
+    table = json.loads((whole / "evaluation.json").read_text())["policies"]
+    again = evaluate_agent(load_agent(whole), episodes=4, timing=False).policies
+    assert table["planner"] == json.loads(json.dumps(again["planner"]))
+
+
+@pytest.fixture(scope="module")
+def half(tmp_path_factory) -> Path:
+    """The first 20 of those updates."""
+    folder = tmp_path_factory.mktemp("jobs") / "half"
+    finished(begin(folder, "gpus=2", "trainer.updates=20"), folder)
+    return folder
+
+
+def test_going_on_is_exact(whole, half, tmp_path) -> None:
+    again = tmp_path / "again"
+    finished(begin(again, f"resume={half}", "trainer.updates=40"), again)  # as many processes as before
+    one, other = bits(whole), bits(again)
+    assert [name for name in one if one[name] != other[name]] == []
+
+
+def test_another_number_of_processes_goes_on(half, tmp_path) -> None:
+    """Two, then one, then two: weights and optimiser as they were, every world with its experience."""
+    one, two = tmp_path / "one", tmp_path / "two"
+    said = finished(begin(one, f"resume={half}", "gpus=1", "trainer.updates=20"), one)
+    assert "the checkpoint is of 2 processes, here are 1" in said
+    for name in ("model", "optimizer"):
+        file = f"{name}.safetensors"
+        assert (latest_checkpoint(one) / file).read_bytes() == (latest_checkpoint(half) / file).read_bytes()
+    before, after = checkpoint(half).replay(), checkpoint(one).replay()
+    assert before is not None and after is not None and torch.equal(before["state"], after["state"])
+    finished(begin(two, f"resume={one}", "gpus=2", "trainer.updates=24"), two)
+    longer = checkpoint(two).replay()
+    assert longer is not None and checkpoint(two).processes == 2
+    assert torch.equal(longer["state"][:, : after.shape[1]], after["state"])  # no world is lost or exchanged
+
+
+def test_sigterm_to_one_saves_all(tmp_path) -> None:
+    folder = tmp_path / "stopped"
+    job = begin(folder, "gpus=2", "trainer.updates=100000", "trainer.checkpoint_every=1")
+    saved(folder, job)
+    os.kill(workers(folder)[1], signal.SIGTERM)
+    said = finished(job, folder, status=130)
+    assert said.count("stopped; go on with") == 1
+    updates = checkpoint(folder).counters["updates"]
+    assert checkpoint(folder).processes == 2
+    more = tmp_path / "more"
+    finished(begin(more, f"resume={folder}", f"trainer.updates={int(updates) + 3}"), more)
+
+
+def test_a_killed_process_ends_the_others(tmp_path) -> None:
+    folder = tmp_path / "killed"
+    job = begin(folder, "gpus=2", "trainer.updates=100000", "trainer.checkpoint_every=1")
+    saved(folder, job)
+    number = workers(folder)[1]
+    os.kill(number, signal.SIGKILL)
+    started = time.monotonic()
+    said = finished(job, folder, status=1)
+    assert time.monotonic() - started < 60
+    advice = re.search(rf"process 1 of the run \(pid {number}\) was ended by SIGKILL.*(resume=\S+)", said)
+    assert advice is not None, said
+    updates = int(checkpoint(folder).counters["updates"])
+    assert not workers(folder)
+    finished(begin(tmp_path / "on", advice[1], f"trainer.updates={updates + 2}"), tmp_path / "on")
+
+
+def test_torchrun_starts_a_job_anew(tmp_path) -> None:
+    """Two agents as two hosts; after a process has died, all begin again from what was saved."""
+    folder = tmp_path / "anew"
+    with socket.socket() as one:
+        one.bind(("localhost", 0))
+        port = one.getsockname()[1]
+    meeting = ("--rdzv-backend=c10d", f"--rdzv-endpoint=localhost:{port}", "--rdzv-id=7", "--max-restarts=1")
+    nodes = (*TORCHRUN, "--nnodes=2", "--nproc-per-node=1", "--local-addr=localhost", *meeting)
+    updates = ("trainer.updates=400", "trainer.checkpoint_every=1")
+    jobs = [begin(folder, *updates, before=nodes, log=f"log{k}") for k in range(2)]
+    for _ in range(1200):
+        if (folder / "checkpoints" / "latest" / "manifest.json").exists():
+            break
+        time.sleep(0.1)
+    os.kill(workers(folder)[1], signal.SIGKILL)
+    said = "".join(finished(job, folder, log=f"log{k}") for k, job in enumerate(jobs))
+    assert f"started anew: going on from {folder}" in said and "updates 400/400" in said
+    assert checkpoint(folder).counters["updates"] == 400
+
+
+@pytest.mark.parametrize(
+    ("overrides", "says"),
+    [
+        (["gpus=2", "device=auto"], "gpus=2: this machine has 0 usable CUDA devices"),
+        (
+            ["gpus=2", "replay.batch_size=7"],
+            "replay.batch_size=7: 2 GPUs cannot share it; use a multiple of 2",
+        ),
+        (["gpus=3"], "collector.num_envs=8: 3 GPUs cannot share it"),
+        (["gpus=0"], "gpus=0: must be a whole number of at least 1"),
+        (["gpus=2", "export=lerobot"], "export=lerobot: needs gpus=1"),
+        (["gpus=2", "seed=0,1", "--multirun"], "gpus with --multirun"),
+    ],
+)
+def test_what_cannot_be_shared_is_one_line(tmp_path, overrides, says) -> None:
+    if "device=auto" in overrides and torch.cuda.is_available():
+        pytest.skip("there are GPUs")
+    folder = tmp_path / "none"
+    said = finished(begin(folder, *overrides), folder, status=1)
+    assert [line for line in said.splitlines() if says in line] and "Traceback" not in said
+    assert not folder.exists()
+
+
+def test_other_options_in_another_process_are_refused(tmp_path) -> None:
+    with socket.socket() as one:
+        one.bind(("localhost", 0))
+        port = one.getsockname()[1]
+    nodes = (*TORCHRUN, "--nnodes=2", "--nproc-per-node=1", "--local-addr=localhost", "--rdzv-backend=c10d")
+    nodes = (*nodes, f"--rdzv-endpoint=localhost:{port}", "--rdzv-id=8")
+    folder = tmp_path / "two"
+    jobs = [begin(folder, f"seed={k}", before=nodes, log=f"log{k}") for k in range(2)]
+    assert all(job.wait(timeout=240) for job in jobs)
+    said = "".join(folder.with_suffix(f".log{k}").read_text() for k in range(2))
+    assert "has options" in said and "start all of a job with the same command" in said
+    assert not folder.exists()

@@ -1,0 +1,39 @@
+"""Two processes with half of each batch learn what one process learns from all of it, in every family."""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+
+from parts_of_batches import FAMILIES, learn
+
+HELPER = Path(__file__).parents[1] / "helpers" / "parts_of_batches.py"
+
+
+@pytest.fixture(scope="module")
+def learned(tmp_path_factory) -> dict[str, dict[str, torch.Tensor]]:
+    """Family -> weights that two processes have learned together."""
+    folder = tmp_path_factory.mktemp("processes")
+    environment = {**os.environ, "OMP_NUM_THREADS": "1"}
+    ranks = [
+        subprocess.Popen([sys.executable, str(HELPER), str(rank), str(folder)], env=environment)
+        for rank in range(2)
+    ]
+    assert [rank.wait(timeout=300) for rank in ranks] == [0, 0]
+    return torch.load(folder / "learned.pt", weights_only=True)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", FAMILIES)
+def test_parts_of_a_batch_teach_what_the_whole_does(learned, name):
+    if "dino" in name:
+        pytest.importorskip("transformers")
+    alone = learn(name)
+    assert alone.keys() == learned[name].keys()
+    for key, value in alone.items():
+        torch.testing.assert_close(
+            learned[name][key], value, rtol=1e-7, atol=1e-9, msg=lambda m, k=key: f"{k}: {m}"
+        )
