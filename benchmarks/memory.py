@@ -3,6 +3,7 @@
     python benchmarks/memory.py                       100,000 steps of 64 worlds
     python benchmarks/memory.py --steps 10000 --pixels
     python benchmarks/memory.py --env lift --minutes 20
+    python benchmarks/memory.py --minutes 25 --train env=lift scale=gpu     a whole training run, watched from outside
 
 A leak shows as a slope over the later rows: the first tenth is warm-up.
 """
@@ -12,20 +13,74 @@ from __future__ import annotations
 import argparse
 import gc
 import os
+import signal
+import subprocess
+import sys
+import tempfile
 import time
 from pathlib import Path
+from typing import Any
 
 import torch
 from common import publish
 
 from franka_wm import conf
 from franka_wm.envs import FrankaConfig, FrankaEnv
+from franka_wm.training.checkpoint import latest_checkpoint, load_checkpoint
 from franka_wm.training.settings import RunSettings
 
+ROOT = Path(__file__).resolve().parents[1]
 
-def resident() -> float:
-    """Memory of this process [MB]."""
-    return int(Path("/proc/self/statm").read_text().split()[1]) * 4096 / 1e6
+
+def process(number: int | str = "self") -> dict[str, float]:
+    """What a process holds."""
+    place = Path("/proc", str(number))
+    return {
+        "resident [MB]": round(int((place / "statm").read_text().split()[1]) * 4096 / 1e6, 1),
+        "descriptors": len(os.listdir(place / "fd")),
+        "threads": len(os.listdir(place / "task")),
+    }
+
+
+def watch(arguments: list[str], minutes: float, device: str) -> list[dict[str, Any]]:
+    """A training run with these arguments of train.py, for so long; Ctrl-C ends it, and it saves."""
+    with tempfile.TemporaryDirectory() as folder:
+        command = [
+            sys.executable,
+            str(ROOT / "train.py"),
+            *arguments,
+            f"device={device}",
+            "trainer.updates=100000000",
+        ]
+        command += [
+            f"hydra.run.dir={folder}/run",
+            "evaluation.episodes=64",
+            "trainer.checkpoint_replay=false",
+        ]
+        with open(f"{folder}/said", "w") as said:
+            run = subprocess.Popen(command, stdout=said, stderr=subprocess.STDOUT, cwd=ROOT)
+        seen, started = [], time.time()
+        for part in range(1, 11):
+            while time.time() - started < 6 * part * minutes:
+                time.sleep(1.0)
+                if run.poll() is not None:
+                    raise SystemExit(Path(folder, "said").read_text()[-4000:])
+            seen.append({"minutes": round(minutes * part / 10, 1), **process(run.pid)})
+            print(seen[-1], flush=True)
+        run.send_signal(signal.SIGINT)
+        run.wait(timeout=120)
+        logged = (load_checkpoint(latest_checkpoint(f"{folder}/run")).extra() or {})["rows"]
+    logged = [row for row in logged if "loss" in row]
+    for k, row in enumerate(seen):
+        there = logged[: max(1, (k + 1) * len(logged) // 10)]
+        last = there[-1]
+        row |= {"updates": int(last["updates"]), "env steps": int(last["env_steps"])}
+        row |= {"device [MB]": round(last["device_memory_mb"], 1)} if "device_memory_mb" in last else {}
+        row["broken worlds"] = round(sum(one.get("train/nonfinite", 0.0) for one in there))
+        row["finite"] = all(
+            value == value and abs(value) < float("inf") for one in there for value in one.values()
+        )
+    return seen
 
 
 def main() -> None:
@@ -37,9 +92,14 @@ def main() -> None:
     parser.add_argument("--env", help="one of conf/env; a plain reach if not given")
     parser.add_argument("--worlds", type=int, default=64)
     parser.add_argument("--pixels", action="store_true", help="with 64×64 images")
+    parser.add_argument(
+        "--train", nargs="+", metavar="ARG", help="watch train.py with these arguments instead"
+    )
     parser.add_argument("--device", default="auto")
     parser.add_argument("--out", help="JSON file")
     args = parser.parse_args()
+    if args.train:
+        return publish("memory", watch(args.train, args.minutes or 25.0, args.device), args.out)
     observations = ("pixels", "state") if args.pixels else ("state",)
     config = (
         RunSettings.of(conf.compose(f"env={args.env}")).env.arm
@@ -66,9 +126,7 @@ def main() -> None:
         gc.collect()
         row = {
             "steps": steps,
-            "resident [MB]": round(resident(), 1),
-            "descriptors": len(os.listdir("/proc/self/fd")),
-            "threads": len(os.listdir("/proc/self/task")),
+            **process(),
             "episodes": round(seen["episodes"]),
             "broken worlds": round(broken),
             "finite": bool(torch.isfinite(tensordict["state"]).all()),

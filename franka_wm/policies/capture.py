@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import OrderedDict
 from collections.abc import Callable, Hashable, Sequence
+from contextlib import suppress
 from typing import NamedTuple
 
 import torch
@@ -126,7 +127,7 @@ def _record(
     work: Work, inputs: TensorDictBase, held: tuple[object, ...], generators: Sequence[torch.Generator]
 ) -> _Graph:
     static = TensorDict({name: x.clone() for name, x in inputs.items()}, batch_size=inputs.batch_size)
-    graph = torch.cuda.CUDAGraph()
+    graph, pool = torch.cuda.CUDAGraph(), torch.cuda.graph_pool_handle()
     device = _device(static)
     default = torch.cuda.default_generators[device.index or 0]
     noise = [generator.get_state() for generator in (default, *generators)]
@@ -134,9 +135,12 @@ def _record(
         graph.register_generator_state(generator)
     try:
         # Other threads (a live page, a data loader) may allocate meanwhile.
-        with torch.cuda.device(device), torch.cuda.graph(graph, capture_error_mode="thread_local"):
+        with torch.cuda.device(device), torch.cuda.graph(graph, pool, capture_error_mode="thread_local"):
             outputs = work(static)
     except RuntimeError as error:
+        # A capture that could not be ended goes on taking memory from its pool, which nobody frees.
+        with suppress(RuntimeError):
+            torch._C._cuda_endAllocateToPool(device.index or 0, pool)  # pyright: ignore[reportAttributeAccessIssue]
         # Generators believe that they are still being captured, and would refuse to draw from now on.
         for generator, state in zip((default, *generators), noise, strict=True):
             fresh = torch.Generator(device)

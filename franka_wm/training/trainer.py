@@ -288,6 +288,8 @@ class Trainer:
             if self.diagnose is not None and self._batch is not None:
                 numbers, warning = self.diagnose(self.model, self._batch)
                 row |= numbers
+        if self.learner.device.type == "cuda":  # torch's, without the simulator's
+            row["device_memory_mb"] = torch.cuda.memory_reserved(self.learner.device) / 1e6
         row |= progress.line(self.learner.updates, self.env_steps, text)
         if warning:
             say(f"  warning: {warning}")
