@@ -368,10 +368,8 @@ class GaussianPolicy(nn.Module):
         return torch.tanh(raw), (log_prob - log_slope).sum(-1, keepdim=True)
 
     def imitation_error(self, z: Tensor, action: Tensor, shown: Tensor) -> Tensor:
-        """Mean squared error (,) of the mode against actions (..., action_dim) where `shown` (..., 1); 0 if nowhere."""
-        error = (self(z, deterministic=True) - action).square().mean(-1, keepdim=True)
-        count = processes.mean(shown.sum(dtype=error.dtype))
-        return (error * shown).sum() / count.clamp_min(1 / processes.count())
+        """Squared error (,) of the mode against actions (..., action_dim), 0 where not `shown` (..., 1): the mean."""
+        return ((self(z, deterministic=True) - action).square() * shown).mean()
 
 
 class RunningScale(nn.Module):

@@ -79,7 +79,8 @@ class TDMPC2(SimplicialWorldModel):
         rho: weight of unroll step t is rho^t.
         consistency_coef, reward_coef, value_coef, termination_coef: weights of the losses.
         entropy_coef: weight, against scaled values, of `action_dim` times the policy's entropy [nat].
-        imitation_coef: weight of the policy's squared error at the steps of a batch that are `demonstrated`.
+        imitation_coef: weight of the policy's squared error at the steps of a batch that are `demonstrated`, which
+            is all of its loss in batches of nothing else.
         mode_targets: bootstrap from Q at the policy's mode, so that values are those of the policy that is
             evaluated; False, as in the paper: at a sample, which counts the policy's noise as well.
         tau: how far target Q-functions, and the policy loss's scale, move at each update.
@@ -329,8 +330,10 @@ class TDMPC2(SimplicialWorldModel):
         policy.join(policy_loss, entropy)
         shown = batch.get("demonstrated", None)
         if self.imitation_coef and shown is not None:
-            error = self.policy_head.imitation_error(detached[:-1], action, shown.transpose(0, 1))
-            policy_loss = policy_loss + self.imitation_coef * error
+            shown = shown.transpose(0, 1)
+            error = self.policy_head.imitation_error(detached[:-1], action, shown)
+            # Values that have seen demonstrations alone know nothing of other actions: then it imitates alone.
+            policy_loss = torch.where(shown.all(), 0.0, policy_loss) + self.imitation_coef * error
 
         total = (
             self.consistency_coef * consistency

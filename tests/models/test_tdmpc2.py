@@ -254,8 +254,12 @@ def test_imitation_is_the_error_of_the_mode_at_demonstrated_steps_and_moves_the_
     for t in range(3):
         errors.append((model.policy(z, deterministic=True) - batch["action"][:, t]).square().mean(-1))
         z = model.next(z, batch["action"][:, t])
-    wanted = 2.0 * torch.stack(errors, 1)[shown.squeeze(-1)].mean()
+    wanted = 2.0 * (torch.stack(errors, 1) * shown.squeeze(-1)).mean()  # less of them, less weight
     (plain, before), (imitating, after), (nowhere, _) = loss(), loss(shown), loss(torch.zeros_like(shown))
     torch.testing.assert_close(imitating - plain, wanted.detach(), rtol=1e-4, atol=1e-6)
     torch.testing.assert_close(nowhere, plain)
+    everywhere = loss(torch.ones_like(shown))[0]  # the policy then imitates, and nothing else
+    torch.manual_seed(0)
+    policy = model.loss(batch)["loss_policy"]
+    torch.testing.assert_close(everywhere, plain - policy + 2.0 * torch.stack(errors, 1).mean().detach())
     assert all(torch.equal(one, other) for one, other in zip(before, after, strict=True))

@@ -19,6 +19,7 @@ from franka_wm.training.settings.run import GROUPS
 
 OUT_OF_RANGE = {
     "seed": [-1],
+    "gpus": [0],
     "env.frame_stack": [0],
     "env.episode_length": [0],
     "collector.policy": ["judge"],
@@ -209,3 +210,32 @@ def test_settings_are_what_several_options_make_of_them() -> None:
     assert (other.window, other.learning_rate, other.schedule, other.warmup) == (5, 1.0, "constant", 7)
     assert run.values["replay"]["window"] is None, "the first is as it was"
     assert RunSettings.of(run.values) == run
+
+
+@pytest.mark.parametrize(
+    ("overrides", "says"),
+    [
+        (
+            ["gpus=2", "replay.batch_size=7"],
+            "replay.batch_size=7: 2 GPUs cannot share it; use a multiple of 2",
+        ),
+        (["gpus=3"], "collector.num_envs=8: 3 GPUs cannot share it"),
+        (["gpus=4", "collector.planner_worlds=2"], "collector.planner_worlds=2: 4 GPUs cannot share it"),
+        (["gpus=2", "export=lerobot"], "export=lerobot: needs gpus=1"),
+    ],
+)
+def test_what_several_gpus_cannot_share_is_refused(overrides: list[str], says: str) -> None:
+    with pytest.raises(UserError, match=says):
+        RunSettings.of(compose("scale=smoke", *overrides))
+
+
+def test_a_process_has_its_part_of_the_whole(monkeypatch: pytest.MonkeyPatch) -> None:
+    cfg = compose("scale=smoke", "device=cpu", "gpus=2")
+    whole = RunSettings.of(cfg)
+    monkeypatch.setattr("franka_wm.processes.count", lambda: 2)
+    own = RunSettings.of(cfg)
+    for name in ("num_envs", "batch_size", "capacity"):
+        group = "collector" if name == "num_envs" else "replay"
+        assert 2 * getattr(getattr(own, group), name) == getattr(getattr(whole, group), name)
+    assert own.values == whole.values  # what checkpoints hold is of all
+    assert own.changed(seed=1).collector.num_envs == own.collector.num_envs
