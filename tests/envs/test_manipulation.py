@@ -341,9 +341,13 @@ def test_what_cannot_be_is_said_in_one_line(changes: dict, said: str) -> None:
     assert said in str(caught.value) and "\n" not in str(caught.value)
 
 
-def test_a_goal_out_of_reach_is_refused_also_where_goals_are_drawn() -> None:
+def test_a_goal_that_would_be_drawn_over_is_refused() -> None:
+    with pytest.raises(
+        UserError, match=r"goal=\(0.4, 0.0, 0.2\): task=pick draws its own goals; leave it out"
+    ):
+        FrankaConfig(**(PRESET | {"task": "pick", "goal_sampling": "reachable", "goal": (0.4, 0.0, 0.2)}))
     with pytest.raises(UserError, match=r"goal=\(2.0, 0.0, 0.2\) m: out of the arm's reach"):
-        make(1, task="pick", goal_sampling="reachable", goal=(2.0, 0.0, 0.2))
+        FrankaEnv(FrankaConfig(goal_sampling="reachable", goal=(2.0, 0.0, 0.2)), device="cpu")
 
 
 def test_too_little_room_for_contacts_is_refused() -> None:

@@ -147,6 +147,11 @@ class GripperTask(Task):
 
     @classmethod
     def check(cls, config: "FrankaConfig") -> None:
+        if config.goal != type(config).goal:
+            raise UserError(
+                f"goal={config.goal}: task={config.task} draws its own goals; leave it out, or move them by "
+                "set_goal()"
+            )
         if config.num_objects < cls.least_objects:
             raise UserError(
                 f"scene: task={config.task} is about {cls.least_objects} objects, the scene has "
