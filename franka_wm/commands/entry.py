@@ -6,7 +6,7 @@ import functools
 import os
 import sys
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from pathlib import Path
 from typing import Any, NoReturn, TextIO
 
@@ -24,7 +24,7 @@ from franka_wm.console import say, terminal_log
 from franka_wm.errors import REFUSALS, FrankaError, machine_refused
 
 _sweep: Sweep | None = None
-"""That of this process; jobs in processes of other launchers have none, and fail as a single run does."""
+"""That of this process; jobs in processes of other launchers have a copy."""
 
 INTERRUPTED = 130
 """Exit status after Ctrl-C, as shells expect."""
@@ -77,7 +77,7 @@ def _run(main: Callable[[], Any], arguments: list[str]) -> None:
     if not (elsewhere or only_shows):
         overrides = with_scale(overrides, sys.stderr if asked.cfg else sys.stdout)
         if asked.multirun:
-            _sweep = Sweep(check_sweep(overrides))
+            _sweep = check_sweep(overrides)
         problem = None if asked.cfg or asked.multirun else check_command(overrides)
         if problem is not None:
             fail(problem)
@@ -148,8 +148,10 @@ def one_line_errors(main: Callable[[DictConfig], object]) -> Callable[[DictConfi
     @functools.wraps(main)
     def wrapped(cfg: DictConfig) -> object:
         try:
+            several.spread(cfg, int(HydraConfig.get().job.get("num", 0)))
             if _sweep is not None:
-                return _sweep.run(main, cfg)
+                with nullcontext() if _sweep.process == os.getpid() else terminal_log():
+                    return _sweep.run(main, cfg)
             if several.started_by_torchrun():
                 several.go_on(cfg, Path(HydraConfig.get().runtime.output_dir))
             with one_line_refusals():
@@ -199,15 +201,15 @@ def with_scale(arguments: list[str], stream: TextIO | None = None, *, quiet: boo
     import torch
 
     device = next((a.split("=", 1)[1] for a in arguments if a.startswith("device=")), "auto")
-    on_gpu = device.startswith("cuda") or (device == "auto" and torch.cuda.is_available())
+    on_gpu = device.startswith(("cuda", "spread")) or (device == "auto" and torch.cuda.is_available())
     scale = "gpu" if on_gpu else "laptop"
     if not quiet and not any(a.startswith("resume=") for a in arguments):
         say(f"scale={scale}, by the device; choose with scale=laptop, gpu or smoke", stream)
     return [a for a in arguments if a != given] + [f"scale={scale}"]
 
 
-def check_sweep(overrides: list[str]) -> list[str]:
-    """Checks every job of a sweep, and its folder, before the first one begins; their names."""
+def check_sweep(overrides: list[str]) -> Sweep:
+    """Checks every job of a sweep, and its folder, before the first one begins."""
     try:
         found = jobs(overrides)
     except FrankaError as error:
@@ -216,7 +218,7 @@ def check_sweep(overrides: list[str]) -> list[str]:
         problem = check_command(job.overrides, job.folder)
         if problem is not None:
             fail(f"{name}: {problem}")
-    return names(found)
+    return Sweep(names(found), [job.folder for job in found])
 
 
 def check_command(arguments: list[str], folder: Path | None = None) -> str | None:
@@ -231,6 +233,7 @@ def check_command(arguments: list[str], folder: Path | None = None) -> str | Non
 
     try:
         cfg = compose(arguments)
+        several.spread(cfg)
         import_plugins(cfg.plugins)
         if cfg.resume is not None:
             _, cfg = resumed(cfg, arguments)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gc
+import os
 import sys
 import traceback
 from collections.abc import Callable
@@ -15,6 +16,7 @@ from omegaconf import DictConfig
 from franka_wm import conf
 from franka_wm.console import log_anew, say
 from franka_wm.errors import REFUSALS, FrankaError, UserError, machine_refused
+from franka_wm.versions import FINISHED
 
 
 @dataclass(frozen=True)
@@ -70,12 +72,21 @@ def names(found: list[Job]) -> list[str]:
 
 @dataclass
 class Sweep:
-    """What becomes of the jobs that this process runs; ``names`` are those of all that are known beforehand."""
+    """What becomes of the jobs of a sweep: of those that this process runs, and of those that others run for it.
 
-    names: list[str]
+    Attributes:
+        names, folders: Names and folders of the jobs that are known beforehand.
+        process: Number of the process that checked them; others may run them.
+        folder: Folder of the sweep.
+        failed: By number, the jobs that failed in this process, and why.
+    """
+
+    names: list[str] = field(default_factory=list)
+    folders: list[Path] = field(default_factory=list)
+    process: int = field(default_factory=os.getpid)
     folder: str = ""
     ran: int = 0
-    failed: list[str] = field(default_factory=list)
+    failed: dict[int, str] = field(default_factory=dict)
 
     def run(self, main: Callable[[DictConfig], object], cfg: DictConfig) -> None:
         """One job: skipped if it is done, gone on with if it was begun; if it fails, the others go on all the same.
@@ -103,8 +114,8 @@ class Sweep:
             say(f"the sweep is stopped; {self.advice}")
             raise
         except Exception as error:
-            self.failed.append(f"{name}: {_in_words(error)}")
-            print(f"error: {self.failed[-1]}", file=sys.stderr, flush=True)
+            self.failed[number] = f"{name}: {_in_words(error)}"
+            print(f"error: {self.failed[number]}", file=sys.stderr, flush=True)
         finally:
             log_anew()
             gc.collect()  # the next one needs the memory
@@ -116,9 +127,17 @@ class Sweep:
 
     def outcome(self) -> str | None:
         """In one line, which jobs failed, and why; ``None`` if none did."""
+        if not self.ran and self.folders:  # another launcher's processes ran them: what they left tells
+            self.folder, self.ran = str(self.folders[0].parent), len(self.folders)
+            ends = [(folder / FINISHED).is_file() for folder in self.folders]
+            self.failed = {
+                k: f"{self.names[k]}: see {self.folders[k] / 'train.log'}"
+                for k, well in enumerate(ends)
+                if not well
+            }
         if not self.failed:
             return None
-        reasons = "; ".join(self.failed)
+        reasons = "; ".join(self.failed.values())
         return str(FrankaError(f"{len(self.failed)} of {self.ran} jobs failed: {reasons}; {self.advice}"))
 
 

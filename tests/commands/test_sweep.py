@@ -5,12 +5,17 @@ from __future__ import annotations
 import os
 import signal
 import subprocess
+import sys
 import time
 from pathlib import Path
 
 import pytest
+import torch
+from omegaconf import OmegaConf
 
 from forks import TRAIN, Fork, script, train_in_fork
+from franka_wm.commands.several import spread
+from franka_wm.errors import UserError
 from franka_wm.training.checkpoint import latest_checkpoint, load_checkpoint
 
 SMOKE = [
@@ -84,6 +89,37 @@ def test_a_job_is_refused_before_anything_is_written(swept, tmp_path: Path) -> N
     done = sweep(tmp_path, "seed=0,1", "hydra.sweep.subdir=one")
     assert "jobs 0 and 1 would both write into" in done.stderr and done.stderr.count("\n") == 1
     assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.slow
+def test_jobs_of_other_processes_are_looked_after_as_well(tmp_path: Path) -> None:
+    """Two at a time by joblib: who failed is named, and what is missing runs when it is asked for again."""
+    pytest.importorskip("hydra_plugins.hydra_joblib_launcher")
+    command = [sys.executable, str(TRAIN), "--multirun", "hydra/launcher=joblib", "hydra.launcher.n_jobs=2"]
+    command += [*SMOKE, *SMALL, "trainer.lr=1e30,1e-3", f"hydra.sweep.dir={tmp_path}/sweep"]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=240)
+    assert done.returncode == 1 and "Traceback" not in done.stderr, done.stderr
+    assert (
+        done.stderr.strip()
+        .splitlines()[-1]
+        .startswith("error: 1 of 2 jobs failed: job 0 (trainer.lr=1e+30): see ")
+    )
+    logs = [(tmp_path / "sweep" / job / "train.log").read_text() for job in ("0-reach", "1-reach")]
+    assert "training broke" in logs[0] and "results: " in logs[1]
+    again = subprocess.run(command, capture_output=True, text=True, timeout=240)
+    assert again.returncode == 1 and "job 1 (trainer.lr=0.001) was finished before" in again.stdout
+
+
+def test_jobs_take_the_gpus_in_turn(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    monkeypatch.setattr(torch.cuda, "device_count", lambda: 2)
+    cfgs = [OmegaConf.create({"device": "spread"}) for _ in range(3)]
+    for k, cfg in enumerate(cfgs):
+        spread(cfg, k)
+    assert [cfg.device for cfg in cfgs] == ["cuda:0", "cuda:1", "cuda:0"]
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    with pytest.raises(UserError, match="device=spread: this machine has 0 usable CUDA devices"):
+        spread(OmegaConf.create({"device": "spread"}))
 
 
 def test_ctrl_c_ends_the_sweep(tmp_path: Path) -> None:
