@@ -13,6 +13,7 @@ from typing import Any, NoReturn, TextIO
 from hydra.core.hydra_config import HydraConfig
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.errors import OverrideParseException
+from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
@@ -148,12 +149,13 @@ def one_line_errors(main: Callable[[DictConfig], object]) -> Callable[[DictConfi
     @functools.wraps(main)
     def wrapped(cfg: DictConfig) -> object:
         try:
-            several.spread(cfg, int(HydraConfig.get().job.get("num", 0)))
+            told = HydraConfig.get()
+            several.spread(cfg, int(told.job.num) if told.mode == RunMode.MULTIRUN else 0)
             if _sweep is not None:
                 with nullcontext() if _sweep.process == os.getpid() else terminal_log():
                     return _sweep.run(main, cfg)
             if several.started_by_torchrun():
-                several.go_on(cfg, Path(HydraConfig.get().runtime.output_dir))
+                several.go_on(cfg, Path(told.runtime.output_dir))
             with one_line_refusals():
                 return main(cfg)
         except FrankaError as error:
