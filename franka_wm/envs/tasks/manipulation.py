@@ -149,8 +149,7 @@ class GripperTask(Task):
     def check(cls, config: "FrankaConfig") -> None:
         if config.goal != type(config).goal:
             raise UserError(
-                f"goal={config.goal}: task={config.task} draws its own goals; leave it out, or move them by "
-                "set_goal()"
+                f"goal={config.goal}: task={config.task} draws its own goals; leave it out (docs/tasks.md)"
             )
         if config.num_objects < cls.least_objects:
             raise UserError(
