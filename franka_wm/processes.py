@@ -8,6 +8,7 @@ captured CUDA graph; those on the CPU by gloo.
 from __future__ import annotations
 
 import os
+import sys
 from collections.abc import Iterable, Sequence
 from datetime import timedelta
 from typing import Any
@@ -71,10 +72,15 @@ def join(*, cuda: bool) -> None:
     [_anew] = agree([int(os.environ.get("TORCHELASTIC_RESTART_COUNT", "0")) > 0], [])
 
 
-def leave() -> None:
-    """Parts from the other processes; once more does nothing."""
+def leave(status: int = 0) -> None:
+    """Ends this process where it is one of several; alone it does nothing.
+
+    Parting in order would wait: a captured graph holds NCCL's connections, and threads those of gloo.
+    """
     if _joined():
-        distributed.destroy_process_group()
+        sys.stdout.flush()
+        sys.stderr.flush()
+        os._exit(status)
 
 
 def own_gpu() -> torch.device:

@@ -186,7 +186,9 @@ def fail(message: str) -> NoReturn:
     if several.speaks():
         print(f"error: {several.named(message)}", file=sys.stderr, flush=True)
     if several.started_by_torchrun():
-        os._exit(1)  # nothing is left to be written, and threads that talk to lost processes do not end
+        from franka_wm import processes
+
+        processes.leave(1)
     sys.exit(1)
 
 

@@ -135,6 +135,7 @@ class Run:
     loggers: list[Logger] = field(default_factory=list)
     validation: RecordedWindows | None = None
     """Windows of recorded episodes that training never sees."""
+    _recorded: RecordedWindows | None = None
 
     def build_environments(self) -> tuple[Environment | None, Environment | None]:
         """The training worlds and the evaluation worlds, compiled and ready; ``None`` where there are none.
@@ -142,9 +143,11 @@ class Run:
         A run on recorded data trains in no world; without an environment (``env=none``) none evaluates it either. Of
         several processes the first one alone evaluates.
         """
+        gathers = not self.settings.is_offline
+        if not gathers:  # what is wrong with the data is said before minutes go into building worlds
+            self.recorded()
         if self.settings.env.kind == "none":
             return None, None
-        gathers = not self.settings.is_offline
         worlds = f"{self.settings.evaluation.episodes} evaluation worlds"
         if gathers:
             worlds = f"{self.settings.values['collector']['num_envs']} training and {worlds}"
@@ -170,7 +173,7 @@ class Run:
             shown = open_demonstrations(self.settings, env, hindsight)
             replay = build.make_replay_buffer(self.settings, env.device, hindsight, shown)
             return replay, self.as_saved(Spaces.of_env(env))
-        windows, self.validation = build.open_recorded(self.settings, self.device)
+        windows = self.recorded()
         spaces = Spaces(
             observation_sizes=dict(windows.observation_sizes),
             image_sizes=dict(windows.image_sizes),
@@ -181,6 +184,12 @@ class Run:
             terminates=windows.terminates,
         )
         return windows, self.as_saved(spaces)
+
+    def recorded(self) -> RecordedWindows:
+        """Windows to train on of the datasets that ``dataset`` names; opened once."""
+        if self._recorded is None:
+            self._recorded, self.validation = build.open_recorded(self.settings, self.device)
+        return self._recorded
 
     def as_saved(self, spaces: Spaces) -> Spaces:
         """``spaces`` with what decides on a model's parts as it was when the run that this one goes on from began."""
@@ -200,7 +209,7 @@ class Run:
         """The last line of a run that was interrupted and has saved; exits with 130."""
         close_loggers(self.loggers)
         say(f"stopped; go on with: franka-wm train resume={self.folder}")
-        processes.leave()
+        processes.leave(INTERRUPTED)
         sys.exit(INTERRUPTED)
 
     def close(self) -> None:

@@ -103,21 +103,24 @@ def test_a_failed_capture_gives_the_generator_back(monkeypatch):
         graphsafe_set_state = given.append
 
     @contextmanager
-    def refuse(graph, capture_error_mode):
-        assert capture_error_mode == "thread_local"
+    def refuse(graph, pool, capture_error_mode):
+        assert (pool, capture_error_mode) == ("pool", "thread_local")
         yield
         raise RuntimeError("operation not permitted")
 
     class Graph:
         register_generator_state = staticmethod(lambda generator: None)
 
+    ended = []
+    monkeypatch.setattr(torch.cuda, "graph_pool_handle", lambda: "pool")
+    monkeypatch.setattr(torch._C, "_cuda_endAllocateToPool", lambda *which: ended.append(which), raising=False)
     monkeypatch.setattr(torch.cuda, "CUDAGraph", Graph)
     monkeypatch.setattr(torch.cuda, "default_generators", (Noise(),))
     monkeypatch.setattr(torch.cuda, "graph", refuse)
     monkeypatch.setattr(torch, "Generator", Noise)
     with pytest.raises(CaptureError, match="give capture=False"):
         capture._record(double, numbers(1), (), (Noise(state="own"),))
-    assert given == ["before", "own"]
+    assert given == ["before", "own"] and ended == [(0, "pool")]
 
 
 def test_copies_have_no_graphs(recorded):
