@@ -113,7 +113,9 @@ def test_a_failed_capture_gives_the_generator_back(monkeypatch):
 
     ended = []
     monkeypatch.setattr(torch.cuda, "graph_pool_handle", lambda: "pool")
-    monkeypatch.setattr(torch._C, "_cuda_endAllocateToPool", lambda *which: ended.append(which), raising=False)
+    monkeypatch.setattr(
+        torch._C, "_cuda_endAllocateToPool", lambda *which: ended.append(which), raising=False
+    )
     monkeypatch.setattr(torch.cuda, "CUDAGraph", Graph)
     monkeypatch.setattr(torch.cuda, "default_generators", (Noise(),))
     monkeypatch.setattr(torch.cuda, "graph", refuse)

@@ -11,6 +11,7 @@ from tensordict import TensorDictBase
 
 from franka_wm.envs.kernels import JOINTS, chain_forward, episode_rng
 from franka_wm.envs.tasks.base import Task, with_goal
+from franka_wm.errors import UserError
 
 if TYPE_CHECKING:
     from franka_wm.envs.config import FrankaConfig
@@ -160,6 +161,14 @@ class Reach(Task):
     def __init__(self, config: "FrankaConfig"):
         super().__init__(config)
         self._fixed: tuple[wp.array, wp.array] | None = None
+
+    @classmethod
+    def check(cls, config: "FrankaConfig") -> None:
+        if config.goal_sampling != "fixed" and config.goal != type(config).goal:
+            raise UserError(
+                f"goal={config.goal}: with goal_sampling={config.goal_sampling} each episode draws another; leave it "
+                "out, or give goal_sampling=fixed"
+            )
 
     @property
     def reward_bounds(self) -> tuple[float, float] | None:
