@@ -96,9 +96,9 @@ class FrankaConfig:
         observations: Which of ``("pixels", "depth", "segmentation", "goal_pixels", "state", "joint_target",
             "objects", "contacts")`` are emitted. ``goal`` always is.
         episode_length: Control steps after which an episode is truncated.
-        goal_sampling: Of ``reach`` and ``track``; tasks with a gripper draw their own, and refuse ``goal``. ``"fixed"``
-            (``goal``) or ``"reachable"`` (the tool position of a random pose, drawn
-            per world and episode).
+        goal_sampling: Goals of ``reach`` and ``track``; tasks with a gripper draw their own, and refuse ``goal``.
+            ``"fixed"`` (``goal``) or ``"reachable"`` (the tool position of a random pose, drawn per world and
+            episode).
         goal_noise: For ``goal_sampling="reachable"``: half-width of the uniform noise around the home pose
             from which the goal pose is drawn [rad].
         success_distance: The task is solved where the tool is closer to the goal than this [m].

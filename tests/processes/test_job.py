@@ -164,11 +164,12 @@ def test_another_number_of_processes_goes_on(half, tmp_path) -> None:
     assert torch.equal(longer["state"][:, : after.shape[1]], after["state"])  # no world is lost or exchanged
 
 
-def test_sigterm_to_one_saves_all(tmp_path) -> None:
+@pytest.mark.parametrize("whole", [False, True], ids=["SIGTERM to one", "Ctrl-C"])
+def test_a_signal_saves_all(tmp_path, whole) -> None:
     folder = tmp_path / "stopped"
     job = begin(folder, "gpus=2", "trainer.updates=100000", "trainer.checkpoint_every=1")
     saved(folder, job)
-    os.kill(workers(folder)[1], signal.SIGTERM)
+    os.kill(*(job.pid, signal.SIGINT) if whole else (workers(folder)[1], signal.SIGTERM))
     said = finished(job, folder, status=130)
     assert said.count("stopped; go on with") == 1
     updates = checkpoint(folder).counters["updates"]
