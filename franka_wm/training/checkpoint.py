@@ -258,7 +258,8 @@ class Checkpoint:
         whole = [one for one in found if one is not None]
         if len(whole) < len(found):
             return None
-        joined: TensorDict = whole[0] if len(whole) == 1 else torch.cat(whole)  # pyright: ignore[reportAssignmentType, reportArgumentType]
+        with damaged(self.folder, "one of its replays"):
+            joined: Any = whole[0] if len(whole) == 1 else torch.cat(whole)  # pyright: ignore[reportArgumentType]
         return joined.to(device or "cpu")
 
     def _replay(self, rank: int) -> TensorDict | None:

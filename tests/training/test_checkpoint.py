@@ -1,5 +1,6 @@
 """Checkpoints: exact after a round trip."""
 
+import functools
 import random
 from collections.abc import Callable
 from pathlib import Path
@@ -11,6 +12,7 @@ from torch import Tensor, nn
 
 from franka_wm.errors import UserError
 from franka_wm.training.checkpoint import latest_checkpoint, load_checkpoint, save_checkpoint
+from franka_wm.training.shards import add_part, own_experience, own_moment
 from small_checkpoint import Small, save, some_replay, train
 
 
@@ -261,3 +263,41 @@ def test_a_captured_optimizer_goes_on_on_the_gpu_and_on_the_cpu(tmp_path: Path) 
     checkpoint.load_model(on_cpu)
     checkpoint.load_optimizer(cpu_optimizer)
     train(on_cpu, cpu_optimizer, 1)
+
+
+def test_parts_of_several_processes_are_one_checkpoint(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    first, second = some_replay(), some_replay()
+    moments = [{"worlds": {"state": {"q": torch.full((6, 2), float(k))}}} for k in range(2)]
+
+    def other() -> None:
+        torch.manual_seed(7)
+        add_part(tmp_path / "a", 1, replay=second, moment=moments[1])
+        torch.manual_seed(8)
+
+    save(tmp_path / "a", Small(), replay=first, extra={"moment": moments[0]}, others=other)
+    found = load_checkpoint(tmp_path / "a")
+    whole = found.replay()
+    assert found.processes == 2 and whole is not None
+    assert torch.equal(whole["state"], torch.cat((first["state"], second["state"])))
+    part = found.replay(rank=1)
+    assert part is not None and torch.equal(part["pixels"], second["pixels"])
+    found.restore_rng(1)
+    drawn = torch.rand(3)
+    torch.manual_seed(7)
+    assert torch.equal(drawn, torch.rand(3))
+    # As many processes as before have their own; others divide the worlds anew, in their order.
+    monkeypatch.setattr("franka_wm.processes.count", lambda: 3)
+    monkeypatch.setattr("franka_wm.processes.rank", lambda: 1)
+    own = own_experience(found, torch.device("cpu"))
+    assert own is not None and torch.equal(own["state"], whole["state"][4:8])
+    assert own_moment(found)["worlds"]["state"]["q"][:, 0].tolist() == [0.0, 0.0, 1.0, 1.0]
+
+
+def test_parts_that_do_not_fit_together_are_damage(tmp_path: Path) -> None:
+    narrow = some_replay()[:, :3]
+    others = functools.partial(add_part, tmp_path / "a", 1, replay=narrow, moment={})
+    save(tmp_path / "a", Small(), replay=some_replay(), others=others)
+    with pytest.raises(UserError, match="is damaged: one of its replays"):
+        load_checkpoint(tmp_path / "a").replay()

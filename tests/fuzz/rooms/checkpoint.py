@@ -92,6 +92,7 @@ class Checkpoint:
         from franka_wm.training.check import check
         from franka_wm.training.checkpoint import latest_checkpoint, load_checkpoint
         from franka_wm.training.load import load_model
+        from franka_wm.training.resume import restore
         from franka_wm.training.settings import RunSettings
 
         self._damaged(folder / "latest", case["mutations"])
@@ -105,7 +106,7 @@ class Checkpoint:
         if settings.values != self.settings.values:
             return
         trainer = self.trainer
-        trainer.restore(checkpoint)
+        restore(trainer, checkpoint)
         trainer.gather()
         trainer.learner.update(trainer.replay.sample())
         trainer.require_finite(weights=True)
