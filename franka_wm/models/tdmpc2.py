@@ -79,8 +79,8 @@ class TDMPC2(SimplicialWorldModel):
         rho: weight of unroll step t is rho^t.
         consistency_coef, reward_coef, value_coef, termination_coef: weights of the losses.
         entropy_coef: weight, against scaled values, of `action_dim` times the policy's entropy [nat].
-        imitation_coef: weight of the policy's squared error at the steps of a batch that are `demonstrated`, which
-            is all of its loss in batches of nothing else.
+        imitation_coef: weight of the policy's squared error at the steps of a batch that are `demonstrated`. In
+            batches of nothing else it is all of the policy's loss, and the encoder learns from it.
         mode_targets: bootstrap from Q at the policy's mode, so that values are those of the policy that is
             evaluated; False, as in the paper: at a sample, which counts the policy's noise as well.
         tau: how far target Q-functions, and the policy loss's scale, move at each update.
@@ -284,7 +284,8 @@ class TDMPC2(SimplicialWorldModel):
         """Losses of a batch of windows; call `backward` once on the entry `loss`.
 
         The policy's parameters then hold the gradient of the policy loss alone, and all others that of the
-        model losses alone. In training mode the running scale of the policy loss is updated as well.
+        model losses alone; but in batches of demonstrations alone the encoder learns from imitation, too. In training
+        mode the running scale of the policy loss is updated as well.
 
         Args:
             batch: batch size [B, H]: H contiguous transitions, all of one episode, with the observation keys,
@@ -331,9 +332,12 @@ class TDMPC2(SimplicialWorldModel):
         shown = batch.get("demonstrated", None)
         if self.imitation_coef and shown is not None:
             shown = shown.transpose(0, 1)
-            error = self.policy_head.imitation_error(detached[:-1], action, shown)
-            # Values that have seen demonstrations alone know nothing of other actions: then it imitates alone.
-            policy_loss = torch.where(shown.all(), 0.0, policy_loss) + self.imitation_coef * error
+            # Values that have seen demonstrations alone know nothing of other actions: then the policy imitates alone,
+            # and the encoder learns for it, too (MoDem's first phase).
+            alone = shown.all()
+            z = torch.where(alone, encoded[:-1], detached[:-1])
+            error = self.policy_head.imitation_error(z, action, shown)
+            policy_loss = torch.where(alone, 0.0, policy_loss) + self.imitation_coef * error
 
         total = (
             self.consistency_coef * consistency

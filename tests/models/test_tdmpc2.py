@@ -258,8 +258,34 @@ def test_imitation_is_the_error_of_the_mode_at_demonstrated_steps_and_moves_the_
     (plain, before), (imitating, after), (nowhere, _) = loss(), loss(shown), loss(torch.zeros_like(shown))
     torch.testing.assert_close(imitating - plain, wanted.detach(), rtol=1e-4, atol=1e-6)
     torch.testing.assert_close(nowhere, plain)
-    everywhere = loss(torch.ones_like(shown))[0]  # the policy then imitates, and nothing else
-    torch.manual_seed(0)
-    policy = model.loss(batch)["loss_policy"]
-    torch.testing.assert_close(everywhere, plain - policy + 2.0 * torch.stack(errors, 1).mean().detach())
     assert all(torch.equal(one, other) for one, other in zip(before, after, strict=True))
+
+
+def test_among_demonstrations_alone_the_policy_and_the_encoder_imitate():
+    model, batch = small(imitation_coef=2.0), windows()
+    randomise(model)
+    model.eval()
+
+    def loss(flags):
+        torch.manual_seed(0)
+        model.zero_grad()
+        result = model.loss(batch.clone().set("demonstrated", flags))
+        result["loss"].backward()
+        return result, {name: p.grad.clone() for name, p in model.named_parameters() if p.grad is not None}
+
+    some = torch.zeros(6, 3, 1, dtype=torch.bool)
+    plain, before = loss(some)
+    result, after = loss(~some)
+    z = model.encode(batch)
+    error = 2.0 * (model.policy(z, deterministic=True) - batch["action"]).square().mean()
+    torch.testing.assert_close(result["loss"] - plain["loss"], (error - plain["loss_policy"]).detach())
+    model.zero_grad()
+    error.backward()  # what is new in all gradients but the policy's own, which is all of theirs
+    for name, parameter in model.named_parameters():
+        if parameter.grad is not None:
+            wanted = parameter.grad + (0.0 if "policy" in name else before[name])
+            torch.testing.assert_close(after[name], wanted, rtol=1e-4, atol=1e-6)
+    assert {n.split(".")[0] for n in before if not torch.equal(before[n], after[n])} == {
+        "encoder",
+        "policy_head",
+    }
