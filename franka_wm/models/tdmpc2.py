@@ -79,8 +79,7 @@ class TDMPC2(SimplicialWorldModel):
         rho: weight of unroll step t is rho^t.
         consistency_coef, reward_coef, value_coef, termination_coef: weights of the losses.
         entropy_coef: weight, against scaled values, of `action_dim` times the policy's entropy [nat].
-        imitation_coef: weight of the policy's squared error at the steps of a batch that are `demonstrated`. In
-            batches of nothing else it is all of the policy's loss, and the encoder learns from it.
+        imitation_coef: of the policy's squared error at `demonstrated` steps; among these alone it is all of its loss.
         mode_targets: bootstrap from Q at the policy's mode, so that values are those of the policy that is
             evaluated; False, as in the paper: at a sample, which counts the policy's noise as well.
         tau: how far target Q-functions, and the policy loss's scale, move at each update.
@@ -283,9 +282,9 @@ class TDMPC2(SimplicialWorldModel):
     ) -> TensorDict:
         """Losses of a batch of windows; call `backward` once on the entry `loss`.
 
-        The policy's parameters then hold the gradient of the policy loss alone, and all others that of the
-        model losses alone; but in batches of demonstrations alone the encoder learns from imitation, too. In training
-        mode the running scale of the policy loss is updated as well.
+        The policy's parameters then hold the gradient of the policy loss alone, all others that of the model losses
+        (and the encoder, among demonstrations alone, that of imitation). In training mode the running scale of the
+        policy loss is updated as well.
 
         Args:
             batch: batch size [B, H]: H contiguous transitions, all of one episode, with the observation keys,
@@ -310,10 +309,8 @@ class TDMPC2(SimplicialWorldModel):
         action, reward, terminated = (
             batch.get(key).transpose(0, 1) for key in ("action", ("next", "reward"), ("next", "terminated"))
         )
-        horizon = action.shape[0]
-        weight = self.rho ** torch.arange(horizon + 1, device=action.device, dtype=action.dtype).view(
-            -1, 1, 1
-        )
+        steps = torch.arange(action.shape[0] + 1, device=action.device, dtype=action.dtype)
+        weight = self.rho ** steps.view(-1, 1, 1)
 
         encoded = call["_encode_window"](batch)  # (H+1, B, D), one call
         after = encoded[1:].detach()
@@ -331,12 +328,11 @@ class TDMPC2(SimplicialWorldModel):
         policy.join(policy_loss, entropy)
         shown = batch.get("demonstrated", None)
         if self.imitation_coef and shown is not None:
-            shown = shown.transpose(0, 1)
             # Values that have seen demonstrations alone know nothing of other actions: then the policy imitates alone,
             # and the encoder learns for it, too (MoDem's first phase).
             alone = shown.all()
             z = torch.where(alone, encoded[:-1], detached[:-1])
-            error = self.policy_head.imitation_error(z, action, shown)
+            error = self.policy_head.imitation_error(z, action, shown.transpose(0, 1))
             policy_loss = torch.where(alone, 0.0, policy_loss) + self.imitation_coef * error
 
         total = (
