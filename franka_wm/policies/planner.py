@@ -47,6 +47,23 @@ def latent_of(tensordict: TensorDictBase, encode: Encode, observe: Observe | Non
     return observe(tensordict, before, tensordict.get("context_action"), is_init)
 
 
+class Guide:
+    """A model's policy as the source of a plan's candidates: the first follows its mode, the others draw.
+
+    Early in training, and where entropy weighs much, samples of a policy are far from its mode. Without that candidate
+    a plan can be worse than the policy itself.
+    """
+
+    def __init__(self, model: WorldModel) -> None:
+        self.policy = model.policy
+
+    def act(self, z: Tensor, deterministic: bool = False) -> Tensor:
+        """Latents (E, S, D) of S candidates -> actions (E, S, A)."""
+        if deterministic:
+            return self.policy(z, deterministic=True)
+        return torch.cat((self.policy(z[:, :1], deterministic=True), self.policy(z[:, 1:])), dim=1)
+
+
 def captures(wanted: bool | None, observation: Tensor) -> bool:
     """Whether decisions are captured: where the observations are on CUDA, unless it is not wanted.
 
@@ -155,7 +172,7 @@ class PlannerPolicy(TensorDictModuleBase):
             objective: rewards plus value of the model, with its `discount`, when None.
             explore, capture, precision, compile: see the class.
 
-        A model with `policy` supplies the prior.
+        A model with `policy` supplies the prior, see :class:`Guide`.
 
         Raises:
             ValueError: the model lacks what a default needs.
@@ -176,7 +193,7 @@ class PlannerPolicy(TensorDictModuleBase):
             objective=objective,
             observation_keys=observation_keys,
             observe=model.observe if model.has_memory else None,
-            prior=model.policy if model.has_policy else None,
+            prior=Guide(model).act if model.has_policy else None,
             explore=explore,
             model=model,
             capture=capture,

@@ -12,7 +12,9 @@ from torchrl.envs.utils import ExplorationType, check_env_specs, set_exploration
 from franka_wm.models import WorldModel, make
 from franka_wm.planning import CEM, ICEM, MPPI, GoalDistance, GradientPlanner
 from franka_wm.policies import ModelPolicy, PlannerPolicy
+from franka_wm.policies.planner import Guide
 from points import GOAL, Points
+from small_tdmpc2 import small, windows
 
 HORIZON = 3
 
@@ -255,7 +257,8 @@ def test_a_compiled_policy_decides_the_same():
             policy = PlannerPolicy.for_model(model, planner, explore=False, compile=wanted)
             torch.manual_seed(1)
             actions.append(policy(TensorDict({"state": torch.ones(3, 2)}, batch_size=[3]))["action"])
-    assert all(part in calls for part in (model.next, model.reward, model.value, model.policy))
+    assert all(part in calls for part in (model.next, model.reward, model.value))
+    assert any(getattr(part, "__func__", None) is Guide.act for part in calls)
     torch.testing.assert_close(*actions)
 
 
@@ -265,3 +268,31 @@ def test_capture_is_refused_where_there_is_no_gpu():
     )
     with pytest.raises(ValueError, match="on CUDA"):
         policy(TensorDict({"state": torch.ones(3, 2)}, batch_size=[3]))
+
+
+def test_a_plan_knows_the_policy_s_mode_however_noisy_the_policy_is():
+    """The first of its candidates follows the mode at every step; the others are samples."""
+    torch.manual_seed(0)
+    model = small()
+    z = model.encode(windows()[:, 0])
+    seen: list[torch.Tensor] = []
+
+    def objective(trajectory, actions):
+        seen.append(actions)
+        return -actions.square().sum((-2, -1))
+
+    policy = PlannerPolicy.for_model(
+        model,
+        MPPI(action_dim=2, horizon=3, num_samples=32, num_policy_samples=5, num_elites=4),
+        objective=objective,
+    )
+    assert policy.prior is not None
+    policy.planner.plan(z, model.next, policy.objective, prior=policy.prior, explore=False)
+    latent = z
+    for t in range(3):
+        mode = model.policy(latent, deterministic=True)
+        torch.testing.assert_close(seen[0][:, 0, t], mode)
+        assert not torch.isclose(seen[0][:, 1:5, t], mode.unsqueeze(1)).all(-1).any()
+        latent = model.next(latent, mode)
+    mode = policy.prior(z.unsqueeze(1), deterministic=True)[:, 0]
+    torch.testing.assert_close(mode, model.policy(z, deterministic=True))
