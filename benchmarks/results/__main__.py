@@ -63,6 +63,9 @@ def parse(arguments: list[str] | None) -> argparse.Namespace:
     one.add_argument("row")
     one.add_argument("--seeds", type=int, nargs="+", help="default: those of the row")
     one.add_argument("--jobs", type=int, default=1, help="runs at a time, on each device")
+    one.add_argument(
+        "--beside", type=int, default=0, help="other runs on the same GPU meanwhile, to be recorded"
+    )
     one.add_argument("--device", nargs="+", default=[], help="of a row on a GPU: cuda:0 cuda:1 …")
     one.add_argument("--threads", type=int, help="of each run; default: the row's, on a GPU torch's choice")
     one.add_argument("--out", type=Path, default=Path("outputs/results"), help="folder for the runs' folders")
@@ -90,7 +93,11 @@ def main(arguments: list[str] | None = None) -> int:
         if chosen.verb == "run":
             row = choose(rows, chosen.row)
             machine = running.Machine(
-                jobs=chosen.jobs, devices=chosen.device, threads=chosen.threads, commit=chosen.commit
+                jobs=chosen.jobs,
+                beside=chosen.beside,
+                devices=chosen.device,
+                threads=chosen.threads,
+                commit=chosen.commit,
             )
             out = chosen.out.absolute()
             failed = running.run(row, machine, seeds=chosen.seeds or row.seeds, out=out, place=chosen.results)

@@ -25,6 +25,7 @@ class Machine:
 
     Attributes:
         jobs: runs at a time, on each device.
+        beside: other runs that share each device or the cores' host meanwhile; recorded beside the times.
         devices: of runs on GPUs, as ``device=`` takes them; empty: what train.py chooses.
         threads: of each run; on CPU cores it has these to itself. ``None``: as many as the section says, and as torch
             chooses on a GPU.
@@ -32,6 +33,7 @@ class Machine:
     """
 
     jobs: int = 1
+    beside: int = 0
     devices: Sequence[str] = ()
     threads: int | None = None
     commit: str | None = None
@@ -99,7 +101,7 @@ def run(row: Row, machine: Machine, *, seeds: Sequence[int], out: Path, place: P
             ]
             failure = _call([*before, *command], environment, folder / f"seed-{seed}.log")
             if failure is None:
-                print(write(record_run(row, target, jobs=jobs), place), flush=True)
+                print(write(record_run(row, target, jobs=jobs + machine.beside), place), flush=True)
             return failure
         except UserError as error:
             return str(error)
