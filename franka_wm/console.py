@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import io
+import shutil
 import sys
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TextIO
@@ -15,6 +16,21 @@ from typing import TextIO
 def say(text: str, stream: TextIO | None = None) -> None:
     """One line, at once."""
     print(text, file=sys.stdout if stream is None else stream, flush=True)
+
+
+def program() -> str:
+    """What to type for ``franka-wm`` here: its name where the shell finds it, else where it lies beside this Python."""
+    beside = Path(sys.executable).with_name("franka-wm")
+    if shutil.which("franka-wm") or not beside.is_file():
+        return "franka-wm"
+    here = Path.cwd()
+    return str(beside.relative_to(here) if beside.is_relative_to(here) else beside)
+
+
+def named_plugins(config: Mapping[str, object]) -> str:
+    """`` plugins=[…]`` as a command about a run needs it, since what a run names is never imported by itself."""
+    names = config.get("plugins")
+    return f" plugins=[{','.join(map(str, names))}]" if isinstance(names, list | tuple) and names else ""
 
 
 class _Copied:

@@ -28,6 +28,9 @@ from typing import Any, Literal, NamedTuple, TypeGuard, Union, get_args, get_ori
 
 from franka_wm.errors import UserError
 
+OF_ONES_OWN = "; one of your own: import its module first (plugins=[MODULE])"
+"""Ends the refusal of a task, model or planner that is not known."""
+
 
 @dataclass(frozen=True)
 class Rule:

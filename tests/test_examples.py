@@ -65,6 +65,18 @@ def test_add(arguments: tuple[str, ...], root: Path, tmp_path: Path) -> None:
     assert ("height [m]" in out) is own and ("final distance" in out) is not own
     assert told["protocol"]["task"] == ("raise_tool" if own else "reach")
     assert ("final_distance" in told["policies"]["planner"]) is not own
+    if own:  # what a run was trained with is imported only if it is asked for
+        evaluate = [
+            "evaluate",
+            f"{tmp_path}/run",
+            "episodes=2",
+            "open_loop=false",
+            "probes=false",
+            "device=cpu",
+        ]
+        with pytest.raises(AssertionError, match=r"import its module first \(plugins=\[MODULE\]\)"):
+            run(root, "franka_wm/__main__.py", *evaluate)
+        assert "height [m]" in run(root, "franka_wm/__main__.py", *evaluate, arguments[0])
 
 
 def test_a_plugin_that_is_not_there(root: Path, tmp_path: Path) -> None:

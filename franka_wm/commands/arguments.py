@@ -11,6 +11,7 @@ Nothing heavy is imported here or at the top of a verb's file: arguments are che
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Callable, Iterator, Sequence
 from difflib import get_close_matches
@@ -185,6 +186,41 @@ def word(
     return click.option(
         f"--{name}", name, cls=Word, type=kind, help=help, metavar=metavar, required=required, **given
     )
+
+
+def plugins(function: Callable[..., Any]) -> Callable[..., Any]:
+    """Declare ``plugins=[MODULE,…]`` of a verb: modules of the user's own, imported before it runs.
+
+    What a run was trained with is never imported by itself: its folder may be a stranger's.
+    """
+
+    @functools.wraps(function)
+    def importing(plugins: str | None, **options: Any) -> Any:
+        if plugins is not None:
+            from franka_wm.training.run import import_plugins
+
+            import_plugins(listed(plugins))
+        return function(**options)
+
+    text = "modules of your own to import first, where the run was trained with tasks or models of yours"
+    return word("plugins", text, metavar="[MODULE,…]")(importing)
+
+
+def listed(text: str) -> list[str]:
+    """The entries of ``[A,B]``, or of ``A,B``."""
+    return [one.strip() for one in text.strip("[]").split(",") if one.strip()]
+
+
+def check_run(verb: str, option: str, folder: str) -> None:
+    """Whether a run's folder is there, asked before anything heavy is imported.
+
+    Raises:
+        UserError: It is not.
+    """
+    if not folder.startswith("hf:") and not Path(folder).is_dir():
+        raise UserError(
+            f"{verb}: {option}={folder}: no such folder; give that of a run, as train.py prints it last"
+        )
 
 
 def verb(name: str, **settings: Any) -> Callable[[Any], Verb]:

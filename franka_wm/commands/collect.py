@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from franka_wm.commands.arguments import FLAG, real, verb, whole, word
+from franka_wm.commands.arguments import FLAG, check_run, plugins, real, verb, whole, word
 from franka_wm.commands.overrides import compose, number
 from franka_wm.console import announced, say
 from franka_wm.data.lerobot.schema import FORMATS, schema_for
@@ -51,6 +51,7 @@ _PARTS = ("planner", "policy")
 @word("success_only", "keep only episodes that end in success", FLAG, False)
 @word("noise", "of the expert's actions, standard deviation; it recovers from that", real(0.0), metavar="X")
 @word("resume", "go on with an unfinished dataset, or add to a finished one", FLAG, False)
+@plugins
 def collect(
     out: str,
     episodes: int,
@@ -66,6 +67,9 @@ def collect(
 
     Ctrl-C stops and leaves a dataset of the whole episodes so far.
     """
+    from franka_wm.data.lerobot.writer import check_out
+
+    check_out(out, resume=writing["resume"])
     source = open_source(
         policy, checkpoint, overrides, episodes=episodes, num_envs=num_envs, format=format, noise=noise
     )
@@ -120,6 +124,8 @@ def open_source(
                 f"collect: policy={name!r}: must be one of {', '.join(_SIMPLE)}, or the folder of a run"
             )
         name, checkpoint = "", name
+    if checkpoint:
+        check_run("collect", "checkpoint", checkpoint)
     if noise and name != "expert":
         raise UserError(f"collect: noise={noise:g}: is for policy=expert")
     if name in _SIMPLE:

@@ -7,6 +7,7 @@ from pathlib import Path
 import click
 
 from franka_wm.commands.arguments import verb, word
+from franka_wm.errors import UserError
 
 
 @verb("compare")
@@ -14,8 +15,22 @@ from franka_wm.commands.arguments import verb, word
 @word("out", "the page to write", default="compare.html")
 def compare(runs: tuple[str, ...], out: str) -> None:
     """Show several runs side by side on one page."""
+    check_page("compare", out)
+    for one in runs:
+        if not Path(one).is_dir():
+            raise UserError(f"{one} is not a folder; give the folder of a run, as train.py prints it last.")
     from franka_wm.report.compare import compare_page
     from franka_wm.report.document import write_document
     from franka_wm.report.run import read_run
 
     print(write_document(compare_page([read_run(folder) for folder in runs]), Path(out)))
+
+
+def check_page(verb: str, out: str | None) -> None:
+    """Whether a page can have this name, asked before anything is read.
+
+    Raises:
+        UserError: It does not end in .html.
+    """
+    if out is not None and not out.lower().endswith(".html"):
+        raise UserError(f"{verb}: out={out}: the page must end in .html")

@@ -6,7 +6,7 @@ import os
 from pathlib import Path
 from typing import Any
 
-from franka_wm.commands.arguments import FLAG, verb, whole, word
+from franka_wm.commands.arguments import FLAG, check_run, plugins, verb, whole, word
 from franka_wm.errors import UserError
 
 
@@ -28,6 +28,7 @@ from franka_wm.errors import UserError
 )
 @word("probes", "joints, tool and goal predicted from the latents by probes; spectrum", FLAG, True)
 @word("robustness", "the same in shifted worlds: looks, camera, dynamics, delay, noise", FLAG, False)
+@plugins
 def evaluate(checkpoint: str, out: str | None, **options: Any) -> None:
     """Evaluate a checkpoint on held-out episodes. Success, predictions, latents, robustness.
 
@@ -35,6 +36,8 @@ def evaluate(checkpoint: str, out: str | None, **options: Any) -> None:
     """
     place = default_folder(checkpoint) if out is None else Path(out)
     check_folder(place)
+    check_run("evaluate", "checkpoint", checkpoint)
+    check_larger(place, options["episodes"])
     from franka_wm.commands.evaluate_checkpoint import Options, run
 
     run(Options(checkpoint=checkpoint, out=place, **options))
@@ -60,3 +63,21 @@ def check_folder(folder: Path) -> None:
         raise UserError(f"evaluate: out={folder}: {there} is a file; give a folder for the results")
     if not os.access(there, os.W_OK | os.X_OK):
         raise UserError(f"evaluate: out={folder}: {there} may not be written to; give another folder")
+
+
+def check_larger(folder: Path, episodes: int) -> None:
+    """Whether a result of more episodes would be lost there; asked before anything is played.
+
+    Raises:
+        UserError: It would.
+    """
+    if not (folder / "evaluation.json").is_file():
+        return
+    from franka_wm.evaluation.results import read_result
+
+    there = read_result(folder / "evaluation.json").episodes
+    if there > episodes:
+        raise UserError(
+            f"evaluate: {folder} holds a result of {there} episodes, which one of {episodes} would replace; "
+            "give out=FOLDER, or more episodes="
+        )

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import click
 
-from franka_wm.commands.arguments import verb, whole, word
+from franka_wm.commands.arguments import check_run, verb, whole, word
 from franka_wm.console import announced
 from franka_wm.data.lerobot.schema import FORMATS
 from franka_wm.errors import UserError
@@ -26,7 +26,10 @@ def export(source: str, out: str, format: str, workers: int) -> None:
     The checkpoint must have been saved with its replay (trainer.checkpoint_replay=true). Only whole episodes are
     written; how many partial ones the buffer holds is said.
     """
+    check_run("export", "source", source)
+    from franka_wm.data.lerobot.writer import check_out
 
+    check_out(out, resumable=False)
     from franka_wm.data.lerobot.export import arm_config, export_replay, tell
     from franka_wm.training.checkpoint import latest_checkpoint, load_checkpoint
 

@@ -7,7 +7,7 @@ import inspect
 from collections.abc import Sequence
 from pathlib import Path
 
-from franka_wm.commands.arguments import verb, word
+from franka_wm.commands.arguments import listed, verb, word
 from franka_wm.errors import UserError
 from franka_wm.untrusted import linked_json
 
@@ -36,7 +36,7 @@ def show_list(plugins: str | None, overrides: Sequence[str]) -> None:
     """
     folders = [PACKAGE / "conf"]
     folders += [
-        Path(one.removeprefix("file://")) for word in overrides for one in _list(word.partition("=")[2])
+        Path(one.removeprefix("file://")) for word in overrides for one in listed(word.partition("=")[2])
     ]
     for folder in folders:
         if not folder.is_dir():
@@ -54,16 +54,12 @@ def show_list(plugins: str | None, overrides: Sequence[str]) -> None:
         "experiments (experiment=)": options("experiment", folders),
     }
     if plugins is not None:
-        sections |= registered(_list(plugins))
+        sections |= registered(listed(plugins))
     for title, entries in sections.items():
         if entries:
             print(title)
         for name, line in entries.items():
             print(f"  {name:24s} {line}".rstrip())
-
-
-def _list(text: str) -> list[str]:
-    return [one.strip() for one in text.strip("[]").split(",") if one.strip()]
 
 
 def options(group: str, folders: Sequence[Path] = (PACKAGE / "conf",)) -> dict[str, str]:

@@ -5,8 +5,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
-from franka_wm.commands.arguments import real, verb, whole, word
+from franka_wm.commands.arguments import check_run, did_you_mean, plugins, real, verb, whole, word
 from franka_wm.errors import UserError
+from franka_wm.policies.names import POLICIES, refuse_old_name
 
 if TYPE_CHECKING:
     from franka_wm.live.stage import Options
@@ -29,6 +30,7 @@ if TYPE_CHECKING:
 @word("seed", "of the world", whole(), 0)
 @word("device", "auto, cpu, cuda, cuda:K", default="auto")
 @word("rerun", "no page: writes one episode for the Rerun viewer", metavar="FILE.rrd")
+@plugins
 def view(**options: Any) -> None:
     """Show an arm in the browser. Drag its goal, switch policies, move the planner's settings.
 
@@ -46,6 +48,12 @@ def show(**given: Any) -> None:
     Raises:
         UserError: A bad value, a missing extra, or a checkpoint that cannot be shown.
     """
+    if given.get("checkpoint") is not None:  # before anything that takes time
+        check_run("view", "checkpoint", given["checkpoint"])
+    refuse_old_name("view: policy", given.get("policy"))
+    if given.get("policy") not in (None, *POLICIES):
+        near = did_you_mean(given["policy"], POLICIES)
+        raise UserError(f"view: policy={given['policy']}: must be one of {', '.join(POLICIES)}{near}")
     options = options_of(**given)
     from franka_wm.live.page import import_viser
     from franka_wm.live.stage import build, record, serve
@@ -53,7 +61,7 @@ def show(**given: Any) -> None:
     if options.rerun is not None:
         record(options)
         return
-    import_viser()  # before anything that takes time
+    import_viser()
     serve(build(options), options)
 
 

@@ -11,7 +11,7 @@ from franka_wm.envs.constants import HAND_DIM, HOME, JOINT_DIM, NUM_FINGERS, NUM
 from franka_wm.envs.ranges import Randomization
 from franka_wm.envs.scene import Scene
 from franka_wm.errors import UserError
-from franka_wm.options import check_whole, is_real
+from franka_wm.options import OF_ONES_OWN, check_whole, is_real
 
 if TYPE_CHECKING:
     from franka_wm.envs.tasks import Task
@@ -234,7 +234,7 @@ class FrankaConfig:
         self._check_choice("robot", tuple(SOURCES))
         self._check_choice("goal_sampling", ("fixed", "reachable"))
         self._check_choice("action_mode", tuple(ACTION_MODES))
-        self._check_choice("task", TASKS)
+        self._check_choice("task", TASKS, more=OF_ONES_OWN)
         self._check_choice("reward", self.task_class.rewards)
         self._check_choice("auto_reset", ("native", "standard"))
         for name in (f.name for f in fields(self) if isinstance(f.default, bool) or f.name == "gripper"):
@@ -394,10 +394,10 @@ class FrankaConfig:
             bounds = f"above {low:g} and at most {high:g}" if open_low else f"from {low:g} to {high:g}"
             raise UserError(f"{name}={value!r}: must be {bounds} ({unit})")
 
-    def _check_choice(self, name: str, allowed: Sequence[str]) -> None:
+    def _check_choice(self, name: str, allowed: Sequence[str], more: str = "") -> None:
         value = getattr(self, name)
         if value not in allowed:
-            raise UserError(f"{name}={value!r}: must be one of {', '.join(allowed)}")
+            raise UserError(f"{name}={value!r}: must be one of {', '.join(allowed)}{more}")
 
 
 def _is_number(value: object) -> bool:

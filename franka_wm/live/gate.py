@@ -213,9 +213,9 @@ def foreign(headers: Any) -> str | None:
     except ValueError:
         host = None
     if host not in NEARBY:
-        return f"for another host than this machine: {short(hosts)}"
+        return f"for another host than this machine: {short(', '.join(hosts))}"
     if len(origins) > 1 or (origins and origins[0] != f"http://{hosts[0]}"):
-        return f"from another page: {short(origins)}"
+        return f"from another page: {short(', '.join(origins))}"
     return None
 
 

@@ -87,7 +87,9 @@ class Session:
         self._pinned: torch.Tensor | None = None
         self._asked: dict[str, list[float]] = {}
         self._path: torch.Tensor | None = None
-        self._policy = policy or next((name for name in PREFERRED if name in self.policies), "")
+        self._policy = policy or next(
+            (name for name in (*PREFERRED, *self.policies) if name in self.policies), ""
+        )
         self._check_policy(self._policy)
         self._now = env.reset(seed=seed)
         self._observed = list(self._now.keys())

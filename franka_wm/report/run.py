@@ -46,6 +46,7 @@ class RunFiles:
         counters: of the checkpoint: ``updates``, ``env_steps``, ``seconds``.
         images: name -> path, of `IMAGES`.
         timing: policy -> ``seconds_per_decision``, ``worlds``.
+        damage: why the newest checkpoint cannot be read; empty if it can, or there is none.
     """
 
     folder: Path
@@ -57,6 +58,7 @@ class RunFiles:
     counters: Mapping[str, float] = field(default_factory=dict)
     images: Mapping[str, Path] = field(default_factory=dict)
     timing: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
+    damage: str = ""
 
     @property
     def policies(self) -> Mapping[str, Mapping[str, Any]]:
@@ -118,7 +120,7 @@ def _read_run(run: Path) -> RunFiles:
             f"{run} holds neither config.yaml nor evaluation.json; give the folder of a run, "
             "as train.py prints it last."
         )
-    rows, counters, version = _history(files)
+    rows, counters, version, damage = _history(files)
     versions = files.json("versions.json") or ({"franka_wm": version} if version else {})
     end = last_row(found, ((config or {}).get("evaluation") or {}).get("during") or ())
     numbers = end.keys() - {"env_steps", "time_s"}
@@ -135,6 +137,7 @@ def _read_run(run: Path) -> RunFiles:
         counters=counters,
         images={name: path for name in IMAGES if (path := _image(files, name)) is not None},
         timing=files.json("evaluation/timing.json") or files.json("timing.json") or {},
+        damage=damage,
     )
 
 
@@ -178,18 +181,25 @@ def _image(files: UntrustedFolder, name: str) -> Path | None:
     return path
 
 
-def _history(files: UntrustedFolder) -> tuple[list[dict[str, float]], dict[str, float], str | None]:
-    """Rows, counters and the package's version, from the newest checkpoint; rows from ``csv/`` without one."""
+def _history(files: UntrustedFolder) -> tuple[list[dict[str, float]], dict[str, float], str | None, str]:
+    """Rows, counters and the package's version, from the newest checkpoint; rows from ``csv/`` without a whole one.
+
+    The last is why a checkpoint that is there cannot be read.
+    """
+    damage = ""
     checkpoints = files.below("checkpoints")
     if any(checkpoints.root.glob("*/manifest.json")):
         from franka_wm.training.checkpoint import latest_checkpoint, load_checkpoint
         from franka_wm.training.manifest import read_manifest
 
         checkpoints.check_links()
-        checkpoint = load_checkpoint(latest_checkpoint(files.root))
-        rows = (checkpoint.extra() or {}).get("rows") or []
-        return list(rows), dict(checkpoint.counters), read_manifest(checkpoint.folder).written_by
-    return csv_rows(files.below("csv/scalars").root), {}, None
+        try:
+            checkpoint = load_checkpoint(latest_checkpoint(files.root))
+            rows = (checkpoint.extra() or {}).get("rows") or []
+            return list(rows), dict(checkpoint.counters), read_manifest(checkpoint.folder).written_by, ""
+        except UserError as error:
+            damage = str(error)
+    return csv_rows(files.below("csv/scalars").root), {}, None, damage
 
 
 def csv_rows(folder: str | Path) -> list[dict[str, float]]:

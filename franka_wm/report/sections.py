@@ -9,6 +9,7 @@ from typing import Any
 from markupsafe import Markup
 from omegaconf import OmegaConf
 
+from franka_wm.console import named_plugins
 from franka_wm.evaluation.results import COMMAND, END
 from franka_wm.report import style
 from franka_wm.report.bars import bars_figure
@@ -56,9 +57,9 @@ def sections(run: RunFiles) -> list[Section]:
 
 
 def warnings(run: RunFiles) -> list[str]:
-    """What evaluation found wrong, in its words."""
+    """What evaluation found wrong, in its words, and a checkpoint that cannot be read."""
     spectrum, found = run.extras.get("spectrum") or {}, run.extras.get("health") or {}
-    texts = [spectrum.get("warning"), *found.get("warnings", [])]
+    texts = [run.damage, spectrum.get("warning"), *found.get("warnings", [])]
     return list(dict.fromkeys(str(text) for text in texts if text))
 
 
@@ -279,20 +280,22 @@ def what(run: RunFiles) -> str:
 
 
 def reproduce(run: RunFiles) -> str:
-    place = shlex.quote(str(_near(run.folder)))
+    place, own = shlex.quote(str(_near(run.folder))), named_plugins(run.config)
     lines = []
     if run.overrides:
-        lines += ["# train it again", f"franka-wm train {shlex.join(run.overrides)}", ""]
+        again = any(one.startswith("resume=") for one in run.overrides)  # its scale is that of the first part
+        words = [one for one in run.overrides if not (again and one.startswith("scale="))]
+        lines += ["# train it again", f"franka-wm train {shlex.join(words)}", ""]
     if run.counters:
         lines += [
             "# evaluate it, also in shifted worlds",
-            f"franka-wm evaluate {place}{_episodes(run)} robustness=true",
+            f"franka-wm evaluate {place}{_episodes(run)} robustness=true{own}",
             "",
         ]
     if run.counters:
-        lines += ["# watch it", f"franka-wm view checkpoint={place}", ""]
+        lines += ["# watch it", f"franka-wm view checkpoint={place}{own}", ""]
     if run.counters and run.overrides:
-        lines += ["# go on with it", f"franka-wm train resume={place}", ""]
+        lines += ["# go on with it", f"franka-wm train resume={place}{own}", ""]
     lines += ["# this page", f"franka-wm report {place}"]
     return commands(lines)
 

@@ -12,6 +12,7 @@ from franka_wm.envs.multitask_config import MultiTaskConfig
 from franka_wm.errors import UserError
 from franka_wm.models import WorldModel
 from franka_wm.models.vision import ViT
+from franka_wm.options import OF_ONES_OWN
 from franka_wm.planning import registry
 from franka_wm.training import build
 from franka_wm.training.demos import check_demonstrations
@@ -147,7 +148,7 @@ def _check_planner(run: RunSettings) -> None:
     """Its options, also where the sizes of actions are not known yet."""
     if run.planner.name not in registry.available():
         raise UserError(
-            f"planner.name={run.planner.name!r}: must be one of {', '.join(registry.available())}"
+            f"planner.name={run.planner.name!r}: must be one of {', '.join(registry.available())}{OF_ONES_OWN}"
         )
     registry.validate(run.planner.name, run.planner.options)
 

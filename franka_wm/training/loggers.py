@@ -47,7 +47,9 @@ def check_loggers(names: Iterable[str], **options: Mapping[str, object]) -> None
         if name not in NAMES:
             raise UserError(f"no logger {name!r}; choose from {', '.join(NAMES)}.")
         if name in SERVICES and importlib.util.find_spec(name) is None:
-            raise UserError(f"logger {name!r} needs a package that is not installed: pip install {name}")
+            raise UserError(
+                f"logger {name!r} needs a package that is not installed: pip install 'franka-wm[{name}]'"
+            )
     for name, given in options.items():
         if name not in OPTIONS:
             raise UserError(f"no options for a logger {name!r}; {', '.join(OPTIONS)} have some.")

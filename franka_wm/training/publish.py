@@ -15,7 +15,7 @@ from franka_wm.data.lerobot.publish import README, publish_staged
 from franka_wm.errors import UserError
 from franka_wm.training.checkpoint import latest_checkpoint, load_checkpoint
 from franka_wm.training.manifest import read_manifest, saved_at, write_manifest
-from franka_wm.untrusted import UntrustedFolder
+from franka_wm.untrusted import UntrustedFolder, values_of
 
 
 def publish_model(
@@ -73,8 +73,9 @@ def stage_model(checkpoint: Path, place: Path, *, repo_id: str, license: str) ->
     if (place / "extra.json").is_file():
         _copy_json(place / "extra.json", place / "extra.json")
     write_manifest(place, manifest.model, written_by=manifest.written_by, saved_at_ns=saved_at(opened.folder))
-    # Where the verb evaluate puts them; a published model has them at its top.
-    written = "evaluation/" if files.path("evaluation/evaluation.md") else ""
+    # Where the verb evaluate puts them, unless it played fewer episodes; a published model has them at its top.
+    verb = files.path("evaluation/evaluation.md") and _episodes(files, "evaluation/") >= _episodes(files, "")
+    written = "evaluation/" if verb else ""
     if source := files.path(f"{written}evaluation.json"):
         _copy_json(source, place / "evaluation.json")
     if (text := files.text(f"{written}evaluation.md")) is not None:
@@ -84,6 +85,13 @@ def stage_model(checkpoint: Path, place: Path, *, repo_id: str, license: str) ->
     card = model_card(place, repo_id=repo_id, license=license)
     (place / README).write_text(card, encoding="utf-8")
     return place
+
+
+def _episodes(files: UntrustedFolder, place: str) -> int:
+    """Episodes of each policy in an ``evaluation.json``; 0 without one."""
+    with values_of(str(files.root / place / "evaluation.json"), "measure the run again."):
+        policies = (files.json(f"{place}evaluation.json") or {}).get("policies") or {}
+        return max((int(one.get("episodes", 0)) for one in policies.values()), default=0)
 
 
 def _copy_json(source: Path, target: Path) -> None:

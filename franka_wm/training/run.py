@@ -20,7 +20,7 @@ from tensordict import TensorDictBase
 from torchrl.record.loggers import Logger
 
 from franka_wm import processes
-from franka_wm.console import announced, log_to, say
+from franka_wm.console import announced, log_to, named_plugins, program, say
 from franka_wm.data.lerobot.export import export_run
 from franka_wm.data.lerobot.windows import RecordedWindows
 from franka_wm.data.replay import WindowReplay
@@ -208,7 +208,8 @@ class Run:
     def stop(self) -> NoReturn:
         """The last line of a run that was interrupted and has saved; exits with 130."""
         close_loggers(self.loggers)
-        say(f"stopped; go on with: franka-wm train resume={self.folder}")
+        own = named_plugins(self.settings.values)
+        say(f"stopped; go on with: {program()} train resume={self.folder}{own}")
         processes.leave(INTERRUPTED)
         sys.exit(INTERRUPTED)
 
@@ -262,6 +263,8 @@ def start(cfg: DictConfig) -> Run:
         OmegaConf.save(OmegaConf.create(dict(settings.values)), folder / "config.yaml")
     write_versions(folder, device)
     say(f"device {device}   seed {settings.seed}   results in {folder}")
+    if checkpoint is not None:
+        say(f"going on from update {int(checkpoint.counters.get('updates', 0))} of {checkpoint.folder}")
     return Run(settings, folder, checkpoint, open_loggers(settings, folder))
 
 

@@ -91,8 +91,20 @@ def test_a_checkpoint_that_is_not_there(tmp_path: Path, capsys) -> None:
     for name in ("checkpoint=", ""):
         arguments = [f"{name}{tmp_path}/nowhere", f"out={tmp_path}/out", "device=cpu"]
         assert cli.main(["evaluate", *arguments]) == 1
-        assert f"no checkpoint in {tmp_path}/nowhere" in capsys.readouterr().err
+        assert f"checkpoint={tmp_path}/nowhere: no such folder" in capsys.readouterr().err
     assert not (tmp_path / "out").exists()
+
+
+def test_a_result_of_more_episodes_is_not_replaced(tmp_path: Path, capsys) -> None:
+    (tmp_path / "checkpoints").mkdir()
+    place = tmp_path / "evaluation"
+    place.mkdir()
+    told = {"protocol": {}, "policies": {"planner": {"episodes": 100}}}
+    (place / "evaluation.json").write_text(json.dumps(told))
+    assert cli.main(["evaluate", str(tmp_path), "episodes=99", "device=cpu"]) == 1
+    assert "holds a result of 100 episodes, which one of 99 would replace" in capsys.readouterr().err
+    assert cli.main(["evaluate", str(tmp_path), "episodes=100", "device=cpu"]) == 1
+    assert "no checkpoint in" in capsys.readouterr().err  # nothing against it: it goes on to load
 
 
 @pytest.mark.parametrize("out", ["taken", "taken/below"])
@@ -109,7 +121,7 @@ def test_results_that_cannot_be_written_are_refused_before_playing(out: str, tmp
 def test_shifting_what_is_no_arm_is_refused_before_playing(tmp_path: Path, monkeypatch, capsys) -> None:
     monkeypatch.setattr(evaluate_checkpoint, "load_agent", lambda *a, **k: SimpleNamespace(env=object()))
     monkeypatch.setattr(evaluate_checkpoint, "evaluate_agent", lambda *a, **k: pytest.fail("played"))
-    arguments = ["checkpoint=gym", f"out={tmp_path}/out", "robustness=true"]
+    arguments = [f"checkpoint={tmp_path}", f"out={tmp_path}/out", "robustness=true"]
     monkeypatch.setattr(evaluate_checkpoint, "protocol", lambda *a: pytest.fail("went on"))
     assert cli.main(["evaluate", *arguments]) == 1
     captured = capsys.readouterr()

@@ -305,5 +305,5 @@ def test_a_bad_file_is_one_line(files: Path, changes: dict, said: str) -> None:
 
 def test_without_a_reader_it_says_what_to_install(files: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "trimesh", None)
-    with pytest.raises(UserError, match=r"needs trimesh; pip install franka-wm\[meshes\]"):
+    with pytest.raises(UserError, match=r"needs trimesh; pip install 'franka-wm\[meshes\]'"):
         mesh(files, "cube.obj", scale=0.00123)  # a scale that no other test has read

@@ -28,7 +28,7 @@ def has_panda() -> bool:
     return bool(find_spec("trimesh") and find_spec("collada"))
 
 
-needs_meshes = pytest.mark.skipif(not has_panda(), reason="needs pip install franka-wm[meshes]")
+needs_meshes = pytest.mark.skipif(not has_panda(), reason="needs pip install 'franka-wm[meshes]'")
 FRANKA = Path(str(SOURCES["embedded"].find(FrankaConfig())))
 
 
@@ -109,7 +109,7 @@ def test_asset_without_git_python(monkeypatch) -> None:
         raise ImportError("GitPython package is required")
 
     monkeypatch.setattr(newton.utils, "download_asset", fail)
-    with pytest.raises(UserError, match=re.escape("pip install franka-wm[meshes]")):
+    with pytest.raises(UserError, match=re.escape("pip install 'franka-wm[meshes]'")):
         load_robot(FrankaConfig(robot="newton_asset"))
 
 
@@ -155,7 +155,7 @@ def test_where_mesh_names_lead(tmp_path: Path) -> None:
 
 def test_missing_mesh_reader_names_the_extra(monkeypatch, tmp_path: Path) -> None:
     monkeypatch.setitem(__import__("sys").modules, "trimesh", None)
-    with pytest.raises(UserError, match=re.escape("pip install franka-wm[meshes]")):
+    with pytest.raises(UserError, match=re.escape("pip install 'franka-wm[meshes]'")):
         meshes.read(tmp_path / "link0.stl")
 
 
@@ -164,14 +164,14 @@ def test_missing_package_names_the_extra(monkeypatch) -> None:
         raise sources.PackageNotFoundError(name)
 
     monkeypatch.setattr(sources, "distribution", missing)
-    with pytest.raises(UserError, match=re.escape("pip install franka-wm[meshes]")):
+    with pytest.raises(UserError, match=re.escape("pip install 'franka-wm[meshes]'")):
         load_robot(FrankaConfig(robot="panda_meshes"))
 
 
 @pytest.mark.parametrize("suffix", [".stl", ".dae", ".obj"])
 def test_file_that_is_no_mesh(tmp_path: Path, suffix: str) -> None:
-    pytest.importorskip("trimesh", reason="needs pip install franka-wm[meshes]")
-    pytest.importorskip("collada", reason="needs pip install franka-wm[meshes]")
+    pytest.importorskip("trimesh", reason="needs pip install 'franka-wm[meshes]'")
+    pytest.importorskip("collada", reason="needs pip install 'franka-wm[meshes]'")
     path = tmp_path / f"bad{suffix}"
     path.write_text("not a mesh")
     with pytest.raises(UserError) as caught:
@@ -204,7 +204,7 @@ def test_thinning_keeps_the_surface() -> None:
 
 
 def test_meshes_are_placed_scaled_and_coloured(tmp_path: Path) -> None:
-    trimesh = pytest.importorskip("trimesh", reason="needs pip install franka-wm[meshes]")
+    trimesh = pytest.importorskip("trimesh", reason="needs pip install 'franka-wm[meshes]'")
     trimesh.creation.box((1, 2, 3)).export(tmp_path / "box.stl")
     root = ET.fromstring("""<robot name="r"><material name="red"><color rgba="1 0 0 1"/></material>
       <link name="a"><visual><origin xyz="0 0 5" rpy="0 0 1.5707963267948966"/>

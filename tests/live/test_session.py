@@ -57,6 +57,12 @@ def test_doing_nothing_ignores_the_goal(make_session) -> None:
     assert frame.distance == pytest.approx(float(np.linalg.norm(frame.tool - np.array(RIGHT))), abs=1e-5)
 
 
+def test_a_policy_of_any_name_may_be_the_only_one(make_session) -> None:
+    session = make_session()
+    only = Session(session.env, {"mine": session.policies["noop"]})
+    assert only.step().policy == "mine"
+
+
 def test_another_policy_acts_at_once_and_plans_are_dropped(make_session) -> None:
     session = make_session(policy="planner")
     assert play(session, 2).path is not None

@@ -27,7 +27,9 @@ CHEAP = ["env.substeps=2", "device=cpu"]
 
 
 def parse(arguments: list[str]) -> Options:
-    return options_of(**view_verb.make_context("view", arguments).params)
+    given = view_verb.make_context("view", arguments).params
+    assert given.pop("plugins") is None
+    return options_of(**given)
 
 
 def test_arguments() -> None:
@@ -50,6 +52,12 @@ def test_arguments() -> None:
         ("seconds=0", "must be a finite number above 0"),
         ("seconds=nan", "must be a finite number above 0"),
         ("rerun=x.txt", "rerun=x.txt: must end in .rrd"),
+        ("checkpoint=nowhere", "checkpoint=nowhere: no such folder"),
+        (
+            "policy=planer",
+            "policy=planer: must be one of planner, policy, noop, random, ik, expert; did you mean",
+        ),
+        ("policy=oracle", "this policy is called ik now"),
     ],
 )
 def test_bad_arguments_are_one_line(argument: str, said: str, capsys: pytest.CaptureFixture[str]) -> None:
@@ -62,12 +70,12 @@ def test_bad_arguments_are_one_line(argument: str, said: str, capsys: pytest.Cap
 
 @pytest.mark.parametrize(("kind", "what"), [("gym", "another environment (gym)"), ("none", "recorded data")])
 def test_a_checkpoint_of_another_environment_is_refused_before_anything_is_built(
-    kind: str, what: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    kind: str, what: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:
     found = SimpleNamespace(config=OmegaConf.create({"env": {"kind": kind}}))
     monkeypatch.setattr("franka_wm.live.stage.find_checkpoint", lambda folder: found)
     monkeypatch.setattr("franka_wm.live.stage.load_agent", lambda *a, **k: pytest.fail("built"))
-    assert cli.main(["view", "checkpoint=run"]) == 1
+    assert cli.main(["view", f"checkpoint={tmp_path}"]) == 1
     captured = capsys.readouterr()
     assert what in captured.err and "the live page shows the arm only" in captured.err
     assert captured.err.count("\n") == 1

@@ -136,6 +136,22 @@ def test_the_page_says_how_to_do_it_again(make_run) -> None:
     assert f"franka-wm report {run}" in text
 
 
+def test_the_page_of_a_resumed_run_with_plugins_says_commands_that_work(make_run) -> None:
+    run = make_run()
+    (run / ".hydra" / "overrides.yaml").write_text("- resume=/before\n- scale=laptop\n- plugins=[mine]\n")
+    config = run / "config.yaml"
+    config.write_text(config.read_text() + "\nplugins: [mine]\n")
+    checkpoint(run)
+    text = read(run).text
+    assert "franka-wm train resume=/before 'plugins=[mine]'" in text
+    for words in (
+        f"franka-wm evaluate {run} robustness=true plugins=[mine]",
+        f"franka-wm view checkpoint={run} plugins=[mine]",
+        f"franka-wm train resume={run} plugins=[mine]",
+    ):
+        assert words in text, text[-900:]
+
+
 @pytest.mark.parametrize("episodes", [2, 128])
 def test_of_two_results_the_one_with_more_episodes_is_shown_and_the_other_named(
     episodes: int, make_run, capsys
@@ -195,19 +211,33 @@ def test_the_curves_last_point_is_the_end_of_training(make_run) -> None:
     assert read_run(run).rows == rows  # of other episodes
 
 
-def test_a_checkpoints_rows_and_counters_are_read(make_run) -> None:
+def checkpoint(run: Path) -> Path:
     import torch
 
     from franka_wm.training.checkpoint import save_checkpoint
 
-    run = make_run(rows=False)
-    save_checkpoint(
+    return save_checkpoint(
         run / "checkpoints" / "latest",
         model=torch.nn.Linear(2, 2),
         config={"seed": 0},
         counters={"updates": 900, "env_steps": 7360, "seconds": 30.2},
         extra={"rows": [{"env_steps": 10, "updates": 1, "loss": 0.5}]},
     )
+
+
+def test_a_run_whose_checkpoint_is_damaged_has_a_page_that_says_so(make_run) -> None:
+    run = make_run()
+    rows = read_run(run).rows
+    weights = checkpoint(run) / "model.safetensors"
+    weights.write_bytes(weights.read_bytes()[:-1] + b"x")
+    found = read_run(run)
+    assert found.rows == rows and "is damaged" in found.damage
+    assert found.damage in read(run).text
+
+
+def test_a_checkpoints_rows_and_counters_are_read(make_run) -> None:
+    run = make_run(rows=False)
+    checkpoint(run)
     found = read_run(run)
     assert found.rows == [{"env_steps": 10, "updates": 1, "loss": 0.5}]
     text = Reader(page(found)).text

@@ -262,7 +262,7 @@ def test_what_does_not_exist_is_refused(tmp_path: Path, names, options, says: st
 def test_a_missing_package_is_one_line_that_names_it(tmp_path: Path, monkeypatch, name: str) -> None:
     find = importlib.util.find_spec
     monkeypatch.setattr(importlib.util, "find_spec", lambda n, *a: None if n == name else find(n, *a))
-    with pytest.raises(UserError, match=f"pip install {name}$"):
+    with pytest.raises(UserError, match=rf"pip install 'franka-wm\[{name}\]'$"):
         make_loggers(["csv", name], tmp_path)
     assert list(tmp_path.iterdir()) == []
 

@@ -15,6 +15,7 @@ from franka_wm.data.lerobot.hub import check_repo_id, explained
 from franka_wm.data.lerobot.paths import without_paths
 from franka_wm.data.lerobot.provenance import read_provenance
 from franka_wm.data.lerobot.schema import PROVENANCE
+from franka_wm.data.lerobot.source import check_finite
 from franka_wm.errors import UserError
 from franka_wm.untrusted import linked_json
 
@@ -144,9 +145,10 @@ def stage_dataset(root: Path, place: Path, *, repo_id: str, license: str) -> Pat
         ``place``: what is published, file by file.
 
     Raises:
-        UserError: A link in the dataset leads to what is not part of it.
+        UserError: A link in the dataset leads to what is not part of it, or a number in it is not finite.
     """
     _check_links(root)
+    check_finite(root)
     for name in files_of(root):
         (place / name).parent.mkdir(parents=True, exist_ok=True)
         if name not in (README, PROVENANCE, IMAGE):

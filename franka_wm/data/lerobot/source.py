@@ -225,6 +225,35 @@ def _episodes(root: Path, videos: Sequence[str]) -> dict[str, np.ndarray]:
     return found
 
 
+def check_finite(root: Path) -> None:
+    """Whether every number of every step can be trained on; images are not looked at.
+
+    Raises:
+        UserError: One is not finite, or a file cannot be read.
+    """
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    for path in sorted((root / "data").glob("*/*.parquet")):
+        try:
+            file = pq.ParquetFile(path)
+            kinds = {field.name: field.type for field in file.schema_arrow}
+            for name, kind in kinds.items():
+                while hasattr(kind, "value_type"):
+                    kind = kind.value_type
+                if not pa.types.is_floating(kind):
+                    continue
+                column = file.read(columns=[name])[name].combine_chunks()
+                while hasattr(column.type, "value_type"):
+                    column = column.flatten()
+                if not np.isfinite(column.to_numpy(zero_copy_only=False)).all():
+                    raise UserError(
+                        f"{path}: {name} holds a number that is not finite; delete the episode (lerobot-edit-dataset)"
+                    )
+        except (pa.ArrowException, OSError) as error:
+            raise UserError(f"{path} cannot be read: {error}") from error
+
+
 def find_dataset(repo_id: str, revision: str | None = None) -> Path:
     """The folder of a dataset on the Hub: LeRobot's own copy if there is one, otherwise downloaded.
 

@@ -36,14 +36,40 @@ from franka_wm.data.lerobot.shard_workers import (
     lock_folder,
     wait_for_orphans,
 )
-from franka_wm.data.lerobot.source import MOST_ROWS
+from franka_wm.data.lerobot.source import MOST_ROWS, check_finite
 from franka_wm.data.lerobot.terminal import TERMINAL_FOLDER
 from franka_wm.errors import UserError
 from franka_wm.options import is_whole, whole_rule
-from franka_wm.untrusted import linked_json, values_of
+from franka_wm.untrusted import UntrustedFolder, linked_json, values_of
 
 SHARD_BYTES = 64_000_000
 """Images and numbers of one shard in memory, before they are compressed."""
+
+
+def check_out(out: str | Path, *, resume: bool = False, resumable: bool = True) -> None:
+    """Whether a dataset can go there, as far as can be told without writing. Arguments as for :class:`DatasetWriter`.
+
+    Raises:
+        UserError: The folder exists, or holds something else, or an unfinished dataset.
+    """
+    out = Path(out).absolute()
+    working = _working(out)
+    if out.exists() and not resume:
+        more = ", or add to it with resume=true" if resumable else ""
+        raise UserError(f"out={out} exists; choose another folder{more}")
+    if out.exists() and not (out / "meta" / "info.json").is_file():
+        raise UserError(f"out={out} is not a LeRobot dataset; choose another folder")
+    if _shards(working) and not resume:
+        more = "go on with resume=true, or " if resumable else ""
+        raise UserError(f"{working} holds an unfinished dataset; {more}remove {working}")
+
+
+def _working(out: Path) -> Path:
+    return out.with_name(out.name + ".writing")
+
+
+def _shards(working: Path) -> list[Path]:
+    return sorted(folder for folder in (working / "shards").glob("shard-*") if folder.suffix != PARTIAL)
 
 
 class DatasetWriter:
@@ -81,7 +107,7 @@ class DatasetWriter:
         whole_rule(least=1, null="by their size").check("shard_frames", shard_frames)
         self.out = Path(out).absolute()
         self.schema = schema
-        self.working = self.out.with_name(self.out.name + ".writing")
+        self.working = _working(self.out)
         self.shard_frames = default_shard_frames(schema) if shard_frames is None else shard_frames
         self._buffer: list[Episode] = []
         self._buffered = 0
@@ -95,14 +121,7 @@ class DatasetWriter:
     # -- before ------------------------------------------------------------------------------------------------
 
     def _open(self, resume: bool) -> None:
-        if self.out.exists() and not resume:
-            more = ", or add to it with resume=true" if self._resumable else ""
-            raise UserError(f"out={self.out} exists; choose another folder{more}")
-        if self.out.exists() and not (self.out / "meta" / "info.json").is_file():
-            raise UserError(f"out={self.out} is not a LeRobot dataset; choose another folder")
-        if self._shards() and not resume:
-            more = "go on with resume=true, or " if self._resumable else ""
-            raise UserError(f"{self.working} holds an unfinished dataset; {more}remove {self.working}")
+        check_out(self.out, resume=resume, resumable=self._resumable)
         try:
             (self.working / "shards").mkdir(parents=True, exist_ok=True)
             self._lock = lock_folder(self.working / "lock")
@@ -114,7 +133,7 @@ class DatasetWriter:
             wait_for_orphans(self.working / LOCK)
             self._recover()
         except UserError:
-            if self._shards():
+            if _shards(self.working):
                 self.close()
             else:
                 self._remove_working()
@@ -135,9 +154,12 @@ class DatasetWriter:
         shutil.rmtree(merged, ignore_errors=True)
         for folder in (self.working / "shards").glob("*" + PARTIAL):
             shutil.rmtree(folder)
-        kept = self._shards()
+        kept = _shards(self.working)
         with values_of(str(self.out if self.out.exists() else self.working), "choose another out"):
             self._check_schema(state)
+        if self.out.exists():
+            UntrustedFolder(self.out).check_links()
+            check_finite(self.out)
         totals = [_totals(folder) for folder in ([self.out] if self.out.exists() else []) + kept]
         self.resumed = self.episodes = sum(episodes for episodes, _ in totals)
         self.frames = sum(frames for _, frames in totals)
@@ -156,7 +178,7 @@ class DatasetWriter:
         if self.out.exists() and finished is None:
             raise UserError(f"out={self.out} was not written by franka-wm; merge with lerobot-edit-dataset")
         mine = json.loads(json.dumps(self.schema.to_dict()))
-        for other in (state if self._shards() else None, finished):
+        for other in (state if _shards(self.working) else None, finished):
             if other is not None and not isinstance(other["sessions"], list):
                 raise TypeError("sessions that are no list")
             if other is not None and other["schema"] != mine:
@@ -171,16 +193,11 @@ class DatasetWriter:
         path.with_suffix(".new").write_text(json.dumps(state, indent=1), encoding="utf-8")
         path.with_suffix(".new").replace(path)
 
-    def _shards(self) -> list[Path]:
-        return sorted(
-            folder for folder in (self.working / "shards").glob("shard-*") if folder.suffix != PARTIAL
-        )
-
     def keys(self) -> set[int]:
         """Keys of the episodes that are on disk: shards are finished out of order, so a kill may leave a gap."""
         import pyarrow.parquet as pq
 
-        roots = ([self.out] if self.out.exists() else []) + self._shards()
+        roots = ([self.out] if self.out.exists() else []) + _shards(self.working)
         files = [file for root in roots for file in (root / TERMINAL_FOLDER).glob("*.parquet")]
         return {key for file in files for key in pq.read_table(file)["episode_key"].to_pylist()}
 
@@ -255,7 +272,7 @@ class DatasetWriter:
             UserError: There is no episode, or writing failed. What is finished stays in ``OUT.writing``.
         """
         self.flush()
-        shards = self._shards()
+        shards = _shards(self.working)
         if not shards:
             self._remove_working()
             if self.out.exists():  # resumed, with nothing to add

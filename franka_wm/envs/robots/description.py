@@ -102,7 +102,9 @@ def _check_tree(root: ET.Element) -> None:
     """Names that are there once, and joints that make one tree of all links."""
     links, joints = _named(root, "link"), _named(root, "joint")
     if not links:
-        raise UserError("has no links")
+        raise UserError(
+            "has no links" + ("; it is MJCF, and robots are read as URDF" if root.tag == "mujoco" else "")
+        )
     above: dict[str, str] = {}
     for name, joint in joints.items():
         if joint.get("type") not in JOINTS:

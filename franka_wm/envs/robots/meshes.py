@@ -23,7 +23,7 @@ import warp as wp
 
 from franka_wm.errors import UserError
 
-INSTALL = "pip install franka-wm[meshes]"
+INSTALL = "pip install 'franka-wm[meshes]'"
 
 Color = tuple[float, float, float]
 

@@ -14,7 +14,19 @@ from franka_wm.envs.config import FrankaConfig
 from franka_wm.envs.external import ExternalConfig, external_config
 from franka_wm.envs.multitask_config import MultiTaskConfig, multi_task_config
 from franka_wm.errors import UserError
-from franka_wm.options import choice, flag, is_whole, read, real, several, text, value, whole, whole_rule
+from franka_wm.options import (
+    OF_ONES_OWN,
+    choice,
+    flag,
+    is_whole,
+    read,
+    real,
+    several,
+    text,
+    value,
+    whole,
+    whole_rule,
+)
 from franka_wm.policies.names import POLICIES
 from franka_wm.policies.planner import PRECISIONS
 from franka_wm.training.learner import SCHEDULES
@@ -181,7 +193,7 @@ class ModelSettings:
         read_first = read(_Learning, {k: v for k, v in values.items() if k in training}, prefix)
         if read_first.name not in models.available():
             raise UserError(
-                f"{prefix}.name={read_first.name!r}: must be one of {', '.join(models.available())}"
+                f"{prefix}.name={read_first.name!r}: must be one of {', '.join(models.available())}{OF_ONES_OWN}"
             )
         options = {key: value for key, value in values.items() if key not in training}
         return cls(**vars(read_first), options=options)

@@ -1,4 +1,4 @@
-"""Synthetic episodes, quick to make, and what reads them back: LeRobot's own code, offline."""
+"""Synthetic episodes, quick to make, what reads them back (LeRobot's own code, offline), and a Hub on loopback."""
 
 from __future__ import annotations
 
@@ -6,6 +6,8 @@ import os
 
 os.environ.setdefault("HF_HUB_OFFLINE", "1")  # before anything imports LeRobot
 
+import subprocess
+import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -13,6 +15,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+import fake_hub
 from franka_wm.data.lerobot.episodes import Episode, complete
 from franka_wm.data.lerobot.provenance import describe
 from franka_wm.data.lerobot.schema import DONE, EPISODE_KEY, SEED, TRUNCATED, Schema, schema_for
@@ -96,5 +99,35 @@ def load(monkeypatch: pytest.MonkeyPatch) -> Callable[..., Any]:
         from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
         return LeRobotDataset("test/set", root=root, video_backend="pyav", **options)
+
+    return run
+
+
+@pytest.fixture
+def hub():
+    hub = fake_hub.Hub()
+    yield hub
+    hub.close()
+
+
+@pytest.fixture
+def publish(hub, tmp_path):
+    """Runs the verb in a process of its own: the Hub's address is read when its client is imported."""
+
+    def run(
+        *arguments: str, token: str | None = fake_hub.TOKEN, url: str | None = None, offline: bool = False
+    ):
+        env = {k: v for k, v in os.environ.items() if not k.startswith(("HF_", "HUGGING"))}
+        env |= {"HF_ENDPOINT": url or hub.url, "HF_HOME": str(tmp_path / "home"), "HF_HUB_DISABLE_XET": "1"}
+        env |= {"HF_TOKEN": token} if token else {}
+        env |= {"HF_HUB_OFFLINE": "1"} if offline else {}
+        return subprocess.run(
+            [sys.executable, "-m", "franka_wm.commands.main", "publish", *arguments],
+            capture_output=True,
+            text=True,
+            cwd=tmp_path,
+            env=env,
+            check=False,
+        )
 
     return run

@@ -2,72 +2,23 @@
 
 from __future__ import annotations
 
-import importlib.util
 import json
-import os
 import shutil
-import subprocess
-import sys
 from email.message import Message
 from pathlib import Path
 
 import pytest
-import torch
 from huggingface_hub import DatasetCard
 from PIL import Image
 
+from fake_hub import TOKEN
 from franka_wm.data.lerobot import card as cards
 from franka_wm.data.lerobot.card import IMAGE
-from franka_wm.data.lerobot.hub import check_repo_id, explained
 from franka_wm.data.lerobot.paths import shortened, without_paths
 from franka_wm.data.lerobot.publish import stage_dataset
 from franka_wm.data.lerobot.schema import PROVENANCE
 from franka_wm.errors import UserError
-from franka_wm.training.checkpoint import load_checkpoint, save_checkpoint
-from franka_wm.training.publish import stage_model
 from franka_wm.untrusted import MOST_JSON
-
-
-def _fake_hub():
-    spec = importlib.util.spec_from_file_location("fake_hub", Path(__file__).with_name("fake_hub.py"))
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
-
-
-fake_hub = _fake_hub()
-
-
-@pytest.fixture
-def hub():
-    hub = fake_hub.Hub()
-    yield hub
-    hub.close()
-
-
-@pytest.fixture
-def publish(hub, tmp_path):
-    """Runs the verb in a process of its own: the Hub's address is read when its client is imported."""
-
-    def run(
-        *arguments: str, token: str | None = fake_hub.TOKEN, url: str | None = None, offline: bool = False
-    ):
-        env = {k: v for k, v in os.environ.items() if not k.startswith(("HF_", "HUGGING"))}
-        env |= {"HF_ENDPOINT": url or hub.url, "HF_HOME": str(tmp_path / "home"), "HF_HUB_DISABLE_XET": "1"}
-        env |= {"HF_TOKEN": token} if token else {}
-        env |= {"HF_HUB_OFFLINE": "1"} if offline else {}
-        return subprocess.run(
-            [sys.executable, "-m", "franka_wm.commands.main", "publish", *arguments],
-            capture_output=True,
-            text=True,
-            cwd=tmp_path,
-            env=env,
-            check=False,
-        )
-
-    return run
 
 
 @pytest.fixture(scope="module")
@@ -85,14 +36,14 @@ def one_line(result, *says: str) -> None:
     assert result.returncode == 1, result.stderr
     assert len(error) == 1, result.stderr
     assert "Traceback" not in result.stderr
-    assert fake_hub.TOKEN not in result.stderr + result.stdout
+    assert TOKEN not in result.stderr + result.stdout
     assert all(text in error[0] for text in says), error
 
 
 def test_a_dataset_goes_with_our_card_and_tag(hub, publish, dataset) -> None:
     done = publish(f"root={dataset}", "repo_id=user/arm", "license=cc-by-4.0")
     assert done.returncode == 0, done.stderr
-    assert fake_hub.TOKEN not in done.stderr + done.stdout
+    assert TOKEN not in done.stderr + done.stdout
     repo = hub.repos["datasets/user/arm"]
     assert repo["private"] is True
     local = contents(dataset)
@@ -246,6 +197,25 @@ def test_a_broken_dataset_is_one_line(text, says, copy, capsys) -> None:
     assert error.count("\n") == 1
 
 
+def test_a_number_that_is_not_finite_is_not_published(copy, capsys) -> None:
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    from franka_wm.commands.main import main
+
+    (path,) = (copy / "data").glob("*/*.parquet")
+    table = pq.read_table(path)
+    values = table["action"].to_pylist()
+    values[3][1] = float("nan")
+    at = table.schema.get_field_index("action")
+    pq.write_table(
+        table.set_column(at, table.schema.field(at), pa.array(values, table.schema.field(at).type)), path
+    )
+    assert main(["publish", f"root={copy}", "repo_id=user/arm", "--dry-run"]) == 1
+    error = capsys.readouterr().err
+    assert f"{path}: action holds a number that is not finite" in error and error.count("\n") == 1
+
+
 @pytest.mark.parametrize(
     ("text", "becomes"),
     [
@@ -298,153 +268,3 @@ def test_bad_arguments_are_one_line(arguments, says, capsys, tmp_path, monkeypat
     error = capsys.readouterr().err
     assert says in error
     assert error.count("\n") == 1
-
-
-# -- models --------------------------------------------------------------------------------------------------------
-
-
-@pytest.fixture
-def run_folder(tmp_path):
-    config = {
-        "seed": 4,
-        "resume": "/home/someone/run",
-        "model": {"name": "tdmpc2", "encoder_from": "/home/someone/jepa"},
-        "dataset": {"root": "/home/someone/set", "cache_dir": "~/someone/cache"},
-        "env": {"kind": "franka", "urdf_path": "/home/someone/arm.urdf", "image_size": 64},
-    }
-    model = torch.nn.Linear(3, 2)
-    save_checkpoint(
-        tmp_path / "run" / "checkpoints" / "latest",
-        model=model,
-        optimizer=torch.optim.AdamW(model.parameters()),
-        config=config,
-        counters={"updates": 7, "env_steps": 70},
-        extra={"spaces": {"action_dim": 2}},
-    )
-    (tmp_path / "run" / "evaluation.md").write_text("| policy | distance |\n|---|---|\n| planner | 1 cm |\n")
-    (tmp_path / "run" / "video.mp4").write_bytes(b"a film")
-    return tmp_path / "run", model
-
-
-def test_a_model_goes_without_what_only_training_needs(hub, publish, run_folder, tmp_path) -> None:
-    folder, model = run_folder
-    done = publish(f"checkpoint={folder}", "repo_id=user/model")
-    assert done.returncode == 0, done.stderr
-    repo = hub.repos["models/user/model"]
-    assert repo["private"] is True
-    assert set(repo["files"]) == {
-        ".gitattributes",
-        "README.md",
-        "config.yaml",
-        "counters.json",
-        "evaluation.md",
-        "extra.json",
-        "extra.safetensors",
-        "manifest.json",
-        "model.safetensors",
-        "video.mp4",
-    }
-    assert "planner | 1 cm" in repo["files"]["README.md"].decode()
-    assert (
-        'src="https://huggingface.co/user/model/resolve/main/video.mp4"'
-        in repo["files"]["README.md"].decode()
-    )
-    assert b"someone" not in b"".join(repo["files"].values())
-    assert "a simulated Franka arm" in repo["files"]["README.md"].decode()
-    there = tmp_path / "there"
-    there.mkdir()
-    for name, content in repo["files"].items():
-        (there / name).write_bytes(content)
-    opened = load_checkpoint(there)  # its manifest fits
-    copy = torch.nn.Linear(3, 2)
-    opened.load_model(copy)
-    assert torch.equal(copy.weight, model.weight)
-    assert opened.extra() == {"spaces": {"action_dim": 2}}
-    assert opened.counters == {"updates": 7, "env_steps": 70}
-
-
-def test_a_models_card_has_the_newest_evaluation_and_the_right_world(tmp_path) -> None:
-    worlds = [
-        ({"kind": "gym", "name": "CartPole-v1"}, "`gym CartPole-v1`", "load_agent"),
-        ({"kind": "none"}, "recorded episodes", "load_model"),
-    ]
-    for i, (env, says, use) in enumerate(worlds):
-        run, place = tmp_path / f"run{i}", tmp_path / f"place{i}"
-        config = {"seed": 4, "model": {"name": "dreamer"}, "env": env}
-        save_checkpoint(
-            run / "checkpoints" / "latest", model=torch.nn.Linear(3, 2), config=config, counters={}
-        )
-        (run / "evaluation").mkdir()
-        (run / "evaluation.md").write_text("the older numbers")
-        (run / "evaluation" / "evaluation.md").write_text("the verb's numbers of /home/someone/run")
-        (run / "evaluation" / "evaluation.json").write_text('{"checkpoint": "/home/someone/run"}')
-        place.mkdir()
-        stage_model(run, place, repo_id="user/model", license="mit")
-        card = (place / "README.md").read_text()
-        assert f"(dreamer) of {says}, trained" in card
-        assert use in card
-        assert "Franka arm, trained" not in card
-        assert "- franka\n" not in card
-        assert "the verb's numbers of run" in card
-        assert "older" not in card
-        assert json.loads((place / "evaluation.json").read_text()) == {"checkpoint": "run"}
-        load_checkpoint(place)
-
-
-def test_a_staged_model_is_damaged_if_changed(run_folder, tmp_path) -> None:
-    place = tmp_path / "place"
-    place.mkdir()
-    stage_model(run_folder[0], place, repo_id="user/model", license="mit")
-    manifest = json.loads((place / "manifest.json").read_text())
-    assert set(manifest["files"]) >= {"model.safetensors", "config.yaml"}
-    weights = bytearray((place / "model.safetensors").read_bytes())
-    weights[-1] ^= 1
-    (place / "model.safetensors").write_bytes(weights)
-    with pytest.raises(UserError, match="damaged"):
-        load_checkpoint(place)
-
-
-def test_downloads_take_tensors_and_plain_values_only(monkeypatch, tmp_path) -> None:
-    import huggingface_hub
-
-    from franka_wm.data.lerobot.hub import download
-
-    asked = {}
-
-    def snapshot(repo_id, **options):
-        asked.update(options, repo_id=repo_id)
-        return str(tmp_path)
-
-    monkeypatch.setattr(huggingface_hub, "snapshot_download", snapshot)
-    with pytest.raises(UserError, match="holds no model"):
-        download("user/model")
-    (tmp_path / "manifest.json").write_text("{}")
-    assert download("user/model@v1") == tmp_path
-    assert asked["repo_id"] == "user/model"
-    assert asked["revision"] == "v1"
-    assert sorted(asked["allow_patterns"]) == ["*.json", "*.safetensors", "*.yaml"]
-    for name in ("model", "../model", "user/../x", "https://x/y", ""):
-        with pytest.raises(UserError, match="must be user/name"):
-            check_repo_id(name)
-
-
-def test_a_missing_repository_is_one_line() -> None:
-    import httpx
-
-    with pytest.raises(UserError, match="cannot be reached"), explained("user/name"):
-        raise httpx.ConnectError("no route")
-
-
-@pytest.mark.parametrize(
-    "name", ["evaluation.md", "evaluation/evaluation.md", "checkpoints/latest/counters.json"]
-)
-def test_links_out_of_a_run_are_not_followed(name: str, run_folder, tmp_path) -> None:
-    run, place, secret = run_folder[0], tmp_path / "place", tmp_path / "secret"
-    place.mkdir()
-    (run / name).parent.mkdir(exist_ok=True)
-    secret.write_bytes((run / name).read_bytes() if (run / name).exists() else b"of this machine")
-    (run / name).unlink(missing_ok=True)
-    (run / name).symlink_to(secret)
-    with pytest.raises(UserError, match="is a link to"):
-        stage_model(run, place, repo_id="user/model", license="mit")
-    assert not (place / "evaluation.md").exists()
