@@ -12,7 +12,7 @@ from typing import Any
 from benchmarks.results.confirm import confirmed
 from benchmarks.results.records import FREE, PLACE, read
 from benchmarks.results.rows import Row
-from benchmarks.results.state import Record, numbers, state
+from benchmarks.results.state import Record, numbers, state, unmeasured
 from franka_wm.errors import UserError
 
 BEGIN, END = "<!-- results: written by `make results` -->", "<!-- end of results -->"
@@ -198,9 +198,13 @@ def part(row: Row, records: Sequence[Record], judged: tuple[str, list[str]], pla
                 "",
             ]
         else:
-            lines += [f"**Measured before changes of** {files}.", ""]
-    if kind == "part":
-        lines += [f"{'; '.join(reasons).capitalize()}.", ""]
+            many = f"{len(reasons)} files" if len(reasons) > 1 else "one file"
+            lines += [
+                f"**Measured before changes of {many}.** <details><summary>Files</summary>{files}</details>",
+                "",
+            ]
+    if missing := unmeasured(row, records):
+        lines += [f"**Not run: seeds {numbers(missing)}** of the {len(row.seeds)} that the row declares.", ""]
     if row.script is not None:
         return "\n".join([*lines, table(list(records[0]["rows"][0]), _cells(records[0]["rows"])), ""])
     if judgement := verdicts(row, records):

@@ -24,8 +24,13 @@ def state(row: Row, records: Sequence[Record]) -> tuple[str, list[str]]:
         return "mixed", reasons
     if reasons := stale(records):
         return "stale", reasons
-    missing = sorted(set(row.seeds) - {record["seed"] for record in records}) if row.seeds else []
+    missing = unmeasured(row, records)
     return ("part", [f"seeds {numbers(missing)} are missing"]) if missing else ("fresh", [])
+
+
+def unmeasured(row: Row, records: Sequence[Record]) -> list[int]:
+    """Seeds that the row declares and no run measured."""
+    return sorted(set(row.seeds) - {record["seed"] for record in records}) if row.seeds else []
 
 
 def mixed(row: Row, records: Sequence[Record]) -> list[str]:

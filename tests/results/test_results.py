@@ -211,7 +211,7 @@ def test_single_seeds_stand_below_and_not_in_the_readme(measured) -> None:
     assert "## Two CPU cores" not in text
     assert text.index("## Single seeds") < text.index("### One fixed goal")
     assert "| planner | 1.00 (0.50 – 2.00) |" in text  # the interval over its episodes
-    assert "Seeds 101 are missing" in text
+    assert "**Not run: seeds 101** of the 2 that" in text
     assert "One fixed goal" not in render.readme_tables({"reach": ROW}, place)
 
 
@@ -341,7 +341,8 @@ def test_rows_older_than_the_code_say_so(measured) -> None:
     place = measured({"seed": 100, **old}, {"seed": 101, **old})
     assert state(ROW, records.read(ROW, place)) == ("stale", ["gone.py", "train.py"])
     text = render.page({"reach": ROW}, place)
-    assert "**Measured before changes of** `gone.py`, `train.py`." in text and "| planner |" in text
+    assert "before changes of 2 files.** <details><summary>Files</summary>`gone.py`, `train.py`<" in text
+    assert "| planner |" in text
     assert "One fixed goal¹" in render.readme_tables({"reach": ROW}, place)
 
 
