@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import gc
 import os
+import sys
 import threading
 import time
 from collections.abc import Mapping
@@ -29,7 +30,10 @@ ARM: dict[str, Any] = {
 """Without a checkpoint: what ``env=reach`` sets. Repeated here, since an installed package has no ``conf``."""
 
 GRACE = 1.0
-"""After Ctrl-C the process ends by itself within this time [s], or is ended."""
+"""After Ctrl-C the process ends within this time [s]."""
+
+INTERRUPTED = 130
+"""Exit status after Ctrl-C, as shells expect."""
 
 ENDLESS = {"episode_length": 1_000_000, "terminate_on_success": False}
 """While somebody watches, an episode ends when they ask for another."""
@@ -169,11 +173,15 @@ def serve(stage: Stage, options: Options) -> None:
             time.sleep(min(0.2, max(0.0, end - time.monotonic())))
         page.close()
     except KeyboardInterrupt:  # the way to end it, also while a long decision or a slow disk holds a thread
-        hurry = threading.Timer(GRACE, os._exit, (130,))
+        hurry = threading.Timer(GRACE, os._exit, (INTERRUPTED,))
         hurry.daemon = True
         hurry.start()
-        if not page.close(timeout=0.3 * GRACE):
-            os._exit(130)  # Python would wait for the thread, or hang on its own way out
+        page.close(timeout=0.3 * GRACE)
+        if session.error is None:
+            sys.stdout.flush()
+            os._exit(
+                INTERRUPTED
+            )  # Python would wait for threads, and take seconds to free what the simulator holds
         hurry.cancel()
     finally:
         gc.unfreeze()
