@@ -19,10 +19,14 @@ on_gpu = pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA 
 
 
 @pytest.fixture(autouse=True)
-def _any_device(monkeypatch):
-    """`torch.cuda.device` of a CPU tensor is an error; the stand-ins for graphs run there."""
-    if not torch.cuda.is_available():
-        monkeypatch.setattr(torch.cuda, "device", lambda device: nullcontext())
+def _on_the_cpu(monkeypatch):
+    """Stand-ins for graphs run on the CPU, also where there is a GPU; `torch.cuda.device` refuses that device."""
+    real = torch.cuda.device
+
+    def device(asked):
+        return nullcontext() if isinstance(asked, torch.device) and asked.type == "cpu" else real(asked)
+
+    monkeypatch.setattr(torch.cuda, "device", device)
 
 
 class FakeGraph:
