@@ -30,7 +30,7 @@ def restore(trainer: Trainer, checkpoint: Checkpoint) -> None:
     worlds of other libraries or of a changed configuration, which start new episodes.
 
     Of another number of processes worlds and experience are divided anew; random numbers of policies and losses start
-    anew.
+    anew. Of another number of worlds (``collector.num_envs``) neither is taken over.
     """
     env, learner, settings = trainer.env, trainer.learner, trainer.settings
     with damaged(checkpoint.folder):
@@ -41,7 +41,9 @@ def restore(trainer: Trainer, checkpoint: Checkpoint) -> None:
         trainer.env_steps = int(checkpoint.counters["env_steps"])
         trainer.seconds = checkpoint.counters["seconds"]
         trainer.rows = list((checkpoint.extra() or {}).get("rows", []))
-        experience = None if env is None else own_experience(checkpoint, env.device)
+        there, here = (one["collector"]["num_envs"] for one in (checkpoint.config, settings.values))
+        fits = env is None or there == here
+        experience = own_experience(checkpoint, env.device) if env is not None and fits else None
         if experience is not None:
             assert env is not None
             gathered = env.fake_tensordict()
@@ -50,8 +52,12 @@ def restore(trainer: Trainer, checkpoint: Checkpoint) -> None:
                     raise ValueError(f"experience of {key} is {saved.dtype}")
             fill(trainer.replay, experience, settings, updates=learner.updates, restored=True)
         elif env is not None and learner.updates < settings.trainer.updates:
-            say("  the checkpoint holds no experience: this run gathers anew and will not be the same")
-        _restore_moment(trainer, checkpoint, own_moment(checkpoint))
+            why = "holds no experience" if fits else f"is of collector.num_envs={there}, this run has {here}"
+            say(f"  the checkpoint {why}: this run gathers anew and will not be the same")
+        if fits:
+            _restore_moment(trainer, checkpoint, own_moment(checkpoint))
+        else:
+            _begin_new_episodes(trainer)
         if checkpoint.processes == processes.count():
             checkpoint.restore_rng(processes.rank())  # the last: whatever is built draws
         else:
@@ -79,7 +85,14 @@ def _restore_moment(trainer: Trainer, checkpoint: Checkpoint, moment: Mapping[st
         else:
             why = "of another configuration" if worlds is not None else "the checkpoint holds none"
         say(f"  worlds: {why}; they start new episodes, and this run will not be the same")
-        # Not those that the first run has seen already.
-        env.set_seed(derive_seed("training", trainer.settings.seed, "resumed", trainer.env_steps))
+        _begin_new_episodes(trainer)
     if not go_on_drawing(trainer.acting.policies, moment.get("policies", {}), env.device):
         say(f"  {OTHER_DEVICE}")
+
+
+def _begin_new_episodes(trainer: Trainer) -> None:
+    """Seeds worlds for episodes that the run has not seen before."""
+    assert trainer.env is not None
+    # Worlds of the arm are told apart by their numbers, those of other libraries by the seed alone.
+    apart = processes.parts() if restorable(trainer.env) is None else ()
+    trainer.env.set_seed(derive_seed("training", trainer.settings.seed, "resumed", trainer.env_steps, *apart))

@@ -8,6 +8,7 @@ import signal
 from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -17,8 +18,9 @@ from safetensors.torch import load_file
 from tensordict import TensorDictBase
 
 from forks import train_in_fork
+from franka_wm import processes
 from franka_wm.commands.main import main
-from franka_wm.training import build
+from franka_wm.training import build, resume
 from franka_wm.training.checkpoint import Checkpoint, latest_checkpoint, load_checkpoint
 from franka_wm.training.learner import Learner
 from franka_wm.training.moment import draws
@@ -174,6 +176,24 @@ def test_a_signal_changes_nothing(make: Callable[..., Trainer]) -> None:
     assert differing(play(second), expected) == []
 
 
+class Seeded:
+    """Worlds of another library, which keep the seed that they were given."""
+
+    def set_seed(self, seed: int) -> None:
+        self.seed = seed
+
+
+def test_worlds_of_other_libraries_go_on_unlike_on_each_gpu(monkeypatch) -> None:
+    seeds = []
+    for rank in range(2):
+        monkeypatch.setattr(processes, "count", lambda: 2)
+        monkeypatch.setattr(processes, "rank", lambda rank=rank: rank)
+        trainer = SimpleNamespace(env=Seeded(), settings=SimpleNamespace(seed=0), env_steps=100)
+        resume._begin_new_episodes(trainer)  # pyright: ignore[reportArgumentType]
+        seeds.append(trainer.env.seed)
+    assert seeds[0] != seeds[1]
+
+
 # -- whole runs ------------------------------------------------------------------------------------------------
 
 
@@ -204,6 +224,19 @@ def test_after_a_kill(train, made: Counter[str], tiny: list[str], tmp_path: Path
     resumed = train(f"resume={tmp_path}/killed", folder=tmp_path / "resumed")
     assert resumed.counters["updates"] == 40 and made == {"TDMPC2": 20}
     assert differing(weights(resumed), whole) == []
+
+
+@pytest.mark.parametrize("worlds", [2, 5])
+def test_another_number_of_worlds_gathers_anew(train, worlds: int, tmp_path: Path, capsys) -> None:
+    first = train("evaluation.during=[]", "trainer.updates=10", folder=tmp_path / "first")
+    more = (f"collector.num_envs={worlds}", "trainer.updates=20")
+    second = train(f"resume={tmp_path}/first", *more, folder=tmp_path / "second")
+    said = [line for line in capsys.readouterr().out.splitlines() if "will not be the same" in line]
+    why = f"the checkpoint is of collector.num_envs=3, this run has {worlds}"
+    assert said == [f"  {why}: this run gathers anew and will not be the same"]
+    before, after = first.replay(), second.replay()
+    assert before is not None and after is not None and second.counters["updates"] == 20
+    assert len(after) == worlds and second.counters["env_steps"] == before.numel() + after.numel()
 
 
 @pytest.fixture
