@@ -183,7 +183,10 @@ class MultiTaskEnv(EnvBase):
         return None if len(known) < len(bounds) else (min(a for a, _ in known), max(b for _, b in known))
 
     def statistics(self, *, clear: bool = True) -> dict[str, float]:
-        """Those of :meth:`FrankaEnv.statistics` over all tasks, and ``success/TASK`` of each; a host sync for each."""
+        """Those of :meth:`FrankaEnv.statistics` over all tasks; ``success/TASK`` and ``episodes/TASK`` of each.
+
+        A host sync for each task.
+        """
         found = {name: env.statistics(clear=clear) for name, env in self.envs.items()}
         ended = {name: one["episodes"] for name, one in found.items()}
         total = sum(ended.values())
@@ -193,7 +196,10 @@ class MultiTaskEnv(EnvBase):
                 out[key] = sum(one[key] * ended[name] for name, one in found.items() if ended[name]) / total
         for key in ("nonfinite", "overflow"):
             out[key] = sum(one.get(key, 0.0) for one in found.values())
-        return out | {f"success/{name}": one["success"] for name, one in found.items() if ended[name]}
+        for name, one in found.items():
+            if ended[name]:
+                out |= {f"success/{name}": one["success"], f"episodes/{name}": ended[name]}
+        return out
 
     def get_state(self) -> TensorDict:
         """Task -> :meth:`FrankaEnv.get_state` of its worlds."""

@@ -198,7 +198,7 @@ class Trainer:
         for _ in range(batches):
             self.gather()
         data = [self.replay[:]]  # (worlds, time): TorchRL gives back what it was extended with
-        if self.demonstrations is not None:
+        if self.demonstrations is not None and processes.is_first():  # all have the same ones
             data.append(self.demonstrations.transitions)
         seen = {key: torch.cat([one.get(key).flatten(0, 1) for one in data]) for key in self._vectors}
         own = {key: (x.mean(0), x.std(0), len(x)) for key, x in seen.items()}
@@ -415,13 +415,15 @@ class Trainer:
 
 
 def _of_all(found: Sequence[Mapping[str, float]]) -> dict[str, float]:
-    """Statistics of all processes' episodes: counts are summed, the others are means over episodes."""
+    """Statistics of all processes' episodes: counts are summed, the others are means over (a task's) episodes."""
     if len(found) == 1:
         return dict(found[0])
     out = {}
     for name in dict.fromkeys(name for one in found for name in one):
-        having = [(one[name], one["episodes"]) for one in found if name in one]
-        if name in ("episodes", "nonfinite", "overflow"):
+        of, _, task = name.partition("/")
+        episodes = f"episodes/{task}" if task else "episodes"
+        having = [(one[name], one[episodes]) for one in found if name in one]
+        if of in ("episodes", "nonfinite", "overflow"):
             out[name] = sum(value for value, _ in having)
         else:
             out[name] = sum(value * n for value, n in having) / max(1.0, sum(n for _, n in having))

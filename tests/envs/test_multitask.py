@@ -108,6 +108,7 @@ def test_statistics_tell_tasks_apart(env) -> None:
     lengths = [4] * 6 + [6] * 2
     assert found["length"] == pytest.approx(sum(lengths) / 8)
     assert {"success/reach", "success/push"} <= set(found)
+    assert (found["episodes/reach"], found["episodes/push"]) == (6, 2)
     assert "return" not in env.statistics()  # nothing has ended since
 
 

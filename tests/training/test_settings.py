@@ -239,3 +239,12 @@ def test_a_process_has_its_part_of_the_whole(monkeypatch: pytest.MonkeyPatch) ->
         assert 2 * getattr(getattr(own, group), name) == getattr(getattr(whole, group), name)
     assert own.values == whole.values  # what checkpoints hold is of all
     assert own.changed(seed=1).collector.num_envs == own.collector.num_envs
+
+
+def test_each_gpu_has_worlds_of_every_task(settled) -> None:
+    """Eight tasks on two GPUs; four worlds on each, or seven and a half tasks, are refused before anything is built."""
+    few = ("env=multitask", "gpus=2", "replay.batch_size=8")
+    for worlds in (8, 24):
+        with pytest.raises(UserError, match=f"collector.num_envs={worlds}: .* use a multiple of 16"):
+            settled(*few, f"collector.num_envs={worlds}")
+    settled(*few, "collector.num_envs=32")

@@ -13,6 +13,7 @@ import pytest
 import torch
 from tensordict import TensorDict
 
+from franka_wm import processes
 from franka_wm.envs import FrankaEnv
 from franka_wm.errors import UserError
 from franka_wm.training import build, storage_budget
@@ -21,7 +22,7 @@ from franka_wm.training.learner import Learner
 from franka_wm.training.resume import restore
 from franka_wm.training.run import Run
 from franka_wm.training.settings import RunSettings
-from franka_wm.training.trainer import Trainer
+from franka_wm.training.trainer import Trainer, _of_all
 
 N, CAPACITY = 4, 50
 
@@ -129,6 +130,21 @@ def test_observations_are_standardized_by_the_seed_data(make: Make) -> None:
     seen = torch.cat([data[key] for key in trainer.model.observation_sizes], -1).flatten(0, 1)
     torch.testing.assert_close(given[0][0], seen.mean(0))
     torch.testing.assert_close(given[0][1], seen.std(0).clamp_min(1e-3))
+
+
+def test_demonstrations_count_once_in_statistics_of_all_processes(make: Make, monkeypatch) -> None:
+    """All processes have the same ones; the first brings them."""
+    counts = []
+    monkeypatch.setattr(processes, "pooled", lambda mean, std, n: counts.append(n) or (mean, std))
+    for first in (True, False):
+        trainer = make()
+        sizes = trainer.model.observation_sizes
+        shown = TensorDict({key: torch.zeros(48, 1, size) for key, size in sizes.items()}, [48, 1])
+        trainer.demonstrations = SimpleNamespace(transitions=shown)
+        monkeypatch.setattr(processes, "is_first", lambda first=first: first)
+        trainer.seed()
+    own = trainer.replay[:].numel()
+    assert {*counts[: len(counts) // 2]} == {own + 48} and {*counts[len(counts) // 2 :]} == {own}
 
 
 def test_experience_is_whole(make: Make) -> None:
@@ -312,3 +328,15 @@ def test_policies_take_turns(make: Make) -> None:
     trainer.fit()
     acted = used[-15:]
     assert acted == ["random"] * 10 + ["policy"] * 5
+
+
+def test_statistics_of_several_processes_are_means_over_their_episodes() -> None:
+    """Success of a task by that task's episodes: here 1 of 1 and 0 of 3."""
+    found = _of_all(
+        [
+            {"episodes": 9, "success": 1.0, "success/lift": 1.0, "episodes/lift": 1, "overflow": 2},
+            {"episodes": 3, "success": 0.0, "success/lift": 0.0, "episodes/lift": 3, "overflow": 1},
+            {"episodes": 0, "overflow": 0},
+        ]
+    )
+    assert found == {"episodes": 12, "success": 0.75, "success/lift": 0.25, "episodes/lift": 4, "overflow": 3}

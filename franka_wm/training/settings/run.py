@@ -11,6 +11,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from franka_wm import processes
 from franka_wm.console import say
+from franka_wm.envs.multitask_config import MultiTaskConfig
 from franka_wm.errors import UserError
 from franka_wm.options import is_whole, read, unknown
 from franka_wm.policies.names import refuse_old_name
@@ -161,6 +162,13 @@ class RunSettings:
         for name, value in divided.items():
             if value % parts:
                 raise UserError(f"{name}={value}: {parts} GPUs cannot share it; use a multiple of {parts}")
+        if parts > 1 and isinstance(self.env.config, MultiTaskConfig) and not self.is_offline:
+            tasks = len(self.env.config.tasks)
+            if c.num_envs % (parts * tasks):
+                raise UserError(
+                    f"collector.num_envs={c.num_envs}: on each of {parts} GPUs as many worlds must have each of the "
+                    f"{tasks} tasks; use a multiple of {parts * tasks}"
+                )
         if parts > 1 and self.export.kind != "none":
             raise UserError(
                 f"export={self.export.kind}: needs gpus=1; franka-wm collect records with the trained agent"
