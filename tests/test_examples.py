@@ -3,6 +3,10 @@
 from __future__ import annotations
 
 import json
+import os
+import signal
+import subprocess
+import time
 from pathlib import Path
 
 import pytest
@@ -84,3 +88,45 @@ def test_a_plugin_that_is_not_there(root: Path, tmp_path: Path) -> None:
     done = run_in_fork(script(TRAIN, *arguments), root)
     assert done.returncode == 1 and "no_such_module" in done.stderr
     assert not (tmp_path / "run").exists()
+
+
+STAND_INS = {
+    "scontrol": 'echo "scontrol $*" >> said; [ "$1" = requeue ] || echo host1',
+    "srun": """case "$1" in
+    torchrun) echo "$OMP_NUM_THREADS $VIRTUAL $*" >> said; while [ ! -e stop ]; do sleep 0.05; done; exit 130;;
+    *) echo "srun $*" >> said; touch stop;;
+esac""",
+}
+
+
+def test_a_job_of_slurm_saves_before_its_time_is_up(root: Path, tmp_path: Path) -> None:
+    """With stand-ins for SLURM: the signal reaches the processes, not torchrun; then the job is queued again."""
+    (tmp_path / "bin").mkdir()
+    for name, text in STAND_INS.items():
+        (tmp_path / "bin" / name).write_text(f"#!/bin/bash\n{text}\n")
+        (tmp_path / "bin" / name).chmod(0o755)
+    (tmp_path / ".venv" / "bin").mkdir(parents=True)
+    (tmp_path / ".venv" / "bin" / "activate").write_text("export VIRTUAL=mine\n")
+    slurm = {
+        "JOB_ID": "7",
+        "JOB_NODELIST": "host[1-2]",
+        "NNODES": "2",
+        "GPUS_ON_NODE": "4",
+        "CPUS_PER_TASK": "32",
+    }
+    environment = os.environ | {f"SLURM_{name}": value for name, value in slurm.items()}
+    environment["PATH"] = f"{tmp_path}/bin:{os.environ['PATH']}"
+    script = root / "examples/cluster/train.slurm"
+    job = subprocess.Popen(["bash", str(script), "env=lift", "name=a b"], cwd=tmp_path, env=environment)
+    said = tmp_path / "said"
+    for _ in range(200):
+        if said.is_file() and "torchrun" in said.read_text():
+            break
+        time.sleep(0.05)
+    time.sleep(0.2)  # it waits for the run
+    job.send_signal(signal.SIGUSR1)
+    job.wait(timeout=30)
+    lines = said.read_text().splitlines()
+    assert lines[1].startswith("8 mine torchrun --nnodes=2 --nproc-per-node=4 ")
+    assert lines[1].endswith(f"train.py env=lift name=a b hydra.run.dir={tmp_path}/outputs/7")
+    assert "pkill -TERM" in lines[2] and lines[3:] == ["scontrol requeue 7"]
