@@ -8,6 +8,7 @@ captured CUDA graph; those on the CPU by gloo.
 from __future__ import annotations
 
 import os
+import socket
 import sys
 from collections.abc import Iterable, Sequence
 from datetime import timedelta
@@ -21,9 +22,22 @@ from franka_wm.errors import UserError
 TIMEOUT = timedelta(minutes=30)
 """How long a process waits for another one that lives: the first one evaluates alone, and compiles kernels."""
 
+MEETING = timedelta(minutes=10)
+"""How long a process waits at the start for the others, which are started at the same time."""
+
 
 def restarted() -> bool:
-    """Whether torchrun has started the job anew, after one of its processes had died."""
+    """Whether the job was started anew: by torchrun after a process had died, or by SLURM, which requeued it."""
+    return _anew or requeued()
+
+
+def requeued() -> bool:
+    """Whether SLURM has requeued the job."""
+    return int(os.environ.get("SLURM_RESTART_COUNT") or 0) > 0
+
+
+def begun_again() -> bool:
+    """Whether torchrun has started the processes of the job anew."""
     return _anew
 
 
@@ -54,22 +68,58 @@ def join(*, cuda: bool) -> None:
     """Meets the other processes that torchrun has started, and takes this one's GPU of the host.
 
     Raises:
-        UserError: This host has fewer GPUs than processes.
+        UserError: The others cannot be met, or a host has fewer GPUs than processes; all processes raise the latter.
     """
+    from torch.distributed.rendezvous import rendezvous
+
     global _anew
-    local = int(os.environ["LOCAL_RANK"])
-    if cuda:
-        there = torch.cuda.device_count()
-        if local >= there:
-            raise UserError(
-                f"gpus={os.environ['WORLD_SIZE']}: process {os.environ['RANK']} would need GPU {local} of this host, "
-                f"which has {there}; use fewer, or device=cpu"
-            )
-        torch.cuda.set_device(local)
-    backend = "cpu:gloo,cuda:nccl" if cuda else "gloo"
-    _together(lambda: distributed.init_process_group(backend, timeout=TIMEOUT))
-    # Of several hosts, that whose process died alone counts it.
-    [_anew] = agree([int(os.environ.get("TORCHELASTIC_RESTART_COUNT", "0")) > 0], [])
+    address = f"{os.environ.get('MASTER_ADDR')}:{os.environ.get('MASTER_PORT')}"
+    try:
+        store, rank, size = next(rendezvous("env://", timeout=MEETING))
+        store.set_timeout(MEETING)
+        lacks = _told(store, rank, size, _lack_of_gpus() if cuda else "")
+        if lacks:
+            raise UserError(lacks)
+        if cuda:
+            torch.cuda.set_device(own_gpu())
+        backend = "cpu:gloo,cuda:nccl" if cuda else "gloo"
+        distributed.init_process_group(backend, store=store, rank=rank, world_size=size, timeout=MEETING)
+        # Of several hosts, that whose process died alone counts it.
+        _anew = any(objects(int(os.environ.get("TORCHELASTIC_RESTART_COUNT", "0")) > 0))
+        if cuda:
+            distributed.all_reduce(torch.zeros(1, device=own_gpu()))  # NCCL connects at the first one
+            torch.cuda.synchronize()
+    except RuntimeError as error:
+        why = str(error).splitlines()[0][:120]
+        host = socket.gethostname()
+        raise UserError(
+            f"process {os.environ['RANK']} on {host} cannot meet the others at {address} ({why}); check that all hosts "
+            "reach it, and name the interface between them by GLOO_SOCKET_IFNAME and NCCL_SOCKET_IFNAME"
+        ) from error
+    store.set_timeout(TIMEOUT)
+    distributed.distributed_c10d._set_pg_timeout(TIMEOUT)
+
+
+def _lack_of_gpus() -> str:
+    """What is wrong with this host, which has fewer GPUs than processes; nothing where it has enough."""
+    there = torch.cuda.device_count() if torch.cuda.is_available() else 0
+    needed = int(os.environ["LOCAL_WORLD_SIZE"])
+    if there >= needed:
+        return ""
+    return (
+        f"host {socket.gethostname()} has {there} usable CUDA devices for {needed} processes; start fewer processes "
+        "there, leave the host out, or use device=cpu for all"
+    )
+
+
+def _told(store: Any, rank: int, size: int, mine: str) -> str:
+    """The first of what all processes say that is not empty; they need not have a process group yet."""
+    store.set(f"said by {rank}", mine)
+    found = [store.get(f"said by {k}").decode() for k in range(size)]
+    store.set(f"heard by {rank}", "")
+    if rank == 0:  # it may keep the store, which ends with it
+        store.wait([f"heard by {k}" for k in range(size)])
+    return next(filter(None, found), "")
 
 
 def leave(status: int = 0) -> None:
@@ -89,9 +139,12 @@ def own_gpu() -> torch.device:
 
 
 def speaks_first() -> bool:
-    """Whether no process of the job has said before why it ends; the first to ask is told so, once."""
+    """Whether no process of the job has said before why it ends; the first to ask is told so, once.
+
+    Before they have met, the first process of each host is.
+    """
     if not _joined():
-        return os.environ.get("RANK", "0") == "0"
+        return os.environ.get("LOCAL_RANK", "0") == "0"
     store = distributed.distributed_c10d._get_default_store()
     try:
         return store.add(f"ends {os.environ.get('TORCHELASTIC_RESTART_COUNT', 0)}", 1) == 1
@@ -161,12 +214,13 @@ def average_gradients(parameters: Iterable[Tensor]) -> None:
     torch._foreach_copy_(grads, parts)  # pyright: ignore[reportPrivateImportUsage]
 
 
-def pooled(mean: Tensor, std: Tensor, count_each: int) -> tuple[Tensor, Tensor]:
-    """Mean and unbiased deviation of all processes' samples, from those of each, of `count_each` samples."""
+def pooled(mean: Tensor, std: Tensor, samples: int) -> tuple[Tensor, Tensor]:
+    """Mean and unbiased deviation of all processes' samples, from those of each, of so many samples."""
     means, deviations = gather(mean.unsqueeze(0)), gather(std.unsqueeze(0))
-    whole, n = means.mean(0), len(means)
-    squares = (count_each - 1) * deviations.square().sum(0) + count_each * (means - whole).square().sum(0)
-    return whole, (squares / max(1, n * count_each - 1)).sqrt()
+    counts = gather(mean.new_full((1, *[1] * mean.dim()), samples))
+    whole = (counts / counts.sum() * means).sum(0)
+    squares = (counts - 1) * deviations.square() + counts * (means - whole).square()
+    return whole, (squares.sum(0) / (counts.sum() - 1).clamp_min(1)).sqrt()
 
 
 # -- the loop ----------------------------------------------------------------------------------------------------

@@ -19,7 +19,7 @@ from omegaconf.errors import OmegaConfBaseException
 
 from franka_wm import conf
 from franka_wm.commands import several
-from franka_wm.commands.overrides import compose, explain
+from franka_wm.commands.overrides import compose, explain, given
 from franka_wm.commands.sweep import Sweep, jobs, names
 from franka_wm.console import say, terminal_log
 from franka_wm.errors import REFUSALS, FrankaError, machine_refused
@@ -38,11 +38,15 @@ def run_command(main: Callable[[], object], arguments: list[str] | None = None) 
         main: Reads ``sys.argv``, as Hydra's are.
         arguments: After the program's name; the command line's if not given.
     """
-    with terminal_log(), one_line_refusals():
-        try:
-            _run(main, sys.argv[1:] if arguments is None else arguments)
-        except KeyboardInterrupt:  # before a run begins
-            sys.exit(INTERRUPTED)
+    try:
+        with terminal_log(), one_line_refusals():
+            try:
+                _run(main, sys.argv[1:] if arguments is None else arguments)
+            except KeyboardInterrupt:  # before a run begins
+                sys.exit(INTERRUPTED)
+    except BaseException as error:
+        several.part(error)
+        raise
 
 
 @contextmanager
@@ -154,7 +158,9 @@ def one_line_errors(main: Callable[[DictConfig], object]) -> Callable[[DictConfi
             if _sweep is not None:
                 with nullcontext() if _sweep.process == os.getpid() else terminal_log():
                     return _sweep.run(main, cfg)
-            if several.started_by_torchrun():
+            from franka_wm import processes
+
+            if processes.restarted():
                 several.go_on(cfg, Path(told.runtime.output_dir))
             with one_line_refusals():
                 return main(cfg)
@@ -247,7 +253,6 @@ def check_command(arguments: list[str], folder: Path | None = None) -> str | Non
             return unwritable(folder, "hydra.sweep.dir")
     except FrankaError as error:
         return str(error)
-    chosen = next((a.split("=", 1)[1] for a in arguments if a.startswith("hydra.run.dir=")), "outputs")
-    place = folder or Path(chosen)
+    place = folder or Path(given(arguments, "hydra.run.dir") or "outputs")
     problem = unwritable(place)
     return problem if processes.restarted() else problem or occupied(place, cfg.resume)

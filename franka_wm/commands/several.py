@@ -7,18 +7,23 @@ import os
 import signal
 import sys
 import tempfile
+import traceback
 import uuid
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 from omegaconf import DictConfig
 
 from franka_wm import conf
-from franka_wm.commands.overrides import compose
+from franka_wm.commands.overrides import compose, quoted
 from franka_wm.console import say
 from franka_wm.errors import UserError
 from franka_wm.versions import PACKAGES, versions
 
 INTERRUPTED = 130
+SAVING = 1800
+"""How long processes that were asked to stop may take to save [s]."""
 
 
 def started_by_torchrun() -> bool:
@@ -60,9 +65,9 @@ def launch(flags: list[str], overrides: list[str], gpus: int, device: str) -> No
     os.environ.setdefault("OMP_NUM_THREADS", str(max(1, (os.cpu_count() or 1) // gpus)))
     places = [str(conf.FOLDER.parents[1]), *filter(None, [os.environ.get("PYTHONPATH")])]
     os.environ["PYTHONPATH"] = os.pathsep.join(places)
-    command = ["-m", "franka_wm", "train", *flags, *fixed, f"hydra.run.dir={folder}"]
+    command = ["-m", "franka_wm", "train", *flags, *fixed, f"hydra.run.dir={quoted(str(folder))}"]
     try:
-        with tempfile.TemporaryDirectory(prefix="franka_wm-") as logs:
+        with tempfile.TemporaryDirectory(prefix="franka_wm-") as logs, patience():
             config = LaunchConfig(
                 min_nodes=1,
                 max_nodes=1,
@@ -85,6 +90,29 @@ def launch(flags: list[str], overrides: list[str], gpus: int, device: str) -> No
             f"process {rank} of the run (pid {failure.pid}) was ended by {failure.signal_name()}, the others with it; "
             f"go on from the last checkpoint: franka-wm train resume={folder}"
         ) from None
+
+
+@contextmanager
+def patience() -> Iterator[None]:
+    """Inside, processes that are asked to stop have half an hour to save, not torchrun's 30 s.
+
+    Once: who asks again does not want to wait. Nor do those wait for long that have lost one of them.
+    """
+    from torch.distributed.elastic.multiprocessing.api import SubprocessContext
+
+    before, asked = SubprocessContext._close, False
+
+    def close(self: SubprocessContext, death_sig: signal.Signals, timeout: int = 30) -> None:
+        nonlocal asked
+        live = all(one.proc.poll() is None for one in self.subprocess_handlers.values())
+        first, asked = not asked, True
+        before(self, death_sig, SAVING if first and live else timeout)
+
+    SubprocessContext._close = close
+    try:
+        yield
+    finally:
+        SubprocessContext._close = before
 
 
 def _require_gpus(gpus: int, device: str) -> None:
@@ -127,15 +155,13 @@ def enter(overrides: list[str]) -> list[str]:
     All write into one folder, the first one's. All but the first one are silent, unless they end first.
 
     Raises:
-        UserError: Versions or options differ between processes, or this host has too few GPUs.
+        UserError: The others cannot be met, versions or options differ, or a host has too few GPUs.
     """
-    import torch
-
     from franka_wm import processes
 
     if os.environ["RANK"] != "0":
         sys.stdout = open(os.devnull, "w")  # noqa: SIM115  # as long as the process
-    processes.join(cuda=wanted(overrides)[1] != "cpu" and torch.cuda.is_available())
+    processes.join(cuda=wanted(overrides)[1] != "cpu")
     own = [one for one in overrides if not one.startswith(("hydra.run.dir=", "gpus="))]
     decisive = ("franka_wm", "python", "commit", *PACKAGES)
     same = {"options": " ".join(own)} | {k: v for k, v in versions().items() if k in decisive}
@@ -147,18 +173,60 @@ def enter(overrides: list[str]) -> list[str]:
                     "job with the same command in the same environment"
                 )
     folder = processes.objects(str(run_folder(overrides)))[0]
-    own += [f"gpus={processes.count()}", f"hydra.run.dir={folder}"]
+    own += [f"gpus={processes.count()}", f"hydra.run.dir={quoted(folder)}"]
     return own if processes.is_first() else [*own, "hydra.output_subdir=null"]
 
 
 def go_on(cfg: DictConfig, folder: Path) -> None:
-    """After torchrun has started a job anew: from what it had saved, if anything."""
-    from franka_wm import processes
-    from franka_wm.training.run import left_by
+    """After a job was started anew: from what it had saved, if anything.
 
-    if processes.count() > 1 and processes.restarted() and cfg.resume is None and left_by(folder, cfg):
+    The first process looks: others may see later what is on a disk of the network.
+
+    Raises:
+        UserError: The job was asked to stop; or what was saved is a run's of other settings.
+    """
+    from franka_wm import processes
+
+    stopped, left = processes.objects(_left(cfg, folder) if processes.is_first() else None)[0]
+    if stopped:
+        raise UserError(stopped)
+    if left:
         say(f"started anew: going on from {folder}")
         cfg.resume = str(folder)
+
+
+def _left(cfg: DictConfig, folder: Path) -> tuple[str, bool]:
+    """Why a job that was started anew ends, and whether it has saved in its folder."""
+    from franka_wm import processes
+    from franka_wm.training.checkpoint import latest_checkpoint
+    from franka_wm.training.run import STOPPED, left_by
+
+    mark = folder / STOPPED
+    if processes.begun_again() and mark.is_file():
+        return mark.read_text().strip(), False
+    if cfg.resume is None:
+        return "", left_by(folder, cfg) is not None
+    try:  # a folder that was not this job's own was refused when it began
+        latest_checkpoint(folder)
+    except UserError:
+        return "", False
+    return "", True
+
+
+def part(error: BaseException) -> None:
+    """Ends this process, where it is one of several, by what ended its run; alone it does nothing.
+
+    To leave as Python does would wait for threads that wait for the other processes.
+    """
+    if not started_by_torchrun():
+        return
+    from franka_wm import processes
+
+    if isinstance(error, SystemExit):
+        processes.leave(error.code if isinstance(error.code, int) else int(error.code is not None))
+    elif processes.count() > 1:
+        traceback.print_exception(error)
+        processes.leave(1)
 
 
 def spread(cfg: DictConfig, job: int = 0) -> None:

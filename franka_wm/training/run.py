@@ -7,14 +7,16 @@ import importlib
 import logging
 import sys
 import tempfile
+import time
+import uuid
 from collections.abc import Callable, Iterable
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import IO, NoReturn
 
 import torch
 from hydra.core.hydra_config import HydraConfig
-from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 from tensordict import TensorDictBase
 from torchrl.record.loggers import Logger
@@ -41,6 +43,13 @@ from franka_wm.versions import FINISHED, write_finished, write_versions
 INTERRUPTED = 130
 """Exit status after Ctrl-C, as shells expect."""
 
+
+STOPPED = "stopped.txt"
+"""Says in the folder of a run that it was asked to stop; while it is there, torchrun does not begin the run again."""
+
+SEEN = ".seen"
+SOON = 90.0
+"""After so long every host sees what one has written to a disk of the network [s]."""
 
 SMALL_FILES = 65536
 """Room for a run's configuration and first lines, which are written before there is anything to lose [bytes]."""
@@ -209,7 +218,12 @@ class Run:
         """The last line of a run that was interrupted and has saved; exits with 130."""
         close_loggers(self.loggers)
         own = named_plugins(self.settings.values)
-        say(f"stopped; go on with: {program()} train resume={self.folder}{own}")
+        line = f"stopped; go on with: {program()} train resume={self.folder}{own}"
+        if processes.is_first():
+            (self.folder / STOPPED).write_text(f"{line}\n")
+        say(line)
+        with suppress(UserError):  # nobody leaves before the mark is there: torchrun would end who writes it
+            processes.wait()
         processes.leave(INTERRUPTED)
         sys.exit(INTERRUPTED)
 
@@ -235,14 +249,16 @@ def start(cfg: DictConfig) -> Run:
     Raises:
         UserError: One line, before anything is built or written.
     """
-    folder = Path(HydraConfig.get().runtime.output_dir)
+    told = HydraConfig.get()
+    folder = Path(told.runtime.output_dir)
+    require_seen(folder)
     checkpoint, again = None, False
     import_plugins(cfg.plugins)  # those of the command line: what a checkpoint names is never imported
     if cfg.resume is not None:
-        told = HydraConfig.get()
-        again = told.mode == RunMode.MULTIRUN or processes.restarted()
-        again = again and cfg.resume == str(folder)  # see `left_by`
-        checkpoint, cfg = resumed(cfg, [] if again else list(told.overrides.task))
+        typed = list(told.overrides.task)
+        again = not any(one.startswith("resume=") for one in typed)  # a job that found its own beginning
+        checkpoint, cfg = resumed(cfg, [] if again else typed)
+        _require_same(checkpoint)
     settings = RunSettings.of(cfg, saved=checkpoint is not None)
     if settings != _checked:
         check(settings)
@@ -257,7 +273,8 @@ def start(cfg: DictConfig) -> Run:
     problem = occupied(folder, settings.resume)  # also of a sweep, whose folders only Hydra knows
     if problem is not None:
         raise UserError(problem)
-    (folder / FINISHED).unlink(missing_ok=True)
+    for mark in (FINISHED, STOPPED):
+        (folder / mark).unlink(missing_ok=True)
     log_to(folder / "train.log")
     if not again:
         OmegaConf.save(OmegaConf.create(dict(settings.values)), folder / "config.yaml")
@@ -266,6 +283,41 @@ def start(cfg: DictConfig) -> Run:
     if checkpoint is not None:
         say(f"going on from update {int(checkpoint.counters.get('updates', 0))} of {checkpoint.folder}")
     return Run(settings, folder, checkpoint, open_loggers(settings, folder))
+
+
+def require_seen(folder: Path) -> None:
+    """Checks that every process of the job sees what the first one writes into the run's folder.
+
+    Raises:
+        UserError: One does not.
+    """
+    if processes.count() == 1:
+        return
+    mark = folder / SEEN
+    token = processes.objects(uuid.uuid4().hex)[0]
+    if processes.is_first():
+        mark.write_text(token)
+    processes.wait()
+    until = time.monotonic() + SOON
+    while not (seen := mark.is_file() and mark.read_text() == token) and time.monotonic() < until:
+        time.sleep(0.1)
+    blind = [rank for rank, one in enumerate(processes.objects(seen)) if not one]
+    if processes.is_first():
+        mark.unlink()
+    if blind:
+        raise UserError(
+            f"rank {blind[0]} does not see {folder}: give hydra.run.dir on a disk that all hosts see"
+        )
+
+
+def _require_same(checkpoint: Checkpoint) -> None:
+    found = processes.objects(checkpoint.counters)
+    other = next((rank for rank, one in enumerate(found) if one != found[0]), None)
+    if other is not None:
+        raise UserError(
+            f"rank {other} sees another checkpoint in {checkpoint.folder} than rank 0 ({found[other]['updates']} and "
+            f"{found[0]['updates']} updates): start again in a minute"
+        )
 
 
 _checked: RunSettings | None = None

@@ -16,6 +16,7 @@ import pytest
 import torch
 from tensordict import TensorDict
 
+from franka_wm.commands.overrides import quoted
 from franka_wm.envs import FrankaConfig, FrankaEnv
 from franka_wm.evaluation.protocol import evaluate_agent
 from franka_wm.training.checkpoint import Checkpoint, latest_checkpoint, load_checkpoint
@@ -30,13 +31,26 @@ TORCHRUN = ["-m", "torch.distributed.run"]
 pytestmark = [pytest.mark.slow]
 
 
-def begin(folder: Path, *overrides: str, before: tuple[str, ...] = (), log: str = "log") -> subprocess.Popen:
-    """A job in the background; what it says is in ``FOLDER.log``."""
+def begin(
+    folder: Path,
+    *overrides: str,
+    before: tuple[str, ...] = (),
+    log: str = "log",
+    within: Path | None = None,
+) -> subprocess.Popen:
+    """A job in the background, within a folder; what it says is in ``FOLDER.log``."""
     out = folder.with_suffix(f".{log}").open("w")
     kept = [] if any("resume=" in one for one in overrides) else SMOKE  # a run that resumes has its own
-    command = [sys.executable, *before, str(ROOT / "train.py"), *kept, *overrides, f"hydra.run.dir={folder}"]
+    command = [
+        sys.executable,
+        *before,
+        str(ROOT / "train.py"),
+        *kept,
+        *overrides,
+        f"hydra.run.dir={quoted(str(folder))}",
+    ]
     environment = {**os.environ, "OMP_NUM_THREADS": "1", "TORCH_DISABLE_SHARE_RDZV_TCP_STORE": "1"}
-    return subprocess.Popen(command, stdout=out, stderr=subprocess.STDOUT, env=environment)
+    return subprocess.Popen(command, stdout=out, stderr=subprocess.STDOUT, env=environment, cwd=within)
 
 
 def finished(job: subprocess.Popen, folder: Path, *, status: int = 0, log: str = "log") -> str:
@@ -212,6 +226,37 @@ def test_torchrun_starts_a_job_anew(tmp_path) -> None:
     said = "".join(finished(job, folder, log=f"log{k}") for k, job in enumerate(jobs))
     assert f"started anew: going on from {folder}" in said and "updates 400/400" in said
     assert checkpoint(folder).counters["updates"] == 400
+
+
+def test_torchrun_does_not_begin_a_stopped_job_again(tmp_path) -> None:
+    folder = tmp_path / "stopped"
+    nodes = (*TORCHRUN, "--standalone", "--nproc-per-node=2", "--max-restarts=1")
+    job = begin(folder, "trainer.updates=100000", "trainer.checkpoint_every=1", before=nodes)
+    saved(folder, job)
+    os.kill(workers(folder)[1], signal.SIGTERM)
+    said = finished(job, folder, status=1)
+    line = f"stopped; go on with: franka-wm train resume={folder}"
+    assert said.count(line) == 2  # when it stops, and when it is started anew
+    assert re.search(rf"error: (process 1: )?{line}", said)
+    assert (folder / "stopped.txt").read_text() == f"{line}\n"
+
+
+def test_an_exception_in_one_process_ends_all(tmp_path) -> None:
+    """Of the second, whose threads would keep it alive."""
+    (tmp_path / "breaks.py").write_text(
+        "import os, threading, time\n"
+        "from franka_wm.training.learner import Learner\n"
+        "def broken(self, *arguments, **options):\n"
+        "    if os.environ['RANK'] == '1':\n"
+        "        threading.Thread(target=time.sleep, args=(1000,)).start()\n"
+        "        raise KeyError('of a plugin')\n"
+        "    update(self, *arguments, **options)\n"
+        "if 'RANK' in os.environ:\n"
+        "    update, Learner.update = Learner.update, broken\n"
+    )
+    folder = tmp_path / "run with spaces, [brackets]"
+    said = finished(begin(folder, "gpus=2", "plugins=[breaks]", within=tmp_path), folder, status=1)
+    assert "KeyError: 'of a plugin'" in said and (folder / "config.yaml").is_file()
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,186 @@
+"""How processes of one job meet, and what they find of it: one line where they cannot go on together."""
+
+from __future__ import annotations
+
+import os
+import socket
+import subprocess
+import sys
+from datetime import timedelta
+from pathlib import Path
+from types import SimpleNamespace
+
+import pytest
+import torch
+from omegaconf import OmegaConf
+from torch.distributed.elastic.multiprocessing.api import SubprocessContext
+
+from franka_wm import processes
+from franka_wm.commands import several
+from franka_wm.commands.overrides import compose, given, quoted
+from franka_wm.errors import UserError
+from franka_wm.training import run
+
+ROOT = Path(__file__).resolve().parents[2]
+
+
+@pytest.fixture
+def port() -> int:
+    """One that nobody listens at."""
+    with socket.socket() as one:
+        one.bind(("localhost", 0))
+        return one.getsockname()[1]
+
+
+@pytest.fixture
+def second(monkeypatch) -> None:
+    """This process as the second of two."""
+    monkeypatch.setattr(processes, "count", lambda: 2)
+    monkeypatch.setattr(processes, "rank", lambda: 1)
+    monkeypatch.setattr(processes, "wait", lambda: None)
+
+
+def test_others_that_cannot_be_met_are_one_line(monkeypatch, port) -> None:
+    place = {"RANK": 1, "LOCAL_RANK": 1, "WORLD_SIZE": 2, "MASTER_ADDR": "localhost", "MASTER_PORT": port}
+    for name, value in place.items():
+        monkeypatch.setenv(name, str(value))
+    monkeypatch.setattr(processes, "MEETING", timedelta(seconds=1))
+    with pytest.raises(
+        UserError, match=f"cannot meet.*localhost:{port}.*GLOO_SOCKET_IFNAME.*NCCL_SOCKET_IFNAME"
+    ):
+        processes.join(cuda=False)
+
+
+def together(port: int, work: str) -> list[tuple[int, str]]:
+    """Exit status and errors of two processes of two hosts that do the same."""
+    common = {"WORLD_SIZE": "2", "LOCAL_WORLD_SIZE": "1", "LOCAL_RANK": "0", "TORCHELASTIC_RUN_ID": "1"}
+    common |= {"MASTER_ADDR": "localhost", "MASTER_PORT": str(port), "OMP_NUM_THREADS": "1"}
+    code = (
+        "import time\nfrom datetime import timedelta\nimport torch\nfrom franka_wm import processes\n"
+        f"from franka_wm.commands.entry import fail\nfrom franka_wm.errors import UserError\n{work}"
+    )
+    ranks = [
+        subprocess.Popen(
+            [sys.executable, "-c", code],
+            env={**os.environ, **common, "RANK": str(rank), "PYTHONPATH": str(ROOT)},
+            stderr=subprocess.PIPE,
+            text=True,
+        )
+        for rank in range(2)
+    ]
+    said = [one.communicate(timeout=120)[1] for one in ranks]
+    return [(one.returncode, text) for one, text in zip(ranks, said, strict=True)]
+
+
+def test_a_host_without_a_gpu_says_so_and_all_end(port) -> None:
+    """The second is that host; the first has one."""
+    found = together(
+        port,
+        "import os\nthere = os.environ['RANK'] == '0'\n"
+        "torch.cuda.is_available, torch.cuda.device_count = lambda: there, lambda: int(there)\n"
+        "try:\n    processes.join(cuda=True)\nexcept UserError as error:\n    fail(str(error))\n",
+    )
+    assert [status for status, _ in found] == [1, 1]
+    assert f"host {socket.gethostname()} has 0 usable CUDA devices for 1 processes" in found[1][1]
+    assert not any("Traceback" in text for _, text in found)
+
+
+def test_who_has_met_is_waited_for_longer(port) -> None:
+    found = together(
+        port,
+        "processes.MEETING = timedelta(seconds=3)\nprocesses.join(cuda=False)\n"
+        "time.sleep(6 * processes.rank())\nprocesses.wait()\nprocesses.leave(7)\n",
+    )
+    assert [status for status, _ in found] == [7, 7], found
+
+
+@pytest.mark.parametrize("restarts", ["", "0", "2"])
+def test_a_job_that_slurm_requeued_was_started_anew(monkeypatch, restarts) -> None:
+    monkeypatch.setenv("SLURM_RESTART_COUNT", restarts)
+    assert processes.restarted() is (restarts == "2")
+
+
+def config(resume: str | None = None):
+    return OmegaConf.create({"resume": resume})
+
+
+@pytest.fixture
+def saved(tmp_path) -> Path:
+    """A folder of a run that has saved."""
+    latest = tmp_path / "own" / "checkpoints" / "latest"
+    latest.mkdir(parents=True)
+    (latest / "manifest.json").write_text("{}")
+    return tmp_path / "own"
+
+
+def test_what_was_asked_to_stop_is_not_begun_again(monkeypatch, saved) -> None:
+    (saved / run.STOPPED).write_text(f"stopped; go on with: franka-wm train resume={saved}\n")
+    monkeypatch.setattr(processes, "begun_again", lambda: True)
+    with pytest.raises(UserError, match=f"go on with: franka-wm train resume={saved}"):
+        several.go_on(config(), saved)
+    monkeypatch.setattr(processes, "begun_again", lambda: False)  # requeued: SLURM had asked it
+    cfg = config("elsewhere")
+    several.go_on(cfg, saved)
+    assert cfg.resume == str(saved)
+
+
+def test_a_resumed_job_goes_on_from_its_own_folder_if_it_has_saved(saved, tmp_path) -> None:
+    cfg = config(str(tmp_path / "first"))
+    several.go_on(cfg, tmp_path / "nothing")
+    assert cfg.resume == str(tmp_path / "first")
+    several.go_on(cfg, saved)
+    assert cfg.resume == str(saved)
+
+
+def test_the_first_process_decides_whether_a_job_goes_on(monkeypatch, second, tmp_path) -> None:
+    """The second does not see the folder yet."""
+    monkeypatch.setattr(processes, "objects", lambda mine: [("", True), mine])
+    cfg = config()
+    several.go_on(cfg, tmp_path / "late")
+    assert cfg.resume == str(tmp_path / "late")
+
+
+def test_a_folder_that_another_process_does_not_see_is_one_line(monkeypatch, second, tmp_path) -> None:
+    monkeypatch.setattr(run, "SOON", 0.3)
+    monkeypatch.setattr(
+        processes, "objects", lambda mine: ["word", mine] if isinstance(mine, str) else [True, mine]
+    )
+    with pytest.raises(
+        UserError, match=f"rank 1 does not see {tmp_path}: give hydra.run.dir on a disk that all"
+    ):
+        run.require_seen(tmp_path)
+    (tmp_path / run.SEEN).write_text("word")
+    run.require_seen(tmp_path)
+
+
+def test_processes_that_shall_stop_may_take_long_to_save(monkeypatch) -> None:
+    given = []
+    monkeypatch.setattr(SubprocessContext, "_close", lambda self, sig, timeout=30: given.append(timeout))
+
+    def ended(*status: int | None) -> SimpleNamespace:
+        proc = [SimpleNamespace(poll=lambda one=one: one) for one in status]
+        return SimpleNamespace(subprocess_handlers=dict(enumerate(SimpleNamespace(proc=one) for one in proc)))
+
+    for processes_of_job in ([ended(None, None)] * 2, [ended(None, -9)]):
+        with several.patience():
+            for one in processes_of_job:
+                SubprocessContext._close(one, 15)  # pyright: ignore[reportArgumentType]
+    assert given == [several.SAVING, 30, 30]  # who asks again, and who has lost a process, does not wait
+
+
+@pytest.mark.parametrize("name", ["a b", "[1,2]", "it's", "{x:1}", "k=v", "end\\", "back\\'s", "ü#"])
+def test_odd_names_arrive_unchanged(name) -> None:
+    override = f"resume={quoted(f'/tmp/{name}')}"
+    assert compose([override]).resume == f"/tmp/{name}" == given([override], "resume")
+
+
+def test_statistics_of_unequal_parts(monkeypatch) -> None:
+    """What the first process has beside its own experience counts once."""
+    parts = [torch.randn(40, 3) + 2, torch.randn(10, 3)]
+    moments = [(x.mean(0), x.std(0), len(x)) for x in parts]
+    means, stds, counts = (list(one) for one in zip(*moments, strict=True))
+    answers = iter([torch.stack(means), torch.stack(stds), torch.tensor(counts).view(2, 1).float()])
+    monkeypatch.setattr(processes, "gather", lambda x: next(answers))
+    mean, std = processes.pooled(*moments[0])
+    torch.testing.assert_close(mean, torch.cat(parts).mean(0))
+    torch.testing.assert_close(std, torch.cat(parts).std(0))
