@@ -85,7 +85,7 @@ def run(row: Row, machine: Machine, *, seeds: Sequence[int], out: Path, place: P
         slots.put(slot)
     jobs = min(machine.jobs, len(seeds) or 1)
     folder = out / row.name / datetime.now().strftime("%Y-%m-%d_%H-%M-%S")
-    folder.mkdir(parents=True)
+    folder.mkdir(parents=True, exist_ok=True)  # another command may have begun in the same second
 
     def one(seed: int) -> str | None:
         before, after, environment = slot = slots.get()
