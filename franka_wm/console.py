@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import io
+import re
+import shlex
 import shutil
 import sys
 import threading
@@ -24,13 +26,29 @@ def program() -> str:
     if shutil.which("franka-wm") or not beside.is_file():
         return "franka-wm"
     here = Path.cwd()
-    return str(beside.relative_to(here) if beside.is_relative_to(here) else beside)
+    return shlex.quote(str(beside.relative_to(here) if beside.is_relative_to(here) else beside))
+
+
+def quoted(value: str) -> str:
+    """A text as the value of an override, so that Hydra reads it as it is: brackets, commas and spaces included."""
+    if re.fullmatch(r"[\w/.+-]+", value, re.ASCII):
+        return value
+    escaped = re.sub(r"(\\*)'", r"\1\1\\'", value)
+    ending = re.search(r"\\*$", escaped)
+    return f"'{escaped}{ending[0] if ending else ''}'"
+
+
+def resuming(folder: Path, config: Mapping[str, object]) -> str:
+    """The command that goes on with a run, as a shell takes it."""
+    return f"{program()} train {shlex.quote(f'resume={quoted(str(folder))}')}{named_plugins(config)}"
 
 
 def named_plugins(config: Mapping[str, object]) -> str:
-    """`` plugins=[…]`` as a command about a run needs it, since what a run names is never imported by itself."""
+    """`` 'plugins=[…]'`` as a command about a run needs it, since what a run names is never imported by itself."""
     names = config.get("plugins")
-    return f" plugins=[{','.join(map(str, names))}]" if isinstance(names, list | tuple) and names else ""
+    if not isinstance(names, list | tuple) or not names:
+        return ""
+    return " " + shlex.quote(f"plugins=[{','.join(map(str, names))}]")
 
 
 class _Copied:

@@ -91,6 +91,8 @@ def join(*, cuda: bool) -> None:
             torch.cuda.synchronize()
     except RuntimeError as error:
         why = str(error).splitlines()[0][:120]
+        if isinstance(error, torch.OutOfMemoryError) or "CUDA error" in why:
+            raise
         host = socket.gethostname()
         raise UserError(
             f"process {os.environ['RANK']} on {host} cannot meet the others at {address} ({why}); check that all hosts "
@@ -103,12 +105,11 @@ def join(*, cuda: bool) -> None:
 def _lack_of_gpus() -> str:
     """What is wrong with this host, which has fewer GPUs than processes; nothing where it has enough."""
     there = torch.cuda.device_count() if torch.cuda.is_available() else 0
-    needed = int(os.environ["LOCAL_WORLD_SIZE"])
-    if there >= needed:
+    if int(os.environ["LOCAL_RANK"]) < there:
         return ""
     return (
-        f"host {socket.gethostname()} has {there} usable CUDA devices for {needed} processes; start fewer processes "
-        "there, leave the host out, or use device=cpu for all"
+        f"host {socket.gethostname()} has {there} usable CUDA devices for {os.environ['LOCAL_WORLD_SIZE']} processes; "
+        "start fewer processes there, leave the host out, or use device=cpu for all"
     )
 
 

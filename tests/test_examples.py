@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import signal
 import subprocess
 import time
@@ -129,4 +130,6 @@ def test_a_job_of_slurm_saves_before_its_time_is_up(root: Path, tmp_path: Path) 
     lines = said.read_text().splitlines()
     assert lines[1].startswith("8 mine torchrun --nnodes=2 --nproc-per-node=4 ")
     assert lines[1].endswith(f"train.py env=lift name=a b hydra.run.dir={tmp_path}/outputs/7")
-    assert "pkill -TERM" in lines[2] and lines[3:] == ["scontrol requeue 7"]
+    ranks = f"-u train\\.py .*hydra\\.run\\.dir={tmp_path}/outputs/7"  # of this job alone, not of another one
+    assert f"pkill -TERM -f -- {ranks}" in lines[2] and lines[3:] == ["scontrol requeue 7"]
+    assert re.search(ranks, f"python -u train.py env=lift hydra.run.dir={tmp_path}/outputs/7")

@@ -64,7 +64,10 @@ def parse(arguments: list[str] | None) -> argparse.Namespace:
     one.add_argument("--seeds", type=int, nargs="+", help="default: those of the row")
     one.add_argument("--jobs", type=int, default=1, help="runs at a time, on each device")
     one.add_argument(
-        "--beside", type=int, default=0, help="other runs on the same GPU meanwhile, to be recorded"
+        "--beside",
+        type=int,
+        default=0,
+        help="other runs on the same GPU meanwhile, counted in the row's 'N at a time'",
     )
     one.add_argument("--device", nargs="+", default=[], help="of a row on a GPU: cuda:0 cuda:1 …")
     one.add_argument("--threads", type=int, help="of each run; default: the row's, on a GPU torch's choice")

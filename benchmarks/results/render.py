@@ -204,7 +204,11 @@ def part(row: Row, records: Sequence[Record], judged: tuple[str, list[str]], pla
                 "",
             ]
     if missing := unmeasured(row, records):
-        lines += [f"**Not run: seeds {numbers(missing)}** of the {len(row.seeds)} that the row declares.", ""]
+        one = "seed" if len(missing) == 1 else "seeds"
+        lines += [
+            f"**Not run: {one} {numbers(missing)}** of the {len(row.seeds)} that the row declares.",
+            "",
+        ]
     if row.script is not None:
         return "\n".join([*lines, table(list(records[0]["rows"][0]), _cells(records[0]["rows"])), ""])
     if judgement := verdicts(row, records):

@@ -217,7 +217,10 @@ def check_run(verb: str, option: str, folder: str) -> None:
     Raises:
         UserError: It is not.
     """
-    if not folder.startswith("hf:") and not Path(folder).is_dir():
+    there = any(
+        Path(one).is_dir() for one in (folder, f"{folder.rstrip('/')}.old")
+    )  # see training/checkpoint.py
+    if not there and not folder.startswith("hf:"):
         raise UserError(
             f"{verb}: {option}={folder}: no such folder; give that of a run, as train.py prints it last"
         )

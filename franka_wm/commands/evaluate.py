@@ -75,7 +75,10 @@ def check_larger(folder: Path, episodes: int) -> None:
         return
     from franka_wm.evaluation.results import read_result
 
-    there = read_result(folder / "evaluation.json").episodes
+    try:
+        there = read_result(folder / "evaluation.json").episodes
+    except UserError:  # nobody can read it
+        return
     if there > episodes:
         raise UserError(
             f"evaluate: {folder} holds a result of {there} episodes, which one of {episodes} would replace; "

@@ -29,15 +29,6 @@ def compose(overrides: Sequence[str], options: Sequence[str] = ()) -> Any:
         raise UserError(explain(str(error), allowed=_allowed(str(error), overrides, options))) from error
 
 
-def quoted(value: str) -> str:
-    """A text as the value of an override, so that Hydra reads it as it is: brackets, commas and spaces included."""
-    if re.fullmatch(r"[\w/.+-]+", value, re.ASCII):
-        return value
-    escaped = re.sub(r"(\\*)'", r"\1\1\\'", value)
-    ending = re.search(r"\\*$", escaped)
-    return f"'{escaped}{ending[0] if ending else ''}'"
-
-
 def given(overrides: Sequence[str], key: str) -> str | None:
     """The text that an override gives to ``key``, without quotes; ``None`` where there is none."""
     from hydra.core.override_parser.overrides_parser import OverridesParser

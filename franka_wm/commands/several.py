@@ -16,9 +16,10 @@ from pathlib import Path
 from omegaconf import DictConfig
 
 from franka_wm import conf
-from franka_wm.commands.overrides import compose, quoted
-from franka_wm.console import say
+from franka_wm.commands.overrides import compose
+from franka_wm.console import quoted, resuming, say
 from franka_wm.errors import UserError
+from franka_wm.untrusted import UntrustedFolder
 from franka_wm.versions import PACKAGES, versions
 
 INTERRUPTED = 130
@@ -88,7 +89,7 @@ def launch(flags: list[str], overrides: list[str], gpus: int, device: str) -> No
             sys.exit(failure.exitcode)
         raise UserError(
             f"process {rank} of the run (pid {failure.pid}) was ended by {failure.signal_name()}, the others with it; "
-            f"go on from the last checkpoint: franka-wm train resume={folder}"
+            f"go on from the last checkpoint: {resuming(folder, {})}"
         ) from None
 
 
@@ -204,13 +205,15 @@ def _left(cfg: DictConfig, folder: Path) -> tuple[str, bool]:
     mark = folder / STOPPED
     if processes.begun_again() and mark.is_file():
         return mark.read_text().strip(), False
+    mark.unlink(missing_ok=True)
     if cfg.resume is None:
         return "", left_by(folder, cfg) is not None
-    try:  # a folder that was not this job's own was refused when it began
+    try:
         latest_checkpoint(folder)
     except UserError:
         return "", False
-    return "", True
+    # Of another run than this one, which is refused later.
+    return "", (UntrustedFolder(folder).yaml("config.yaml") or {}).get("resume") == cfg.resume
 
 
 def part(error: BaseException) -> None:

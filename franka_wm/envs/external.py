@@ -1,7 +1,6 @@
 """Other environments than the arm, through TorchRL's own wrappers: Gymnasium and the DeepMind Control Suite.
 
-They run on the CPU, one copy after the other (``SerialEnv``): a way to hold algorithms against published curves,
-not a fast one.
+They run on the CPU, one copy after the other (``SerialEnv``) or each in a process of its own (``ParallelEnv``).
 """
 
 from __future__ import annotations
@@ -13,7 +12,7 @@ from typing import Any
 
 import torch
 from tensordict import TensorDictBase
-from torchrl.envs import EnvBase, SerialEnv, TransformedEnv
+from torchrl.envs import EnvBase, ParallelEnv, SerialEnv, TransformedEnv
 from torchrl.envs.transforms import (
     ActionScaling,
     CatTensors,
@@ -68,6 +67,7 @@ class ExternalEnv(TransformedEnv):
         num_envs: Copies, N.
         seed: Seed of all copies.
         device: Where the TensorDicts live; the simulators stay on the CPU.
+        parallel: Each copy in a process of its own; it plays the same episodes. ``close()`` ends the processes.
 
     Raises:
         UserError: The extra is not installed, or there is no such environment or observation.
@@ -83,6 +83,7 @@ class ExternalEnv(TransformedEnv):
         num_envs: int = 1,
         seed: int = 0,
         device: torch.device | str | None = None,
+        parallel: bool = False,
     ):
         make = partial(_make_one, config)
         one = make()
@@ -98,7 +99,12 @@ class ExternalEnv(TransformedEnv):
             RewardSum(),
             InitTracker(),
         ]
-        base = SerialEnv(num_envs, make, device=device)
+        # Daemons end with this process, however it ends.
+        base = (
+            ParallelEnv(num_envs, make, device=device, daemon=True)
+            if parallel
+            else SerialEnv(num_envs, make, device=device)
+        )
         super().__init__(base, Compose(*transforms))
         self.config, self.num_envs = config, num_envs
         self._totals = torch.zeros(3, device=device)

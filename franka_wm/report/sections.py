@@ -9,7 +9,7 @@ from typing import Any
 from markupsafe import Markup
 from omegaconf import OmegaConf
 
-from franka_wm.console import named_plugins
+from franka_wm.console import named_plugins, quoted
 from franka_wm.evaluation.results import COMMAND, END
 from franka_wm.report import style
 from franka_wm.report.bars import bars_figure
@@ -295,7 +295,8 @@ def reproduce(run: RunFiles) -> str:
     if run.counters:
         lines += ["# watch it", f"franka-wm view checkpoint={place}{own}", ""]
     if run.counters and run.overrides:
-        lines += ["# go on with it", f"franka-wm train resume={place}{own}", ""]
+        resume = shlex.quote(f"resume={quoted(str(_near(run.folder)))}")
+        lines += ["# go on with it", f"franka-wm train {resume}{own}", ""]
     lines += ["# this page", f"franka-wm report {place}"]
     return commands(lines)
 

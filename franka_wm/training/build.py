@@ -54,22 +54,23 @@ def make_env(
     num_envs: int | None = None,
     seed: int | None = None,
     first_world: int = 0,
+    parallel: bool = False,
     **changes: object,
 ) -> Environment:
     """The environment that ``run.env`` describes; ``changes`` override fields of its config.
 
     For a model of discrete actions the arm takes numbers of rows of a table. Its episodes are those of training
-    unless ``seed`` says otherwise. Worlds of other libraries are told apart by the seed alone, not by ``first_world``.
+    unless ``seed`` says otherwise. Worlds of other libraries differ by the seed alone; ``parallel``: each in a process.
     """
     described = run.env.changed(**changes)
     worlds = run.collector.num_envs if num_envs is None else num_envs
     start = derive_seed("training", run.seed) if seed is None else seed
     if isinstance(described.config, MultiTaskConfig):
-        return MultiTaskEnv(
-            described.config, num_envs=worlds, device=run.device, seed=start, first_world=first_world
-        )
+        many: Any = {"num_envs": worlds, "seed": start, "first_world": first_world}
+        return MultiTaskEnv(described.config, device=run.device, **many)
     if isinstance(described.config, ExternalConfig):
-        return ExternalEnv(described.config, num_envs=worlds, device=resolve_device(run.device), seed=start)
+        device = resolve_device(run.device)
+        return ExternalEnv(described.config, num_envs=worlds, seed=start, device=device, parallel=parallel)
     config = described.arm
     env = FrankaEnv(
         config,

@@ -37,6 +37,11 @@ def check(run: RunSettings) -> None:
             f"collector.planner_worlds={run.collector.planner_worlds}: must be a whole number of at most "
             f"collector.num_envs={run.collector.num_envs}; 0 leaves all worlds to the policy"
         )
+    if run.collector.parallel and not isinstance(run.env.config, ExternalConfig):
+        raise UserError(
+            "collector.parallel=true: is for env=gym and env=dm_control, a process for each world; leave it out, since "
+            "the arm's worlds are one simulator"
+        )
     if run.is_offline:
         _check_dataset(run)
     elif run.env.kind == "none":

@@ -22,7 +22,7 @@ from tensordict import TensorDictBase
 from torchrl.record.loggers import Logger
 
 from franka_wm import processes
-from franka_wm.console import announced, log_to, named_plugins, program, say
+from franka_wm.console import announced, log_to, resuming, say
 from franka_wm.data.lerobot.export import export_run
 from franka_wm.data.lerobot.windows import RecordedWindows
 from franka_wm.data.replay import WindowReplay
@@ -121,7 +121,7 @@ def left_by(folder: Path, cfg: DictConfig) -> str | None:
     if other is not None:
         raise UserError(
             f"{folder} holds a run of other settings: {other} is {there.get(other)} there and {here.get(other)} here; "
-            "choose another folder with hydra.sweep.dir=…"
+            "choose another folder with hydra.run.dir=…, or that of a sweep with hydra.sweep.dir=…"
         )
     return "finished" if (folder / FINISHED).is_file() else "begun"
 
@@ -164,7 +164,8 @@ class Run:
         with announced(f"building {worlds}" + (f"; {compiling}" if self.settings.is_arm else "")):
             eval_env = build.make_evaluation_env(self.settings) if processes.is_first() else None
             own = processes.rank() * self.settings.collector.num_envs
-            env = build.make_env(self.settings, first_world=own) if gathers else None
+            parallel = self.settings.collector.parallel
+            env = build.make_env(self.settings, first_world=own, parallel=parallel) if gathers else None
             apart = () if self.settings.env.kind in ("franka", "multitask") else processes.parts()
             for one in (env, eval_env):
                 if one is not None:
@@ -217,9 +218,8 @@ class Run:
     def stop(self) -> NoReturn:
         """The last line of a run that was interrupted and has saved; exits with 130."""
         close_loggers(self.loggers)
-        own = named_plugins(self.settings.values)
-        line = f"stopped; go on with: {program()} train resume={self.folder}{own}"
-        if processes.is_first():
+        line = f"stopped; go on with: {resuming(self.folder, self.settings.values)}"
+        if processes.is_first() and processes.count() > 1:
             (self.folder / STOPPED).write_text(f"{line}\n")
         say(line)
         with suppress(UserError):  # nobody leaves before the mark is there: torchrun would end who writes it
@@ -256,7 +256,8 @@ def start(cfg: DictConfig) -> Run:
     import_plugins(cfg.plugins)  # those of the command line: what a checkpoint names is never imported
     if cfg.resume is not None:
         typed = list(told.overrides.task)
-        again = not any(one.startswith("resume=") for one in typed)  # a job that found its own beginning
+        # A job that found its own beginning in its folder goes on with the options of then.
+        again = cfg.resume == str(folder) and not any(one.lstrip("+").startswith("resume=") for one in typed)
         checkpoint, cfg = resumed(cfg, [] if again else typed)
         _require_same(checkpoint)
     settings = RunSettings.of(cfg, saved=checkpoint is not None)
@@ -314,9 +315,10 @@ def _require_same(checkpoint: Checkpoint) -> None:
     found = processes.objects(checkpoint.counters)
     other = next((rank for rank, one in enumerate(found) if one != found[0]), None)
     if other is not None:
+        updates = [one.get("updates") for one in (found[other], found[0])]
         raise UserError(
-            f"rank {other} sees another checkpoint in {checkpoint.folder} than rank 0 ({found[other]['updates']} and "
-            f"{found[0]['updates']} updates): start again in a minute"
+            f"rank {other} sees another checkpoint in {checkpoint.folder} than rank 0 ({updates[0]} and {updates[1]} "
+            "updates): start again in a minute"
         )
 
 

@@ -97,3 +97,33 @@ def test_episodes_end_and_begin_on_the_gpu_as_on_the_cpu() -> None:
             assert step["next", "state"].device.type == tensordict["state"].device.type == device
         rollouts.append(torch.stack(rows))
     torch.testing.assert_close(*rollouts)
+
+
+def test_processes_of_their_own_play_the_same_and_end() -> None:
+    """Episodes are drawn and end as in one process after the other."""
+    import multiprocessing
+
+    config = ExternalConfig(kind="gym", name="Pendulum-v1", episode_length=4)
+    rollouts = []
+    for parallel in (False, True):
+        env = ExternalEnv(config, num_envs=2, seed=3, parallel=parallel)
+        assert len(multiprocessing.active_children()) == (2 if parallel else 0)
+        actions = torch.linspace(-1, 1, 20).reshape(2, 10, 1)
+        carry, steps = env.reset(), []
+        for k in range(10):
+            step, carry = env.step_and_maybe_reset(carry.set("action", actions[:, k]))
+            steps.append(step)
+        rollouts.append((torch.stack(steps).to_tensordict(), env.statistics()))
+        env.close()
+    (one, told), (other, said) = rollouts
+    assert told == said and told["episodes"] == 4
+    for key in (
+        "state",
+        "is_init",
+        ("next", "state"),
+        ("next", "reward"),
+        ("next", "done"),
+        ("next", "step_count"),
+    ):
+        assert torch.equal(one[key], other[key]), key
+    assert not multiprocessing.active_children()

@@ -16,7 +16,7 @@ import pytest
 import torch
 from tensordict import TensorDict
 
-from franka_wm.commands.overrides import quoted
+from franka_wm.console import quoted, resuming
 from franka_wm.envs import FrankaConfig, FrankaEnv
 from franka_wm.evaluation.protocol import evaluate_agent
 from franka_wm.training.checkpoint import Checkpoint, latest_checkpoint, load_checkpoint
@@ -235,7 +235,7 @@ def test_torchrun_does_not_begin_a_stopped_job_again(tmp_path) -> None:
     saved(folder, job)
     os.kill(workers(folder)[1], signal.SIGTERM)
     said = finished(job, folder, status=1)
-    line = f"stopped; go on with: franka-wm train resume={folder}"
+    line = f"stopped; go on with: {resuming(folder, {})}"
     assert said.count(line) == 2  # when it stops, and when it is started anew
     assert re.search(rf"error: (process 1: )?{line}", said)
     assert (folder / "stopped.txt").read_text() == f"{line}\n"

@@ -17,7 +17,8 @@ from torch.distributed.elastic.multiprocessing.api import SubprocessContext
 
 from franka_wm import processes
 from franka_wm.commands import several
-from franka_wm.commands.overrides import compose, given, quoted
+from franka_wm.commands.overrides import compose, given
+from franka_wm.console import quoted
 from franka_wm.errors import UserError
 from franka_wm.training import run
 
@@ -88,8 +89,8 @@ def test_a_host_without_a_gpu_says_so_and_all_end(port) -> None:
 def test_who_has_met_is_waited_for_longer(port) -> None:
     found = together(
         port,
-        "processes.MEETING = timedelta(seconds=3)\nprocesses.join(cuda=False)\n"
-        "time.sleep(6 * processes.rank())\nprocesses.wait()\nprocesses.leave(7)\n",
+        "processes.MEETING = timedelta(seconds=10)\nprocesses.join(cuda=False)\n"
+        "time.sleep(15 * processes.rank())\nprocesses.wait()\nprocesses.leave(7)\n",
     )
     assert [status for status, _ in found] == [7, 7], found
 
@@ -110,18 +111,19 @@ def saved(tmp_path) -> Path:
     latest = tmp_path / "own" / "checkpoints" / "latest"
     latest.mkdir(parents=True)
     (latest / "manifest.json").write_text("{}")
+    (tmp_path / "own" / "config.yaml").write_text(f"resume: {tmp_path}/first\n")
     return tmp_path / "own"
 
 
-def test_what_was_asked_to_stop_is_not_begun_again(monkeypatch, saved) -> None:
+def test_what_was_asked_to_stop_is_not_begun_again(monkeypatch, saved, tmp_path) -> None:
     (saved / run.STOPPED).write_text(f"stopped; go on with: franka-wm train resume={saved}\n")
     monkeypatch.setattr(processes, "begun_again", lambda: True)
     with pytest.raises(UserError, match=f"go on with: franka-wm train resume={saved}"):
         several.go_on(config(), saved)
     monkeypatch.setattr(processes, "begun_again", lambda: False)  # requeued: SLURM had asked it
-    cfg = config("elsewhere")
+    cfg = config(str(tmp_path / "first"))
     several.go_on(cfg, saved)
-    assert cfg.resume == str(saved)
+    assert cfg.resume == str(saved) and not (saved / run.STOPPED).exists()
 
 
 def test_a_resumed_job_goes_on_from_its_own_folder_if_it_has_saved(saved, tmp_path) -> None:
@@ -130,6 +132,9 @@ def test_a_resumed_job_goes_on_from_its_own_folder_if_it_has_saved(saved, tmp_pa
     assert cfg.resume == str(tmp_path / "first")
     several.go_on(cfg, saved)
     assert cfg.resume == str(saved)
+    cfg = config("another")  # whose folder that is not
+    several.go_on(cfg, saved)
+    assert cfg.resume == "another"
 
 
 def test_the_first_process_decides_whether_a_job_goes_on(monkeypatch, second, tmp_path) -> None:

@@ -145,9 +145,9 @@ def test_the_page_of_a_resumed_run_with_plugins_says_commands_that_work(make_run
     text = read(run).text
     assert "franka-wm train resume=/before 'plugins=[mine]'" in text
     for words in (
-        f"franka-wm evaluate {run} robustness=true plugins=[mine]",
-        f"franka-wm view checkpoint={run} plugins=[mine]",
-        f"franka-wm train resume={run} plugins=[mine]",
+        f"franka-wm evaluate {run} robustness=true 'plugins=[mine]'",
+        f"franka-wm view checkpoint={run} 'plugins=[mine]'",
+        f"franka-wm train resume={run} 'plugins=[mine]'",
     ):
         assert words in text, text[-900:]
 

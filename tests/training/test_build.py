@@ -416,6 +416,8 @@ def test_the_models_policy_explores_and_others_act_as_they_are(settled) -> None:
         "collector.noise=some",
         "collector.planner_worlds=100000",
         "collector.planner_worlds=1.5",
+        "collector.parallel=true",
+        "collector.parallel=2",
         "replay.hindsight=2",
     ],
 )
