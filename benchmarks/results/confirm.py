@@ -36,13 +36,23 @@ SIZES = (
     "replay.capacity",
     "replay.batch_size",
 )
+SHORT_DEMOS = "replay.demo_updates=10"
+"""Of a row that begins with demonstrations alone; a smoke run makes 30 updates in all."""
 SHORT = ("scale=smoke", "device=cpu", "seed=3", "logger=none", "evaluation.video_episodes=0")
 
 
 def short(row: Row) -> list[str]:
     """The arguments of the row's command with a smoke run's sizes."""
-    sized = (*SIZES, "collector.num_envs", "collector.seed_steps", "evaluation.episodes")
-    return [word for word in row.words if word.split("=", 1)[0] not in sized] + list(SHORT)
+    sized = (
+        *SIZES,
+        "collector.num_envs",
+        "collector.seed_steps",
+        "evaluation.episodes",
+        "replay.demo_updates",
+    )
+    kept = [word for word in row.words if word.split("=", 1)[0] not in sized]
+    shown = [SHORT_DEMOS] if any(word.startswith("replay.demo_updates=") for word in row.words) else []
+    return [*kept, *SHORT, *shown]
 
 
 def confirm(row: Row, place: Path = PLACE) -> Path:

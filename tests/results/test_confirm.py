@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -60,6 +61,9 @@ def test_a_short_run_has_the_rows_task_and_a_smoke_runs_sizes() -> None:
     words = confirm.short(row)
     assert words[:2] == ["env=reach", "env.cameras=[front,side]"] and "scale=smoke" in words
     assert not {"scale=laptop", "trainer.updates=9", "evaluation.episodes=128"} & set(words)
+    shown = replace(row, arguments="env=push replay.demos=set replay.demo_updates=2000 trainer.updates=4000")
+    assert "replay.demo_updates=2000" not in (words := confirm.short(shown))
+    assert confirm.SHORT_DEMOS in words and "replay.demos=set" in words
 
 
 def test_equal_runs_are_written_down_and_hold(measured: Path, monkeypatch: pytest.MonkeyPatch) -> None:
