@@ -101,6 +101,8 @@ class RunFolder:
                 refused = error
             if out.is_file() and (SECRET in (text := out.read_text()) or "root:x:0" in text):
                 raise AcceptedError("something of this machine in the page", "leak")
+        if refused is None and (damage := self.read(str(run)).damage):
+            refused = UserError(damage)  # which the page says
         if refused is not None:
             raise refused
 
