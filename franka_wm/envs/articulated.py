@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import itertools
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 from franka_wm.envs.solids import REACH, Box, Solid
@@ -26,7 +27,74 @@ INSIDE = 0.03
 
 
 @dataclass(frozen=True, kw_only=True)
-class Articulated(Solid):
+class Standing(Solid):
+    """A case that stands on the table where each episode draws anew, and has something that opens.
+
+    Attributes:
+        at: Middle of where the case stands, (x, y) [m].
+        angle: Its angle around the vertical axis [rad].
+        spread: Half-width of the uniform draw around ``at`` in x and y [m].
+        turn: Half-width of the draw around ``angle`` [rad].
+        case_color: Colour of the case.
+    """
+
+    at: tuple[float, float] = (0.72, 0.0)
+    angle: float = 0.0
+    spread: tuple[float, float] = (0.0, 0.0)
+    turn: float = 0.0
+    case_color: tuple[float, float, float] = (0.36, 0.40, 0.46)
+
+    def _check_stance(self) -> None:
+        for name, count, what in (
+            ("at", 2, "x, y in metres"),
+            ("spread", 2, "half-widths in x and y, in metres"),
+            ("case_color", 3, "red, green, blue"),
+        ):
+            self._numbers(name, count, what)
+        self._real("angle", -math.pi, math.pi, f"{-math.pi:g} to {math.pi:g} (rad)")
+        self._real("turn", 0.0, math.pi, f"0 to {math.pi:g} (rad)")
+        if not all(s >= 0 for s in self.spread):
+            raise UserError(f"{self._where}.spread={list(self.spread)}: must be at least 0")
+        if not all(0 <= c <= 1 for c in self.case_color):
+            raise UserError(
+                f"{self._where}.case_color={list(self.case_color)}: red, green and blue must be from 0 to 1"
+            )
+
+    @property
+    def footprint(self) -> tuple[float, float, float, float]:
+        """What it takes of the table, opened at any width, in the case's frame: centre x, y, half sides [m]."""
+        raise NotImplementedError
+
+    def places(self) -> list[tuple[float, float, float]]:
+        """Middle and corners of where the case may stand: x, y [m], angle [rad]."""
+        return [
+            (self.at[0] + i * self.spread[0], self.at[1] + j * self.spread[1], self.angle + k * self.turn)
+            for i, j, k in itertools.product((-1, 0, 1), repeat=3)
+        ]
+
+    def corners(self, x: float, y: float, angle: float) -> list[tuple[float, float]]:
+        """Corners of the case where it stands so [m]."""
+        cos, sin = math.cos(angle), math.sin(angle)
+        a, b = 0.5 * self.size[0], 0.5 * self.size[1]
+        return [
+            (x + cos * u - sin * v, y + sin * u + cos * v) for u, v in ((a, b), (a, -b), (-a, b), (-a, -b))
+        ]
+
+    def _check_reach(self, grips: Mapping[str, tuple[float, float, float]]) -> None:
+        """Refuses a handle that the arm cannot reach where it is closed or open."""
+        for opened, (gx, gy, _) in grips.items():
+            for x, y, angle in self.places():
+                cos, sin = math.cos(angle), math.sin(angle)
+                away = math.hypot(x + cos * gx - sin * gy, y + sin * gx + cos * gy)
+                if not REACH[0] <= away <= REACH[1]:
+                    raise UserError(
+                        f"{self._where}: its handle may be {away:.2f} m from the base where it is {opened}; the arm "
+                        f"reaches {REACH[0]} to {REACH[1]} m on the table: change at, spread, turn or travel"
+                    )
+
+
+@dataclass(frozen=True, kw_only=True)
+class Articulated(Standing):
     """A case that stands on the table, and a drawer or a door in it. Each episode draws anew where the case stands.
 
     The handle is an upright bar on two posts. What is observed as the body's place is the bar's middle.
@@ -54,12 +122,7 @@ class Articulated(Solid):
     mass: float = 1.0
     joint_friction: float = 1.0
     joint_damping: float = 2.0
-    at: tuple[float, float] = (0.72, 0.0)
-    angle: float = 0.0
-    spread: tuple[float, float] = (0.0, 0.0)
-    turn: float = 0.0
     color: tuple[float, float, float] = (0.72, 0.45, 0.20)
-    case_color: tuple[float, float, float] = (0.36, 0.40, 0.46)
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -70,27 +133,14 @@ class Articulated(Solid):
             )
         if self.kind not in KINDS:
             raise UserError(f"{where}.kind={self.kind!r}: must be one of {', '.join(KINDS)}")
-        for name, count, what in (
-            ("handle", 3, "distance from the front, thickness, height of the bar, in metres"),
-            ("at", 2, "x, y in metres"),
-            ("spread", 2, "half-widths in x and y, in metres"),
-            ("case_color", 3, "red, green, blue"),
-        ):
-            self._numbers(name, count, what)
+        self._numbers("handle", 3, "distance from the front, thickness, height of the bar, in metres")
+        self._check_stance()
         for name, low, high, unit in (
             ("mass", 0.01, 50.0, "kg"),
             ("joint_friction", 0.0, 100.0, "N, or N·m of a door"),
             ("joint_damping", 0.0, 1000.0, "N·s/m, or N·m·s/rad of a door"),
-            ("angle", -math.pi, math.pi, "rad"),
-            ("turn", 0.0, math.pi, "rad"),
         ):
             self._real(name, low, high, f"{low:g} to {high:g} ({unit})")
-        if not all(s >= 0 for s in self.spread):
-            raise UserError(f"{where}.spread={list(self.spread)}: must be at least 0")
-        if not all(0 <= c <= 1 for c in self.case_color):
-            raise UserError(
-                f"{where}.case_color={list(self.case_color)}: red, green and blue must be from 0 to 1"
-            )
         if min(self.size) < 0.08:
             raise UserError(
                 f"{where}.size={list(self.size)}: must be at least 0.08 m each; boards are {WALL} m thick"
@@ -105,7 +155,11 @@ class Articulated(Solid):
         longest = self.size[0] - WALL - INSIDE if self.kind == "drawer" else math.pi
         unit = "m, so that the drawer stays in its case" if self.kind == "drawer" else "rad"
         self._real("travel", 0.01, longest, f"0.01 to {longest:.4g} {unit}")
-        self._check_reach()
+        self._check_reach({"closed": self.grip, "open": self.grip_at(self.travel)})
+
+    def _take_file(self) -> None:
+        if self.file is not None:
+            raise UserError(f"{self._where}.file={self.file!r}: a body from a file is an ArticulatedFile")
 
     # -- the joint ------------------------------------------------------------------------------------------
 
@@ -120,6 +174,11 @@ class Articulated(Solid):
         length, width, height = self.size
         aside = 0.0 if self.slides else -0.5 * width + 0.03
         return (-0.5 * length - self.handle[0], aside, 0.5 * height)
+
+    @property
+    def bar(self) -> tuple[float, float]:
+        """Thickness of the handle between the fingers [m], and the hand's angle around it [rad]."""
+        return (self.handle[1], 0.0)
 
     @property
     def hinge(self) -> tuple[float, float, float]:
@@ -207,37 +266,8 @@ class Articulated(Solid):
         center = (0.5 * (least_x + most_x), 0.5 * (least_y + most_y))
         return (*center, 0.5 * (most_x - least_x), 0.5 * (most_y - least_y))
 
-    def places(self) -> list[tuple[float, float, float]]:
-        """Middle and corners of where the case may stand: x, y [m], angle [rad]."""
-        return [
-            (self.at[0] + i * self.spread[0], self.at[1] + j * self.spread[1], self.angle + k * self.turn)
-            for i, j, k in itertools.product((-1, 0, 1), repeat=3)
-        ]
 
-    def corners(self, x: float, y: float, angle: float) -> list[tuple[float, float]]:
-        """Corners of the case where it stands so [m]."""
-        cos, sin = math.cos(angle), math.sin(angle)
-        a, b = 0.5 * self.size[0], 0.5 * self.size[1]
-        return [
-            (x + cos * u - sin * v, y + sin * u + cos * v) for u, v in ((a, b), (a, -b), (-a, b), (-a, -b))
-        ]
-
-    def _check_reach(self) -> None:
-        """Refuses a handle that the arm cannot reach where it is closed or open."""
-        for opened in (0.0, self.travel):
-            for x, y, angle in self.places():
-                gx, gy, _ = self.grip_at(opened)
-                cos, sin = math.cos(angle), math.sin(angle)
-                away = math.hypot(x + cos * gx - sin * gy, y + sin * gx + cos * gy)
-                if not REACH[0] <= away <= REACH[1]:
-                    raise UserError(
-                        f"{self._where}: its handle may be {away:.2f} m from the base where it is "
-                        f"{'open' if opened else 'closed'}; the arm reaches {REACH[0]} to {REACH[1]} m on the table: "
-                        "change at, spread, turn or travel"
-                    )
-
-
-def box_on_table(one: Articulated, x: float, y: float, angle: float) -> tuple[float, ...]:
+def box_on_table(one: Standing, x: float, y: float, angle: float) -> tuple[float, ...]:
     """Its footprint where it stands so: x, y, half sides, cosine and sine of the angle, and 0, a radius around."""
     cx, cy, half_x, half_y = one.footprint
     cos, sin = math.cos(angle), math.sin(angle)

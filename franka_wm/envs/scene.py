@@ -10,22 +10,35 @@ A scene is made of frozen, validated dataclasses, or of the same names in YAML::
         - {name: wall, shape: box, size: [0.02, 0.3, 0.1], at: [0.6, 0.0, 0.05]}
       articulated:
         - {name: drawer, kind: drawer, travel: 0.2, at: [0.72, 0.0]}
+        - {name: cabinet, file: cabinet.urdf, handle: handle, at: [0.72, 0.5]}
 """
 
 from __future__ import annotations
 
 import math
 import random
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
 from franka_wm.envs.articulated import Articulated, box_on_table
+from franka_wm.envs.articulated_file import ArticulatedFile
 from franka_wm.envs.solids import REACH, SIZES, Body, Obstacle, Solid, Table, known_fields, short
 from franka_wm.errors import UserError
 from franka_wm.options import is_real
 
-__all__ = ["FLOOR", "REACH", "SIZES", "Articulated", "Body", "Obstacle", "Scene", "Solid", "Table"]
+__all__ = [
+    "FLOOR",
+    "REACH",
+    "SIZES",
+    "Articulated",
+    "ArticulatedFile",
+    "Body",
+    "Obstacle",
+    "Scene",
+    "Solid",
+    "Table",
+]
 
 FLOOR = -0.75
 """Height of the ground, which the table stands on [m]."""
@@ -45,25 +58,25 @@ class Scene:
     Attributes:
         objects: That move freely, in the order in which they are observed.
         obstacles: That stand still.
-        articulated: Drawers and doors, observed behind the objects.
+        articulated: Drawers, doors and what opens from files, observed behind the objects.
         table: That everything stands on.
         space: Between circles around objects at the start, at least, and between them and obstacles [m].
     """
 
     objects: tuple[Body, ...] = ()
     obstacles: tuple[Obstacle, ...] = ()
-    articulated: tuple[Articulated, ...] = ()
+    articulated: tuple[Articulated | ArticulatedFile, ...] = ()
     table: Table = field(default_factory=Table)
     space: float = 0.01
 
     def __post_init__(self) -> None:
-        for name, kind in (("objects", Body), ("obstacles", Obstacle), ("articulated", Articulated)):
+        for name, make in (("objects", Body.of), ("obstacles", Obstacle.of), ("articulated", _articulated)):
             given = getattr(self, name)
             if not isinstance(given, Sequence) or isinstance(given, str):
                 raise UserError(f"scene.{name}={short(given)}: must be a list")
             if len(given) > MOST_BODIES:
                 raise UserError(f"scene.{name}: has {len(given)} bodies; the most is {MOST_BODIES}")
-            object.__setattr__(self, name, tuple(kind.of(one) for one in given))
+            object.__setattr__(self, name, tuple(make(one) for one in given))
         object.__setattr__(self, "table", Table.of(self.table))
         if not is_real(self.space) or not 0 <= self.space <= 1:
             raise UserError(f"scene.space={self.space!r}: must be from 0 to 1 m")
@@ -196,6 +209,13 @@ class Scene:
             else:
                 return body.name
         return ""
+
+
+def _articulated(values: Any) -> Articulated | ArticulatedFile:
+    """A drawer or a door, or what a file holds."""
+    if isinstance(values, ArticulatedFile) or (isinstance(values, Mapping) and "file" in values):
+        return ArticulatedFile.of(values)
+    return Articulated.of(values)
 
 
 def _distance(x: float, y: float, blocked: tuple[float, ...]) -> float:

@@ -45,13 +45,14 @@ def hold_open(
     mask: wp.array[wp.bool],
     bases: wp.array2d[wp.transformf],
     grip: wp.vec3f,
+    around: float,
     joint: int,
     travel: float,
     opening: float,
     goal_rest: wp.array2d[float],
     hand: wp.array2d[float],
 ):
-    """The first drawer all open, the hand at ``grip``, where its handle then is in the case's frame."""
+    """The first drawer all open, the hand at ``grip``, where its handle then is in the case's frame, turned by ``around``."""
     world = wp.tid()
     if not mask[world]:
         return
@@ -60,7 +61,7 @@ def hold_open(
     for i in range(3):
         hand[world, i] = place[i]
     hand[world, 3] = nearest_turn(
-        2.0 * wp.atan2(turn[2], turn[3]), wp.PI
+        2.0 * wp.atan2(turn[2], turn[3]) + around, wp.PI
     )  # a bar is the same after half a turn
     for f in range(FINGERS):
         goal_rest[world, f] = opening

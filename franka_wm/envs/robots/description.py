@@ -62,11 +62,20 @@ def read_description(path: Path) -> ET.Element:
             raise
         raise UserError(f"{path}: not a readable URDF ({error})") from error
     try:
-        _check_numbers(root)
-        _check_tree(root)
+        check_description(root)
     except UserError as error:
         raise UserError(f"{path.name}: {error}") from error
     return root
+
+
+def check_description(root: ET.Element) -> None:
+    """Refuses links and joints that are no tree, and numbers that cannot be.
+
+    Raises:
+        UserError: One line that says what is wrong.
+    """
+    _check_numbers(root)
+    _check_tree(root)
 
 
 def _check_numbers(root: ET.Element) -> None:

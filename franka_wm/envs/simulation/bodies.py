@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 import warp as wp
 
+from franka_wm.envs.articulated_file import ArticulatedFile
 from franka_wm.envs.config import FrankaConfig
 from franka_wm.envs.kernels import articulated, goals
 from franka_wm.envs.kernels import bodies as kernels
@@ -32,6 +33,7 @@ def contact_options(config: FrankaConfig) -> dict[str, object]:
     assert scene is not None
     contacts = config.max_contacts or scene.contacts(config.collisions)[1]
     meshes = any(one.shape == "mesh" for one in (*scene.objects, *scene.obstacles))
+    meshes |= any(isinstance(one, ArticulatedFile) and one.mechanism.has_meshes for one in scene.articulated)
     return {
         "enable_multiccd": meshes or None,  # one contact of a mesh and a box is too few to stand on
         "use_mujoco_contacts": True,

@@ -1,16 +1,20 @@
 # pyright: reportArgumentType=false, reportCallIssue=false
 # (Warp's annotations know neither vectors nor shapes as tuples.)
-"""What can be touched, in Newton's builder: fingers, table, objects, obstacles, drawers and doors."""
+"""What can be touched, in Newton's builder: fingers, table, objects, obstacles, drawers, doors, bodies from files."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import newton
+import numpy as np
 import warp as wp
 
 from franka_wm.envs.articulated import Articulated
-from franka_wm.envs.mesh_solids import MOST_CORNERS
+from franka_wm.envs.articulated_file import ArticulatedFile
+from franka_wm.envs.mechanisms import Mechanism, Part, Point
+from franka_wm.envs.mesh_solids import MOST_CORNERS, Surface
 from franka_wm.envs.robots import Robot
 from franka_wm.envs.robots.gripper import add_colliders
 from franka_wm.envs.robots.links import add_link_colliders
@@ -45,7 +49,7 @@ def add_scene(builder: newton.ModelBuilder, scene: Scene, tool_body: int, cell: 
         body = builder.add_body(xform=at, label=one.name)
         _add_shape(builder, body, one, density=one.mass / one.volume, at=wp.transform_identity(), cell=cell)
     for one in scene.articulated:
-        for shape in _add_articulated(builder, one, scene.top):
+        for shape in _add_articulated(builder, one, scene.top, cell):
             for other in still:  # it slides or turns free of what it stands on and among
                 builder.add_shape_collision_filter_pair(shape, other)
 
@@ -67,9 +71,9 @@ def _add_shape(
     if solid.shape == "socket":
         return _add_boxes(builder, body, solid, solid.boards, at=at, density=density, color=solid.color)
     if solid.shape == "mesh":
-        _draw(builder, solid, cell, body=body, **more)
-        config.is_visible = False
         surface = solid.surface
+        _draw(builder, surface, cell, body=body, **more)
+        config.is_visible = False
         # MuJoCo takes its convex hull, Newton the surface for mass, centre and inertia.
         mesh = newton.Mesh(surface.vertices, surface.faces.flatten(), maxhullvert=MOST_CORNERS)
         shape = builder.add_shape_mesh(body, mesh=mesh, **more)
@@ -86,14 +90,17 @@ def _add_shape(
     return [shape]
 
 
-def _draw(builder: newton.ModelBuilder, solid: Solid, cell: float, **more: Any) -> None:
+def _draw(builder: newton.ModelBuilder, surface: Surface, cell: float, **more: Any) -> None:
     """What is seen of a mesh: no detail smaller than ``cell`` [m], nor a tenth of its middle side."""
-    piece = simplify(Piece(*solid.surface.flat(), None), min(cell, 0.1 * sorted(solid.size)[1]))
+    piece = simplify(Piece(*surface.flat(), None), min(cell, 0.1 * sorted(surface.size)[1]))
     mesh = newton.Mesh(piece.vertices, piece.faces.flatten(), normals=piece.normals, compute_inertia=False)
-    unfelt = newton.ModelBuilder.ShapeConfig(
+    builder.add_shape_mesh(mesh=mesh, **(more | {"cfg": _unfelt()}))
+
+
+def _unfelt() -> newton.ModelBuilder.ShapeConfig:
+    return newton.ModelBuilder.ShapeConfig(
         density=0.0, has_shape_collision=False, has_particle_collision=False
     )
-    builder.add_shape_mesh(mesh=mesh, **(more | {"cfg": unfelt}))
 
 
 def _add_boxes(
@@ -121,8 +128,53 @@ def _add_boxes(
     return shapes
 
 
-def _add_articulated(builder: newton.ModelBuilder, one: Articulated, top: float) -> list[int]:
-    """A case that is fixed to the world, where each episode says, and what moves in it. Returns all shapes."""
+def _add_parts(
+    builder: newton.ModelBuilder,
+    body: int,
+    one: ArticulatedFile,
+    parts: Sequence[Part],
+    *,
+    origin: Point,
+    color: Point,
+    cell: float,
+) -> list[int]:
+    """Geometry of a file on one body, whose frame is at ``origin`` of the case's. Returns what is touched."""
+    shapes = []
+    for part in parts:
+        turn = wp.quat_from_matrix(wp.mat33(*part.rotation.flatten().tolist()))
+        at = wp.transform(wp.vec3(*(p - o for p, o in zip(part.place, origin, strict=True))), turn)
+        more: dict[str, Any] = {"xform": at, "color": part.color or color, "label": one.name}
+        if part.surface is not None and part.seen:
+            _draw(builder, part.surface, cell, body=body, **more)
+        config = newton.ModelBuilder.ShapeConfig(
+            density=0.0, mu=one.friction, gap=0.0, has_particle_collision=False,
+            is_visible=part.seen and part.surface is None,
+        )  # fmt: skip
+        more["cfg"] = config if part.touched else _unfelt()
+        if part.hull is not None:
+            hull = newton.Mesh(part.hull.vertices, part.hull.faces.flatten(), maxhullvert=MOST_CORNERS)
+            shape = builder.add_shape_mesh(body, mesh=hull, **more)
+        elif part.surface is not None:
+            continue
+        elif part.shape == "box":
+            hx, hy, hz = part.size
+            shape = builder.add_shape_box(body, hx=hx, hy=hy, hz=hz, **more)
+        elif part.shape == "sphere":
+            shape = builder.add_shape_sphere(body, radius=part.size[0], **more)
+        elif part.shape == "cylinder":
+            shape = builder.add_shape_cylinder(body, radius=part.size[0], half_height=part.size[1], **more)
+        else:
+            shape = builder.add_shape_capsule(body, radius=part.size[0], half_height=part.size[1], **more)
+        if part.touched:
+            _harden(builder, shape)
+            shapes.append(shape)
+    return shapes
+
+
+def _add_articulated(
+    builder: newton.ModelBuilder, one: Articulated | ArticulatedFile, top: float, cell: float
+) -> list[int]:
+    """A case that is fixed to the world, where each episode says, and what moves in it. Returns what is touched."""
 
     def shift(point: tuple[float, ...]) -> wp.transform:
         return wp.transform(wp.vec3(*point), wp.quat_identity())
@@ -130,9 +182,18 @@ def _add_articulated(builder: newton.ModelBuilder, one: Articulated, top: float)
     base = wp.transform(wp.vec3(*one.at, top), wp.quat_from_axis_angle(wp.vec3(0.0, 0.0, 1.0), one.angle))
     case = builder.add_link(xform=base, label=f"{one.name}_case")
     moving = builder.add_link(xform=base * shift(one.grip), label=one.name)
-    shapes = _add_boxes(builder, case, one, one.case, density=0.0, color=one.case_color)
-    density = one.mass / one.moving_volume
-    shapes += _add_boxes(builder, moving, one, one.moving, density=density, color=one.color)
+    if isinstance(one, ArticulatedFile):
+        m = one.mechanism
+        nowhere = (0.0, 0.0, 0.0)
+        shapes = _add_parts(builder, case, one, m.case, origin=nowhere, color=one.case_color, cell=cell)
+        shapes += _add_parts(builder, moving, one, m.moving, origin=one.grip, color=one.color, cell=cell)
+        _weigh(builder, moving, m, one.grip)
+        friction, damping, armature = m.friction, m.damping, m.armature
+    else:
+        shapes = _add_boxes(builder, case, one, one.case, density=0.0, color=one.case_color)
+        density = one.mass / one.moving_volume
+        shapes += _add_boxes(builder, moving, one, one.moving, density=density, color=one.color)
+        friction, damping, armature = one.joint_friction, one.joint_damping, 0.0
     fixed = builder.add_joint_fixed(-1, case, parent_xform=base, label=f"{one.name}_base")
     add = builder.add_joint_prismatic if one.slides else builder.add_joint_revolute
     from_grip = tuple(h - g for h, g in zip(one.hinge, one.grip, strict=True))
@@ -144,15 +205,23 @@ def _add_articulated(builder: newton.ModelBuilder, one: Articulated, top: float)
         axis=wp.vec3(*one.axis),
         limit_lower=0.0,
         limit_upper=one.travel,
-        friction=one.joint_friction,
-        damping=one.joint_damping,
-        armature=0.0,
+        friction=friction,
+        damping=damping,
+        armature=armature,
         label=f"{one.name}_joint",
     )
     builder.add_articulation([fixed, joint], label=one.name)
     dof = builder.joint_qd_start[joint]
     _set(builder, dof, {"mujoco:solreflimit": wp.vec2(*SOLREF), "mujoco:solreflimit_mode": 1})
     return shapes
+
+
+def _weigh(builder: newton.ModelBuilder, body: int, m: Mechanism, origin: Point) -> None:
+    """Mass, centre of mass and inertia of what moves, whose frame is at ``origin`` of the case's."""
+    builder.body_mass[body], builder.body_inv_mass[body] = m.mass, 1.0 / m.mass
+    builder.body_com[body] = wp.vec3(*(c - o for c, o in zip(m.center, origin, strict=True)))
+    builder.body_inertia[body] = wp.mat33(*m.inertia.flatten().tolist())
+    builder.body_inv_inertia[body] = wp.mat33(*np.linalg.inv(m.inertia).flatten().tolist())
 
 
 def _harden(builder: newton.ModelBuilder, shape: int) -> None:

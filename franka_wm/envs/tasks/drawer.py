@@ -10,7 +10,7 @@ import torch
 import warp as wp
 
 from franka_wm.envs.kernels import goals
-from franka_wm.envs.scene import Articulated, Scene, Table
+from franka_wm.envs.scene import Articulated, ArticulatedFile, Scene, Table
 from franka_wm.envs.tasks.manipulation import (
     Aim,
     GripperTask,
@@ -115,7 +115,7 @@ class Drawer(GripperTask):
             )
 
     @property
-    def drawer(self) -> Articulated:
+    def drawer(self) -> Articulated | ArticulatedFile:
         """The scene's first."""
         assert self.config.resolved_scene is not None
         return self.config.resolved_scene.articulated[0]
@@ -128,7 +128,8 @@ class Drawer(GripperTask):
         """The drawer all open, its handle in the hand."""
         w, drawer = sim.warp, self.drawer
         grip, joint = wp.vec3f(*drawer.grip_at(drawer.travel)), 2 + 7 * self.config.num_objects
-        inputs = [mask, w.bases, grip, joint, drawer.travel, 0.5 * drawer.handle[1], w.goal_rest, w.goal_hand]
+        thick, turn = drawer.bar
+        inputs = [mask, w.bases, grip, turn, joint, drawer.travel, 0.5 * thick, w.goal_rest, w.goal_hand]
         wp.launch(goals.hold_open, sim.num_envs, inputs, device=sim.device)
         assert sim.bodies is not None
         sim.bodies.launch_upright(mask)
@@ -146,4 +147,4 @@ class Drawer(GripperTask):
     def expert(self, sight: Sight) -> Aim:
         """Grasp the handle from above and pull it to where it is when the drawer is open."""
         handle = self.config.num_objects
-        return fetch(sight, handle, moved(sight.goal), step=math.pi)[0]
+        return fetch(sight, handle, moved(sight.goal), step=math.pi, turn=self.drawer.bar[1])[0]

@@ -343,6 +343,7 @@ def fetch(
     above: float = 0.08,
     grip: float = 0.0,
     step: float = 0.5 * math.pi,
+    turn: float = 0.0,
 ) -> tuple[Aim, torch.Tensor]:
     """Grasps an object from above and brings it to ``to``; begins anew where it was lost. It remembers nothing.
 
@@ -355,6 +356,7 @@ def fetch(
         above: Height over the object in which the hand gets into place [m].
         grip: Where to grasp it: so far over its centre [m].
         step: By which turns of the hand the object can be grasped [rad].
+        turn: Angle of the hand that grasps it, from the object's [rad].
 
     Returns:
         Where the hand shall be, and (N,) bool: the object is held.
@@ -363,7 +365,7 @@ def fetch(
     missing = to - place
     if grip:
         place = moved(place, z=grip)
-    yaw = quarter_turn(angle, sight.yaw, step=step)
+    yaw = quarter_turn(angle + turn, sight.yaw, step=step)
     away = place - sight.tool
     aside, below = away[..., :2].norm(dim=-1), away[..., 2].abs()
     closing = sight.command < 0.9 * MOST_OPEN
