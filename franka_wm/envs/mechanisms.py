@@ -339,7 +339,6 @@ def _compile(source: Source) -> mujoco.MjModel:
         spec = mujoco.MjSpec.from_string(source.xml, assets=source.meshes)
         for mesh in spec.meshes:
             mesh.inertia = mujoco.mjtMeshInertia.mjMESH_INERTIA_CONVEX
-            mesh.needhull = 1
         return spec.compile()
     except Exception as error:  # MuJoCo's reader and compiler fail in ways of their own
         reason = " ".join(str(error).split()) or type(error).__name__
@@ -365,11 +364,12 @@ def _surface(vertices: np.ndarray, faces: np.ndarray) -> Surface:
 
 def _hull(m: mujoco.MjModel, number: int, vertices: np.ndarray) -> Surface:
     """A mesh's convex hull as MuJoCo keeps it: counts, then first edges, numbers of vertices, edges, faces."""
+    if m.mesh_graphadr[number] < 0:
+        raise UserError(f"mesh {m.mesh(number).name!r} has no convex hull")
     graph = m.mesh_graph[m.mesh_graphadr[number] :]
     points, faces = int(graph[0]), int(graph[1])
-    used = graph[2 + points : 2 + 2 * points]
     begin = 2 + 3 * points + 3 * faces
-    corners = np.searchsorted(used, graph[begin : begin + 3 * faces])
+    used, corners = np.unique(graph[begin : begin + 3 * faces], return_inverse=True)
     return _surface(vertices[used], corners.reshape(-1, 3))
 
 
