@@ -15,11 +15,19 @@ import pytest
 from forks import spare
 from rooms.campaign import short_run
 
-NUMBER = {"config": 60, "urdf": 60, "scene": 60, "dataset": 40, "checkpoint": 40, "run_folder": 20}
+NUMBER = {
+    "config": 60,
+    "urdf": 60,
+    "scene": 60,
+    "mechanism": 60,
+    "dataset": 40,
+    "checkpoint": 40,
+    "run_folder": 20,
+}
 """Cases of the short run: two minutes in all on two cores."""
 
 SLOW = [pytest.param(name, marks=pytest.mark.slow) for name in ("dataset", "checkpoint", "run_folder")]
-ROOMS = ["config", "urdf", "scene", *SLOW]
+ROOMS = ["config", "urdf", "scene", "mechanism", *SLOW]
 
 
 @pytest.fixture(scope="module")

@@ -24,11 +24,12 @@ def rooms() -> dict[str, type]:
     from rooms.checkpoint import Checkpoint
     from rooms.config import Config
     from rooms.dataset import Dataset
+    from rooms.mechanism import Mechanism
     from rooms.run_folder import RunFolder
     from rooms.scene import Scenes
     from rooms.urdf import Urdf
 
-    return {one.name: one for one in (Config, Checkpoint, RunFolder, Dataset, Urdf, Scenes)}
+    return {one.name: one for one in (Config, Checkpoint, RunFolder, Dataset, Urdf, Scenes, Mechanism)}
 
 
 def outcome(room: Any, case: dict[str, Any]) -> Outcome:

@@ -35,35 +35,7 @@ class Urdf:
         self.config = FrankaConfig(observations=("state",))
         self.load = robots.load_robot
         self.load(self.config)
-        size = len(list(self.root.iter()))
-        number = st.integers(0, size - 1)
-        self.cases = st.fixed_dictionaries(
-            {
-                "mutations": st.lists(
-                    st.one_of(
-                        *[
-                            st.tuples(
-                                st.just("attribute"), number, st.integers(0, 5), st.sampled_from(ATTRIBUTES)
-                            ),
-                        ]
-                        * 4,
-                        st.tuples(st.just("drop"), number, st.just(0), st.just("")),
-                        st.tuples(st.just("double"), number, st.just(0), st.just("")),
-                        st.tuples(st.just("move"), number, number, st.just("")),
-                        st.tuples(
-                            st.just("tag"),
-                            number,
-                            st.just(0),
-                            st.sampled_from(["link", "joint", "mesh", "x", "inertial"]),
-                        ),
-                        st.tuples(st.just("empty"), number, st.just(0), st.just("")),
-                        st.tuples(st.just("cut"), st.integers(0, 30000), st.just(0), st.just("")),
-                    ).map(list),
-                    min_size=1,
-                    max_size=3,
-                )
-            }
-        )
+        self.cases = cases_of(len(list(self.root.iter())))
 
     def use(self, case: dict[str, Any], folder: Path) -> None:
         """As the environment loads it, and as a world of it is built."""
@@ -73,7 +45,7 @@ class Urdf:
         from franka_wm.envs.robots import add_robot, arm_builder
 
         file = folder / "robot.urdf"
-        file.write_text(self._damaged(case["mutations"]), encoding="utf-8")
+        file.write_text(damaged(self.root, case["mutations"]), encoding="utf-8")
         builder = arm_builder()
         robot = add_robot(builder, self.config, file)
         _finite(robot.lower, "limits")
@@ -87,37 +59,71 @@ class Urdf:
         model = builder.finalize(device="cpu")
         newton.eval_fk(model, model.joint_q, model.joint_qd, model.state())
 
-    def _damaged(self, mutations: list[Any]) -> str:
-        root, cut = copy.deepcopy(self.root), None
-        for what, first, second, text in mutations:
-            elements = list(root.iter())
-            parents = {child: parent for parent in elements for child in parent}
-            if what == "cut":
-                cut = first
-                continue
-            element = elements[first % len(elements)]
-            if what == "attribute":
-                names = sorted(element.attrib)
-                if not names:
-                    raise NotApplicable("no attribute")
-                element.set(names[second % len(names)], text)
-            elif what == "tag":
-                element.tag = text
-            elif what == "empty":
-                element.attrib.clear()
-            elif element not in parents:
-                raise NotApplicable("the root")
-            elif what == "drop":
-                parents[element].remove(element)
-            elif what == "double":
-                parents[element].append(copy.deepcopy(element))
-            else:
-                target = elements[second % len(elements)]
-                if target in element.iter():
-                    raise NotApplicable("into itself")
-                parents[element].remove(element)
-                target.append(element)
-        return ET.tostring(root, encoding="unicode")[:cut]
+
+def cases_of(size: int) -> Any:
+    """Cases of a file of so many elements."""
+    number = st.integers(0, size - 1)
+    return st.fixed_dictionaries(
+        {
+            "mutations": st.lists(
+                st.one_of(
+                    *[
+                        st.tuples(
+                            st.just("attribute"), number, st.integers(0, 5), st.sampled_from(ATTRIBUTES)
+                        ),
+                    ]
+                    * 4,
+                    st.tuples(st.just("drop"), number, st.just(0), st.just("")),
+                    st.tuples(st.just("double"), number, st.just(0), st.just("")),
+                    st.tuples(st.just("move"), number, number, st.just("")),
+                    st.tuples(
+                        st.just("tag"),
+                        number,
+                        st.just(0),
+                        st.sampled_from(["link", "joint", "mesh", "x", "inertial"]),
+                    ),
+                    st.tuples(st.just("empty"), number, st.just(0), st.just("")),
+                    st.tuples(st.just("cut"), st.integers(0, 30000), st.just(0), st.just("")),
+                ).map(list),
+                min_size=1,
+                max_size=3,
+            )
+        }
+    )
+
+
+def damaged(source: ET.Element, mutations: list[Any]) -> str:
+    """A file with so many mutations."""
+    root, cut = copy.deepcopy(source), None
+    for what, first, second, text in mutations:
+        elements = list(root.iter())
+        parents = {child: parent for parent in elements for child in parent}
+        if what == "cut":
+            cut = first
+            continue
+        element = elements[first % len(elements)]
+        if what == "attribute":
+            names = sorted(element.attrib)
+            if not names:
+                raise NotApplicable("no attribute")
+            element.set(names[second % len(names)], text)
+        elif what == "tag":
+            element.tag = text
+        elif what == "empty":
+            element.attrib.clear()
+        elif element not in parents:
+            raise NotApplicable("the root")
+        elif what == "drop":
+            parents[element].remove(element)
+        elif what == "double":
+            parents[element].append(copy.deepcopy(element))
+        else:
+            target = elements[second % len(elements)]
+            if target in element.iter():
+                raise NotApplicable("into itself")
+            parents[element].remove(element)
+            target.append(element)
+    return ET.tostring(root, encoding="unicode")[:cut]
 
 
 def _finite(array: Any, what: str) -> None:
