@@ -1,3 +1,5 @@
+# pyright: reportAttributeAccessIssue=false
+# (MuJoCo is compiled: pyright knows none of its names.)
 """Mechanisms from URDF and MJCF files: what stands still, and what one joint moves.
 
 MuJoCo's own compiler reads both formats. Before it sees a file, everything is taken out that is not links, joints and
@@ -244,7 +246,7 @@ class _Reader:
         mass = float(sum(m.body_mass[b] for b in bodies))
         if not bodies or not math.isfinite(mass):
             raise UserError(f"what joint {m.joint(self.joint).name!r} moves has no mass; give it an inertial")
-        center = sum(m.body_mass[b] * d.xipos[b] for b in bodies) / mass
+        center = sum((m.body_mass[b] * d.xipos[b] for b in bodies), np.zeros(3)) / mass
         total = np.zeros((3, 3))
         for b in bodies:
             turn, away = d.ximat[b].reshape(3, 3), d.xipos[b] - center
@@ -323,7 +325,7 @@ class _Reader:
             size=tuple(s * float(x) for x in m.geom_size[geom][:size]),
             place=point(d.geom_xpos[geom]),
             rotation=d.geom_xmat[geom].reshape(3, 3).copy(),
-            color=None if color == UNSAID else color[:3],
+            color=None if color == UNSAID else (color[0], color[1], color[2]),
             touched=touched,
             seen=seen,
             surface=surface,
