@@ -118,9 +118,15 @@ class Scene:
             collisions: What of the robot touches the scene, as in the environment's config.
         """
         objects, obstacles, joints = len(self.objects), len(self.obstacles), len(self.articulated)
+        parts = sum(len(one.hulls) for one in (*self.objects, *self.obstacles) if one.parts)
         least = 8 + 4 * objects
         enough = (
-            8 + 16 * (objects + joints) + 4 * obstacles + 2 * objects * (objects - 1) + 8 * objects * joints
+            8
+            + 16 * (objects + joints)
+            + 4 * obstacles
+            + 2 * objects * (objects - 1)
+            + 8 * objects * joints
+            + 8 * parts
         )
         if collisions == "hand":
             return least, enough

@@ -7,7 +7,9 @@ from collections.abc import Mapping, Sequence
 from dataclasses import MISSING, dataclass, fields
 from typing import Any, Self
 
-from franka_wm.envs.mesh_solids import Surface, read_surface
+import numpy as np
+
+from franka_wm.envs.mesh_solids import Surface, read_parts, read_surface
 from franka_wm.errors import UserError
 from franka_wm.options import is_real
 
@@ -50,6 +52,8 @@ class Solid:
         shape: ``box``, ``cylinder``, ``sphere``, ``capsule``, ``socket`` or ``mesh``; round ones stand upright.
         size: As :data:`SIZES` says [m]; of a mesh that of the box around it, whose middle is the solid's place.
         file: File of a mesh: a closed surface (OBJ, STL or PLY), its z up. It is drawn; its convex hull is touched.
+        parts: File of a mesh's convex parts, in place and units of ``file``: an OBJ or PLY. Each connected part
+            of it is touched as its hull. ``None``: the hull of the whole is, and what is hollow is full.
         scale: Scale of a mesh: metres per unit of the file, one number or one along each of x, y and z.
         friction: Coefficient of sliding friction; of two solids that touch, the larger one counts. The fingers' is 1.
         color: Red, green, blue, from 0 to 1.
@@ -59,6 +63,7 @@ class Solid:
     shape: str = "box"
     size: tuple[float, ...] = EDGES
     file: str | None = None
+    parts: str | None = None
     scale: float | tuple[float, float, float] = 1.0
     friction: float = 0.4
     color: tuple[float, float, float] = (0.80, 0.20, 0.18)
@@ -88,8 +93,11 @@ class Solid:
         """The size of a mesh from its file."""
         where = self._where
         if self.shape != "mesh":
-            if self.file is not None:
-                raise UserError(f"{where}.file={self.file!r}: is for shape: mesh, this is a {self.shape}")
+            for name in ("file", "parts"):
+                if getattr(self, name) is not None:
+                    raise UserError(
+                        f"{where}.{name}={short(getattr(self, name))}: is for shape: mesh, this is a {self.shape}"
+                    )
             return
         if not isinstance(self.file, str) or not self.file:
             raise UserError(f"{where}.file={self.file!r}: a mesh needs the path of an OBJ, STL or PLY file")
@@ -112,6 +120,21 @@ class Solid:
                 f"{where}: its mesh is {sides} m; it must be from 0.001 to 5 m each: change scale"
             )
         object.__setattr__(self, "size", size)
+        if self.parts is not None:
+            if not isinstance(self.parts, str) or not self.parts:
+                raise UserError(
+                    f"{where}.parts={short(self.parts)}: must be the path of an OBJ or PLY file, or null"
+                )
+            try:
+                _ = self.hulls
+            except UserError as error:
+                raise UserError(f"{where}.parts={error}") from error
+
+    @property
+    def hulls(self) -> tuple[np.ndarray, ...]:
+        """Corners (V, 3) of what is touched, each as its convex hull [m]: the parts of a mesh."""
+        assert self.parts is not None and isinstance(self.scale, tuple)  # seen to at the start
+        return read_parts(self.parts, self.scale, self.surface)
 
     @property
     def surface(self) -> Surface:

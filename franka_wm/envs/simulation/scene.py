@@ -5,11 +5,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
 import newton
 import numpy as np
 import warp as wp
+from scipy.spatial import ConvexHull
 
 from franka_wm.envs.articulated import Articulated
 from franka_wm.envs.articulated_file import ArticulatedFile
@@ -71,13 +73,9 @@ def _add_shape(
     if solid.shape == "socket":
         return _add_boxes(builder, body, solid, solid.boards, at=at, density=density, color=solid.color)
     if solid.shape == "mesh":
-        surface = solid.surface
-        _draw(builder, surface, cell, body=body, **more)
-        config.is_visible = False
-        # MuJoCo takes its convex hull, Newton the surface for mass, centre and inertia.
-        mesh = newton.Mesh(surface.vertices, surface.faces.flatten(), maxhullvert=MOST_CORNERS)
-        shape = builder.add_shape_mesh(body, mesh=mesh, **more)
-    elif solid.shape == "box":
+        _draw(builder, solid.surface, cell, body=body, **more)
+        return _add_mesh(builder, body, solid, at=at, density=density)
+    if solid.shape == "box":
         hx, hy, hz = (0.5 * s for s in size)
         shape = builder.add_shape_box(body, hx=hx, hy=hy, hz=hz, **more)
     elif solid.shape == "sphere":
@@ -88,6 +86,39 @@ def _add_shape(
         shape = builder.add_shape_capsule(body, radius=size[0], half_height=0.5 * size[1], **more)
     _harden(builder, shape)
     return [shape]
+
+
+def _add_mesh(
+    builder: newton.ModelBuilder, body: int, solid: Solid, *, at: wp.transform, density: float
+) -> list[int]:
+    """What is touched of a mesh, and what it weighs: mass, centre and inertia are those of the surface's inside.
+
+    MuJoCo takes the convex hull of each shape that is touched, so one without parts is both.
+    """
+    config = newton.ModelBuilder.ShapeConfig(
+        density=density, mu=solid.friction, gap=0.0, has_particle_collision=False, is_visible=False
+    )
+    surface = solid.surface
+    mesh = newton.Mesh(surface.vertices, surface.faces.flatten(), maxhullvert=MOST_CORNERS)
+    more: dict[str, Any] = {"xform": at, "label": solid.name}
+    if solid.parts is None:
+        shapes = [builder.add_shape_mesh(body, mesh=mesh, cfg=config, **more)]
+    else:
+        config.has_shape_collision = False
+        builder.add_shape_mesh(body, mesh=mesh, cfg=config, **more)
+        config = replace(config, density=0.0, has_shape_collision=True)
+        shapes = [
+            builder.add_shape_convex_hull(body, mesh=_hull(corners), cfg=config, **more)
+            for corners in solid.hulls
+        ]
+    for shape in shapes:
+        _harden(builder, shape)
+    return shapes
+
+
+def _hull(corners: np.ndarray) -> newton.Mesh:
+    faces = ConvexHull(corners).simplices.flatten()
+    return newton.Mesh(corners, faces, maxhullvert=MOST_CORNERS, compute_inertia=False)
 
 
 def _draw(builder: newton.ModelBuilder, surface: Surface, cell: float, **more: Any) -> None:
