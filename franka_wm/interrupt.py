@@ -9,6 +9,9 @@ from typing import Any
 
 from franka_wm.console import say
 
+INTERRUPTED = 130
+"""Exit status after Ctrl-C, as shells expect."""
+
 
 @contextmanager
 def interruptible() -> Iterator[Any]:

@@ -89,3 +89,14 @@ def test_no_file_is_long() -> None:
     lengths = {file: len(file.read_text(encoding="utf-8").splitlines()) for file in files}
     assert len(lengths) > 300
     assert not [f"{f.relative_to(ROOT)}: {n} lines" for f, n in lengths.items() if n > LONGEST]
+
+
+def test_the_exit_status_after_ctrl_c_is_written_once() -> None:
+    nodes = {module: ast.walk(ast.parse(file.read_text(encoding="utf-8"))) for module, file in FILES.items()}
+    told = {
+        name
+        for name, some in nodes.items()
+        for node in some
+        if isinstance(node, ast.Constant) and node.value == 130
+    }
+    assert told == {"franka_wm.interrupt"}

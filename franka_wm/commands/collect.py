@@ -13,6 +13,7 @@ from franka_wm.commands.overrides import compose, number
 from franka_wm.console import announced, say
 from franka_wm.data.lerobot.schema import FORMATS, schema_for
 from franka_wm.errors import UserError
+from franka_wm.interrupt import INTERRUPTED
 from franka_wm.policies.names import refuse_old_name
 
 if TYPE_CHECKING:
@@ -78,7 +79,7 @@ def collect(
     folder, complete = gather(source, out=out, episodes=episodes, format=format, **writing)
     if not complete:
         say(f"stopped; what was gathered is in {folder}; add the rest with resume=true")
-        return 130
+        return INTERRUPTED
     say(f"dataset: {folder}")
     return 0
 

@@ -23,12 +23,10 @@ from franka_wm.commands.overrides import compose, explain, given
 from franka_wm.commands.sweep import Sweep, jobs, names
 from franka_wm.console import say, terminal_log
 from franka_wm.errors import REFUSALS, FrankaError, machine_refused
+from franka_wm.interrupt import INTERRUPTED
 
 _sweep: Sweep | None = None
 """That of this process; jobs in processes of other launchers have a copy."""
-
-INTERRUPTED = 130
-"""Exit status after Ctrl-C, as shells expect."""
 
 
 def run_command(main: Callable[[], object], arguments: list[str] | None = None) -> None:

@@ -11,6 +11,7 @@ import click
 
 from franka_wm.commands.arguments import did_you_mean, verb
 from franka_wm.errors import REFUSALS, FrankaError, machine_refused
+from franka_wm.interrupt import INTERRUPTED
 from franka_wm.version import __version__
 
 VERBS = {
@@ -28,7 +29,7 @@ VERBS = {
     "bench": "franka_wm.commands.bench:bench",
 }
 
-USAGE, INTERRUPTED = 2, 130
+USAGE = 2
 
 
 class Verbs(click.Group):

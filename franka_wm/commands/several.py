@@ -19,10 +19,10 @@ from franka_wm import conf
 from franka_wm.commands.overrides import compose
 from franka_wm.console import quoted, resuming, say
 from franka_wm.errors import UserError
+from franka_wm.interrupt import INTERRUPTED
 from franka_wm.untrusted import UntrustedFolder
 from franka_wm.versions import PACKAGES, versions
 
-INTERRUPTED = 130
 SAVING = 1800
 """How long processes that were asked to stop may take to save [s]."""
 

@@ -14,6 +14,7 @@ from typing import Any
 from franka_wm.console import announced, say
 from franka_wm.envs import FrankaConfig, FrankaEnv
 from franka_wm.errors import UserError
+from franka_wm.interrupt import INTERRUPTED
 from franka_wm.live.commanded import kinematic_planner
 from franka_wm.policies.expert import ExpertPolicy
 from franka_wm.policies.scripted import IKPolicy, NoopPolicy, SmoothRandomPolicy
@@ -31,9 +32,6 @@ ARM: dict[str, Any] = {
 
 GRACE = 1.0
 """After Ctrl-C the process ends within this time [s]."""
-
-INTERRUPTED = 130
-"""Exit status after Ctrl-C, as shells expect."""
 
 ENDLESS = {"episode_length": 1_000_000, "terminate_on_success": False}
 """While somebody watches, an episode ends when they ask for another."""
@@ -179,9 +177,8 @@ def serve(stage: Stage, options: Options) -> None:
         page.close(timeout=0.3 * GRACE)
         if session.error is None:
             sys.stdout.flush()
-            os._exit(
-                INTERRUPTED
-            )  # Python would wait for threads, and take seconds to free what the simulator holds
+            # Python would wait for threads, and take seconds to free what the simulator holds.
+            os._exit(INTERRUPTED)
         hurry.cancel()
     finally:
         gc.unfreeze()

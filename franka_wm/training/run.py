@@ -29,6 +29,7 @@ from franka_wm.data.replay import WindowReplay
 from franka_wm.device import resolve_device
 from franka_wm.envs import Environment
 from franka_wm.errors import FrankaError, UserError
+from franka_wm.interrupt import INTERRUPTED
 from franka_wm.seeding import derive_seed, seeded
 from franka_wm.training import build
 from franka_wm.training.check import check
@@ -39,10 +40,6 @@ from franka_wm.training.settings import RunSettings, plain
 from franka_wm.training.spaces import Spaces
 from franka_wm.untrusted import UntrustedFolder
 from franka_wm.versions import FINISHED, write_finished, write_versions
-
-INTERRUPTED = 130
-"""Exit status after Ctrl-C, as shells expect."""
-
 
 STOPPED = "stopped.txt"
 """Says in the folder of a run that it was asked to stop; while it is there, torchrun does not begin the run again."""
