@@ -5,12 +5,13 @@ from __future__ import annotations
 import os
 import subprocess
 from dataclasses import replace
+from pathlib import Path
 
 import pytest
 
 from benchmarks.results import records, running
 from benchmarks.results.__main__ import main
-from benchmarks.results.rows import Row, Section
+from benchmarks.results.rows import Row, Section, load_rows
 from benchmarks.results.state import state
 from franka_wm.errors import UserError
 
@@ -79,6 +80,23 @@ def test_what_a_row_needs_first_is_made_once(tmp_path, monkeypatch) -> None:
     (tmp_path / "push").mkdir()
     assert running.prepare(row, tmp_path) is None and len(called) == 2
     assert running.prepare(ROW, tmp_path) is None
+
+
+def test_what_runs_beside_is_recorded_with_the_times(tmp_path, monkeypatch) -> None:
+    """`--jobs` of them at a time, no more than there are seeds, and `--beside` others."""
+    told = []
+
+    def recorded(row: Row, folder: Path, *, jobs: int) -> dict[str, object]:
+        told.append(jobs)
+        return {"row": row.name, "seed": folder.name, "code": {}}
+
+    monkeypatch.setattr(running, "_call", lambda *_: None)
+    monkeypatch.setattr(running, "record_run", recorded)
+    name = next(iter(load_rows()))
+    for words in (["--beside", "2"], []):
+        seeds = ["--seeds", "1", "--threads", "1", "--out", str(tmp_path / "out")]
+        assert main(["run", name, *words, *seeds, "--results", str(tmp_path / "place")]) == 0
+    assert told == [3, 1]
 
 
 @pytest.mark.slow

@@ -10,7 +10,6 @@ import pytest
 import torch
 from tensordict import TensorDict
 
-from franka_wm.conf import compose
 from franka_wm.errors import UserError
 from franka_wm.planning import Sum
 from franka_wm.training import build
@@ -433,18 +432,3 @@ def test_plans_stay_near_the_policy_on_the_arm_and_are_the_published_ones_elsewh
         objective = build.make_objective(cfg, build.make_model(cfg, spaces))
         assert isinstance(objective, Sum) == penalised
         assert penalised == (cfg.model.options["entropy_coef"] > 1e-4) == cfg.model.options["mode_targets"]
-
-
-def test_recorded_data_are_opened_before_worlds_are_built(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
-    """What is wrong with them is a line in seconds, not after minutes of compiling."""
-
-    def opened(*_: object) -> None:
-        raise UserError("damaged")
-
-    monkeypatch.setattr(build, "open_recorded", opened)
-    monkeypatch.setattr(build, "make_evaluation_env", lambda *_: pytest.fail("built"))
-    arguments = ("scale=smoke", "device=cpu", "dataset=lerobot", "dataset.root=there", "trainer=offline")
-    with pytest.raises(UserError, match="damaged"):
-        Run(RunSettings.of(compose(*arguments)), tmp_path).build_environments()
