@@ -217,10 +217,9 @@ def check_run(verb: str, option: str, folder: str) -> None:
     Raises:
         UserError: It is not.
     """
-    there = any(
-        Path(one).is_dir() for one in (folder, f"{folder.rstrip('/')}.old")
-    )  # see training/checkpoint.py
-    if not there and not folder.startswith("hf:"):
+    # A checkpoint has another name for a moment while a newer one takes its place: see training/checkpoint.py.
+    places = (folder, f"{folder.rstrip('/')}.old")
+    if not folder.startswith("hf:") and not any(Path(one).is_dir() for one in places):
         raise UserError(
             f"{verb}: {option}={folder}: no such folder; give that of a run, as train.py prints it last"
         )

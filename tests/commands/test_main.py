@@ -11,6 +11,8 @@ import pytest
 import franka_wm
 from franka_wm.commands import bench, entry, listing
 from franka_wm.commands import main as cli
+from franka_wm.commands.arguments import check_run
+from franka_wm.errors import UserError
 from light import Answer, answers
 
 
@@ -204,6 +206,14 @@ def test_bad_arguments_are_answered_before_anything_heavy_is_imported(
     assert done.returncode == 1 and said in done.stderr and done.stderr.count("\n") == 1, done.stderr
     assert done.stderr.startswith("error: ") and not done.loaded & HEAVY
     assert list(place.iterdir()) == []
+
+
+def test_a_run_is_there_while_its_checkpoint_is_replaced(tmp_path: Path) -> None:
+    """Killed between two renames, NAME is only there as NAME.old, which is read in its place."""
+    (tmp_path / "last.old").mkdir()
+    check_run("view", "checkpoint", f"{tmp_path}/last/")
+    with pytest.raises(UserError, match="no such folder"):
+        check_run("view", "checkpoint", str(tmp_path / "first"))
 
 
 def test_shells_complete_verbs_options_and_choices(monkeypatch: pytest.MonkeyPatch) -> None:
