@@ -80,6 +80,9 @@ COEFFICIENT = Bounds(least=0, most=1e6)
 """Weights of losses, temperatures and the like."""
 
 
+PRECISIONS = ("float32", "bfloat16")
+"""What models compute in."""
+
 LARGEST = 3e38
 """Largest finite number: what float32 holds."""
 

@@ -65,11 +65,14 @@ def _run(main: Callable[[], Any], arguments: list[str]) -> None:
     flags = [a for a in arguments if a not in asked.overrides]
     overrides = list(asked.overrides)
     elsewhere = asked.config_dir or asked.config_name or asked.config_path or asked.experimental_rerun
-    if not (elsewhere or asked.hydra_help or asked.shell_completion):
-        for one in swept(overrides) if asked.multirun else [overrides]:
-            check_overrides(one)
     only_shows = asked.help or asked.hydra_help or asked.shell_completion or asked.info
     joins = several.started_by_torchrun() and not only_shows
+    if not (elsewhere or asked.hydra_help or asked.shell_completion):
+        composed = list(swept(overrides)) if asked.multirun else [overrides]
+        for one in composed:
+            check_overrides(one)
+        for one in [] if only_shows or asked.cfg or joins else composed:
+            check_settings(one)
     if joins:
         if elsewhere or asked.multirun:
             fail("several processes learn one model of this package's configuration: leave out Hydra's flags")
@@ -183,6 +186,22 @@ def check_overrides(arguments: list[str]) -> None:
         fail(str(error))
     except OmegaConfBaseException as error:
         fail(explain(str(error)))
+
+
+def check_settings(arguments: list[str]) -> None:
+    """Reads the settings of checked overrides: a value of a wrong type or out of range is answered as early.
+
+    At any scale, since the device that decides on it is not known yet: each value's own range is that of all scales.
+    Not where plugins have names of their own, nor where the other options are those of a checkpoint.
+    """
+    from franka_wm.training.settings import RunSettings
+
+    try:
+        cfg = compose([a for a in arguments if a != "scale=auto"])
+        if not cfg.plugins and cfg.resume is None:
+            RunSettings.whole(cfg)
+    except FrankaError as error:
+        fail(str(error))
 
 
 def fail(message: str) -> NoReturn:

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 from franka_wm.commands.arguments import check_run, did_you_mean, plugins, real, verb, whole, word
 from franka_wm.errors import UserError
+from franka_wm.live.extras import import_rerun, import_viser
 from franka_wm.policies.names import POLICIES, refuse_old_name
 
 if TYPE_CHECKING:
@@ -55,14 +56,12 @@ def show(**given: Any) -> None:
         near = did_you_mean(given["policy"], POLICIES)
         raise UserError(f"view: policy={given['policy']}: must be one of {', '.join(POLICIES)}{near}")
     options = options_of(**given)
-    from franka_wm.live.page import import_viser
     from franka_wm.live.stage import build, record, serve
 
     if options.rerun is not None:
         record(options)
-        return
-    import_viser()
-    serve(build(options), options)
+    else:
+        serve(build(options), options)
 
 
 def options_of(
@@ -72,7 +71,7 @@ def options_of(
     checkpoint: str | None = None,
     **given: Any,
 ) -> Options:
-    """The words of the verb as options.
+    """The words of the verb as options; what they need is looked at before the simulator is imported.
 
     Args:
         overrides: ``env.KEY=VALUE`` …
@@ -82,7 +81,7 @@ def options_of(
         given: The other fields of the options.
 
     Raises:
-        UserError: A value that cannot be.
+        UserError: A value that cannot be, or a missing extra.
     """
     from omegaconf import OmegaConf
     from omegaconf.errors import OmegaConfBaseException
@@ -94,11 +93,14 @@ def options_of(
         changes: Any = OmegaConf.to_container(OmegaConf.from_dotlist(list(overrides)))
     except (YAMLError, OmegaConfBaseException) as error:
         raise UserError(f"view: {' '.join(overrides)}: not a value as in YAML ({error})") from error
+    fields = _named(env, checkpoint) | changes.get("env", {})
+    if rerun is None:
+        import_viser()
+    else:
+        import_rerun()
     from franka_wm.live.stage import Options
 
-    return Options(
-        rerun=rerun, checkpoint=checkpoint, env=_named(env, checkpoint) | changes.get("env", {}), **given
-    )
+    return Options(rerun=rerun, checkpoint=checkpoint, env=fields, **given)
 
 
 def _named(env: str | None, checkpoint: str | None) -> dict[str, Any]:

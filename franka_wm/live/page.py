@@ -14,6 +14,7 @@ import numpy as np
 
 from franka_wm.envs.scene import FLOOR
 from franka_wm.errors import UserError
+from franka_wm.live.extras import import_viser
 from franka_wm.live.frame import Frame
 from franka_wm.live.gate import Gate, is_number, is_point
 from franka_wm.live.objects import room, rows
@@ -42,19 +43,6 @@ LABELS = {
     "num_simulations": "simulations",
     "temperature": "temperature",
 }
-
-
-def import_viser() -> Any:
-    """The module ``viser``.
-
-    Raises:
-        UserError: It is not installed; the message names the extra.
-    """
-    try:
-        import viser
-    except ImportError as error:
-        raise UserError(f"the live page needs viser ({error}): pip install 'franka-wm[view]'") from error
-    return viser
 
 
 class Page:

@@ -8,27 +8,13 @@ from typing import Any
 
 from franka_wm.errors import UserError
 from franka_wm.files import atomic_write
+from franka_wm.live.extras import import_rerun
 from franka_wm.live.frame import Frame
 from franka_wm.live.session import Session
 from franka_wm.live.shapes import arm_shapes
 from franka_wm.report.style import BLUE, VERMILION
 
 GOAL, PATH, TRAIL = (213, 94, 0), (0, 114, 178), (150, 156, 166)
-
-
-def import_rerun() -> Any:
-    """The module ``rerun``.
-
-    Raises:
-        UserError: It is not installed; the message names the extra.
-    """
-    try:
-        import rerun
-    except ImportError as error:
-        raise UserError(
-            f"a recording for Rerun needs rerun-sdk ({error}): pip install 'franka-wm[rerun]'"
-        ) from error
-    return rerun
 
 
 def record_episode(

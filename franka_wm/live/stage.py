@@ -135,9 +135,8 @@ def untrained(options: Options, changes: Mapping[str, Any]) -> Stage:
 
 def record(options: Options) -> None:
     """Writes one episode for the Rerun viewer."""
-    from franka_wm.live.rerun_recording import import_rerun, record_episode
+    from franka_wm.live.rerun_recording import record_episode
 
-    import_rerun()  # before anything that takes time
     assert options.rerun is not None
     length = options.env.pop(
         "episode_length", None

@@ -3,14 +3,18 @@
 Every family is a `WorldModel` (`franka_wm.models.base`): `encode(observation) -> z` and `loss(batch) -> TensorDict`,
 and the optional abilities that it defines, such as `next(z, action) -> z'`, `reward(z, action)` or `policy(z)`.
 To add one, write one file here and one line in `_FAMILIES`, or call `register` with a class of your own. A family
-is imported when it is made.
+is imported when it is made, and torch with the first of them: names alone are read without it.
 """
 
+from __future__ import annotations
+
 from importlib import import_module
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from franka_wm.errors import UserError
-from franka_wm.models.base import WorldModel
+
+if TYPE_CHECKING:
+    from franka_wm.models.base import WorldModel
 
 __all__ = ["WorldModel", "available", "family", "make", "register"]
 
@@ -66,6 +70,8 @@ def register(name: str, cls: type[WorldModel], *, line: str = "") -> None:
     Raises:
         UserError: `cls` is no subclass of `WorldModel`.
     """
+    from franka_wm.models.base import WorldModel
+
     if not issubclass(cls, WorldModel):
         raise UserError(f"model {name!r}: {cls.__name__} must be a subclass of franka_wm.models.WorldModel")
     _REGISTERED[name] = (cls, line)
@@ -100,3 +106,9 @@ def make(name: str, **overrides: Any) -> WorldModel:
         ValueError: no family has this name; the message lists those that exist.
     """
     return family(name)(**overrides)
+
+
+def __getattr__(name: str) -> Any:
+    if name != "WorldModel":
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return import_module(f"{__name__}.base").WorldModel

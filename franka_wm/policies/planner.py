@@ -14,12 +14,12 @@ from tensordict.nn.probabilistic import interaction_type
 from torch import Tensor, nn
 
 from franka_wm.models.base import WorldModel
+from franka_wm.options import PRECISIONS
 from franka_wm.planning.base import Planner
 from franka_wm.planning.objectives import Objective, RewardPlusValue, Score, as_objective
 from franka_wm.policies.capture import GraphCache
 from franka_wm.policies.graph_key import graph_key
 
-PRECISIONS = ("float32", "bfloat16")
 """How a model may compute while planning."""
 
 

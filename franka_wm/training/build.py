@@ -18,10 +18,10 @@ from franka_wm.data.hindsight import Hindsight
 from franka_wm.data.lerobot.windows import RecordedWindows
 from franka_wm.data.replay import WindowReplay, make_replay
 from franka_wm.device import resolve_device
-from franka_wm.envs import Environment, FrankaEnv, TransformedFrankaEnv
+from franka_wm.envs import Environment, FrankaEnv, MultiTaskEnv, TransformedFrankaEnv
 from franka_wm.envs.discretize import DiscreteActions
-from franka_wm.envs.external import ExternalConfig, ExternalEnv
-from franka_wm.envs.multitask import MultiTaskEnv
+from franka_wm.envs.external import ExternalEnv
+from franka_wm.envs.external_config import ExternalConfig
 from franka_wm.envs.multitask_config import MultiTaskConfig
 from franka_wm.errors import UserError
 from franka_wm.planning import registry

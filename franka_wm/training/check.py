@@ -6,7 +6,8 @@ import torch
 
 from franka_wm import models
 from franka_wm.device import resolve_device
-from franka_wm.envs.external import ExternalConfig, check_external
+from franka_wm.envs.external import check_external
+from franka_wm.envs.external_config import ExternalConfig
 from franka_wm.envs.franka import check_robot
 from franka_wm.envs.multitask_config import MultiTaskConfig
 from franka_wm.errors import UserError

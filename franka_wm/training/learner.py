@@ -11,12 +11,11 @@ from torch import nn
 
 from franka_wm import processes
 from franka_wm.errors import UserError
+from franka_wm.options import PRECISIONS
+from franka_wm.training.settings.groups import SCHEDULES
 
 if TYPE_CHECKING:
     from franka_wm.models.base import WorldModel
-
-PRECISIONS = ("float32", "bfloat16")
-SCHEDULES = ("constant", "cosine")
 
 
 class Learner:

@@ -169,6 +169,7 @@ WRONG: list[tuple[list[str], str]] = [
     (["report", "RUN", "out=x"], "out=x: the page must end in .html"),
     (["compare", "A", "B"], "A is not a folder"),
     (["evaluate", "nowhere"], "checkpoint=nowhere: no such folder"),
+    (["view", "env=nope"], "env=nope: must be one of dm_control, drawer"),
     (["view", "checkpoint=nowhere"], "checkpoint=nowhere: no such folder"),
     (["export", "source=nowhere", "out=y"], "source=nowhere: no such folder"),
     (["bench", "envv"], "did you mean env?"),

@@ -403,20 +403,27 @@ TYPOS = [
     ("-m env=[", "no viable alternative at input '['"),
     ("--cfg jbo", "invalid choice: 'jbo' (choose from 'job', 'hydra', 'all')"),
     ("--fast", "unrecognized arguments: --fast"),
+    ("model=nope", "model=nope: must be one of action_world_model"),
+    ("trainer.updates=-1", "trainer.updates=-1: must be a whole number of at least 0"),
+    ("scale=auto trainer.lr=abc", "trainer.lr='abc': must be a finite number above 0"),
+    ("env=gym model.name=nope", "model.name='nope': must be one of tdmpc2"),
+    ("env=gym env.frame_skip=0", "env.frame_skip=0: must be a whole number"),
+    ("env.substeps=0", "substeps=0: must be a whole number"),
+    ("-m seed=0,1 planner.precision=half", "planner.precision='half': must be one of float32, bfloat16"),
 ]
 SCRIPT, VERB = (str(TRAIN),), ("-m", "franka_wm", "train")
 
 
 @pytest.fixture(scope="module")
 def answered(tmp_path_factory) -> tuple[Path, dict[tuple[str, ...], Answer]]:
-    """The folder of all the typing errors, and how each of them ended."""
+    """The folder of all these commands, and how each of them ended."""
     place = tmp_path_factory.mktemp("typos")
     return place, answers([(*program, *a.split()) for a, _ in TYPOS for program in (SCRIPT, VERB)], place)
 
 
 @pytest.mark.parametrize(("arguments", "said"), TYPOS)
 @pytest.mark.parametrize("program", [SCRIPT, VERB], ids=["train.py", "franka-wm train"])
-def test_a_typo_is_answered_before_torch_and_the_simulator_load(
+def test_a_typo_or_a_wrong_value_is_answered_before_torch_and_the_simulator_load(
     program: tuple[str, ...], arguments: str, said: str, answered
 ) -> None:
     place, found = answered

@@ -5,7 +5,8 @@ from __future__ import annotations
 import pytest
 import torch
 
-from franka_wm.envs.external import ExternalConfig, ExternalEnv, external_config
+from franka_wm.envs.external import ExternalEnv
+from franka_wm.envs.external_config import ExternalConfig, external_config
 from franka_wm.errors import UserError
 from franka_wm.training.spaces import Spaces
 

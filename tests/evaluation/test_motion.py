@@ -9,7 +9,8 @@ from tensordict.nn import TensorDictModule
 
 from franka_wm.envs import TransformedFrankaEnv
 from franka_wm.envs.discretize import DiscreteActions
-from franka_wm.envs.external import ExternalConfig, ExternalEnv
+from franka_wm.envs.external import ExternalEnv
+from franka_wm.envs.external_config import ExternalConfig
 from franka_wm.evaluation.closed_loop import (
     arm_of,
     decision_times,

@@ -1,6 +1,7 @@
 """The groups of a run's settings: each option declared once, with what it may be.
 
-What an option means stands beside its value in ``conf/``.
+What an option means stands beside its value in ``conf/``. All but the arm's configuration is read without torch and the
+simulator, so that what is wrong is answered before they load.
 """
 
 from __future__ import annotations
@@ -11,11 +12,12 @@ from typing import Any
 
 from franka_wm import models
 from franka_wm.envs.config import FrankaConfig
-from franka_wm.envs.external import ExternalConfig, external_config
+from franka_wm.envs.external_config import ExternalConfig, external_config
 from franka_wm.envs.multitask_config import MultiTaskConfig, multi_task_config
 from franka_wm.errors import UserError
 from franka_wm.options import (
     OF_ONES_OWN,
+    PRECISIONS,
     choice,
     flag,
     is_whole,
@@ -28,8 +30,9 @@ from franka_wm.options import (
     whole_rule,
 )
 from franka_wm.policies.names import POLICIES
-from franka_wm.policies.planner import PRECISIONS
-from franka_wm.training.learner import SCHEDULES
+
+SCHEDULES = ("constant", "cosine")
+"""How the learning rate goes on after the warm-up."""
 
 MODELS_OWN = "the model's own"
 MOST_UPDATES = 10**12

@@ -9,7 +9,6 @@ from typing import Any, Literal
 
 from omegaconf import DictConfig, OmegaConf
 
-from franka_wm import processes
 from franka_wm.console import say
 from franka_wm.envs.multitask_config import MultiTaskConfig
 from franka_wm.errors import UserError
@@ -82,7 +81,7 @@ class RunSettings:
 
     @classmethod
     def of(cls, cfg: DictConfig | Mapping[str, Any], *, saved: bool = False) -> RunSettings:
-        """Reads a configuration.
+        """Reads a configuration: what this process has of it, where several learn together.
 
         Args:
             cfg: Hydra's, or what a checkpoint holds.
@@ -90,6 +89,20 @@ class RunSettings:
 
         Raises:
             UserError: One line that names the option and what is allowed.
+        """
+        settings = cls.whole(cfg, saved=saved)
+        shared = settings._shared(settings.gpus)  # refused here, wherever the run will be
+        from franka_wm import processes  # here: it imports torch
+
+        if processes.count() == 1:
+            return settings
+        return shared if shared.device == "cpu" else replace(shared, device=str(processes.own_gpu()))
+
+    @classmethod
+    def whole(cls, cfg: DictConfig | Mapping[str, Any], *, saved: bool = False) -> RunSettings:
+        """Reads a configuration as that of all processes together; see :meth:`of`.
+
+        The environment's comes last: the arm's imports torch and the simulator.
         """
         values = plain(cfg)
         missing = [name for name in ("seed", "device", "env", "model", "planner") if name not in values]
@@ -116,22 +129,18 @@ class RunSettings:
         gpus = values.get("gpus", 1)  # earlier versions had one
         if not is_whole(gpus) or gpus < 1:
             raise UserError(f"gpus={gpus!r}: must be a whole number of at least 1")
-        settings = cls(
+        return cls(
             values=values,
             seed=values["seed"],
             device=values["device"],
             resume=values.get("resume"),
             gpus=gpus,
-            env=EnvSettings.of(values["env"]),
             model=ModelSettings.of(values["model"]),
             planner=PlannerSettings.of(values["planner"]),
             logger=LoggerSettings(tuple(names), loggers),
+            env=EnvSettings.of(values["env"]),
             **groups,
         )
-        shared = settings._shared(gpus)  # refused here, wherever the run will be
-        if processes.count() == 1:
-            return settings
-        return shared if shared.device == "cpu" else replace(shared, device=str(processes.own_gpu()))
 
     def changed(self, **changes: Any) -> RunSettings:
         """The same with other values: ``changed(seed=3, model={"encoder_from": …})``; groups are merged."""
