@@ -232,6 +232,7 @@ def check_finite(root: Path) -> None:
         UserError: One is not finite, or a file cannot be read.
     """
     import pyarrow as pa
+    import pyarrow.compute as pc
     import pyarrow.parquet as pq
 
     for path in sorted((root / "data").glob("*/*.parquet")):
@@ -244,11 +245,16 @@ def check_finite(root: Path) -> None:
                 if not pa.types.is_floating(kind):
                     continue
                 column = file.read(columns=[name])[name].combine_chunks()
+                step = np.arange(len(column))  # of each number
                 while hasattr(column.type, "value_type"):
+                    step = step[pc.list_parent_indices(column).to_numpy()]
                     column = column.flatten()
-                if not np.isfinite(column.to_numpy(zero_copy_only=False)).all():
+                wrong = step[~np.isfinite(column.to_numpy(zero_copy_only=False))]
+                if len(wrong):
+                    episode = file.read(columns=["episode_index"])["episode_index"][int(wrong[0])]
                     raise UserError(
-                        f"{path}: {name} holds a number that is not finite; delete the episode (lerobot-edit-dataset)"
+                        f"{path}: {name} holds a number that is not finite, in episode {episode}; delete the episode "
+                        "(lerobot-edit-dataset)"
                     )
         except (pa.ArrowException, OSError) as error:
             raise UserError(f"{path} cannot be read: {error}") from error

@@ -206,14 +206,16 @@ def test_a_number_that_is_not_finite_is_not_published(copy, capsys) -> None:
     (path,) = (copy / "data").glob("*/*.parquet")
     table = pq.read_table(path)
     values = table["action"].to_pylist()
-    values[3][1] = float("nan")
+    episode = table["episode_index"].to_pylist()[-1]
+    values[-1][1] = float("nan")
     at = table.schema.get_field_index("action")
     pq.write_table(
         table.set_column(at, table.schema.field(at), pa.array(values, table.schema.field(at).type)), path
     )
     assert main(["publish", f"root={copy}", "repo_id=user/arm", "--dry-run"]) == 1
     error = capsys.readouterr().err
-    assert f"{path}: action holds a number that is not finite" in error and error.count("\n") == 1
+    assert f"{path}: action holds a number that is not finite, in episode {episode};" in error
+    assert episode > 0 and error.count("\n") == 1
 
 
 @pytest.mark.parametrize(
