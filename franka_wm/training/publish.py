@@ -9,7 +9,7 @@ from pathlib import Path
 from omegaconf import OmegaConf
 
 from franka_wm.data.lerobot.card import FILM, model_card
-from franka_wm.data.lerobot.hub import check_repo_id
+from franka_wm.data.lerobot.hub import check_license, check_repo_id
 from franka_wm.data.lerobot.paths import shortened, without_paths
 from franka_wm.data.lerobot.publish import README, publish_staged
 from franka_wm.errors import UserError
@@ -37,6 +37,7 @@ def publish_model(
         UserError: One line.
     """
     check_repo_id(repo_id)
+    check_license(license)
     latest_checkpoint(Path(checkpoint))  # refused before the Hub's token is asked for
 
     def stage(place: Path) -> Path:

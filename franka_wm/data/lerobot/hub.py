@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Iterator
 from contextlib import contextmanager
+from difflib import get_close_matches
 from pathlib import Path
 
 from franka_wm.errors import UserError
@@ -19,6 +20,30 @@ def check_repo_id(repo_id: str) -> None:
     """Raises ``UserError`` unless it is ``user/name``."""
     if not _NAME.fullmatch(repo_id) or ".." in repo_id or "--" in repo_id:
         raise UserError(f"repo_id={repo_id!r}: must be user/name, of letters, digits, '-', '_' and '.'")
+
+
+_LICENSES = (
+    "apache-2.0 mit afl-3.0 artistic-2.0 bsl-1.0 isc ms-pl ncsa postgresql unlicense wtfpl zlib bsd "
+    "bsd-2-clause bsd-3-clause bsd-3-clause-clear ecl-2.0 epl-1.0 epl-2.0 etalab-2.0 eupl-1.1 eupl-1.2 "
+    "agpl-3.0 gpl gpl-2.0 gpl-3.0 lgpl lgpl-2.1 lgpl-3.0 lgpl-lr gfdl lppl-1.3c mpl-2.0 ofl-1.1 "
+    "osl-3.0 c-uda cdla-sharing-1.0 odbl odc-by cdla-permissive-1.0 cdla-permissive-2.0 pddl cc "
+    "cc0-1.0 cc-by-2.0 cc-by-2.5 cc-by-3.0 cc-by-4.0 cc-by-sa-3.0 cc-by-sa-4.0 cc-by-nc-2.0 "
+    "cc-by-nc-3.0 cc-by-nc-4.0 cc-by-nd-4.0 cc-by-nc-nd-3.0 cc-by-nc-nd-4.0 cc-by-nc-sa-2.0 "
+    "cc-by-nc-sa-3.0 cc-by-nc-sa-4.0 openrail openrail++ bigscience-openrail-m bigcode-openrail-m "
+    "creativeml-openrail-m openmdw-1.0 openmdw-1.1 unknown other"
+)
+LICENSES = tuple(_LICENSES.split())
+"""Identifiers of https://huggingface.co/docs/hub/repositories-licenses, without those of one company's models."""
+
+
+def check_license(license: str) -> None:
+    """Raises ``UserError`` unless the Hub knows the identifier."""
+    if license not in LICENSES:
+        near = get_close_matches(license.lower(), LICENSES, n=1)
+        raise UserError(
+            f"license={license}: no identifier of the Hub{f'; did you mean {near[0]}?' if near else ''}; use "
+            "apache-2.0, mit, cc-by-4.0 or another of https://huggingface.co/docs/hub/repositories-licenses, or other"
+        )
 
 
 def download(repo_id: str, *, revision: str | None = None) -> Path:

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from franka_wm.data.lerobot.card import IMAGE, dataset_card, make_image
-from franka_wm.data.lerobot.hub import check_repo_id, explained
+from franka_wm.data.lerobot.hub import check_license, check_repo_id, explained
 from franka_wm.data.lerobot.paths import without_paths
 from franka_wm.data.lerobot.provenance import read_provenance
 from franka_wm.data.lerobot.schema import PROVENANCE
@@ -44,7 +44,7 @@ def publish_dataset(
             place of a README.md that is there.
         repo_id: ``user/name``.
         private: Whether only you can see it.
-        license: License of the data.
+        license: License of the data, as the Hub names it (:data:`~franka_wm.data.lerobot.hub.LICENSES`).
         update: Allow a repository that exists; files in it that the dataset has not are removed.
         dry_run: Only say what would go, and write the card.
 
@@ -53,6 +53,7 @@ def publish_dataset(
     """
     root = Path(root).absolute()
     check_repo_id(repo_id)
+    check_license(license)
     _check_dataset(root)
     note = ""
     if (root / README).is_file():

@@ -197,6 +197,26 @@ def test_a_broken_dataset_is_one_line(text, says, copy, capsys) -> None:
     assert error.count("\n") == 1
 
 
+@pytest.mark.parametrize("what", ["root", "checkpoint"])
+def test_a_license_that_the_hub_does_not_know_is_refused(
+    what: str, copy, tmp_path, capsys, monkeypatch
+) -> None:
+    """Also by a dry run, before the card is written."""
+    from franka_wm.commands.main import main
+
+    monkeypatch.chdir(tmp_path)
+    before = sorted(tmp_path.rglob("*"))
+    given = [f"{what}={copy}", "repo_id=user/arm", "--dry-run"]
+    for license, said in (
+        ("foo", "license=foo: no identifier of the Hub; use"),
+        ("MIT", "did you mean mit?"),
+    ):
+        assert main(["publish", *given, f"license={license}"]) == 1
+        error = capsys.readouterr().err
+        assert said in error and "or other" in error and error.count("\n") == 1
+    assert sorted(tmp_path.rglob("*")) == before
+
+
 def test_a_number_that_is_not_finite_is_not_published(copy, capsys) -> None:
     import pyarrow as pa
     import pyarrow.parquet as pq
