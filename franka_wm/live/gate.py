@@ -10,11 +10,12 @@ import contextlib
 import gc
 import io
 import math
+import sys
 import threading
 import time
 from collections.abc import Callable, Mapping
 from http import HTTPStatus
-from typing import Any
+from typing import Any, TextIO
 from urllib.parse import urlsplit
 
 from franka_wm.console import say
@@ -199,6 +200,27 @@ class Gate:
         self._left += 1
         if self._left % LEFT == 0:
             gc.collect()
+
+
+class _WithoutFarewell:
+    """A stream that leaves out the line in which viser says that its server has stopped."""
+
+    def __init__(self, stream: TextIO) -> None:
+        self._stream = stream
+
+    def write(self, text: str) -> int:
+        farewell = "(viser)" in text and text.rstrip().endswith("Server stopped")
+        return len(text) if farewell else self._stream.write(text)
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._stream, name)
+
+
+def stop(server: Any) -> None:
+    """Stops a viser server without a word on the terminal, for which it has no option; errors are shown."""
+    shown: Any = _WithoutFarewell(sys.stdout)
+    with contextlib.redirect_stdout(shown):
+        server.stop()
 
 
 def foreign(headers: Any) -> str | None:

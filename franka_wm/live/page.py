@@ -16,7 +16,7 @@ from franka_wm.envs.scene import FLOOR
 from franka_wm.errors import UserError
 from franka_wm.live.extras import import_viser
 from franka_wm.live.frame import Frame
-from franka_wm.live.gate import Gate, is_number, is_point
+from franka_wm.live.gate import Gate, is_number, is_point, stop
 from franka_wm.live.objects import room, rows
 from franka_wm.live.session import FARTHEST, GOAL_NAME, SPEEDS, Session
 from franka_wm.live.shapes import arm_shapes
@@ -117,7 +117,7 @@ class Page:
             self._closed = True
             ended &= all(self._pending.acquire(timeout=timeout) for _ in range(PENDING))
         if ended:
-            self.server.stop()
+            stop(self.server)
         return ended
 
     # -- controls ----------------------------------------------------------------------------------------

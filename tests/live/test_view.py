@@ -21,6 +21,7 @@ from franka_wm.commands.view import options_of
 from franka_wm.commands.view import view as view_verb
 from franka_wm.envs import FrankaConfig
 from franka_wm.errors import UserError
+from franka_wm.live import gate
 from franka_wm.live.stage import ARM, Options, build, serve
 
 CHEAP = ["env.substeps=2", "device=cpu"]
@@ -197,6 +198,18 @@ def test_it_serves_this_machine_only_and_ends_in_time(
     assert steps[0] > 3, "it plays from the start"
     out = capsys.readouterr().out
     assert re.search(rf"^http://127\.0\.0\.1:{port}   Ctrl-C ends it$", out, re.MULTILINE)
+    assert "Server stopped" not in out
+
+
+def test_only_the_farewell_of_the_server_is_left_out(capsys: pytest.CaptureFixture[str]) -> None:
+    def say() -> None:
+        print("saved")
+        print("\x1b[1m(viser)\x1b[0m Server stopped\n", end="")
+        print("(viser) Server stopped answering")
+        print("cannot be", file=sys.stderr)
+
+    gate.stop(SimpleNamespace(stop=say))
+    assert capsys.readouterr() == ("saved\n(viser) Server stopped answering\n", "cannot be\n")
 
 
 def reachable(host: str, port: int) -> bool:
