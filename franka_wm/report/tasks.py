@@ -34,12 +34,14 @@ def tasks_table(runs: Iterable[RunFiles]) -> Table | None:
 
 
 def task_of(run: RunFiles) -> str:
-    """The preset that was typed, else the task of the configuration, with the domain of other libraries' tasks."""
+    """The task that was typed, else the preset, else the configuration's task; of other libraries with its domain."""
     env = run.config.get("env")
     env = env if isinstance(env, Mapping) else {}
     domain, task = env.get("name"), env.get("task")
     if domain:
         return f"{domain} {task}" if task else str(domain)
+    if task and any(one.lstrip("+").startswith("env.task=") for one in run.overrides):
+        return str(task)
     typed = [one.removeprefix("env=") for one in run.overrides if one.startswith("env=")]
     return typed[-1] if typed else str(task or MISSING)
 

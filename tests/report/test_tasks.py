@@ -1,10 +1,11 @@
 """Tasks by families, of several runs."""
 
+from dataclasses import replace
 from pathlib import Path
 
 from franka_wm.evaluation.results import Result
 from franka_wm.report.run import RunFiles
-from franka_wm.report.tasks import tasks_table
+from franka_wm.report.tasks import task_of, tasks_table
 
 
 def interval(mean: float) -> dict[str, float]:
@@ -51,6 +52,12 @@ def test_runs_of_one_task_and_family_share_a_cell() -> None:
         ["reach_fixed", "–", "50 % within 5 cm"],
         ["walker walk", "return 812.3", "–"],
     ]
+
+
+def test_a_task_of_ones_own_is_named_after_itself() -> None:
+    """Not after the preset whose rate and camera it has."""
+    mine = replace(run("mine", "tdmpc2", {}), overrides=["plugins=[mine]", "env=reach", "env.task=mine"])
+    assert task_of(mine) == "mine"
 
 
 def test_what_was_measured_differently_is_not_averaged() -> None:
