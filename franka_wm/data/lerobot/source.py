@@ -247,7 +247,7 @@ def check_finite(root: Path) -> None:
                 column = file.read(columns=[name])[name].combine_chunks()
                 step = np.arange(len(column))  # of each number
                 while hasattr(column.type, "value_type"):
-                    step = step[pc.list_parent_indices(column).to_numpy()]
+                    step = step[pc.call_function("list_parent_indices", [column]).to_numpy()]
                     column = column.flatten()
                 wrong = step[~np.isfinite(column.to_numpy(zero_copy_only=False))]
                 if len(wrong):
