@@ -96,9 +96,9 @@ class FrankaConfig:
         observations: Which of ``("pixels", "depth", "segmentation", "goal_pixels", "state", "joint_target",
             "objects", "contacts")`` are emitted. ``goal`` always is.
         episode_length: Control steps after which an episode is truncated.
-        goal_sampling: Goals of ``reach`` and ``track``; tasks with a gripper draw their own, and refuse ``goal``.
-            ``"fixed"`` (``goal``) or ``"reachable"`` (the tool position of a random pose, drawn per world and
-            episode).
+        goal_sampling: ``"fixed"`` (``goal``) or ``"reachable"`` (the tool position of a random pose, drawn per world
+            and episode). Tasks with a gripper draw their own goals per world and episode: they refuse ``"fixed"``,
+            ``goal`` and ``goal_noise``. ``None``: as the task does, ``"fixed"`` for ``reach`` and ``track``.
         goal_noise: For ``goal_sampling="reachable"``: half-width of the uniform noise around the home pose
             from which the goal pose is drawn [rad].
         success_distance: The task is solved where the tool is closer to the goal than this [m].
@@ -156,7 +156,7 @@ class FrankaConfig:
     finger_opening: float = 0.02
     observations: tuple[str, ...] = ("pixels", "state")
     episode_length: int = 50
-    goal_sampling: str = "fixed"
+    goal_sampling: str | None = None
     goal_noise: float = 0.8
     success_distance: float = 0.05
     terminate_on_success: bool = False
@@ -232,7 +232,8 @@ class FrankaConfig:
         from franka_wm.envs.tasks import TASKS
 
         self._check_choice("robot", tuple(SOURCES))
-        self._check_choice("goal_sampling", ("fixed", "reachable"))
+        if self.goal_sampling is not None:
+            self._check_choice("goal_sampling", ("fixed", "reachable"))
         self._check_choice("action_mode", tuple(ACTION_MODES))
         self._check_choice("task", TASKS, more=OF_ONES_OWN)
         self._check_choice("reward", self.task_class.rewards)
@@ -280,6 +281,11 @@ class FrankaConfig:
     def start_pose(self) -> tuple[float, ...]:
         """Joint angles at the start, before noise, (7,) [rad]."""
         return self.home or self.task_class.home or HOME
+
+    @property
+    def fixed_goal(self) -> bool:
+        """Whether every episode has the same goal, ``goal``."""
+        return self.goal_sampling != "reachable" and not self.task_class.draws_goals
 
     @property
     def action_dim(self) -> int:

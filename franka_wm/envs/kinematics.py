@@ -182,7 +182,7 @@ class Kinematics:
 def check_robot(config: FrankaConfig, urdf_path: str | Path | None = None) -> None:
     """Raises ``UserError`` if the robot cannot be loaded, or a fixed goal is out of its reach."""
     robot = load_robot(config, urdf_path)
-    if config.goal_sampling == "fixed" and not Kinematics(robot).reachable(config.goal):
+    if config.fixed_goal and not Kinematics(robot).reachable(config.goal):
         raise UserError(
             f"goal={config.goal} m: out of the arm's reach; it reaches about 0.85 m from (0, 0, 0.333)"
         )

@@ -387,7 +387,7 @@ def no_hindsight(run: RunSettings, env: Environment) -> str | None:
     noise = config.randomization.observation_noise or config.randomization.object_noise
     if config.reward == "normalized" or noise:
         return "rewards of another goal are exact without observation noise and with reward=dense or sparse alone"
-    if config.goal_sampling == "fixed":
+    if config.fixed_goal:
         return "there is one goal (env.goal_sampling=fixed)"
     for key in arm.simulation.task.relabel_reads:
         if key not in config.observations:

@@ -29,6 +29,7 @@ class Task:
     Attributes:
         num_draws: How many random numbers, uniform in [0, 1), each episode of each world gets in ``sim.warp.draws``
             before ``reset``. They depend on seed, world and episode alone.
+        draws_goals: Whether the task draws its goals itself; then the config's ``goal`` is not among them.
         gripper: Whether the task needs driven fingers.
         scene: What stands around the arm, where the config does not say.
         home: Joint angles at the start [rad], where the config does not say; ``None``: the arm's.
@@ -38,6 +39,7 @@ class Task:
     """
 
     num_draws = 0
+    draws_goals = False
     gripper = False
     scene: Scene | None = None
     home: tuple[float, ...] | None = None

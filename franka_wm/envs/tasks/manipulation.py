@@ -139,6 +139,7 @@ def bring_to_goal(
 class GripperTask(Task):
     """A task with a hand that starts upright over the table; rewards are in [0, 1], minus the action penalty."""
 
+    draws_goals = True
     gripper = True
     home = READY
     rewards = ("dense", "sparse")
@@ -147,10 +148,15 @@ class GripperTask(Task):
 
     @classmethod
     def check(cls, config: "FrankaConfig") -> None:
-        if config.goal != type(config).goal:
-            raise UserError(
-                f"goal={config.goal}: task={config.task} draws its own goals; leave it out (docs/tasks.md)"
-            )
+        for name, value, idle in (
+            ("goal", config.goal, config.goal == type(config).goal),
+            ("goal_sampling", config.goal_sampling, config.goal_sampling != "fixed"),
+            ("goal_noise", config.goal_noise, config.goal_noise == type(config).goal_noise),
+        ):
+            if not idle:
+                raise UserError(
+                    f"{name}={value}: task={config.task} draws its own goals; leave it out (docs/tasks.md)"
+                )
         if config.num_objects < cls.least_objects:
             raise UserError(
                 f"scene: task={config.task} is about {cls.least_objects} objects, the scene has "

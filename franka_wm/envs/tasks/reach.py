@@ -164,7 +164,7 @@ class Reach(Task):
 
     @classmethod
     def check(cls, config: "FrankaConfig") -> None:
-        if config.goal_sampling != "fixed" and config.goal != type(config).goal:
+        if config.goal_sampling == "reachable" and config.goal != type(config).goal:
             raise UserError(
                 f"goal={config.goal}: with goal_sampling={config.goal_sampling} each episode draws another; leave it "
                 "out, or give goal_sampling=fixed"
@@ -191,7 +191,7 @@ class Reach(Task):
     def choose(self, sim: "Simulation", mask: wp.array, goal: wp.array) -> None:
         """Writes the masked worlds' goals into ``goal`` (N, 3) and poses that reach them into ``goal_q``."""
         w, c, n = sim.warp, sim.chain, sim.num_envs
-        if self.config.goal_sampling == "fixed":
+        if self.config.fixed_goal:
             if self._fixed is None:
                 point = torch.tensor(self.config.goal, dtype=torch.float32)
                 pose = sim.kinematics.solve(
