@@ -9,6 +9,7 @@ from pathlib import Path
 
 ROOT = Path(__file__).parents[1]
 LONGEST = 450  # lines of a file
+LONGEST_TASK = 150  # of a task with a gripper
 PAGE = ROOT / "docs" / "architecture.md"
 FILES = {
     ".".join(file.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__"): file
@@ -100,3 +101,10 @@ def test_the_exit_status_after_ctrl_c_is_written_once() -> None:
         if isinstance(node, ast.Constant) and node.value == 130
     }
     assert told == {"franka_wm.interrupt"}
+
+
+def test_a_task_with_a_gripper_is_one_short_file() -> None:
+    texts = {f.name: f.read_text(encoding="utf-8") for f in (ROOT / "franka_wm/envs/tasks").glob("*.py")}
+    tasks = {name: text.splitlines() for name, text in texts.items() if "(GripperTask):" in text}
+    assert {"lift.py", "push.py", "pick.py", "stack.py", "drawer.py", "peg.py"} <= set(tasks)
+    assert not [f"{name}: {len(lines)} lines" for name, lines in tasks.items() if len(lines) > LONGEST_TASK]

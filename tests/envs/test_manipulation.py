@@ -356,7 +356,9 @@ def test_a_goal_that_would_be_drawn_over_is_refused() -> None:
 @pytest.mark.parametrize("task", ["lift", "push", "pick", "stack", "drawer", "peg"])
 def test_options_of_other_goals_are_refused_with_a_gripper(task: str, preset: Callable) -> None:
     for name, value in (("goal_sampling", "fixed"), ("goal_noise", 0.3)):
-        with pytest.raises(UserError, match=f"^{name}={value}: task={task} draws its own goals; leave it out"):
+        with pytest.raises(
+            UserError, match=f"^{name}={value}: task={task} draws its own goals; leave it out"
+        ):
             replace(preset(task), **{name: value})
     assert not preset(task).fixed_goal and not FrankaConfig(task=task).fixed_goal
     assert FrankaConfig(task="reach").fixed_goal and not FrankaConfig(goal_sampling="reachable").fixed_goal

@@ -31,15 +31,6 @@ HEIGHT = 0.20
 
 
 @wp.kernel(enable_backward=False)
-def goal_above(mask: wp.array[wp.bool], rest_q: wp.array2d[float], height: float, goal: wp.array2d[float]):
-    world = wp.tid()
-    if mask[world]:
-        for i in range(3):
-            goal[world, i] = rest_q[world, 2 + i]  # behind the two fingers: the first object
-        goal[world, 2] += height
-
-
-@wp.kernel(enable_backward=False)
 def lift_reward_and_success(
     state: wp.array2d[float],
     joint_target: wp.array2d[float],
@@ -79,8 +70,7 @@ class Lift(GripperTask):
     words = "Lift the cube."
 
     def reset(self, sim: "Simulation", mask: wp.array) -> None:
-        w = sim.warp
-        wp.launch(goal_above, sim.num_envs, [mask, w.rest_q, HEIGHT, w.task_goal], device=sim.device)
+        self.launch_goal(sim, mask, away=(0.0, 0.0, HEIGHT))
 
     def pose_at_goal(self, sim: "Simulation", mask: wp.array) -> None:
         """The cube up there, in the hand."""

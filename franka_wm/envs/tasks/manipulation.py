@@ -97,6 +97,25 @@ def effort(action: wp.array2d[float], world: int) -> float:
 
 
 @wp.kernel(enable_backward=False)
+def goal_from_start(
+    mask: wp.array[wp.bool],
+    rest_q: wp.array2d[float],
+    body: int,
+    away: wp.vec3f,
+    rise: float,
+    sizes: wp.array2d[float],
+    goal: wp.array2d[float],
+):
+    """A goal where an object stands as the episode begins, moved; see :meth:`GripperTask.launch_goal`."""
+    world = wp.tid()
+    if mask[world]:
+        for i in range(3):
+            goal[world, i] = rest_q[world, FIRST + 7 * body + i] + away[i]
+        if rise > 0.0:
+            goal[world, 2] += rise * (sizes[world, 0] + sizes[world, 1])
+
+
+@wp.kernel(enable_backward=False)
 def bring_to_goal(
     mask: wp.array[wp.bool],
     goal: wp.array2d[float],
@@ -166,6 +185,28 @@ class GripperTask(Task):
     @property
     def reward_bounds(self) -> tuple[float, float]:
         return -self.config.action_penalty, 1.0
+
+    def launch_goal(
+        self,
+        sim: "Simulation",
+        mask: wp.array,
+        *,
+        body: int = 0,
+        away: tuple[float, float, float] = (0.0, 0.0, 0.0),
+        rise: float = 0.0,
+    ) -> None:
+        """For ``reset``: the goal is where an object stands as the episode begins, moved.
+
+        Args:
+            sim, mask: As given.
+            body: Number of the object.
+            away: From its centre [m].
+            rise: Half of the edge of the first two objects, if the first is to lie on the second: up by both, as large
+                as they are drawn [m].
+        """
+        w = sim.warp
+        inputs = [mask, w.rest_q, body, wp.vec3f(*away), rise, w.sizes, w.task_goal]
+        wp.launch(goal_from_start, sim.num_envs, inputs, device=sim.device)
 
     def launch_reward(self, sim: "Simulation", kernel: wp.Kernel, *further: object) -> None:
         """Launches a kernel that takes state, joint target and objects after the step, goal, action, whether the reward

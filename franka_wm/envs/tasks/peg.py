@@ -45,15 +45,6 @@ def end_in_hole(objects: wp.array2d[float], world: int, halves: wp.vec3f) -> wp.
 
 
 @wp.kernel(enable_backward=False)
-def goal_in_hole(mask: wp.array[wp.bool], rest_q: wp.array2d[float], above: float, goal: wp.array2d[float]):
-    world = wp.tid()
-    if mask[world]:
-        for i in range(3):
-            goal[world, i] = rest_q[world, 9 + i]  # behind the two fingers and the peg: the block
-        goal[world, 2] += above
-
-
-@wp.kernel(enable_backward=False)
 def peg_reward_and_success(
     state: wp.array2d[float],
     joint_target: wp.array2d[float],
@@ -126,9 +117,8 @@ class Peg(GripperTask):
         return peg.half_height, block.half_height, 0.5 * block.size[1]
 
     def reset(self, sim: "Simulation", mask: wp.array) -> None:
-        w, (peg, block, _) = sim.warp, self._halves()
-        inputs = [mask, w.rest_q, peg - block + PLATE, w.task_goal]
-        wp.launch(goal_in_hole, sim.num_envs, inputs, device=sim.device)
+        peg, block, _ = self._halves()
+        self.launch_goal(sim, mask, body=1, away=(0.0, 0.0, peg - block + PLATE))
 
     def pose_at_goal(self, sim: "Simulation", mask: wp.array) -> None:
         """The peg in the hole, still in the hand."""

@@ -33,15 +33,6 @@ BEHIND = 0.035
 
 
 @wp.kernel(enable_backward=False)
-def goal_ahead(mask: wp.array[wp.bool], rest_q: wp.array2d[float], ahead: float, goal: wp.array2d[float]):
-    world = wp.tid()
-    if mask[world]:
-        for i in range(3):
-            goal[world, i] = rest_q[world, 2 + i]  # behind the two fingers: the first object
-        goal[world, 0] += ahead
-
-
-@wp.kernel(enable_backward=False)
 def push_reward_and_success(
     state: wp.array2d[float],
     joint_target: wp.array2d[float],
@@ -101,8 +92,7 @@ class Push(GripperTask):
     achieved = ("objects", slice(0, 3))
 
     def reset(self, sim: "Simulation", mask: wp.array) -> None:
-        w = sim.warp
-        wp.launch(goal_ahead, sim.num_envs, [mask, w.rest_q, AHEAD, w.task_goal], device=sim.device)
+        self.launch_goal(sim, mask, away=(AHEAD, 0.0, 0.0))
 
     def pose_at_goal(self, sim: "Simulation", mask: wp.array) -> None:
         """The cube in the middle of the disc, the closed fingers behind it."""

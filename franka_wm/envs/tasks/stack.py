@@ -39,21 +39,6 @@ STILL = 0.01
 
 
 @wp.kernel(enable_backward=False)
-def goal_on_top(
-    mask: wp.array[wp.bool],
-    rest_q: wp.array2d[float],
-    edge: float,
-    sizes: wp.array2d[float],
-    goal: wp.array2d[float],
-):
-    world = wp.tid()
-    if mask[world]:
-        for i in range(3):
-            goal[world, i] = rest_q[world, 9 + i]  # behind the two fingers and the first cube: the second one
-        goal[world, 2] += 0.5 * edge * (sizes[world, 0] + sizes[world, 1])
-
-
-@wp.kernel(enable_backward=False)
 def stack_reward_and_success(
     state: wp.array2d[float],
     joint_target: wp.array2d[float],
@@ -117,8 +102,7 @@ class Stack(GripperTask):
     words = "Put the red cube on the green one."
 
     def reset(self, sim: "Simulation", mask: wp.array) -> None:
-        w = sim.warp
-        wp.launch(goal_on_top, sim.num_envs, [mask, w.rest_q, EDGE, w.sizes, w.task_goal], device=sim.device)
+        self.launch_goal(sim, mask, body=1, rise=0.5 * EDGE)
 
     def pose_at_goal(self, sim: "Simulation", mask: wp.array) -> None:
         """The first cube on the second, the open hand over it."""
@@ -159,9 +143,6 @@ class Stack(GripperTask):
         up = sight.target.clone()
         free = (sight.opening > 0.03) & (sight.tool[:, 2] < cube[:, 2] + 0.10)
         up[:, 2] += torch.where(free, 0.08, 0.0)
-        tool = torch.where(placed[:, None], up, aim.tool)
-        return Aim(
-            tool,
-            torch.where(placed, sight.target_yaw, aim.yaw),
-            torch.where(placed, MOST_OPEN, aim.opening),
-        )
+        yaw = torch.where(placed, sight.target_yaw, aim.yaw)
+        opening = torch.where(placed, MOST_OPEN, aim.opening)
+        return Aim(torch.where(placed[:, None], up, aim.tool), yaw, opening)
