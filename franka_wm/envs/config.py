@@ -381,6 +381,7 @@ class FrankaConfig:
             )
         for name, there, what in (
             ("contact_friction", self.resolved_scene, "a scene"),
+            ("table_height", self.resolved_scene, "a scene"),
             ("grip_force", self.has_gripper, "the gripper"),
             ("object_size", self.num_objects, "objects"),
             ("object_noise", self.object_dim, "objects"),

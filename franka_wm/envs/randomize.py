@@ -62,6 +62,8 @@ class Randomizer:
 
         if self.ranges.object_size:
             self._note_sizes()
+        if self.ranges.table_height:
+            self._note_table()
         if self.ranges.contact_friction:  # MuJoCo's own, which nothing else writes
             self._frictions = sim.solver.mjw_model.geom_friction
             self._plain_frictions = wp.clone(self._frictions)
@@ -97,6 +99,25 @@ class Randomizer:
         self._sized = [*touched, *seen]
         self._plain_sizes = [wp.clone(array)[0] for array in touched] + [wp.clone(array) for array in seen]
 
+    def _note_table(self) -> None:
+        """Where table and obstacles are."""
+        sim, n = self.sim, self.sim.num_envs
+        model, scene = sim.model, sim.config.resolved_scene
+        worlds, bodies = model.shape_world.numpy(), model.shape_body.numpy()
+        start, shapes = int(np.argmax(worlds == 0)), int((worlds == 0).sum())
+        geoms = sim.solver.mjc_geom_to_newton_shape.numpy()[0].tolist()
+        names = {one.name for one in (scene.table, *scene.obstacles)}
+        still = [
+            shape
+            for shape in range(start, start + shapes)
+            if bodies[shape] < 0 and model.shape_label[shape] in names
+        ]
+        parts = [(shape - start, geoms.index(shape) if shape in geoms else -1) for shape in still]
+        self._still = wp.array(parts, dtype=wp.vec2i, device=sim.device)
+        frames = model.shape_transform[start : start + n * shapes].reshape((n, shapes))
+        self._places = [sim.solver.mjw_data.geom_xpos, frames]
+        self._plain_places = [wp.clone(array) for array in self._places]
+
     def launch(self, mask: wp.array) -> None:
         """Draws for the masked worlds."""
         sim, r, w = self.sim, self.ranges, self.sim.warp
@@ -115,6 +136,10 @@ class Randomizer:
         if r.contact_friction:
             inputs = [*known, r.contact_friction, self._plain_frictions, self._frictions]
             wp.launch(kernels.draw_frictions, sim.num_envs, inputs, device=sim.device)
+        if r.table_height:
+            inputs = [*known, r.table_height, w.raised]
+            wp.launch(kernels.draw_table, sim.num_envs, inputs, device=sim.device)
+            self._raise_table()
         if r.grip_force:
             inputs = [
                 *known,
@@ -149,6 +174,8 @@ class Randomizer:
     def apply(self) -> None:
         """Hands the physical values to MuJoCo."""
         sim = self.sim
+        if self.ranges.table_height:
+            self._raise_table()
         if self.ranges.object_size:
             inputs = [sim.warp.sizes, self._parts, *self._plain_sizes, *self._sized]
             wp.launch(kernels.resize, (sim.num_envs, len(self._parts)), inputs, device=sim.device)
@@ -157,3 +184,9 @@ class Randomizer:
             if self.ranges.inertial:
                 flags |= ModelFlags.BODY_INERTIAL_PROPERTIES
             sim.solver.notify_model_changed(flags)
+
+    def _raise_table(self) -> None:
+        """Puts table and obstacles at their heights, in all worlds."""
+        sim = self.sim
+        inputs = [sim.warp.raised, self._still, *self._plain_places, *self._places]
+        wp.launch(kernels.raise_table, (sim.num_envs, len(self._still)), inputs, device=sim.device)

@@ -25,6 +25,7 @@ class Randomization:
         friction: Largest dry friction of a joint [N·m]; drawn from [0, friction].
         mass: Factor of every link's and object's mass and inertia.
         object_size: Factor of each object's size; its mass goes with the cube, its inertia with the fifth power.
+        table_height: Offset of the table's height [m]; all that stands on it stands with it, the arm does not.
         contact_friction: Factor of the sliding friction of each shape that is touched: objects, table, fingers.
         grip_force: Factor of the fingers' stiffness and largest force.
         action_noise: Standard deviation of noise added to actions, in every step.
@@ -44,6 +45,7 @@ class Randomization:
     friction: float = 0.0
     mass: float = 0.0
     object_size: float = 0.0
+    table_height: float = 0.0
     contact_friction: float = 0.0
     grip_force: float = 0.0
     action_noise: float = 0.0
@@ -52,7 +54,13 @@ class Randomization:
     object_noise: float = 0.0
 
     def __post_init__(self) -> None:
-        limits = {"color": 1.0, "brightness": 0.99, "object_noise": 1.0, "object_size": 0.5}
+        limits = {
+            "color": 1.0,
+            "brightness": 0.99,
+            "object_noise": 1.0,
+            "object_size": 0.5,
+            "table_height": 0.1,
+        }
         limits |= dict.fromkeys(("gains", "armature", "mass", "contact_friction", "grip_force"), 0.9)
         for f in fields(self):
             value, limit = getattr(self, f.name), limits.get(f.name, 100.0)

@@ -83,7 +83,8 @@ def move_object(arm: FrankaEnv, name: str, point: Sequence[float]) -> TensorDict
     at, speed = NUM_FINGERS + 7 * number, NUM_FINGERS + 6 * number
     place, row = state["rest_q"][0, at : at + 7], rows(arm)[name]
     size = float(arm.simulation.tensors.sizes[0, number])
-    lowest = scene.top + size * _hanging(scene.objects[number], place[3:].tolist())
+    top = scene.top + float(arm.simulation.tensors.raised[0])
+    lowest = top + size * _hanging(scene.objects[number], place[3:].tolist())
     place[:3] = torch.tensor([x, y, max(z, lowest)], device=place.device)
     state["rest_qd"][0, speed : speed + 6] = 0.0
     state["body_q"][0, row], state["body_qd"][0, row] = place, 0.0

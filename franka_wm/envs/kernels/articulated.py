@@ -25,6 +25,7 @@ def place_cases(
     footprints: wp.array2d[float],
     blocked: wp.array2d[float],
     height: float,
+    raised: wp.array[float],
     margin: float,
     count: int,
     # outputs
@@ -50,7 +51,7 @@ def place_cases(
                 y = middle[m, 1] + spread[m, 1] * wp.randf(rng, -1.0, 1.0)
                 angle = middle[m, 2] + spread[m, 2] * wp.randf(rng, -1.0, 1.0)
                 turn = wp.quatf(0.0, 0.0, wp.sin(0.5 * angle), wp.cos(0.5 * angle))
-                base = wp.transformf(wp.vec3f(x, y, height), turn)
+                base = wp.transformf(wp.vec3f(x, y, height + raised[world]), turn)
                 at = wp.transform_point(base, wp.vec3f(footprints[m, 0], footprints[m, 1], 0.0))
                 clear = bool(True)
                 for o in range(blocked.shape[0]):  # x, y, half sides, cosine and sine of the angle, radius

@@ -73,6 +73,7 @@ def place(
     radius: wp.array[float],
     rise: wp.array[float],
     sizes: wp.array2d[float],
+    raised: wp.array[float],
     blocked: wp.array2d[float],
     margin: float,
     bases: wp.array2d[wp.transformf],
@@ -87,7 +88,8 @@ def place(
 ):
     """New episodes of the masked worlds: fingers open, objects at rest where nothing else stands.
 
-    ``height`` and ``radius`` are those of an object of its plain size, ``rise`` the half of its own height [m].
+    ``height`` and ``radius`` are those of an object of its plain size on a table that is not ``raised``, ``rise`` the
+    half of its own height [m].
     A place is drawn anew while something stands there. That one is left is seen to when the scene is made.
     """
     world = wp.tid()
@@ -134,7 +136,7 @@ def place(
         angle = turn[b] * wp.randf(rng, -1.0, 1.0)
         rest_q[world, at] = x
         rest_q[world, at + 1] = y
-        rest_q[world, at + 2] = height[b] + (sizes[world, b] - 1.0) * rise[b]
+        rest_q[world, at + 2] = height[b] + (sizes[world, b] - 1.0) * rise[b] + raised[world]
         rest_q[world, at + 3] = 0.0
         rest_q[world, at + 4] = 0.0
         rest_q[world, at + 5] = wp.sin(0.5 * angle)
@@ -280,6 +282,7 @@ def cut_short(
     center: wp.vec2f,
     half: wp.vec2f,
     lowest: float,
+    raised: wp.array[float],
     ended: wp.array[wp.bool],
     column: int,
     # outputs
@@ -295,5 +298,5 @@ def cut_short(
         for b in range(count):
             x = wp.abs(objects[world, EACH * b] - center[0])
             y = wp.abs(objects[world, EACH * b + 1] - center[1])
-            stop = stop or x > half[0] or y > half[1] or objects[world, EACH * b + 2] < lowest
+            stop = stop or x > half[0] or y > half[1] or objects[world, EACH * b + 2] < lowest + raised[world]
     cut[world] = stop

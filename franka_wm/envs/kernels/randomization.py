@@ -167,6 +167,47 @@ def resize(
 
 
 @wp.kernel(enable_backward=False)
+def draw_table(
+    mask: wp.array[wp.bool],
+    seed: wp.array[int],
+    episode: wp.array[int],
+    width: float,
+    # output
+    raised: wp.array[float],
+):
+    """Height of the table in the masked worlds' new episodes."""
+    world = wp.tid()
+    if mask[world]:
+        rng = episode_rng(seed[0], seed[1] + world, episode[world], 13)
+        raised[world] = wp.randf(rng, -width, width)
+
+
+@wp.kernel(enable_backward=False)
+def raise_table(
+    raised: wp.array[float],
+    parts: wp.array[wp.vec2i],
+    plain_place: wp.array2d[wp.vec3f],
+    plain_frame: wp.array2d[wp.transformf],
+    # outputs
+    place: wp.array2d[wp.vec3f],
+    frame: wp.array2d[wp.transformf],
+):
+    """What MuJoCo touches and what cameras see of table and obstacles. dim = (worlds, parts); a part is Newton's shape
+    and MuJoCo's geom, both counted in a world, −1 where there is none.
+
+    Of what never moves MuJoCo reads places in the world, ``place``, which it derived once from those in its model.
+    """
+    world, k = wp.tid()  # pyright: ignore
+    up = wp.vec3f(0.0, 0.0, raised[world])
+    shape = parts[k][0]
+    geom = parts[k][1]
+    at = plain_frame[world, shape]
+    frame[world, shape] = wp.transformf(wp.transform_get_translation(at) + up, wp.transform_get_rotation(at))
+    if geom >= 0:
+        place[world, geom] = plain_place[world, geom] + up
+
+
+@wp.kernel(enable_backward=False)
 def draw_frictions(
     mask: wp.array[wp.bool],
     seed: wp.array[int],

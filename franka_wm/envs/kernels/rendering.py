@@ -124,10 +124,11 @@ def move_goal_marker(
     goal: wp.array2d[float],
     flat: bool,
     ground: float,
+    raised: wp.array[float],
     shapes: wp.array[int],
     transforms: wp.array[wp.transformf],
 ):
     """Puts each world's marker on its goal, or, a ``flat`` one, on the ground below it."""
     world = wp.tid()
-    at = wp.vec3f(goal[world, 0], goal[world, 1], wp.where(flat, ground, goal[world, 2]))
+    at = wp.vec3f(goal[world, 0], goal[world, 1], wp.where(flat, ground + raised[world], goal[world, 2]))
     transforms[shapes[world]] = wp.transformf(at, wp.quat_identity(dtype=float))

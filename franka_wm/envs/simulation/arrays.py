@@ -73,6 +73,7 @@ class Arrays[T]:
             Newton's frames of joints.
         grip: (N,) the fingers' set point [m].
         sizes: (N, K) factor of each object's size in this episode.
+        raised: (N,) how much higher the table is in this episode than the scene says [m].
         body_q: (N, B) transforms, (N, B, 7) in torch: Newton's frames of the moving links.
         origins, directions: (N, 7) vectors, (N, 7, 3) in torch: scratch memory of the differential inverse kinematics.
     """
@@ -132,6 +133,7 @@ class Arrays[T]:
     bases: T
     grip: T
     sizes: T
+    raised: T
     body_q: T
     origins: T
     directions: T
@@ -231,6 +233,7 @@ def allocate(
         ],  # each is fixed, and carries one joint
         grip=zeros(n),
         sizes=torch.ones(n, config.num_objects, device=device),
+        raised=zeros(n),
         body_q=newtons(state.body_q, 7),
         origins=zeros(n, NUM_JOINTS, 3),
         directions=zeros(n, NUM_JOINTS, 3),

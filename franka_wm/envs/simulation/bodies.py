@@ -76,6 +76,7 @@ class Bodies:
             numbers([one.radius for one in objects], count),
             numbers([one.half_height for one in objects], count),
             sim.warp.sizes,
+            sim.warp.raised,
             obstacles,
             space,
             sim.warp.bases,
@@ -87,6 +88,7 @@ class Bodies:
             footprints,
             obstacles,
             scene.top if scene else 0.0,
+            sim.warp.raised,
             space,
             count,
         ]
@@ -222,7 +224,7 @@ class Bodies:
         )
         self._launch(
             kernels.cut_short, w.next_true_objects, self._count, w.overflow, self.sim.config.end_when_lost,
-            center, half, self._scene.top - SUNK, w.ended, STATISTICS.index("overflow"), w.cut, w.statistics,
+            center, half, self._scene.top - SUNK, w.raised, w.ended, STATISTICS.index("overflow"), w.cut, w.statistics,
         )  # fmt: skip
 
     def _launch(self, kernel: wp.Kernel, *inputs: object) -> None:

@@ -119,7 +119,8 @@ class Renderer:
         if sim.config.show_goal:
             scene = sim.config.resolved_scene
             ground, flat = (scene.top if scene else 0.0), sim.config.task_class.marker is not None
-            inputs = [sim.warp.task_goal, flat, ground, self._markers, sim.model.shape_transform]
+            w = sim.warp
+            inputs = [w.task_goal, flat, ground, w.raised, self._markers, sim.model.shape_transform]
             wp.launch(kernels.move_goal_marker, sim.num_envs, inputs, device=sim.device)
 
     def _list_worlds(self, mask: wp.array) -> None:

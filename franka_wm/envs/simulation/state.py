@@ -44,6 +44,8 @@ def memory(sim: Simulation) -> dict[str, torch.Tensor]:
         out["bases"] = sim.tensors.bases
     if sim.config.randomization.object_size:
         out["sizes"] = sim.tensors.sizes
+    if sim.config.randomization.table_height:
+        out["raised"] = sim.tensors.raised
     out["body_qd"] = wp.to_torch(sim.newton_state.body_qd).view(sim.num_envs, -1, 6)
     out |= {f"solver_{name}": wp.to_torch(array) for name, array in solver_memory(sim).items() if array.size}
     if sim.task.num_draws:

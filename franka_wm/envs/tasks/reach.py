@@ -84,6 +84,7 @@ def reachable_goal(
     child_frames: wp.array[wp.transformf],
     axes: wp.array[wp.vec3f],
     tool_frame: wp.array[wp.transformf],
+    raised: wp.array[float],
     goal_q: wp.array2d[float],
     goal: wp.array2d[float],
 ):
@@ -98,7 +99,7 @@ def reachable_goal(
             for j in range(JOINTS):
                 goal_q[world, j] = wp.clamp(home[j] + wp.randf(rng, -noise, noise), lower[j], upper[j])
             tool = chain_forward(goal_q, world, parent_frames, child_frames, axes, tool_frame)
-            if tool[2] > 0.10 and wp.sqrt(tool[0] * tool[0] + tool[1] * tool[1]) > 0.25:
+            if tool[2] > 0.10 + raised[world] and wp.sqrt(tool[0] * tool[0] + tool[1] * tool[1]) > 0.25:
                 for i in range(3):
                     goal[world, i] = tool[i]
                 found = True
@@ -152,8 +153,9 @@ class Reach(Task):
     """Bring the tool to the goal and keep it there.
 
     **Goal**: ``config.goal``, or with ``goal_sampling="reachable"`` the tool position of a pose drawn
-    uniformly within ``goal_noise`` of home, above 0.10 m and at least 0.25 m from the base's axis, new in
-    every world and episode. **Reward**: :func:`reach_reward`. **Success**: tool within ``success_distance``.
+    uniformly within ``goal_noise`` of home, above 0.10 m (and what ``randomization.table_height`` adds) and at least
+    0.25 m from the base's axis, new in every world and episode. **Reward**: :func:`reach_reward`. **Success**: tool
+    within ``success_distance``.
     """
 
     words = "Move the tool to the goal position and hold it there."
@@ -210,7 +212,7 @@ class Reach(Task):
             n,
             [
                 mask, w.seed, w.episode, c.home, self.config.goal_noise, c.lower, c.upper,
-                c.parent_frames, c.child_frames, c.axes, c.tool_frame, w.goal_q, goal,
+                c.parent_frames, c.child_frames, c.axes, c.tool_frame, w.raised, w.goal_q, goal,
             ],
             device=sim.device,
         )  # fmt: skip

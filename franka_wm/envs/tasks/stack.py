@@ -60,9 +60,8 @@ def stack_reward_and_success(
     upper = edge * sizes[world, 0]
     rise = 0.5 * (upper + edge * sizes[world, 1])
     missing = place_of(objects, world, 1) + wp.vec3f(0.0, 0.0, rise) - cube
-    placed = (
-        wp.length(wp.vec2f(missing[0], missing[1])) <= aside * sizes[world, 1] and wp.abs(missing[2]) <= off
-    )
+    shift = wp.length(wp.vec2f(missing[0], missing[1]))
+    placed = shift <= aside * sizes[world, 1] and wp.abs(missing[2]) <= off
     away = wp.length(tool_of(state, world) - cube)
     released = away > upper or state[world, 20] + state[world, 21] > upper + 0.004
     solved = placed and released and speed_of(objects, world, 0) < still
@@ -71,9 +70,7 @@ def stack_reward_and_success(
         value += 0.2 + 0.3 * nearness(wp.length(missing))
     if placed:
         value = wp.where(released, 0.9, 0.8)
-    if solved:
-        value = 1.0
-    if sparse:
+    if sparse or solved:
         value = wp.where(solved, 1.0, 0.0)
     reward[world, 0] = value - penalty * effort(action, world)
     success[world, 0] = solved
@@ -120,9 +117,14 @@ class Stack(GripperTask):
         The lower one stands on the table, the upper one is as thick as the fingers are open. One that is let go and
         lies where it can is taken to lie on the other.
         """
-        width, scene = self.config.randomization.object_size, self.config.resolved_scene
+        ranges, scene = self.config.randomization, self.config.resolved_scene
+        width = ranges.object_size
         if not width or scene is None:
             return EDGE
+        if (
+            ranges.table_height
+        ):  # how high they stand says nothing then, but what the goal is over the lower one
+            return sight.goal[:, 2] - sight.body(1)[0][:, 2]
         (upper, _), (lower, _) = sight.body(0), sight.body(1)
         below = lower[:, 2] - scene.top
         lies = upper[:, 2] - lower[:, 2] - below
