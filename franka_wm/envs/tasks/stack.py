@@ -121,9 +121,7 @@ class Stack(GripperTask):
         width = ranges.object_size
         if not width or scene is None:
             return EDGE
-        if (
-            ranges.table_height
-        ):  # how high they stand says nothing then, but what the goal is over the lower one
+        if ranges.table_height:  # the height of the lower one says nothing then, the goal over it does
             return sight.goal[:, 2] - sight.body(1)[0][:, 2]
         (upper, _), (lower, _) = sight.body(0), sight.body(1)
         below = lower[:, 2] - scene.top
