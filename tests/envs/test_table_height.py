@@ -202,6 +202,16 @@ def test_the_whole_arm_does_not_touch_the_table_beside_it() -> None:
     assert not root["truncated"].any()
 
 
+def test_a_link_whose_shape_has_an_obstacles_name_stays() -> None:
+    wall = Obstacle(name="shape_5", at=(0.6, 0.3, 0.02))  # Newton's name of a shape without one
+    env = make(2, scene=Scene(obstacles=(wall,)), task="reach", gripper=True, observations=("state",))
+    moving, frames = env.model.shape_body.numpy() >= 0, env.model.shape_transform.numpy().copy()
+    env.reset(seed=0)
+    now = env.model.shape_transform.numpy()
+    np.testing.assert_array_equal(now[moving], frames[moving])
+    assert (now[~moving] != frames[~moving]).any()
+
+
 def test_the_tables_colour_is_drawn_too() -> None:
     env = make(2, scene=Scene(), task="reach", gripper=True, randomization={"color": 0.3}, height=0.0, **LOOK)
     plain = make(1, scene=Scene(), task="reach", gripper=True, height=0.0, **LOOK)
