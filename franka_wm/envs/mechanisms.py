@@ -360,8 +360,9 @@ def _vertices(m: mujoco.MjModel, number: int) -> np.ndarray:
 
 
 def _surface(vertices: np.ndarray, faces: np.ndarray) -> Surface:
-    length, width, height = np.ptp(vertices, axis=0).tolist()
-    return Surface(vertices, faces.astype(np.int64), (length, width, height), 0.0)
+    low, high = vertices.min(0), vertices.max(0)
+    length, width, height = (high - low).tolist()
+    return Surface(vertices, faces.astype(np.int64), (length, width, height), 0.5 * (low + high), 0.0)
 
 
 def _hull(m: mujoco.MjModel, number: int, vertices: np.ndarray) -> Surface:

@@ -180,6 +180,17 @@ def test_the_expert_opens_it(name: str, lying: bool, tmp_path: Path) -> None:
     assert start.std(0).min() > 0.005  # each episode draws where it stands
 
 
+def test_it_stands_on_the_table_at_each_height(tmp_path: Path) -> None:
+    """Where ``randomization.table_height`` draws one: handles are as much higher, and the expert finds them."""
+    one = body(written(tmp_path, cabinets.urdf()))
+    env = make(one, 4, randomization={"table_height": 0.08})
+    higher = env.reset()["objects"][:, 2] - make(one, 4).reset()["objects"][:, 2]
+    assert higher.std() > 0.02
+    assert (higher - env.simulation.tensors.raised).abs().max() < 1e-4
+    played = play_episodes(env, ExpertPolicy(env.simulation.task, env.kinematics, env.config), seed=1)
+    assert played["success"].all() and env.statistics()["overflow"] == 0
+
+
 def test_what_is_observed_is_where_newton_has_it(tmp_path: Path) -> None:
     """A door that turns: places and quaternions of the handle against Newton's body, and its limit."""
     env = make(
