@@ -56,10 +56,12 @@ def main(cfg: DictConfig) -> None:
     trainer.fit()
     if trainer.interrupted:
         run.stop()
+    found = None
+    if eval_env is not None:  # all processes of a job play
+        found = evaluate_run(run.settings, run.folder, eval_env, eval_policies, counters=trainer.counters)
     if not processes.is_first():
         return  # the first one speaks for all
-    if eval_env is not None:
-        found = evaluate_run(run.settings, run.folder, eval_env, eval_policies, counters=trainer.counters)
+    if found is not None:
         report_run(
             run.settings,
             run.folder,

@@ -20,7 +20,7 @@ from torch import Tensor, distributed
 from franka_wm.errors import UserError
 
 TIMEOUT = timedelta(minutes=30)
-"""How long a process waits for another one that lives: the first one evaluates alone, and compiles kernels."""
+"""How long a process waits for another one that lives: it may compile kernels, or write a large checkpoint."""
 
 MEETING = timedelta(minutes=10)
 """How long a process waits at the start for the others, which are started at the same time."""
@@ -59,8 +59,18 @@ def parts() -> tuple[int, ...]:
     return (rank(),) if count() > 1 else ()
 
 
+def own_part(whole: int, block: int = 1) -> tuple[int, int]:
+    """The first of this process's share of ``whole`` things, and how many they are; blocks stay together.
+
+    Shares differ by one block at most, and the last one may be cut. There may be fewer things than processes.
+    """
+    each, more = divmod(-(-whole // block), count())
+    first, after = (min(whole, block * (k * each + min(k, more))) for k in (rank(), rank() + 1))
+    return first, after - first
+
+
 def is_first() -> bool:
-    """Whether this process is the one that speaks, evaluates and writes for all."""
+    """Whether this process is the one that speaks and writes for all."""
     return rank() == 0
 
 

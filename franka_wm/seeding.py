@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import random
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from typing import Any
 
@@ -65,6 +65,45 @@ def seeded(seed: int, *policies: Any) -> Iterator[None]:
             np.random.set_state(others[1])
             for generator, state in generators:
                 generator.set_state(state)
+
+
+_share: tuple[int, int, int] | None = None
+
+
+def share_of_worlds() -> tuple[int, int, int] | None:
+    """First, count and whole of :func:`drawing_for`; a captured graph that draws depends on them."""
+    return _share
+
+
+@contextmanager
+def drawing_for(first: int, count: int, whole: int) -> Iterator[None]:
+    """Inside, :func:`of_worlds` gives ``count`` worlds, from number ``first``, their part of what ``whole`` draw.
+
+    So a world acts upon the same random numbers, however many processes play the others.
+    """
+    global _share
+    before, _share = _share, (first, count, whole)
+    try:
+        yield
+    finally:
+        _share = before
+
+
+def of_worlds(draw: Callable[[tuple[int, ...]], torch.Tensor], shape: Sequence[int]) -> torch.Tensor:
+    """Random numbers (worlds, …), or (worlds × n, …), by which these worlds act: ``draw(shape)``.
+
+    Where the worlds of an evaluation are divided, all are drawn, of which these worlds' are kept.
+    """
+    if _share is None or _share[1] == _share[2]:
+        return draw(tuple(shape))
+    first, count, whole = _share
+    each = shape[0] // count
+    return draw((each * whole, *shape[1:]))[each * first : each * (first + count)]
+
+
+def normal_like(x: torch.Tensor) -> torch.Tensor:
+    """Normal numbers of the shape, type and device of ``x`` (worlds, …), as :func:`of_worlds` gives them."""
+    return of_worlds(lambda shape: torch.randn(shape, dtype=x.dtype, device=x.device), x.shape)
 
 
 def restore_generator(generator: torch.Generator, state: torch.Tensor) -> bool:

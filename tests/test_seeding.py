@@ -1,13 +1,26 @@
 """Seeds by purpose."""
 
 import random
+from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 import pytest
 import torch
+from tensordict import TensorDict
 from torch import nn
 
-from franka_wm.seeding import derive_seed, evaluation_seed, restore_generator, seeded
+from franka_wm import models
+from franka_wm.models.layers import GaussianPolicy
+from franka_wm.policies.scripted import RandomDiscretePolicy, SmoothRandomPolicy
+from franka_wm.seeding import (
+    derive_seed,
+    drawing_for,
+    evaluation_seed,
+    restore_generator,
+    seeded,
+    share_of_worlds,
+)
 
 
 def test_the_same_purpose_and_seed_give_the_same_number_in_every_process():
@@ -88,3 +101,37 @@ def test_a_generator_of_another_kind_of_device_is_left_alone() -> None:
     assert torch.equal(generator.get_state(), before)
     torch.rand(5, generator=generator)
     assert restore_generator(generator, before) and torch.equal(generator.get_state(), before)
+
+
+def _acting() -> dict[str, Callable[[int], torch.Tensor]]:
+    """Name -> actions of so many worlds, drawn."""
+    gaussian = GaussianPolicy(latent_dim=4, hidden=[8], action_dim=2)
+    small: dict[str, Any] = dict(hidden_dim=16, codes=3, classes=4, blocks=2, encoder_layers=2, bins=41)
+    dreamer: Any = models.make(
+        "dreamer", observation_sizes={"state": 3}, action_dim=2, discount=0.9, deter_dim=16, **small
+    )
+
+    def started(count: int) -> TensorDict:
+        return TensorDict({"is_init": torch.ones(count, 1, dtype=torch.bool)}, [count])
+
+    return {
+        "random": lambda count: SmoothRandomPolicy(2)(started(count))["action"],
+        "discrete": lambda count: RandomDiscretePolicy(1000)(started(count))["action"],
+        "candidates": lambda count: gaussian(torch.ones(count, 3, 4)),
+        "flat": lambda count: gaussian(torch.ones(count * 3, 4)).view(count, 3, 2),
+        "dreamer": lambda count: dreamer.policy(torch.ones(count, 3, dreamer.latent_dim)),
+    }
+
+
+@pytest.mark.parametrize("name", ["random", "discrete", "candidates", "flat", "dreamer"])
+def test_worlds_draw_alike_however_they_are_divided(name) -> None:
+    draw = _acting()[name]
+    torch.manual_seed(0)
+    together = draw(5)
+    parts = []
+    for first, count in ((0, 3), (3, 2)):
+        torch.manual_seed(0)
+        with drawing_for(first, count, 5):
+            parts.append(draw(count))
+    torch.testing.assert_close(torch.cat(parts), together, rtol=0, atol=1e-6)
+    assert (together[0] != together[3]).any() and share_of_worlds() is None

@@ -9,6 +9,7 @@ from functools import partial
 
 import torch
 from tensordict import TensorDictBase
+from torchrl._utils import seed_generator
 from torchrl.envs import EnvBase, ParallelEnv, SerialEnv, TransformedEnv
 from torchrl.envs.transforms import (
     ActionScaling,
@@ -77,7 +78,19 @@ class ExternalEnv(TransformedEnv):
         super().__init__(base, Compose(*transforms))
         self.config, self.num_envs = config, num_envs
         self._totals = torch.zeros(3, device=device)
+        self._first_world = 0
         self.set_seed(seed)
+
+    def set_seed(self, seed: int | None = None, static_seed: bool = False) -> int | None:
+        """Each copy gets a seed that follows from the one before; the first one ``seed``, unless it has a number."""
+        if seed is not None and not static_seed:
+            for _ in range(self._first_world):
+                seed = seed_generator(seed)
+        return super().set_seed(seed, static_seed=static_seed)
+
+    def set_first_world(self, number: int) -> None:
+        """From the next :meth:`set_seed` on, these copies play the episodes of those from ``number``."""
+        self._first_world = number
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
         out = super()._step(tensordict)

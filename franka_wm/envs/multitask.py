@@ -56,8 +56,7 @@ class MultiTaskEnv(EnvBase):
         count = len(config.tasks)
         if num_envs < count:
             raise UserError(f"num_envs={num_envs}: {count} tasks need at least as many worlds")
-        if first_world % count:
-            raise UserError(f"first_world={first_world}: must be a multiple of the {count} tasks")
+        _require_first_task(first_world, count)
         device = resolve_device(device)
         super().__init__(device=device, batch_size=torch.Size([num_envs]))
         self.config, self.num_envs = config, num_envs
@@ -132,6 +131,16 @@ class MultiTaskEnv(EnvBase):
         for name, env in self.envs.items():
             env._set_seed(derive_seed("task", seed, name))
 
+    def set_first_world(self, number: int) -> None:
+        """From the next reset on, these worlds play the episodes of those from ``number``, which has the first task.
+
+        Raises:
+            UserError: It has another task.
+        """
+        _require_first_task(number, len(self.envs))
+        for env in self.envs.values():
+            env.simulation.set_first_world(number // len(self.envs))
+
     def _together(self, parts: list[Any]) -> dict[str, Tensor]:
         """Entries of all worlds, of those of each task's worlds in order; ``task`` is added."""
         count, out = len(parts), {"task": self.one_hot.clone()}
@@ -145,8 +154,8 @@ class MultiTaskEnv(EnvBase):
         return out
 
     def split(self, tensordict: TensorDictBase) -> dict[str, TensorDict]:
-        """Task -> what its worlds observe, in its own sizes."""
-        parts = {}
+        """Task -> what its worlds observe, in its own sizes; of the first worlds alone, only tasks that they have."""
+        parts, worlds = {}, tensordict.batch_size[0]
         for k, (name, env) in enumerate(self.envs.items()):
             sizes = {
                 key: env.observation_spec[key].shape[-1] for key in self.sizes if key in env.observation_spec
@@ -156,12 +165,17 @@ class MultiTaskEnv(EnvBase):
                 for key, size in sizes.items()
                 if tensordict.get(key, None) is not None
             }
-            parts[name] = TensorDict(own, env.batch_size, device=env.device)
+            if k < worlds:
+                parts[name] = TensorDict(own, [len(range(k, worlds, len(self.envs)))], device=env.device)
         return parts
 
     def join(self, parts: Mapping[str, Tensor]) -> Tensor:
-        """Actions (N, A) of all worlds, of those of each task's worlds."""
-        return self._together([{"action": parts[name]} for name in self.envs])["action"]
+        """Actions (N, A) of the worlds that :meth:`split` had, of those of each task's."""
+        out = next(iter(parts.values())).new_zeros(sum(map(len, parts.values())), self.action_dim)
+        for k, name in enumerate(self.envs):
+            if name in parts:
+                out[k :: len(self.envs), : parts[name].shape[-1]] = parts[name]
+        return out
 
     # -- what trainers ask of an environment ----------------------------------------------------------------
 
@@ -226,3 +240,8 @@ class MultiTaskEnv(EnvBase):
         for name, env in self.envs.items():
             entries = dict(state.get(name).items())
             env.set_state(TensorDict(entries, batch_size=env.batch_size, device=env.device))
+
+
+def _require_first_task(first_world: int, tasks: int) -> None:
+    if first_world % tasks:
+        raise UserError(f"first_world={first_world}: must be a multiple of the {tasks} tasks")

@@ -28,9 +28,17 @@ def success_distance(env: Environment) -> float | None:
     return None if arm is None or not arm.simulation.task.goal_distance else arm.config.success_distance
 
 
-def begin(env: Environment, seed: int) -> TensorDictBase:
-    """The first observations of the episodes that ``seed`` names; the same whenever it is asked for."""
-    if arm_of(env) is not None:
+def begin(env: Environment, seed: int, first_world: int | None = None) -> TensorDictBase:
+    """The first observations of the episodes that ``seed`` names; the same whenever it is asked for.
+
+    Args:
+        first_world: The worlds get the episodes of those from this number; if not given, they keep their numbers.
+    """
+    arm = arm_of(env)
+    if first_world is not None:
+        numbered: Any = env if arm is None else arm.simulation
+        numbered.set_first_world(first_world)
+    if arm is not None:
         return env.reset(seed=seed)
     env.set_seed(seed)
     return env.reset()
@@ -61,6 +69,7 @@ def play_episodes(
     *,
     seed: int,
     episodes: int | None = None,
+    first_world: int | None = None,
     video: Callable[[], None] | None = None,
 ) -> TensorDict:
     """Plays one episode in every world and records how it went.
@@ -70,6 +79,7 @@ def play_episodes(
         policy: Run without exploration, its model in evaluation mode.
         seed: Seed of the episodes' poses and goals.
         episodes: Fewer than there are worlds: the first ones. Nothing is decided for the others.
+        first_world: As for :func:`begin`.
         video: Called before every step, to take an image; after the last one the worlds have been reset.
 
     Returns:
@@ -94,7 +104,7 @@ def play_episodes(
     running = torch.ones(n, dtype=torch.bool, device=device)
     count = n if episodes is None else min(episodes, n)
     running[count:] = False
-    tensordict = begin(env, seed)
+    tensordict = begin(env, seed, first_world)
     if motion is not None:
         motion.start()
     with evaluating(policy), set_exploration_type(ExplorationType.DETERMINISTIC):

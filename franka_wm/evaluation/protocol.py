@@ -12,8 +12,8 @@ import torch
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModuleBase
 
-from franka_wm import console
-from franka_wm.envs import Environment
+from franka_wm import console, processes
+from franka_wm.envs import Environment, MultiTaskEnv
 from franka_wm.errors import UserError
 from franka_wm.evaluation.closed_loop import (
     THRESHOLDS,
@@ -25,7 +25,7 @@ from franka_wm.evaluation.closed_loop import (
 from franka_wm.evaluation.results import END, FILE, point, to_json
 from franka_wm.files import atomic_write
 from franka_wm.options import is_whole
-from franka_wm.seeding import derive_seed, seeded
+from franka_wm.seeding import derive_seed, drawing_for, seeded
 from franka_wm.training.settings import EvaluationSettings, RunSettings
 from franka_wm.version import __version__
 from franka_wm.versions import hardware
@@ -88,6 +88,7 @@ def evaluate_policies(
     episodes: int | None = None,
     seeds: Sequence[int] | None = None,
     timing: bool = False,
+    together: int | None = None,
     report: Callable[[str, dict[str, Any]], object] | None = None,
 ) -> Evaluation:
     """Plays every policy over the same held-out episodes: while training, at its end, and in ``franka-wm evaluate``.
@@ -102,31 +103,36 @@ def evaluate_policies(
             many as the environment has worlds; of the last round, the first worlds count. One round if not given.
         seeds: One for each round; :func:`held_out_seeds` if not given.
         timing: Also measure how long decisions take.
+        together: Worlds of all processes of the job, each of which calls this: they divide the episodes of each
+            round, and each of them gets all rows. Not given: this process plays alone.
         report: Called with each name and summary as they come.
 
     Raises:
         UserError: Fewer than 2 episodes, or fewer seeds than rounds.
     """
-    episodes = env.num_envs if episodes is None else episodes
+    worlds = env.num_envs if together is None else together
+    episodes = worlds if episodes is None else episodes
     if not is_whole(episodes) or episodes < 2:
         raise UserError(
             f"episodes={episodes!r}: must be a whole number of at least 2, for the intervals; 100 or more are usual"
         )
-    rounds = math.ceil(episodes / env.num_envs)
+    rounds = math.ceil(episodes / worlds)
     seeds = held_out_seeds(rounds) if seeds is None else list(seeds)
     if len(seeds) < rounds:
         raise UserError(
-            f"{episodes} episodes in {env.num_envs} worlds take {rounds} rounds, each with a seed of its own; "
+            f"{episodes} episodes in {worlds} worlds take {rounds} rounds, each with a seed of its own; "
             f"{len(seeds)} are given"
         )
     seeds = seeds[:rounds]
-    evaluation = Evaluation({}, {}, seeds, worlds=env.num_envs)
+    evaluation = Evaluation({}, {}, seeds, worlds=worlds)
     for name, policy in policies.items():
         played = []
         for k, seed in enumerate(seeds):
-            left = episodes - k * env.num_envs
+            left = min(episodes - k * worlds, worlds)
             with seeded(seed, policy):
-                played.append(play_episodes(env, policy, seed=seed, episodes=left).cpu())
+                played += (
+                    _play(env, policy, seed, left) if together is None else _divided(env, policy, seed, left)
+                )
         rows = cast(TensorDict, torch.cat(played))
         evaluation.episodes[name] = rows
         evaluation.policies[name] = summarize(rows, thresholds=thresholds(env))
@@ -136,6 +142,28 @@ def evaluate_policies(
         if report is not None:
             report(name, evaluation.policies[name])
     return evaluation
+
+
+def _play(env: Environment, policy: TensorDictModuleBase, seed: int, episodes: int) -> list[TensorDict]:
+    return [play_episodes(env, policy, seed=seed, episodes=episodes).cpu()]
+
+
+def _divided(env: Environment, policy: TensorDictModuleBase, seed: int, episodes: int) -> list[TensorDict]:
+    """What each process has played of the episodes, in their order; every process calls this.
+
+    An episode begins and draws as it would if one process played them all.
+    """
+    first, count = processes.own_part(episodes, len(env.envs) if isinstance(env, MultiTaskEnv) else 1)
+    own = None
+    if count:
+        with drawing_for(first, count, episodes):
+            own = play_episodes(env, policy, seed=seed, episodes=count, first_world=first).cpu()
+    return [rows for rows in processes.objects(own) if rows is not None]
+
+
+def all_worlds(settings: EvaluationSettings, env: Environment) -> int:
+    """Evaluation worlds of all processes of a run together."""
+    return env.num_envs if processes.count() == 1 else settings.episodes
 
 
 def protocol(
@@ -160,7 +188,7 @@ def protocol(
         **{name: counters[name] for name in ("updates", "env_steps") if name in counters},
         **({"training_seconds": counters["seconds"]} if "seconds" in counters else {}),
         "episodes": next(iter(evaluation.policies.values()))["episodes"],
-        "worlds": env.num_envs,
+        "worlds": evaluation.worlds,
         "seeds": ", ".join(map(str, evaluation.seeds)),
         **({} if distance is None else {"success_distance": float(distance)}),
         "intervals": INTERVALS,
@@ -178,7 +206,11 @@ def thresholds(env: Environment) -> list[float]:
 
 
 def numbers_to_log(
-    env: Environment, policies: Mapping[str, TensorDictModuleBase], *, episodes: int | None = None
+    env: Environment,
+    policies: Mapping[str, TensorDictModuleBase],
+    *,
+    episodes: int | None = None,
+    together: int | None = None,
 ) -> dict[str, float]:
     """A point of the learning curves: what :func:`evaluate_policies` finds now, as :func:`point` names it.
 
@@ -186,9 +218,11 @@ def numbers_to_log(
         env: Evaluation worlds, those of the run's end.
         policies: That have curves.
         episodes: The first so many of those that the run's end plays; all if not given or more than there are.
+        together: As for :func:`evaluate_policies`.
     """
-    episodes = env.num_envs if episodes is None else min(episodes, env.num_envs)
-    found = evaluate_policies(env, policies, episodes=episodes).policies
+    worlds = env.num_envs if together is None else together
+    episodes = worlds if episodes is None else min(episodes, worlds)
+    found = evaluate_policies(env, policies, episodes=episodes, together=together).policies
     return point(found, success_distance=success_distance(env))
 
 
@@ -205,12 +239,13 @@ def during_training(
 ) -> Callable[[], dict[str, float]]:
     """A function for the trainer: plays the policies of ``evaluation.during`` and returns numbers to log.
 
-    None where there are none, as without an environment.
+    None where there are none, as without an environment. Of several processes all call it; they divide the episodes.
     """
     chosen = {name: policies[name] for name in settings.during if name in policies}
     if env is None or not chosen:
         return dict
-    return lambda: numbers_to_log(env, chosen, episodes=settings.during_episodes)
+    worlds = all_worlds(settings, env)
+    return lambda: numbers_to_log(env, chosen, episodes=settings.during_episodes, together=worlds)
 
 
 def evaluate_run(
@@ -224,17 +259,21 @@ def evaluate_run(
 ) -> Evaluation:
     """The end of a run: every policy over the same held-out episodes, and ``evaluation.json`` in the run's folder.
 
+    Of several processes all call it: they divide the episodes, and the first one writes.
+
     Args:
         settings: Settings of the run.
         folder: Folder of the run.
-        env: Evaluation worlds; as many episodes.
+        env: Evaluation worlds, of several processes this one's; as many episodes.
         policies: By name.
         counters: ``updates``, ``env_steps``, ``seconds`` of the training.
         say: Takes lines for the terminal.
     """
-    say(f"evaluating over {env.num_envs} held-out episodes …")
-    found = evaluate_policies(env, policies, report=lambda name, r: say(describe(name, r)))
+    worlds = all_worlds(settings.evaluation, env)
+    say(f"evaluating over {worlds} held-out episodes …")
+    found = evaluate_policies(env, policies, together=worlds, report=lambda name, r: say(describe(name, r)))
     found.protocol = protocol(settings, env, found, by=END, counters=counters)
-    with atomic_write(folder / FILE) as path:
-        path.write_text(to_json({"protocol": found.protocol, "policies": found.policies}))
+    if processes.is_first():
+        with atomic_write(folder / FILE) as path:
+            path.write_text(to_json({"protocol": found.protocol, "policies": found.policies}))
     return found

@@ -22,6 +22,7 @@ from franka_wm.models.rssm import RSSM, divergence, network
 from franka_wm.models.vision import ConvDecoder, ConvEncoder
 from franka_wm.models.windows import check_windows, window_of
 from franka_wm.options import COEFFICIENT, DEPTH, FRACTION, POSITIVE, Bounds, with_defaults
+from franka_wm.seeding import normal_like
 
 
 class Dreamer(WorldModel):
@@ -227,7 +228,7 @@ class Dreamer(WorldModel):
     def policy(self, z: Tensor, deterministic: bool = False) -> Tensor:
         """Actions (..., action_dim) in [-1, 1] for z (..., latent_dim): a sample, or the mode."""
         mean, std = self.action_distribution(z)
-        return mean if deterministic else (mean + std * torch.randn_like(mean)).clamp(-1.0, 1.0)
+        return mean if deterministic else (mean + std * normal_like(mean)).clamp(-1.0, 1.0)
 
     def action_distribution(self, z: Tensor) -> tuple[Tensor, Tensor]:
         """Mean in [-1, 1] and standard deviation of the actor's Gaussian, each (..., action_dim)."""

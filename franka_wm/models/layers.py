@@ -14,6 +14,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from franka_wm import processes
+from franka_wm.seeding import normal_like
 
 WEIGHT_STD = 0.02  # truncated-normal initialisation of every linear weight, as published
 
@@ -352,7 +353,7 @@ class GaussianPolicy(nn.Module):
     def forward(self, z: Tensor, *, deterministic: bool = False) -> Tensor:
         """Actions (..., action_dim): the squashed mean if `deterministic`, else a reparameterised sample."""
         mean, log_std = self.distribution(z)
-        return torch.tanh(mean if deterministic else mean + log_std.exp() * torch.randn_like(mean))
+        return torch.tanh(mean if deterministic else mean + log_std.exp() * normal_like(mean))
 
     def sample(self, z: Tensor) -> tuple[Tensor, Tensor]:
         """A reparameterised action (..., action_dim) and its log-density (..., 1).

@@ -9,6 +9,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from franka_wm.seeding import of_worlds
+
 
 def require_is_init(is_init: Tensor, envs: int) -> None:
     """Raises ValueError unless `is_init` is (E, 1)."""
@@ -32,8 +34,9 @@ def gaussian_candidates(
 ) -> Tensor:
     """Draws of independent Gaussians: mean and std (E, H, A) -> (E, samples, H, A), clamped."""
     envs, horizon, action_dim = mean.shape
-    noise = torch.randn(
-        envs, samples, horizon, action_dim, device=mean.device, dtype=mean.dtype, generator=generator
+    like = {"device": mean.device, "dtype": mean.dtype}
+    noise = of_worlds(
+        lambda shape: torch.randn(shape, generator=generator, **like), (envs, samples, horizon, action_dim)
     )
     return (mean.unsqueeze(1) + std.unsqueeze(1) * noise).clamp(low, high)
 

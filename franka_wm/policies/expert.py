@@ -117,5 +117,5 @@ class TaskwisePolicy(ScriptedPolicy):
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         seen = self.split(tensordict)
-        actions = {name: policy(seen[name]).get("action") for name, policy in self.policies.items()}
+        actions = {name: self.policies[name](one).get("action") for name, one in seen.items()}
         return tensordict.set("action", self.join(actions))

@@ -19,6 +19,7 @@ from franka_wm.planning.base import Planner
 from franka_wm.planning.objectives import Objective, RewardPlusValue, Score, as_objective
 from franka_wm.policies.capture import GraphCache
 from franka_wm.policies.graph_key import graph_key
+from franka_wm.seeding import share_of_worlds
 
 """How a model may compute while planning."""
 
@@ -222,7 +223,8 @@ class PlannerPolicy(TensorDictModuleBase):
             )
         explore = _explores(self.explore)
         if self._captures(inputs):
-            modes = (explore, self.precision, None if self.model is None else self.model.training)
+            training = None if self.model is None else self.model.training
+            modes = (explore, self.precision, training, share_of_worlds())
             held = (self.planner, self.encode, self.next, self.objective, self.observe, self.prior)
             decision = self._graphs(
                 lambda entries: self._decide(entries, explore),

@@ -13,7 +13,7 @@ from tensordict.nn import TensorDictModuleBase
 from franka_wm.envs.config import FrankaConfig
 from franka_wm.envs.kinematics import Kinematics
 from franka_wm.errors import UserError
-from franka_wm.seeding import restore_generator
+from franka_wm.seeding import of_worlds, restore_generator
 
 
 class ScriptedPolicy(TensorDictModuleBase):
@@ -93,7 +93,9 @@ class SmoothRandomPolicy(DrawingPolicy):
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         is_init = tensordict.get("is_init")
         shape = (*is_init.shape[:-1], self.action_dim)
-        noise = torch.randn(shape, device=is_init.device, generator=self.generator)
+        noise = of_worlds(
+            lambda drawn: torch.randn(drawn, device=is_init.device, generator=self.generator), shape
+        )
         if self._present is None or self._present.shape != noise.shape:
             self._present = noise
         else:
@@ -235,7 +237,10 @@ class RandomDiscretePolicy(DrawingPolicy):
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         is_init = tensordict.get("is_init")
-        action = torch.randint(
-            self.num_actions, is_init.shape[:-1], device=is_init.device, generator=self.generator
+        action = of_worlds(
+            lambda drawn: torch.randint(
+                self.num_actions, drawn, device=is_init.device, generator=self.generator
+            ),
+            is_init.shape[:-1],
         )
         return tensordict.set("action", action)

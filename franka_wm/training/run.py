@@ -28,6 +28,7 @@ from franka_wm.data.lerobot.windows import RecordedWindows
 from franka_wm.data.replay import WindowReplay
 from franka_wm.device import resolve_device
 from franka_wm.envs import Environment
+from franka_wm.envs.multitask_config import MultiTaskConfig
 from franka_wm.errors import FrankaError, UserError
 from franka_wm.interrupt import INTERRUPTED
 from franka_wm.seeding import derive_seed, seeded
@@ -147,7 +148,7 @@ class Run:
         """The training worlds and the evaluation worlds, compiled and ready; ``None`` where there are none.
 
         A run on recorded data trains in no world; without an environment (``env=none``) none evaluates it either. Of
-        several processes the first one alone evaluates.
+        several processes each has as many evaluation worlds as one may have to play.
         """
         gathers = not self.settings.is_offline
         if not gathers:  # what is wrong with the data is said before minutes go into building worlds
@@ -159,7 +160,7 @@ class Run:
             worlds = f"{self.settings.values['collector']['num_envs']} training and {worlds}"
         compiling = "on a machine's first start this compiles kernels for a minute or two"
         with announced(f"building {worlds}" + (f"; {compiling}" if self.settings.is_arm else "")):
-            eval_env = build.make_evaluation_env(self.settings) if processes.is_first() else None
+            eval_env = build.make_evaluation_env(self.settings, num_envs=self._evaluation_worlds())
             own = processes.rank() * self.settings.collector.num_envs
             parallel = self.settings.collector.parallel
             env = build.make_env(self.settings, first_world=own, parallel=parallel) if gathers else None
@@ -172,6 +173,12 @@ class Run:
                     of = "training" if one is env else "evaluation"
                     one.set_seed(derive_seed(of, self.settings.seed, *(apart if one is env else ())))
         return env, eval_env
+
+    def _evaluation_worlds(self) -> int:
+        """This process's; as many of several tasks, or it could not play those that follow another one's."""
+        config, episodes = self.settings.env.config, self.settings.evaluation.episodes
+        tasks = len(config.tasks) if isinstance(config, MultiTaskConfig) else 1
+        return min(episodes, tasks * -(-episodes // (tasks * processes.count())))
 
     def build_experience(self, env: Environment | None) -> tuple[WindowReplay | RecordedWindows, Spaces]:
         """Where batches come from, and what a model must know of it: ``sample()`` and its :class:`Spaces`."""

@@ -11,6 +11,7 @@ import torch
 from tensordict import TensorDictBase
 from torchrl.data import ReplayBuffer
 
+from franka_wm import processes
 from franka_wm.data.memory import free_memory
 from franka_wm.data.stacks import StackStorage, newest
 from franka_wm.device import resolve_device
@@ -72,14 +73,15 @@ def check_memory(run: RunSettings, model: torch.nn.Module, spaces: Spaces) -> No
             torch.empty(step * r.capacity, dtype=torch.uint8)
         except (RuntimeError, TypeError) as error:  # the latter beyond 64 bits
             raise UserError(_not_allocated(r.capacity, step, device)) from error
+    played = -(-e.episodes // processes.count())
     film = min(e.video_episodes, e.episodes) * run.env.episode_length * 3 * e.video_size**2
     parts = {
         "the model and its optimiser (model, size)": 16 * sum(x.numel() for x in model.parameters()),
         f"experience (replay.capacity={r.capacity})": step * min(r.capacity, steps),
         f"a batch (replay.batch_size={r.batch_size})": step * r.batch_size * run.window,
         f"worlds (collector.num_envs={c.num_envs})": c.num_envs * (PER_WORLD + step * c.steps_per_batch),
-        f"worlds (evaluation.episodes={e.episodes})": e.episodes * (PER_WORLD + step),
-        "plans (planner.num_samples, planner.horizon)": 4 * e.episodes * planned * max(spaces.action_dim, 1),
+        f"worlds (evaluation.episodes={e.episodes})": played * (PER_WORLD + step),
+        "plans (planner.num_samples, planner.horizon)": 4 * played * planned * max(spaces.action_dim, 1),
         f"a video (evaluation.video_size={e.video_size})": film,
     }
     needed = sum(parts.values())

@@ -42,8 +42,8 @@ EVALUATION_SHARE = 0.1
 class Trainer:
     """Gathers experience and learns from it, in turns.
 
-    Under several processes each has worlds, experience and a part of every batch of its own; they turn together, and
-    the first one evaluates and speaks for all.
+    Under several processes each has worlds, experience and a part of every batch of its own; they turn and
+    evaluate together, and the first one speaks for all.
 
     Args:
         env: The training worlds; ``None`` on recorded data.

@@ -136,6 +136,8 @@ def test_each_task_has_its_expert(env) -> None:
         own = build.make_scripted_policies(one)
         alone = own.get("expert", own.get("ik"))(env.split(now)[name])["action"]
         assert torch.equal(acted[k::2, : alone.shape[-1]], alone)
+    for count in (1, 4):  # an evaluation may play some of the worlds
+        assert torch.equal(policies["expert"](now[:count].clone())["action"], acted[:count])
 
 
 def test_success_of_a_task_counts_its_own_worlds_alone(env, monkeypatch) -> None:

@@ -126,6 +126,10 @@ class Simulation:
         self.tensors.seed[0] = as_int32(seed)
         self.tensors.episode.fill_(-1)
 
+    def set_first_world(self, number: int) -> None:
+        """From the next reset on, these worlds play the episodes of those from ``number``."""
+        self.tensors.seed[1] = number
+
     def statistics(self, *, clear: bool = True) -> dict[str, float]:
         """Counts and means over the episodes that ended since the last call; one host sync."""
         totals = dict(zip(STATISTICS, self.tensors.statistics.sum(0).tolist(), strict=True))
