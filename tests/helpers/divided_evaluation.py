@@ -60,8 +60,9 @@ def evaluated(name: str, folder: Path) -> dict[str, Any]:
         point = protocol.numbers_to_log(worlds, policies, episodes=3, together=together)
     finally:
         protocol.play_episodes = play
-    for one in (env, worlds):
-        one.close()
+    assert env is not None
+    env.close()
+    worlds.close()
     rows = {name: one.to_dict() for name, one in found.episodes.items()}
     return {
         "rows": rows,

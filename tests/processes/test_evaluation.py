@@ -41,7 +41,9 @@ def test_the_table_is_that_of_one_process(divided, name, tmp_path) -> None:
     assert found[0][name]["protocol"] == alone["protocol"]
     for policy, rows in alone["rows"].items():
         # Matrix products of other batch sizes are rounded otherwise.
-        near = {"rtol": 1e-3, "atol": 1e-5} if policy in ("planner", "policy") else {"rtol": 0, "atol": 0}
+        near: dict[str, Any] = (
+            {"rtol": 1e-3, "atol": 1e-5} if policy in ("planner", "policy") else {"rtol": 0, "atol": 0}
+        )
         torch.testing.assert_close(found[0][name]["rows"][policy], rows, equal_nan=True, **near)
         if policy not in ("planner", "policy"):
             assert found[0][name]["policies"][policy] == alone["policies"][policy]
