@@ -39,7 +39,7 @@ class ArticulatedFile(Standing):
         handle: What is observed as the body's place: name of a link (the middle of its largest geometry), of a site or
             a geom, or a point (x, y, z) in the file's frame, closed, in the file's units.
         scale: Metres per unit of the file; masses go with its cube.
-        color, case_color: Of what moves, and of what stands, where the file has no colour.
+        color, case_color: Colours of what moves and of what stands, where the file has none.
     """
 
     joint: str | None = None

@@ -45,7 +45,7 @@ class Part:
         color: Red, green, blue, from 0 to 1; ``None``: the file has none.
         touched, seen: Whether it collides, and whether it is drawn.
         surface: Triangles of a mesh.
-        hull: Of a mesh that is touched: its convex hull.
+        hull: Convex hull of a mesh that is touched.
         corners: (C, 3) points of which it lies in the convex hull [m].
     """
 
@@ -72,8 +72,8 @@ class Mechanism:
         axis: Direction in which, or around which, it opens.
         hinge: A point of the axis [m].
         travel: How far it opens [m or rad].
-        friction, damping, armature: Of the joint.
-        mass, center, inertia: Of what moves [kg], its centre of mass [m], and (3, 3) about that [kg·m²].
+        friction, damping, armature: What the joint has of each, in MuJoCo's units.
+        mass, center, inertia: Mass of what moves [kg], its centre of mass [m], and (3, 3) about that [kg·m²].
         handle: Place of the handle [m].
         bar: Thickness of the handle between the fingers [m], and the hand's angle around it [rad].
     """
@@ -383,6 +383,6 @@ def _box(corners: np.ndarray) -> tuple[np.ndarray, float]:
 
 
 def _distance(point: np.ndarray, corners: np.ndarray) -> tuple[float, float]:
-    """Of a point to the box around some others, and that box's volume."""
+    """Distance of a point from the box around some others, and that box's volume."""
     away = point - np.clip(point, corners.min(0), corners.max(0))
     return float(np.linalg.norm(away)), _box(corners)[1]

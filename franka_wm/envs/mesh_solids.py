@@ -18,7 +18,7 @@ from franka_wm.errors import UserError
 
 FORMATS = ("obj", "stl", "ply")
 PARTS_FORMATS = ("obj", "ply")
-"""Of files with parts: an STL does not say which triangles belong together."""
+"""Formats of files with parts: an STL does not say which triangles belong together."""
 MOST_BYTES = 64 * 2**20
 """Largest file that is read."""
 MOST_FACES = 50_000
