@@ -106,6 +106,10 @@ def _check_windows(run: RunSettings) -> None:
 
 def _check_demonstrations(run: RunSettings) -> None:
     if run.replay.demos is None:
+        if run.replay.demo_resets:
+            raise UserError(
+                f"replay.demo_resets={run.replay.demo_resets}: needs demonstrations, replay.demos=FOLDER"
+            )
         return
     if run.is_offline:
         raise UserError(

@@ -9,12 +9,20 @@ from tensordict import TensorDict
 from franka_wm.data.demonstrations import Demonstrations
 from franka_wm.data.hindsight import Hindsight
 from franka_wm.envs import Environment
+from franka_wm.envs.simulation.demonstrated import READS
 from franka_wm.errors import UserError
+from franka_wm.training import build
 from franka_wm.training.settings import RunSettings
 from franka_wm.training.spaces import Spaces
 
-SAME = ("task", "reward", "action_mode", "action_scale", "action_penalty", "success_distance")
+SAME = (
+    *("task", "reward", "action_mode", "action_scale", "action_penalty", "success_distance"),
+    "terminate_on_success",
+)
 """Options of the arm that must be those of its demonstrations."""
+
+UNSEEN = ("object_size", "table_height", "observation_noise", "object_noise", "action_latency")
+"""Randomization that is not in what is observed, or hides it: states cannot be restored from that."""
 
 
 def open_demonstrations(
@@ -41,7 +49,7 @@ def open_demonstrations(
         batch_size=1,
         device=env.device,
         validation_fraction=0.0,
-        keys=list(wanted),
+        keys=list({**wanted, **dict.fromkeys(READS if run.replay.demo_resets else ())}),
         frame_stack=run.env.frame_stack,
         action_dim=spaces.action_dim,
     )
@@ -55,7 +63,13 @@ def open_demonstrations(
     if recorded.reward_bounds is None:
         raise UserError("replay.demos: these episodes have no rewards; record them with franka-wm collect")
     keys = [*wanted, "action", "is_init", *(("next", key) for key in (*wanted, "reward", "terminated"))]
-    transitions: Any = TensorDict.cat([one.select(*keys) for one in recorded.batches(4096)])
+    starts = READS if run.replay.demo_resets else ()
+    transitions: Any = TensorDict.cat([one.select(*keys, *starts) for one in recorded.batches(4096)])
+    if starts:
+        arm, steps = build.arm_of(env), transitions.squeeze(1)
+        assert arm is not None
+        arm.simulation.start_along(steps, steps["is_init"].squeeze(-1), run.replay.demo_resets)
+        transitions = transitions.select(*keys)
     most = max(run.demo_windows(update) for update in (0, run.replay.demo_updates, run.trainer.updates))
     return Demonstrations(transitions, window=run.window, most=most, hindsight=hindsight)
 
@@ -66,8 +80,13 @@ def check_demonstrations(run: RunSettings) -> None:
     Raises:
         UserError: One line.
     """
+    share = run.replay.demo_resets
     if run.replay.demos is None:
         return
+    if share and not (run.is_arm and run.env.arm.has_gripper):
+        raise UserError(
+            f"replay.demo_resets={share}: is for tasks with a gripper, such as env=stack; leave it at 0"
+        )
     if run.env.kind == "multitask":
         raise UserError(
             "replay.demos: demonstrations are of one task, env=multitask has several; leave it at null"
@@ -77,9 +96,19 @@ def check_demonstrations(run: RunSettings) -> None:
 
     arm = run.env.arm if run.is_arm else None
     sources, _ = read_datasets(run.replay.demos, fps=arm and arm.fps, action_dim=arm and arm.action_dim)
-    for source in sources if arm else ():
+    if arm is None:
+        return
+    for source in sources:
         for session in (read_provenance(source.root) or {}).get("sessions", ()):
             recorded = session.get("config", {}).get("env", {})
+            drawn = {"run": vars(arm.randomization), "dataset": recorded.get("randomization", {})}
+            for where, ranges in drawn.items():
+                unseen = next((name for name in UNSEEN if share and ranges.get(name)), None)
+                if unseen is not None:
+                    raise UserError(
+                        f"replay.demo_resets={share}: this {where} has env.randomization.{unseen}={ranges[unseen]}, "
+                        "which no observation shows; leave one of them at 0"
+                    )
             for name in SAME:
                 here = getattr(arm, name)
                 if recorded.get(name, here) != here:

@@ -25,7 +25,7 @@ from franka_wm.interrupt import interruptible
 from franka_wm.models import WorldModel
 from franka_wm.policies.exploration import ActingPolicy
 from franka_wm.seeding import derive_seed, seeded
-from franka_wm.training.build import explore
+from franka_wm.training.build import arm_of, explore
 from franka_wm.training.learner import Learner
 from franka_wm.training.loggers import log_numbers
 from franka_wm.training.moment import draws, worlds_now
@@ -110,6 +110,8 @@ class Trainer:
         if (hindsight := getattr(replay, "hindsight", None)) is not None:
             self._keys = list(dict.fromkeys([*self._keys, *hindsight.reads]))
         self.demonstrations = getattr(replay, "demonstrations", None)
+        arm = arm_of(env)
+        self._starts = None if arm is None else arm.simulation.starts
         self._extra = list(self.model.replay_keys)
         # What the acting policy writes for the loss, a random one does not: then the actor fills the replay, too.
         self.acting = None
@@ -214,6 +216,8 @@ class Trainer:
 
     def gather(self) -> None:
         """One batch of the collector into the replay."""
+        if self._starts is not None:
+            self._starts.from_part(self.settings.demo_starts_from(self.learner.updates))
         if self._experience is None:
             self.collect()
         assert self._experience is not None

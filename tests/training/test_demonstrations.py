@@ -14,6 +14,7 @@ from franka_wm.training import build
 from franka_wm.training.check import check
 from franka_wm.training.demos import open_demonstrations
 from franka_wm.training.learner import Learner
+from franka_wm.training.trainer import Trainer
 
 ARM = ("env=reach", "env.substeps=1", "env.episode_length=8", "seed=0", "device=cpu")
 
@@ -61,6 +62,63 @@ def test_statistics_of_observations_see_them_too(demos: Path, train) -> None:
     assert not torch.allclose(one, other)
 
 
+GRIPPER = (
+    "env=push",
+    "env.substeps=1",
+    "env.episode_length=8",
+    "seed=0",
+    "device=cpu",
+    "evaluation.during=[]",
+)
+
+
+@pytest.fixture(scope="module")
+def pushes(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Four episodes of the expert, eight steps each."""
+    root = tmp_path_factory.mktemp("demos") / "push"
+    own = [one for one in GRIPPER if not one.startswith("evaluation")]
+    assert cli.main(["collect", f"out={root}", "policy=expert", "episodes=4", "num_envs=4", *own]) == 0
+    return root
+
+
+def test_training_begins_along_them(pushes: Path, train, monkeypatch) -> None:
+    """From their ends on at first, then everywhere."""
+    parts, begun, gather = [], [], Trainer.gather
+    recorded = open_dataset(pushes, window=1, batch_size=1, validation_fraction=0.0, say=lambda line: None)
+    states = torch.cat([one["state"].flatten(0, 1) for one in recorded.batches(100)])
+
+    def watched(self: Trainer) -> None:
+        gather(self)
+        parts.append(float(self._starts._earliest))  # pyright: ignore[reportOptionalMemberAccess]
+        data = self.replay[:]
+        begun.append(data["state"][data["is_init"].squeeze(-1)])
+
+    monkeypatch.setattr(Trainer, "gather", watched)
+    resets = (
+        f"replay.demos={pushes}",
+        "replay.demo_resets=1",
+        "replay.demo_reset_updates=20",
+        "trainer.updates=30",
+    )
+    train(*GRIPPER, *resets)
+    assert parts == [1.0] * 3 + [0.5, 0.0]
+    first, last = (
+        (starts[:, None, :7] == states[None, :, :7]).all(-1).nonzero() for starts in (begun[0], begun[-1])
+    )
+    assert (len(states), len(first), len(last)) == (32, len(begun[0]), len(begun[-1]))  # each is one of them
+    assert (first[:, 1] % 8 == 7).all() and not (last[:, 1] % 8 == 7).all()
+
+
+def test_what_is_evaluated_never_begins_along_them(pushes: Path, train, monkeypatch) -> None:
+    built = []
+    make = build.make_evaluation_env
+    monkeypatch.setattr(
+        build, "make_evaluation_env", lambda *a, **k: built.append(make(*a, **k)) or built[-1]
+    )
+    train(*GRIPPER, f"replay.demos={pushes}", "replay.demo_resets=1", "trainer.updates=0")
+    assert built and all(env.simulation.starts is None for env in built)
+
+
 def test_none_is_an_episode_of_the_evaluation(demos: Path, settled) -> None:
     recorded = open_dataset(demos, window=1, batch_size=1, validation_fraction=0.0, say=lambda line: None)
     run = settled("scale=smoke", *ARM, "evaluation.episodes=64")
@@ -100,6 +158,12 @@ def test_episodes_without_rewards_are_refused(demos: Path, settled, monkeypatch)
         (("replay.demo_updates=31",), "must be at most trainer.updates=30"),
         (("replay.demos={demos}/nowhere",), "nowhere"),
         (("replay.demo_share=1.5",), "replay.demo_share=1.5"),
+        (
+            ("env.terminate_on_success=true",),
+            "recorded with env.terminate_on_success=False, this run has True",
+        ),
+        (("replay.demo_resets=0.5",), "is for tasks with a gripper"),
+        (("replay.demos=null", "replay.demo_resets=0.5"), "needs demonstrations"),
     ],
 )
 def test_what_cannot_be_is_refused_before_anything_is_built(demos: Path, settled, changes, message) -> None:
@@ -107,6 +171,15 @@ def test_what_cannot_be_is_refused_before_anything_is_built(demos: Path, settled
     with pytest.raises(UserError, match=message) as refused:
         check(settled("scale=smoke", *ARM, *words))
     assert "\n" not in str(refused.value)
+
+
+def test_states_that_no_observation_shows_are_refused(pushes: Path, settled) -> None:
+    words = (f"replay.demos={pushes}", "replay.demo_resets=0.5", "env.randomization.object_size=0.1")
+    run = settled("scale=smoke", *GRIPPER, *words)
+    with pytest.raises(
+        UserError, match=r"this run has env\.randomization\.object_size=0.1, which no observation"
+    ):
+        check(run)
 
 
 @pytest.mark.parametrize(

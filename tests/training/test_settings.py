@@ -37,6 +37,8 @@ OUT_OF_RANGE = {
     "replay.demo_share": [-0.1, 1.1],
     "replay.demo_share_end": [-0.1, 1.1],
     "replay.demo_updates": [-1],
+    "replay.demo_resets": (-0.1, 1.5),
+    "replay.demo_reset_updates": (-1, 0.5),
     "trainer.updates": [-1],
     "trainer.updates_per_batch": [0],
     "trainer.lr": [0.0, -1.0],

@@ -110,6 +110,11 @@ class Bodies:
             pads = [int(name[-1]) if name in ("pad0", "pad1") else -1 for name in names]
             self._finger = wp.array(pads, dtype=int, device=device)
 
+    @property
+    def layout(self) -> list[object]:
+        """How many objects there are; handle, hinge and axis of each articulated body, and whether it slides."""
+        return [self._count, *self._joint_axes]
+
     def articulation_mask(self, mask: wp.array) -> wp.array:
         """A mask of worlds as Newton's forward kinematics takes it, which counts every object as well."""
         self._launch(kernels.spread_mask, mask, self._articulations, self._mask)

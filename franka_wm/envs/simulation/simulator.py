@@ -28,6 +28,7 @@ from franka_wm.envs.simulation import state as worlds
 from franka_wm.envs.simulation.arrays import STATISTICS, allocate, as_int32
 from franka_wm.envs.simulation.bodies import Bodies
 from franka_wm.envs.simulation.build import Chain, build_model, make_solver
+from franka_wm.envs.simulation.demonstrated import DemonstratedStarts
 from franka_wm.envs.simulation.graph import Recorder, Recording
 from franka_wm.envs.simulation.rendering import Renderer
 from franka_wm.envs.tasks import Task, make_task
@@ -90,6 +91,7 @@ class Simulation:
         )
         self.bodies = Bodies(self) if config.has_gripper else None
         self.randomizer = Randomizer(self)
+        self.starts: DemonstratedStarts | None = None
         self.recorder = Recorder(device)
         self.renderer = Renderer(self)
         self._dt = 1.0 / (config.fps * config.substeps)
@@ -125,6 +127,12 @@ class Simulation:
         """The next reset of each world is its episode 0 of this seed."""
         self.tensors.seed[0] = as_int32(seed)
         self.tensors.episode.fill_(-1)
+
+    def start_along(self, steps: Mapping[str, torch.Tensor], begins: torch.Tensor, share: float) -> None:
+        """From the next reset on, a share of the episodes begins in a recorded state: :class:`DemonstratedStarts`."""
+        self.starts = DemonstratedStarts(self, steps, begins, share)
+        self._step_graphs.clear()  # recorded without
+        self._reset_graph = None
 
     def set_first_world(self, number: int) -> None:
         """From the next reset on, these worlds play the episodes of those from ``number``."""
@@ -297,6 +305,8 @@ class Simulation:
         if self.task.num_draws:
             self._launch(randomization.draw_uniform, w.mask, w.seed, w.episode, w.draws)
         self.task.reset(self, w.mask)
+        if self.starts is not None:
+            self.starts.launch(w.mask)
         if self.bodies:
             self.bodies.launch_goal(w.mask)
         self.launch_forward_kinematics(w.mask)

@@ -72,6 +72,8 @@ class ReplaySettings:
     demo_share: float = real(0.5, least=0, most=1)
     demo_share_end: float | None = real(None, least=0, most=1, null="demo_share to the end")
     demo_updates: int = whole(0, least=0, most=MOST_UPDATES)
+    demo_resets: float = real(0.0, least=0, most=1)
+    demo_reset_updates: int = whole(0, least=0, most=MOST_UPDATES)
 
 
 @dataclass(frozen=True)

@@ -225,6 +225,11 @@ class RunSettings:
         end = r.demo_share if r.demo_share_end is None else r.demo_share_end
         return round(r.batch_size * (r.demo_share + (end - r.demo_share) * min(1.0, update / max(1, total))))
 
+    def demo_starts_from(self, update: int) -> float:
+        """From which part of demonstrations on episodes begin at this update: the end at first, then all of them."""
+        over = self.replay.demo_reset_updates
+        return max(0.0, 1.0 - update / over) if over else 0.0
+
     @property
     def learning_rate(self) -> float:
         """The trainer's, or the model's own."""
