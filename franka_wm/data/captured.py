@@ -9,7 +9,6 @@ from tensordict import TensorDictBase
 from torchrl.data import ReplayBuffer
 
 from franka_wm.data.replay import WindowReplay, WindowSampler, newest_step
-from franka_wm.data.stacks import StackStorage
 
 
 class CapturedSampling:
@@ -30,7 +29,7 @@ class CapturedSampling:
     def __init__(self, replay: ReplayBuffer):
         self.replay = replay
         self._calls = 0
-        self._memory: tuple[int, int] | None = None
+        self._memory: tuple[int, ...] | None = None
         self._graph: torch.cuda.CUDAGraph | None = None
         self._batch: TensorDictBase | None = None
         self._crossing: torch.Tensor | None = None
@@ -46,8 +45,7 @@ class CapturedSampling:
         assert isinstance(sampler, WindowSampler)
         span, oldest = sampler.bounds(storage)
         data = storage._storage
-        memory = (id(data), data.get(sampler.boundary).data_ptr())
-        if memory != self._memory:
+        if (memory := storage.memory) != self._memory:
             self._choices = torch.ones((), dtype=torch.float64, device=data.device)
             self._oldest = torch.zeros((), dtype=torch.int64, device=data.device)
             self._newest = torch.zeros((), dtype=torch.int64, device=data.device)
@@ -87,8 +85,8 @@ class CapturedSampling:
         # The largest product rounds up to the number of choices itself for huge buffers only; hence the bound.
         draw = torch.minimum(uniform * self._choices, self._choices - 1.0).long()
         time, world, crossing = sampler.choose(data, draw, self._oldest, size)
-        storage = self.replay.storage
-        self._batch = storage.windows(time, world) if isinstance(storage, StackStorage) else data[time, world]
+        storage: Any = self.replay.storage
+        self._batch = storage.windows(time, world)
         if isinstance(self.replay, WindowReplay):
             if self.replay.hindsight is not None:
                 self.replay.hindsight(self._batch, data, time, world, self._newest)

@@ -8,7 +8,7 @@ import torch
 from tensordict import TensorDictBase
 
 from franka_wm.data.hindsight import Hindsight
-from franka_wm.data.stacks import BOUNDARY
+from franka_wm.data.image_storage import BOUNDARY
 from franka_wm.errors import UserError
 
 DEMONSTRATED = "demonstrated"

@@ -8,7 +8,7 @@ from typing import Any
 import torch
 from tensordict import TensorDictBase
 
-from franka_wm.data.stacks import BOUNDARY
+from franka_wm.data.image_storage import BOUNDARY
 
 Relabel = Callable[[TensorDictBase, torch.Tensor], TensorDictBase]
 """(windows (B, H), goals (B, 3) [m]) -> the entries that another goal changes, of the same shapes."""

@@ -7,12 +7,12 @@ from collections.abc import Sequence
 from typing import Any, cast
 
 import torch
-from torchrl.data import LazyTensorStorage, ReplayBuffer
+from torchrl.data import ReplayBuffer
 from torchrl.data.replay_buffers import RoundRobinWriter, Sampler
 
 from franka_wm.data.demonstrations import Demonstrations
 from franka_wm.data.hindsight import Hindsight
-from franka_wm.data.stacks import BOUNDARY, StackStorage
+from franka_wm.data.image_storage import BOUNDARY, ImageStorage
 from franka_wm.errors import UserError
 
 
@@ -217,7 +217,7 @@ def make_replay(
         hindsight: Relabels a share of each batch with goals that were reached later.
         demonstrations: Take the place of a share of each batch.
         episode_length: Steps of an episode, where it is known: windows of more than half of it are seldom whole, so
-            more of them must be drawn.
+            more of them must be drawn; and how many last images there is room for at first.
 
     Returns:
         A ``ReplayBuffer`` whose samples have batch size (batch_size, window).
@@ -232,10 +232,12 @@ def make_replay(
     oversample = WindowSampler.OVERSAMPLE
     if window <= episode_length < 2 * window:
         oversample = math.ceil(oversample * episode_length / (episode_length - window + 1))
-    storage = (
-        StackStorage(steps * num_envs, frame_stack=frame_stack, stacked=stacked, device=device)
-        if before
-        else LazyTensorStorage(steps * num_envs, ndim=2, device=device)
+    storage = ImageStorage(
+        steps * num_envs,
+        episode_length=episode_length,
+        frame_stack=frame_stack,
+        stacked=stacked if before else (),
+        device=device,
     )
     return WindowReplay(
         hindsight=hindsight,

@@ -412,7 +412,7 @@ def make_replay_buffer(
     hindsight: Hindsight | None = None,
     demonstrations: Demonstrations | None = None,
 ) -> WindowReplay:
-    """The replay buffer that ``run.replay`` describes; it keeps each image of a stack once."""
+    """The replay buffer that ``run.replay`` describes; it keeps each image once."""
     cameras = run.env.arm.cameras if run.is_arm else ()
     return make_replay(
         capacity=run.replay.capacity,

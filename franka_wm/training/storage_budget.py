@@ -13,7 +13,6 @@ from torchrl.data import ReplayBuffer
 
 from franka_wm import processes
 from franka_wm.data.memory import free_memory
-from franka_wm.data.stacks import StackStorage, newest
 from franka_wm.device import resolve_device
 from franka_wm.errors import UserError
 from franka_wm.training.settings import RunSettings
@@ -109,8 +108,7 @@ def fill(
     """
     storage: Any = replay.storage
     device = torch.device(storage.device)
-    kept = newest(batch, storage.stacked, storage.frame_stack) if isinstance(storage, StackStorage) else batch
-    per_step = kept.bytes() / kept.numel()
+    per_step = storage.bytes_per_step(batch)
     steps = run.replay.capacity
     if device.type != "cuda":
         ahead = run.collector.num_envs * run.planned_steps(updates)
@@ -138,10 +136,11 @@ def _not_allocated(capacity: int, per_step: float, device: torch.device) -> str:
 
 
 def filled_bytes(replay: ReplayBuffer) -> int:
-    """Bytes that the filled part of a replay of TorchRL's holds."""
+    """Bytes of the filled part of a replay as a checkpoint holds it: with both images of each step."""
     storage: Any = replay.storage
-    filled, slots = storage._len_along_dim0, storage._storage.shape[0]
-    return storage._storage.bytes() * filled // slots
+    filled, data = storage._len_along_dim0, storage._storage
+    whole = data.bytes() + sum(data.get(key).nbytes for key in storage.images)
+    return whole * filled // data.shape[0]
 
 
 def reason_to_leave_out(size: int, folder: Path, *, last: bool, wanted: bool | None) -> str | None:

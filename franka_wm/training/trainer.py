@@ -410,7 +410,7 @@ class Trainer:
         """The filled part of the replay, (worlds, time), in the order in which it was gathered."""
         if self.env is None or not len(self.replay):
             return None
-        data = self.replay[:]
+        data = self.replay.storage.to_host().transpose(0, 1)
         cursor = self.replay.writer._cursor
         full = self.replay.storage._len_along_dim0 == self.replay.storage._storage.shape[0]
         if full and cursor:

@@ -6,7 +6,6 @@ from types import SimpleNamespace
 import pytest
 import torch
 from tensordict import TensorDict
-from torchrl.data import LazyTensorStorage, ReplayBuffer
 
 from franka_wm.data.replay import make_replay
 from franka_wm.errors import UserError
@@ -14,7 +13,7 @@ from franka_wm.training import storage_budget
 
 
 def test_size_of_what_is_filled() -> None:
-    replay = ReplayBuffer(storage=LazyTensorStorage(10 * 4, ndim=2), batch_size=2)
+    replay = make_replay(capacity=10 * 4, num_envs=4, window=2, batch_size=2, device="cpu")
     replay.extend(TensorDict({"x": torch.zeros(4, 5, 3)}, [4, 5]))
     assert storage_budget.filled_bytes(replay) == replay[:].bytes()
 
@@ -44,7 +43,7 @@ def test_left_out(
 
 
 def test_a_replay_that_memory_cannot_hold_is_refused(monkeypatch, settled) -> None:
-    """Before its first step, in one line that names what would fit; of stacked pictures only one each counts."""
+    """Before its first step, in one line that names what would fit; each image counts once, and each last one."""
     pictures = {
         "pixels": torch.zeros(4, 5, 8, 8, 9, dtype=torch.uint8),
         "is_init": torch.ones(4, 5, 1, dtype=torch.bool),
@@ -55,7 +54,8 @@ def test_a_replay_that_memory_cannot_hold_is_refused(monkeypatch, settled) -> No
         collector={"num_envs": 4, "seed_steps": 1000, "steps_per_batch": 2},
         trainer={"updates": 0, "updates_per_batch": 1},
     )
-    for stack, per_step in ((1, 2 * 8 * 8 * 9 + 1), (3, 2 * 8 * 8 * 3 + 1)):
+    for stack, image in ((1, 8 * 8 * 9), (3, 8 * 8 * 3)):
+        per_step = image + 1 + image / 50
         replay = make_replay(
             capacity=4000,
             num_envs=4,
@@ -64,6 +64,7 @@ def test_a_replay_that_memory_cannot_hold_is_refused(monkeypatch, settled) -> No
             device="cpu",
             frame_stack=stack,
             stacked=["pixels"],
+            episode_length=50,
         )
         monkeypatch.setattr(storage_budget, "free_memory", lambda device, most=4000 * per_step: most)
         storage_budget.fill(replay, batch, cfg)

@@ -7,11 +7,11 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from franka_wm.data.image_storage import newest
 from franka_wm.data.lerobot.episodes import cut_replay
 from franka_wm.data.lerobot.provenance import describe
 from franka_wm.data.lerobot.schema import schema_for
 from franka_wm.data.lerobot.writer import DatasetWriter
-from franka_wm.data.stacks import newest
 from franka_wm.errors import UserError
 
 if TYPE_CHECKING:

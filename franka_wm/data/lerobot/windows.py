@@ -13,9 +13,9 @@ from tensordict import TensorDict
 from torch import Tensor
 
 from franka_wm import processes
+from franka_wm.data.image_storage import CHANNELS
 from franka_wm.data.lerobot.cache import Cache
 from franka_wm.data.lerobot.mapping import FeatureMap
-from franka_wm.data.stacks import CHANNELS
 from franka_wm.errors import UserError
 from franka_wm.options import is_real, whole_rule
 from franka_wm.seeding import derive_seed, restore_generator

@@ -1,4 +1,4 @@
-"""A replay that keeps each picture once gives back the stacks that it was given, bit for bit."""
+"""A replay that keeps each image once gives back the images and stacks that it was given, bit for bit."""
 
 from __future__ import annotations
 
@@ -94,17 +94,97 @@ def test_ends_of_episodes_and_single_resets_are_among_them(played) -> None:
     assert (played["pixels"][:, 1:, ..., :3] != played["pixels"][:, :-1, ..., :3]).any()
 
 
-def test_each_picture_is_kept_once(played) -> None:
+def kept_bytes(replay: Any) -> int:
+    """All that the storage has allocated."""
+    storage = replay.storage
+    ends = storage._ends
+    return storage._storage.bytes() + sum(x.nbytes for x in (ends.slots, ends.free, *ends.images.values()))
+
+
+def test_each_image_is_kept_once(played) -> None:
     before = played.clone()
-    stacked, plain = (
-        filled(played, [9], stacked=KEYS),
-        make_replay(capacity=12 * N, num_envs=N, window=WINDOW, batch_size=64, device="cpu"),
-    )
-    plain.extend(played[:, :9])
+    stacked = filled(played, [9], stacked=KEYS)
     assert (played == before).all()
-    pictures = 2 * len(KEYS) * 16 * 16 * 3 * 9 * N
-    assert filled_bytes(plain) - filled_bytes(stacked) == (COUNT - 1) * pictures
-    assert stacked[:]["pixels"].shape[-1] == 3
+    image = len(KEYS) * 16 * 16 * 3
+    singles = stacked[:]
+    assert singles["pixels"].shape[-1] == 3
+    assert filled_bytes(stacked) == singles.bytes()
+    assert torch.equal(singles["next", "pixels"], played["next", "pixels"][:, :9, ..., -3:])
+    # In two hundred steps the room for the ends of episodes of 50 is little.
+    long = filled(played, [9], steps=200, stacked=KEYS)
+    per_step = (kept_bytes(long) - 200 * N * (singles.bytes() // singles.numel() - 2 * image)) / (200 * N)
+    assert image < per_step < 1.1 * image
+    assert long.storage.bytes_per_step(played) == pytest.approx(kept_bytes(long) / (200 * N), rel=0.08)
+
+
+def synthetic(worlds: int, steps: int, ends: float, seed: int) -> TensorDict:
+    """Steps (worlds, time) with images of one number each; an episode may be one step long."""
+    generator = torch.Generator().manual_seed(seed)
+    begins = torch.rand(worlds, steps, 1, generator=generator) < ends
+    begins[:, 0] = True
+    image = torch.rand(worlds, steps + 1, 1, 1, 3, generator=generator)
+    last = torch.rand(worlds, steps, 1, 1, 3, generator=generator)
+    goes_on = torch.cat([~begins[:, 1:], torch.ones(worlds, 1, 1, dtype=torch.bool)], 1)
+    led_to = torch.where(goes_on[..., None, None], image[:, 1:], last)
+    after = {"pixels": led_to, "number": torch.arange(steps).expand(worlds, steps).unsqueeze(-1) + 1}
+    root = {"pixels": image[:, :-1], "is_init": begins, "number": after["number"] - 1}
+    return TensorDict(root | {"next": TensorDict(after, [worlds, steps])}, [worlds, steps])
+
+
+@pytest.mark.parametrize("ends", [0.0, 0.1, 0.5, 1.0])
+def test_whatever_comes_is_given_back(ends: float) -> None:
+    """Compared with a storage that keeps everything twice: all chunks, wrapped around many times, ends of all kinds."""
+    worlds, times = 5, 13
+    for seed in range(4):
+        data = synthetic(worlds, 120, ends, seed)
+        options = {
+            "capacity": worlds * times,
+            "num_envs": worlds,
+            "window": 2,
+            "batch_size": 4,
+            "device": "cpu",
+        }
+        replay = make_replay(**options, episode_length=7 if seed else 0)
+        sizes = torch.randint(1, 2 * times, (20,), generator=torch.Generator().manual_seed(seed)).tolist()
+        start = 0
+        for size in [1, 1, times, times - 1, *sizes]:
+            if start + size > 120:
+                break
+            replay.extend(data[:, start : start + size])
+            start += size
+            kept = data[:, max(0, start - times) : start]
+            got = replay[:]
+            order = got["number"][0, :, 0].argsort()
+            assert (got[:, order] == kept).all(), (ends, seed, start)
+            time = order.expand(worlds, -1)[:, :-1]
+            world = torch.arange(worlds).unsqueeze(1).expand_as(time)
+            assert (replay.storage.get((time, world)) == kept[:, :-1]).all()
+        taken = (replay.storage._ends.slots >= 2).sum(0)
+        ended = (data["is_init"][:, start - times + 1 : start, 0]).sum(1)
+        assert torch.equal(taken, ended)  # none is lost, none is held for a step that is gone
+        free = len(replay.storage._ends.images["pixels"]) - 2 - taken
+        assert torch.equal(replay.storage._ends.count, free)
+        assert ((taken > 0) & (taken < times - 1)).any() or ends in (0.0, 1.0)
+
+
+def test_emptied_it_begins_anew() -> None:
+    data = synthetic(3, 30, 0.2, 0)
+    replay = make_replay(capacity=3 * 12, num_envs=3, window=2, batch_size=4, device="cpu")
+    replay.extend(data[:, :8])
+    replay.empty()
+    replay.extend(data[:, 20:27])
+    assert (replay[:] == data[:, 20:27]).all()
+
+
+def test_images_that_do_not_follow_are_refused() -> None:
+    """Rather than given back as if they did."""
+    data = synthetic(3, 10, 0.2, 0)
+    wrong = data.clone()
+    wrong["next", "pixels"][1, 4] += 1.0
+    assert not data["is_init"][1, 5]
+    replay = make_replay(capacity=3 * 12, num_envs=3, window=2, batch_size=4, device="cpu")
+    with pytest.raises(UserError, match="pixels: the image that a step begins with is not the one"):
+        replay.extend(wrong)
 
 
 def test_what_a_checkpoint_kept_is_taken_as_it_is(played) -> None:
