@@ -2,7 +2,7 @@
 # Every target sets up .venv first if it has to; the second time that costs nothing.
 #
 #   make train ARGS="env=reach_fixed seed=3"     Hydra overrides go into ARGS
-#   make results ROW=reach-cpu                   measure one row of docs/results.md again
+#   make results ROW="reach-cpu muzero-cpu"      measure rows of docs/results.md again
 #   make clean setup PYTHON=/opt/python3.12      choose the interpreter yourself
 
 SHELL := /bin/bash
@@ -59,7 +59,7 @@ test-slow: $(DEV) ## run the slow tests, which continuous integration runs as we
 	@$(PYTEST) -m slow $(ARGS)
 
 # Numbers come from the files in docs/results/, which runs wrote: benchmarks/results/rows.yaml declares them.
-results: $(DEV) ## which results are older than the code; ROW=name measures one again
+results: $(DEV) ## which results are older than the code; ROW="name …" measures some again
 	@if [[ -n "$(ROW)" ]]; then $(BIN)/python -m benchmarks.results run $(ROW) $(ARGS); fi
 	@$(BIN)/python -m benchmarks.results render
 	@$(BIN)/python -m benchmarks.results list

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import argparse
 import sys
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import benchmarks.results
 from benchmarks.results import confirm, records, render, running
 from benchmarks.results.rows import Row, choose, load_rows
-from benchmarks.results.state import state
+from benchmarks.results.state import state, unmeasured
 from franka_wm.errors import FrankaError
 from franka_wm.files import atomic_write
 from franka_wm.source import ROOT
@@ -39,6 +39,13 @@ def overview(rows: Mapping[str, Row], place: Path) -> str:
     return "\n".join(lines)
 
 
+def to_measure(row: Row, seeds: Sequence[int], place: Path) -> list[int]:
+    """Those of a row's seeds that today's code has not measured."""
+    found = records.read(row, place)
+    kind, _ = state(row, found)
+    return [seed for seed in seeds if kind not in ("fresh", "part") or seed in unmeasured(row, found)]
+
+
 def write_pages(rows: Mapping[str, Row], place: Path) -> None:
     """docs/results.md and README's tables."""
     readme = ROOT / "README.md"
@@ -59,9 +66,11 @@ def parse(arguments: list[str] | None) -> argparse.Namespace:
     verbs = parser.add_subparsers(dest="verb")
     verbs.add_parser("list", help="which rows are fresh, stale, missing")
     verbs.add_parser("render", help="write docs/results.md and README's tables")
-    one = verbs.add_parser("run", help="run a row's seeds")
-    one.add_argument("row")
-    one.add_argument("--seeds", type=int, nargs="+", help="default: those of the row")
+    one = verbs.add_parser("run", help="run the seeds of rows")
+    one.add_argument("rows", nargs="+", metavar="row")
+    one.add_argument("--seeds", type=int, nargs="+", help="default: those of each row")
+    one.add_argument("--missing", action="store_true", help="only seeds that today's code has not measured")
+    one.add_argument("--minutes", type=float, help="no run begins later; those that run are waited for")
     one.add_argument("--jobs", type=int, default=1, help="runs at a time, on each device")
     one.add_argument(
         "--beside",
@@ -94,7 +103,6 @@ def main(arguments: list[str] | None = None) -> int:
     try:
         rows = load_rows()
         if chosen.verb == "run":
-            row = choose(rows, chosen.row)
             machine = running.Machine(
                 jobs=chosen.jobs,
                 beside=chosen.beside,
@@ -102,8 +110,12 @@ def main(arguments: list[str] | None = None) -> int:
                 threads=chosen.threads,
                 commit=chosen.commit,
             )
-            out = chosen.out.absolute()
-            failed = running.run(row, machine, seeds=chosen.seeds or row.seeds, out=out, place=chosen.results)
+            work = [(row, chosen.seeds or row.seeds) for row in (choose(rows, name) for name in chosen.rows)]
+            if chosen.missing:
+                work = [(row, to_measure(row, seeds, chosen.results)) for row, seeds in work]
+            failed = running.run(
+                work, machine, out=chosen.out.absolute(), place=chosen.results, minutes=chosen.minutes
+            )
         elif chosen.verb == "collect":
             row = choose(rows, chosen.row)
             for path in chosen.runs:

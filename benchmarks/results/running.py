@@ -6,6 +6,7 @@ import os
 import shlex
 import subprocess
 import sys
+import time
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
@@ -17,6 +18,9 @@ from benchmarks.results.records import PLACE, record_benchmark, record_run, writ
 from benchmarks.results.rows import Row
 from franka_wm.errors import UserError
 from franka_wm.source import ROOT
+
+Slot = tuple[list[str], list[str], dict[str, str]]
+"""What stands before a run's command, what after it, and what in its environment."""
 
 
 @dataclass(frozen=True)
@@ -38,8 +42,8 @@ class Machine:
     threads: int | None = None
     commit: str | None = None
 
-    def slots(self, row: Row) -> list[tuple[list[str], list[str], dict[str, str]]]:
-        """For each run at a time: what stands before its command, after it, and in its environment.
+    def slots(self, row: Row) -> list[Slot]:
+        """One for each run at a time.
 
         Raises:
             UserError: There are too few cores for so many runs.
@@ -65,33 +69,58 @@ class Machine:
         return [(["taskset", "-c", ",".join(map(str, some))], [], environment) for some in own]
 
 
-def run(row: Row, machine: Machine, *, seeds: Sequence[int], out: Path, place: Path = PLACE) -> list[str]:
-    """Runs a row and writes its files; returns what failed, a line for each.
+def run(
+    work: Sequence[tuple[Row, Sequence[int]]],
+    machine: Machine,
+    *,
+    out: Path,
+    place: Path = PLACE,
+    minutes: float | None = None,
+) -> list[str]:
+    """Runs rows and writes their files; returns what failed, a line for each.
+
+    The runs of all rows wait in one line, so that no device idles while one of another row could run. A benchmark has
+    the machine to itself.
 
     Args:
-        row: What to run.
+        work: Rows, and seeds of each; a benchmark has none.
         machine: Where.
-        seeds: Of ``train.py``; a benchmark has none.
         out: Folder for the runs' own folders and what they print.
         place: Folder of the results.
+        minutes: No run begins later; those that run are waited for. ``None``: all begin.
 
     Raises:
         UserError: Before anything runs.
     """
-    if made := prepare(row, ROOT):
-        return [made]
-    slots: Queue[tuple[list[str], list[str], dict[str, str]]] = Queue()
-    for slot in machine.slots(row):
+    begun, failed = time.monotonic(), []
+    slots_of = [machine.slots(row) for row, _ in work]
+    if any(slots != slots_of[0] for slots in slots_of):
+        raise UserError("these rows do not run on the same kind of device or cores; run them apart")
+    stamp = datetime.now().strftime("%Y-%m-%d_%H-%M-%S")
+    line: list[tuple[Row, int]] = []
+    for row, seeds in work:
+        if made := prepare(row, ROOT):
+            failed.append(made)
+        elif row.script is None:
+            line += [(row, seed) for seed in seeds]
+        else:
+            failed += _benchmark(row, slots_of[0][0], out / row.name / stamp, place)
+    slots: Queue[Slot] = Queue()
+    for slot in slots_of[0]:
         slots.put(slot)
-    jobs = min(machine.jobs, len(seeds) or 1)
-    folder = out / row.name / datetime.now().strftime("%Y-%m-%d_%H-%M-%S")
-    folder.mkdir(parents=True, exist_ok=True)  # another command may have begun in the same second
+    jobs = min(machine.jobs, len(line)) + machine.beside
 
-    def one(seed: int) -> str | None:
-        before, after, environment = slot = slots.get()
+    def one(run: tuple[Row, int]) -> str | None:
+        (row, seed), slot = run, slots.get()
         try:
+            if minutes is not None and time.monotonic() - begun > 60 * minutes:
+                return f"{row.name}, seed {seed}: not begun, {minutes:g} minutes were over"
+            before, after, environment = slot
+            folder = out / row.name / stamp
+            folder.mkdir(parents=True, exist_ok=True)  # another command may have begun in the same second
             target = folder / f"seed-{seed}"
             command = [
+                *before,
                 sys.executable,
                 "train.py",
                 *row.words,
@@ -99,24 +128,27 @@ def run(row: Row, machine: Machine, *, seeds: Sequence[int], out: Path, place: P
                 f"seed={seed}",
                 f"hydra.run.dir={target}",
             ]
-            failure = _call([*before, *command], environment, folder / f"seed-{seed}.log")
+            failure = _call(command, environment, folder / f"seed-{seed}.log")
             if failure is None:
-                print(write(record_run(row, target, jobs=jobs + machine.beside), place), flush=True)
+                print(write(record_run(row, target, jobs=jobs), place), flush=True)
             return failure
         except UserError as error:
             return str(error)
         finally:
             slots.put(slot)
 
-    if row.script is not None:
-        before, _, environment = slots.get()
-        command = [sys.executable, *row.command[1:], "--out", str(folder / "run.json")]
-        failure = _call([*before, *command], environment, folder / "run.log")
-        if failure is None:
-            print(write(record_benchmark(row, folder / "run.json"), place), flush=True)
-        return [failure] if failure else []
     with ThreadPoolExecutor(slots.qsize()) as pool:
-        return [failure for failure in pool.map(one, seeds) if failure]
+        return failed + [failure for failure in pool.map(one, line) if failure]
+
+
+def _benchmark(row: Row, slot: Slot, folder: Path, place: Path) -> list[str]:
+    before, _, environment = slot
+    folder.mkdir(parents=True, exist_ok=True)
+    command = [*before, sys.executable, *row.command[1:], "--out", str(folder / "run.json")]
+    failure = _call(command, environment, folder / "run.log")
+    if failure is None:
+        print(write(record_benchmark(row, folder / "run.json"), place), flush=True)
+    return [failure] if failure else []
 
 
 def prepare(row: Row, top: Path) -> str | None:

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import os
 import subprocess
+import threading
 from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
+from benchmarks.results import __main__ as command_line
 from benchmarks.results import records, running
 from benchmarks.results.__main__ import main
 from benchmarks.results.rows import Row, Section, load_rows
@@ -50,7 +52,7 @@ def test_packages_are_found_where_this_process_finds_them(monkeypatch) -> None:
 def test_a_run_that_fails_is_told_and_leaves_no_file(tmp_path) -> None:
     row = replace(ROW, arguments="env=reach_fixed trainer.updatez=1")
     failed = running.run(
-        row, running.Machine(threads=1), seeds=[100], out=tmp_path / "out", place=tmp_path / "place"
+        [(row, [100])], running.Machine(threads=1), out=tmp_path / "out", place=tmp_path / "place"
     )
     assert len(failed) == 1 and "trainer.updatez" in failed[0]
     assert not (tmp_path / "place").exists()
@@ -74,7 +76,7 @@ def test_what_a_row_needs_first_is_made_once(tmp_path, monkeypatch) -> None:
     monkeypatch.setattr(running.subprocess, "run", made)
     row = replace(ROW, before="franka-wm collect out=push episodes=2")
     assert "the disk is full" in (running.prepare(row, tmp_path) or "")
-    (failed,) = running.run(row, running.Machine(threads=1), seeds=[100], out=tmp_path / "out")
+    (failed,) = running.run([(row, [100])], running.Machine(threads=1), out=tmp_path / "out")
     assert "the disk is full" in failed and not (tmp_path / "out").exists()
     assert called == [["-m", "franka_wm", "collect", "out=push", "episodes=2"]] * 2
     (tmp_path / "push").mkdir()
@@ -99,12 +101,59 @@ def test_what_runs_beside_is_recorded_with_the_times(tmp_path, monkeypatch) -> N
     assert told == [3, 1]
 
 
+GPU = replace(ROW, section=Section(title="One GPU", arguments="scale=gpu"))
+
+
+def test_several_rows_wait_in_one_line(tmp_path, monkeypatch) -> None:
+    """A device that is free takes the next run, of whichever row; each row's files are in its own folder."""
+    ran, both = [], threading.Barrier(2, timeout=20)
+
+    def call(command, environment, log):
+        both.wait()  # two at a time, one of each row: each is the last of its row
+        ran.append((log.parent.parent.name, log.stem, command[-3]))
+
+    told = []
+    monkeypatch.setattr(running, "_call", call)
+    monkeypatch.setattr(
+        running,
+        "record_run",
+        lambda row, folder, *, jobs: told.append(jobs) or {"row": row.name, "seed": folder.name, "code": {}},
+    )
+    work = [(replace(GPU, name="a"), [1]), (replace(GPU, name="b"), [1])]
+    machine = running.Machine(devices=("cuda:0", "cuda:1"))
+    assert running.run(work, machine, out=tmp_path, place=tmp_path / "place") == []
+    assert sorted(name for name, _, _ in ran) == ["a", "b"] and told == [1, 1]
+    assert {device for _, _, device in ran} == {"device=cuda:0", "device=cuda:1"}
+    with pytest.raises(UserError, match="run them apart"):
+        running.run([(GPU, [1]), (ROW, [1])], machine, out=tmp_path)
+
+
+def test_no_run_begins_when_the_time_is_over(tmp_path, monkeypatch) -> None:
+    now = iter([0.0, 59.0, 61.0])
+    monkeypatch.setattr(running.time, "monotonic", lambda: next(now))
+    monkeypatch.setattr(running, "_call", lambda *_: None)
+    monkeypatch.setattr(running, "record_run", lambda row, folder, **_: {"row": "x", "seed": 1, "code": {}})
+    failed = running.run([(GPU, [1, 2])], running.Machine(), out=tmp_path, place=tmp_path / "p", minutes=1)
+    assert failed == ["reach, seed 2: not begun, 1 minutes were over"]
+
+
+def test_only_what_is_missing_is_run(tmp_path, monkeypatch) -> None:
+    records_of = [{"seed": 100}]
+    monkeypatch.setattr(records, "read", lambda row, place: records_of)
+    for kind, seeds in (("part", [101]), ("stale", [100, 101]), ("missing", [100, 101])):
+        monkeypatch.setattr(command_line, "state", lambda row, found, kind=kind: (kind, []))
+        assert command_line.to_measure(ROW, ROW.seeds, tmp_path) == seeds
+    records_of.append({"seed": 101})
+    monkeypatch.setattr(command_line, "state", lambda row, found: ("fresh", []))
+    assert command_line.to_measure(ROW, ROW.seeds, tmp_path) == []
+
+
 @pytest.mark.slow
 def test_a_row_is_run_and_collected(tmp_path, capsys) -> None:
     words = "env=reach_fixed evaluation.episodes=2 evaluation.video_episodes=0 logger=none"
     row = replace(ROW, arguments=words, seeds=(100,))
     place = tmp_path / "place"
-    assert running.run(row, running.Machine(threads=1), seeds=[100], out=tmp_path / "out", place=place) == []
+    assert running.run([(row, [100])], running.Machine(threads=1), out=tmp_path / "out", place=place) == []
     (record,) = records.read(row, place)
     assert state(row, [record]) == ("fresh", [])
     files = record["code"]["files"]
