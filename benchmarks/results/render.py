@@ -249,15 +249,18 @@ def _one_seed(record: Record, policy: str, metric: Metric) -> str:
     return metric.show(*(metric.of(record, policy, bound) for bound in ("mean", "low", "high")))
 
 
+def _commit(record: Record) -> str:
+    """As long as it needs to be to be found."""
+    return str(record["commit"])[:12]
+
+
 def _each_seed(records: Sequence[Record]) -> str:
     """A line for each seed: what acts, with its intervals."""
     policy = acting(records[0]["policies"])
     cells = []
     for record in records:
         line = [_one_seed(record, policy, metric) for metric in columns(records)]
-        cells.append(
-            [str(record["seed"]), *line, duration(seconds(record)), str(record["commit"]), record["date"]]
-        )
+        cells.append([str(record["seed"]), *line, duration(seconds(record)), _commit(record), record["date"]])
     titles = [metric.title for metric in columns(records)]
     return table(["seed", *titles, "training", "commit", "date"], cells)
 
@@ -278,7 +281,7 @@ def _provenance(row: Row, records: Sequence[Record]) -> str:
     allowed = row.section.threads
     fewer = allowed and any(record["machine"]["threads"] < allowed for record in records)
     machines = grouped(records) + (f" (up to {allowed} threads are allowed)" if fewer else "")
-    commits = ", ".join(dict.fromkeys(str(record["commit"]) for record in records))
+    commits = ", ".join(dict.fromkeys(_commit(record) for record in records))
     dates = " – ".join(dict.fromkeys(f(record["date"] for record in records) for f in (min, max)))
     made = records[0]["versions"]
     with_what = f"{machines}; torch {made['torch']}, Newton {made['newton']}; commit {commits}, {dates}."

@@ -78,7 +78,7 @@ def make_run(tmp_path: Path) -> Callable[..., Path]:
         (run / "checkpoints" / "latest" / "counters.json").write_text(json.dumps(counters))
         made = {
             "python": "3.12.1", "torch": "2.11.0", "newton": "1.8.0", "processor": "a processor", "cores": 2,
-            "threads": 2, "device": "cpu", "commit": "0123456789ab", "started": "2026-01-02T03:04:05+00:00",
+            "threads": 2, "device": "cpu", "commit": "0123456789abcdef", "started": "2026-01-02T03:04:05+00:00",
         }  # fmt: skip
         (run / "versions.json").write_text(json.dumps(made | (versions or {})))
         now_there = {n: source.code_hash(n, c) for n, c in source.read(["train.py"]).items()}
@@ -108,7 +108,7 @@ def test_a_record_holds_what_the_run_wrote(make_run) -> None:
     assert record["policies"] == json.loads((run / "evaluation.json").read_text())["policies"]
     assert record["protocol"] == {"episodes": 128}
     assert record["command"] == "python train.py scale=smoke device=cpu env=reach_fixed seed=100"
-    assert (record["seed"], record["commit"], record["date"]) == (100, "0123456789ab", "2026-01-02")
+    assert (record["seed"], record["commit"], record["date"]) == (100, "0123456789abcdef", "2026-01-02")
     machine = {"processor": "a processor", "cores": 2, "threads": 2, "gpu": None, "jobs": 3}
     assert record["machine"] == machine
     assert record["training"] == {"env_steps": 200, "updates": 30, "seconds": 30.0, "command_seconds": 40}
