@@ -11,14 +11,14 @@ from tensordict import TensorDictBase
 
 from franka_wm.envs.camera import project, whole_arm
 from franka_wm.evaluation.closed_loop import play_episodes, success_distance
-from franka_wm.evaluation.protocol import Evaluation, held_out_seeds
+from franka_wm.evaluation.protocol import Evaluation
 from franka_wm.evaluation.results import FILE, Result, last_row
 from franka_wm.files import atomic_write
 from franka_wm.report.curves import axis, plot_learning_curves
 from franka_wm.report.diagnostics import evaluation_markdown, terminal
 from franka_wm.report.style import policy_name
 from franka_wm.report.table import evaluation_tables
-from franka_wm.seeding import seeded
+from franka_wm.seeding import drawing_for, seeded
 from franka_wm.training.build import arm_of, make_evaluation_env
 from franka_wm.training.settings import RunSettings
 from franka_wm.video import draw_labels, draw_marker, tile_frames, write_png, write_video
@@ -63,7 +63,7 @@ def report_run(
         plot_learning_curves(drawn, folder / "curves.png", x=x, success_distance=mark)
     if settings.evaluation.video_episodes and arm is not None:
         name = acting(policies)
-        frames = film(settings, folder, policies[name], name)
+        frames = film(settings, folder, policies[name], name, found)
         if log_video is not None:
             log_video(f"eval/{name}", frames, _slow(arm.config.fps))
     Console(width=120).print(terminal(evaluation_tables(found.policies)[0]))
@@ -74,12 +74,14 @@ def acting(policies: Mapping[str, object]) -> str:
     return next((name for name in ("planner", "policy") if name in policies), next(iter(policies)))
 
 
-def film(settings: RunSettings, folder: Path, policy: Any, name: str) -> torch.Tensor:
-    """``video.mp4`` and ``last_frame.png``: episodes of one policy at half speed, the goal drawn as a ring.
+def film(settings: RunSettings, folder: Path, policy: Any, name: str, found: Evaluation) -> torch.Tensor:
+    """``video.mp4`` and ``last_frame.png``: the worst episodes of one policy at half speed, the goal drawn as a ring.
 
-    Each image says whose episode it is and how it ended; the worst of several is marked.
+    They are played again, one after the other, from the same poses with the same random numbers. Each image says which
+    episode it is and how it ended.
     """
-    env = make_evaluation_env(settings, num_envs=settings.evaluation.video_episodes)
+    rows = found.episodes[name]
+    env = make_evaluation_env(settings, num_envs=1)
     arm = arm_of(env)
     assert arm is not None
     size, whole = settings.evaluation.video_size, whole_arm(arm.config, arm.kinematics)
@@ -90,38 +92,51 @@ def film(settings: RunSettings, folder: Path, policy: Any, name: str) -> torch.T
         marks = project(arm.goal, whole, size)
         frames.append(draw_marker(view.cpu(), marks.cpu(), radius=size / 32))
 
-    seed = held_out_seeds(1)[0]  # the first of the episodes that the table is about
-    with seeded(seed, policy):
-        played = play_episodes(env, policy, seed=seed, video=image)
+    films, lines = [], []
+    for number in worst(rows, settings.evaluation.video_episodes):
+        k, world = divmod(number, found.worlds)
+        together = min(len(rows) - k * found.worlds, found.worlds)
+        with seeded(found.seeds[k], policy), drawing_for(world, 1, together):
+            played = play_episodes(env, policy, seed=found.seeds[k], first_world=world, video=image)
+        films.append(torch.stack(frames))
+        lines.append(ending(played, policy_name(name), number, arm))
+        frames.clear()
     fps = _slow(arm.config.fps)
-    frames += frames[-1:] * fps  # a second to look at the end
-    film = tile_frames(draw_labels(torch.stack(frames), endings(played, policy_name(name), arm)))
+    beside = torch.cat(films, 1)
+    beside = torch.cat([beside, beside[-1:].expand(fps, *beside.shape[1:])])  # a second to look at the end
+    film = tile_frames(draw_labels(beside, lines))
     write_video(film, folder / "video.mp4", fps=fps)
     write_png(film[-1], folder / "last_frame.png")
     return film
 
 
-def endings(played: TensorDictBase, who: str, arm: Any) -> list[str]:
-    """One line for each episode: policy, final distance where there is a goal, success; and which was the worst.
+def worst(episodes: TensorDictBase, count: int) -> list[int]:
+    """Numbers of the worst, worst first: farthest from the goal; else without success, and by return.
 
     Args:
-        played: As :func:`~franka_wm.evaluation.closed_loop.play_episodes` gives it.
+        episodes: As :func:`~franka_wm.evaluation.closed_loop.play_episodes` gives them.
     """
-    distances = played.get("final_distance", None)
-    worst = int(played.get("return").argmin() if distances is None else distances.argmax())
-    lines = []
-    for episode in range(played.numel()):
-        parts = [who]
-        if distances is None:
-            success = bool(played["success"][episode])
-        else:
-            distance = float(distances[episode])
-            success = distance < arm.config.success_distance
-            parts.append(f"{100 * distance:.1f} cm")
-        parts.append("success" if success else "no success")
-        parts += ["worst"] if episode == worst and played.numel() > 1 else []
-        lines.append(", ".join(parts))
-    return lines
+    distance = episodes.get("final_distance", None)
+    if distance is not None:
+        return distance.argsort(descending=True, stable=True)[:count].tolist()
+    order = episodes["return"].argsort(stable=True)
+    return order[episodes["success"][order].argsort(stable=True)][:count].tolist()
+
+
+def ending(played: TensorDictBase, who: str, number: int, arm: Any) -> str:
+    """One line: policy, final distance where there is a goal, success, and which of the episodes it is, from 1.
+
+    Args:
+        played: As :func:`~franka_wm.evaluation.closed_loop.play_episodes` gives it, of one episode.
+    """
+    distance = played.get("final_distance", None)
+    parts = [who]
+    if distance is None:
+        success = bool(played["success"])
+    else:
+        success = float(distance) < arm.config.success_distance
+        parts.append(f"{100 * float(distance):.1f} cm")
+    return ", ".join([*parts, "success" if success else "no success", f"episode {number + 1}"])
 
 
 def _slow(fps: float) -> int:

@@ -92,7 +92,7 @@ def videos(run: RunFiles) -> str:
     if film is not None:
         return card(
             video(film, "episodes of the planner", poster=still),
-            "Held-out episodes; the ring marks the goal.",
+            "The worst of the held-out episodes; the ring marks the goal.",
             kind="single",
         )
     if still is not None:

@@ -12,8 +12,10 @@ from tensordict import TensorDict
 
 from franka_wm.evaluation.protocol import evaluate_run
 from franka_wm.evaluation.results import END, read_result
-from franka_wm.policies.scripted import NoopPolicy
-from franka_wm.report.end_of_run import endings, report_run
+from franka_wm.policies.scripted import NoopPolicy, SmoothRandomPolicy
+from franka_wm.report import end_of_run
+from franka_wm.report.end_of_run import ending, report_run, worst
+from franka_wm.training import build
 from franka_wm.video import draw_labels
 
 
@@ -53,18 +55,42 @@ def test_the_table_is_the_curves_last_point(
         assert drawn[0, "policy"][0] == [50] and logged == []
 
 
-def test_the_video_says_whose_episodes_it_shows_and_how_they_ended(small_env) -> None:
-    arm = small_env(1, success_distance=0.05)
-    near = TensorDict(
-        {"final_distance": torch.tensor([0.021, 0.3]), "return": torch.tensor([-1.0, -9.0])}, [2]
-    )
-    assert endings(near, "planner", arm) == [
-        "planner, 2.1 cm, success",
-        "planner, 30.0 cm, no success, worst",
+def test_the_video_shows_the_worst_episodes_again(settled, tmp_path: Path, monkeypatch) -> None:
+    """Of a policy that draws: the same poses and the same draws, so the same ends."""
+    few = ("env.substeps=1", "env.episode_length=6", "evaluation.episodes=5", "evaluation.video_episodes=2")
+    cfg = settled("scale=smoke", "device=cpu", *few)
+    env = build.make_evaluation_env(cfg)
+    generator = torch.Generator().manual_seed(3)
+    policies = {"policy": SmoothRandomPolicy(7, generator=generator), "noop": NoopPolicy(7)}
+    results = evaluate_run(cfg, tmp_path, env, policies, counters={}, say=lambda text: None)
+    said: list[str] = []
+    monkeypatch.setattr(end_of_run, "draw_labels", lambda frames, lines: said.extend(lines) or frames)
+    report_run(cfg, tmp_path, env, policies, results, rows=[])
+    distances = results.episodes["policy"]["final_distance"]
+    order = distances.argsort(descending=True)[:2].tolist()
+    assert said == [f"policy, {100 * float(distances[k]):.1f} cm, no success, episode {k + 1}" for k in order]
+    assert (tmp_path / "video.mp4").stat().st_size > 1000
+
+
+def test_the_worst_are_those_without_success_and_then_those_with_the_least_return() -> None:
+    found = {"success": torch.tensor([1.0, 0.0, 1.0, 0.0]), "return": torch.tensor([5.0, 3.0, 1.0, 2.0])}
+    assert worst(TensorDict(found, [4]), 3) == [3, 1, 2]
+    assert worst(TensorDict({**found, "final_distance": torch.tensor([0.1, 0.4, 0.2, 0.3])}, [4]), 9) == [
+        1,
+        3,
+        2,
+        0,
     ]
-    other = TensorDict({"success": torch.tensor([0.0, 1.0]), "return": torch.tensor([-1.0, 3.0])}, [2])
-    assert endings(other, "policy", arm) == ["policy, no success, worst", "policy, success"]
-    assert endings(near[:1], "ik", arm) == ["ik, 2.1 cm, success"]
+
+
+def test_a_line_says_whose_episode_it_is_and_how_it_ended(small_env) -> None:
+    arm = small_env(1, success_distance=0.05)
+    for distance, success in ((0.021, "2.1 cm, success"), (0.3, "30.0 cm, no success")):
+        played = TensorDict({"final_distance": torch.tensor([distance])}, [1])
+        assert ending(played, "planner", 6, arm) == f"planner, {success}, episode 7"
+    assert (
+        ending(TensorDict({"success": torch.ones(1)}, [1]), "policy", 0, arm) == "policy, success, episode 1"
+    )
 
 
 @pytest.mark.parametrize("size", [96, 256])
