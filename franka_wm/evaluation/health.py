@@ -90,14 +90,15 @@ def planner_health(policy: PlannerPolicy, observation: TensorDictBase) -> dict[s
     """
     objective = policy.objective.bind(observation)
     z = policy.encode(observation)
-    found = policy.planner.plan(z, policy.next, objective, prior=policy.prior, explore=False)
+    guide = policy.bound_prior(observation)
+    found = policy.planner.plan(z, policy.next, objective, prior=guide, explore=False)
     plan = found.get("best", found.get("plan"))  # iCEM acts by the best one, and its `plan` holds elites, too
-    if policy.prior is None:
+    if guide is None:
         before = torch.zeros_like(plan)
     else:
         latent, actions = z, []
         for _ in range(plan.shape[1]):
-            actions.append(_deterministic(policy.prior, latent))
+            actions.append(_deterministic(guide, latent))
             latent = policy.next(latent, actions[-1])
         before = torch.stack(actions, 1)
 

@@ -77,12 +77,16 @@ class ActionWorldModel(HistoryWorldModel):
         ema: share that the teacher keeps of itself at each update.
         encoder_lr_scale: learning rate of the encoder relative to the rest.
         weight_decay: weight decay of matrices.
+        goal_policy_coef, goal_steps_coef: weights of a policy towards goals and of a distance to them in steps, see
+            `franka_wm.models.goal_heads.GoalHeads`.
 
     Raises:
         ValueError: a setting that cannot work.
         ModuleNotFoundError: `huggingface` without transformers.
     """
 
+    has_goal_policy = True  # by options, see `learn_goals`
+    has_goal_steps = True
     ranges: ClassVar[Mapping[str, Bounds]] = {
         **dict.fromkeys(
             ("action_dim", "encoder_width", "encoder_depth", "encoder_heads", "patch_size"), POSITIVE
@@ -91,6 +95,7 @@ class ActionWorldModel(HistoryWorldModel):
         **dict.fromkeys(("predictor_width", "predictor_depth", "predictor_heads"), POSITIVE),
         **dict.fromkeys(("predictor_hidden_dim", "rollout", "guard_directions"), POSITIVE),
         **dict.fromkeys(("guard_coef", "weight_decay", "encoder_lr_scale"), COEFFICIENT),
+        **dict.fromkeys(("goal_policy_coef", "goal_steps_coef"), COEFFICIENT),
         "ema": FRACTION,
         "dropout": Bounds(least=0, below=1),
         **dict.fromkeys(("encoder_depth", "predictor_depth"), DEPTH),
@@ -133,6 +138,8 @@ class ActionWorldModel(HistoryWorldModel):
         ema: float = 0.996,
         encoder_lr_scale: float = 1.0,
         weight_decay: float = 0.04,
+        goal_policy_coef: float = 0.0,
+        goal_steps_coef: float = 0.0,
     ) -> None:
         self.validate(locals())
         super().__init__()
@@ -203,6 +210,7 @@ class ActionWorldModel(HistoryWorldModel):
         )
         self.adapter = ProjectionMLP(self.token_dim, self.token_dim) if self.guard.acts else None
         self.target_encoder = frozen_copy(self.encoder) if self.guard.kind == "ema" else None
+        self.learn_goals(self.feature_dim, policy=goal_policy_coef, steps=goal_steps_coef)
 
     def train(self, mode: bool = True) -> ActionWorldModel:
         """Set the mode; a frozen encoder stays in evaluation mode."""
@@ -253,7 +261,8 @@ class ActionWorldModel(HistoryWorldModel):
         Returns:
             batch size []: `loss`, and detached `loss_prediction` (teacher forcing), `loss_rollout`,
             `loss_state`, `loss_guard` (weighted), `relative_error` (absolute error of the teacher-forced
-            tokens over that of predicting no change), `feature_std` and `feature_rank` (participation ratio).
+            tokens over that of predicting no change), `feature_std` and `feature_rank` (participation ratio);
+            `loss_goal_policy` and `loss_goal_steps` where asked for.
 
         Raises:
             ValueError: the batch size is not [B, H].
@@ -282,6 +291,9 @@ class ActionWorldModel(HistoryWorldModel):
         # On what is predicted: on a projection of it, the guard would not see it collapse.
         guard = self.guard(self._pooled(frames).transpose(0, 1))
         total = prediction + state + rolled + rolled_state + guard
+        goals = self.goal_losses(frames[..., : self.feature_dim], action)
+        for value in goals.values():
+            total = total + value
         with torch.no_grad():
             unchanged, _ = self._distance(before, after)
             metrics = {
@@ -292,6 +304,7 @@ class ActionWorldModel(HistoryWorldModel):
                 "relative_error": prediction.detach() / unchanged.clamp_min(1e-12),
                 "feature_std": feature_std(frames[..., : self.feature_dim]),
                 "feature_rank": participation_ratio(self._pooled(frames)),
+                **{name: value.detach() for name, value in goals.items()},
             }
         return TensorDict({"loss": total, **metrics}, batch_size=[])
 

@@ -21,6 +21,8 @@ ABILITIES: Mapping[str, tuple[str, ...]] = MappingProxyType(
         "has_value": ("value",),
         "has_policy": ("policy",),
         "has_goal": ("encode_goal",),
+        "has_goal_policy": ("goal_policy",),
+        "has_goal_steps": ("goal_steps",),
         "has_memory": ("observe",),
         "has_search": ("prediction", "recurrent"),
     }
@@ -54,6 +56,8 @@ class WorldModel(nn.Module):
     has_value: bool = False
     has_policy: bool = False
     has_goal: bool = False
+    has_goal_policy: bool = False
+    has_goal_steps: bool = False
     has_memory: bool = False
     has_search: bool = False
 
@@ -123,6 +127,14 @@ class WorldModel(nn.Module):
     def encode_goal(self, observation: TensorDictBase) -> Tensor:
         """Embedding (..., D) of a goal from its images, in the space of `embed`."""
         raise self._lacks("encode_goal")
+
+    def goal_policy(self, z: Tensor, goal: Tensor, deterministic: bool = False) -> Tensor:
+        """Actions (..., A) for z (..., Z) towards goals (..., D) of `encode_goal`: a sample, or the mode."""
+        raise self._lacks("goal_policy")
+
+    def goal_steps(self, embedded: Tensor, goal: Tensor) -> Tensor:
+        """Learned distance (...) in steps, in [0, 1], of embeddings (..., D) to goals (..., D) of `encode_goal`."""
+        raise self._lacks("goal_steps")
 
     def embed(self, z: Tensor) -> Tensor:
         """What distances are measured on (..., D): z itself by default."""

@@ -15,6 +15,7 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 from franka_wm.models.base import WorldModel
+from franka_wm.models.goal_heads import GoalHeads
 from franka_wm.models.normalizer import ObservationNormalizer
 
 
@@ -26,6 +27,9 @@ class HistoryWorldModel(WorldModel):
 
     history: FrameHistory
     vectors: ObservationNormalizer
+    goal_heads: GoalHeads | None
+    has_goal_policy = False  # of families that call `learn_goals`
+    has_goal_steps = False
 
     def encode_frame(self, observation: TensorDictBase, *, batch_statistics: bool = False) -> Tensor:
         """Frames (..., F) of observations (...).
@@ -57,6 +61,36 @@ class HistoryWorldModel(WorldModel):
         frame = self.encode_frame(observation)
         pushed = self.history.push(previous_z, action, frame)
         return torch.where(is_init, self.history.start(frame), pushed)
+
+    def learn_goals(self, embed_dim: int, *, policy: float, steps: float) -> None:
+        """Adds the heads of `GoalHeads`, with these weights in the loss; 0: without. The last of a constructor."""
+        self.has_goal_policy, self.has_goal_steps = policy > 0, steps > 0
+        self._goal_coefs = (policy, steps)
+        self.goal_heads = None
+        if policy or steps:
+            size = self.history.action_dim
+            self.goal_heads = GoalHeads(embed_dim, size, policy=policy > 0, distance=steps > 0)
+
+    def goal_policy(self, z: Tensor, goal: Tensor, deterministic: bool = False) -> Tensor:
+        """Actions (..., A) that lead from z (..., latent_dim) towards goals (..., D), of a model that learns them."""
+        if not self.has_goal_policy or self.goal_heads is None:
+            raise self._lacks("goal_policy")
+        return self.goal_heads.act(self.embed(z), goal, deterministic=deterministic)
+
+    def goal_steps(self, embedded: Tensor, goal: Tensor) -> Tensor:
+        """Learned distance (...) in [0, 1] of embeddings (..., D) to goals (..., D); 1: a window or more."""
+        if not self.has_goal_steps or self.goal_heads is None:
+            raise self._lacks("goal_steps")
+        return self.goal_heads.steps(embedded, goal)
+
+    def goal_losses(self, embedded: Tensor, action: Tensor) -> dict[str, Tensor]:
+        """Weighted losses of these heads, of embeddings (B, H+1, D) and the actions (B, H, A) between them."""
+        if self.goal_heads is None:
+            return {}
+        found = zip(("loss_goal_policy", "loss_goal_steps"), self._goal_coefs, strict=True)
+        losses = self.goal_heads.losses(embedded, action)
+        pairs = zip(found, losses, strict=True)
+        return {name: coef * loss for (name, coef), loss in pairs if loss is not None}
 
     def unpack(self, z: Tensor, action: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Inputs of a predictor from z (..., latent_dim) and the next action (..., A), N = number of latents.

@@ -28,6 +28,11 @@ from franka_wm.models.vision import ViT, vit_size
 from franka_wm.models.windows import check_windows, window_of
 from franka_wm.options import COEFFICIENT, DEPTH, FRACTION, POSITIVE, Bounds, with_defaults
 
+_COEFS = (
+    *("sigreg_coef", "infonce_coef", "inverse_coef", "weight_decay"),
+    *("goal_policy_coef", "goal_steps_coef"),
+)
+
 
 class LeWorldModel(HistoryWorldModel):
     """Encoder and action-conditioned predictor of embeddings, one loss for both (LeWorldModel, after LeJEPA,
@@ -47,8 +52,8 @@ class LeWorldModel(HistoryWorldModel):
     that of the state alone. With images, goals are compared by the image's part.
 
     Deliberate differences: rotary positions in the predictor instead of learned ones, so that a history which
-    is still short predicts as in training; `rollout`, InfoNCE, inverse dynamics and the reward probe, off
-    by default.
+    is still short predicts as in training; `rollout`, InfoNCE, inverse dynamics, heads for goals and the reward
+    probe, off by default.
 
     Args:
         image_sizes: image key -> (height, width, channels); several of one size share the encoder.
@@ -72,6 +77,8 @@ class LeWorldModel(HistoryWorldModel):
             of a window are read from the embeddings of its frames (of the images' part where there are any),
             so that these describe all that the actions move, the hand's turning as well as the large links.
             Windows must then be at least `history` transitions long.
+        goal_policy_coef, goal_steps_coef: weights of a policy towards goals and of a distance to them in steps, see
+            `franka_wm.models.goal_heads.GoalHeads`.
         reward_head: learn the reward as a probe of z whose gradient stops there, for planners that need it;
             the batch must then hold rewards.
         discount: discount of the rewards per step, for planning for return.
@@ -81,6 +88,8 @@ class LeWorldModel(HistoryWorldModel):
         ValueError: a setting that cannot work.
     """
 
+    has_goal_policy = True  # by options, see `learn_goals`
+    has_goal_steps = True
     ranges: ClassVar[Mapping[str, Bounds]] = {
         **dict.fromkeys(
             ("action_dim", "embed_dim", "state_embed_dim", "state_hidden_dim", "history"), POSITIVE
@@ -90,7 +99,7 @@ class LeWorldModel(HistoryWorldModel):
             ("projector_hidden", "predictor_width", "predictor_depth", "predictor_heads"), POSITIVE
         ),
         **dict.fromkeys(("predictor_head_dim", "predictor_mlp", "sigreg_directions", "rollout"), POSITIVE),
-        **dict.fromkeys(("sigreg_coef", "infonce_coef", "inverse_coef", "weight_decay"), COEFFICIENT),
+        **dict.fromkeys(_COEFS, COEFFICIENT),
         "discount": FRACTION,
         "dropout": Bounds(least=0, below=1),
         **dict.fromkeys(("encoder_depth", "predictor_depth"), DEPTH),
@@ -124,6 +133,8 @@ class LeWorldModel(HistoryWorldModel):
         rollout: int = 1,
         infonce_coef: float = 0.0,
         inverse_coef: float = 0.0,
+        goal_policy_coef: float = 0.0,
+        goal_steps_coef: float = 0.0,
         reward_head: bool = False,
         discount: float = 0.99,
         weight_decay: float = 1e-3,
@@ -185,6 +196,7 @@ class LeWorldModel(HistoryWorldModel):
         if reward_head:
             self.two_hot = TwoHotSymlog()
             self.reward_probe = zero_head(self.latent_dim + action_dim, (256, 256), self.two_hot.bins)
+        self.learn_goals(self.image_part or frame, policy=goal_policy_coef, steps=goal_steps_coef)
 
     @classmethod
     def validate(cls, options: Mapping[str, Any], *, window: int | None = None) -> None:
@@ -237,7 +249,7 @@ class LeWorldModel(HistoryWorldModel):
             batch size []: `loss`, and detached `loss_prediction`, `loss_sigreg`, `relative_error` (squared
             error of the prediction over that of predicting no change), `feature_std` and `feature_rank`
             (participation ratio) of the embeddings; `loss_rollout`, `loss_infonce`, `loss_inverse`,
-            `loss_reward` where asked for.
+            `loss_reward`, `loss_goal_policy`, `loss_goal_steps` where asked for.
 
         Raises:
             ValueError: the batch size is not [B, H], or with `inverse_coef` H is below `history`.
@@ -266,6 +278,7 @@ class LeWorldModel(HistoryWorldModel):
             z = self.history.gather(frames[:, :-1].detach(), action)
             logits = self.reward_probe(torch.cat((z, action.to(z.dtype)), dim=-1))
             extra["loss_reward"] = self.two_hot.loss(logits.float(), batch.get(("next", "reward"))).mean()
+        extra |= self.goal_losses(self._comparable(frames), action)
         for value in extra.values():
             total = total + value
         with torch.no_grad():

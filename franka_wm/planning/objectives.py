@@ -11,7 +11,7 @@ Objectives are classes rather than closures, so that a policy that holds one can
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Literal, Protocol, get_args
 
 import torch
@@ -152,6 +152,8 @@ class GoalDistance(Objective):
         summed: over the H predicted latents; else the last one alone.
         metric: see `Metric`.
         embed: latents (..., Z) -> (..., D), what the distance is measured on; None: the latents themselves.
+        steps: a learned distance in steps, (embedded (..., D), goal (..., D)) -> (...); None: none.
+        steps_weight: what it weighs beside the metric.
 
     Raises:
         ValueError: `goal_latent` has another number of dimensions, or there is no such metric.
@@ -164,11 +166,14 @@ class GoalDistance(Objective):
         *,
         metric: Metric = "l2",
         embed: Callable[[Tensor], Tensor] | None = None,
+        steps: Callable[[Tensor, Tensor], Tensor] | None = None,
+        steps_weight: float = 0.0,
     ) -> None:
         if goal_latent.dim() not in (1, 2):
             raise ValueError(f"goal_latent must be (D,) or (E, D), got {tuple(goal_latent.shape)}")
         _require_metric(metric)
         self.goal_latent, self.summed, self.metric, self.embed = goal_latent, summed, metric, embed
+        self.steps, self.steps_weight = steps, steps_weight
 
     def __call__(self, trajectory: Tensor, actions: Tensor) -> Tensor:
         goal = self.goal_latent if self.goal_latent.dim() == 1 else self.goal_latent[:, None, None]
@@ -181,10 +186,14 @@ class GoalDistance(Objective):
                 f"{reached.shape[-1]}: give `embed`, which maps latents to the goal's space"
             )
         if self.metric == "l2":
-            return -(reached - goal).square().sum(dim=(-2, -1))
-        if self.metric == "l1":
-            return -(reached - goal).abs().sum(dim=(-2, -1))
-        return (F.cosine_similarity(reached, goal, dim=-1) - 1.0).sum(-1)
+            score = -(reached - goal).square().sum(dim=(-2, -1))
+        elif self.metric == "l1":
+            score = -(reached - goal).abs().sum(dim=(-2, -1))
+        else:
+            score = (F.cosine_similarity(reached, goal, dim=-1) - 1.0).sum(-1)
+        if self.steps is None:
+            return score
+        return score - self.steps_weight * self.steps(reached, goal.expand_as(reached)).sum(-1)
 
 
 class GoalImage(Objective):
@@ -198,7 +207,7 @@ class GoalImage(Objective):
         embed: latents (..., Z) -> (..., D), the space of `encode_goal`; None: the latents themselves.
         goals: key that the model's encoder reads -> key of the goal's image in the observation,
             (E, H, W, C) uint8. None: `pixels` -> `goal_pixels`.
-        metric, summed: see `GoalDistance`.
+        metric, summed, steps, steps_weight: see `GoalDistance`.
 
     Raises:
         ValueError: there is no such metric, or no image.
@@ -211,6 +220,8 @@ class GoalImage(Objective):
         goals: Mapping[str, str] | None = None,
         metric: Metric = "l2",
         summed: bool = True,
+        steps: Callable[[Tensor, Tensor], Tensor] | None = None,
+        steps_weight: float = 0.0,
     ) -> None:
         _require_metric(metric)
         self.goals = {"pixels": "goal_pixels"} if goals is None else dict(goals)
@@ -218,11 +229,20 @@ class GoalImage(Objective):
             raise ValueError("goals is empty: name at least one image")
         self.encode_goal, self.embed = encode_goal, embed
         self.metric: Metric = metric
-        self.summed = summed
+        self.summed, self.steps, self.steps_weight = summed, steps, steps_weight
         self.in_keys = list(self.goals.values())
 
     def bind(self, tensordict: TensorDictBase) -> GoalDistance:
         """The objective of the present decision.
+
+        Raises:
+            ValueError: the observation has no image of the goal.
+        """
+        options = {"embed": self.embed, "steps": self.steps, "steps_weight": self.steps_weight}
+        return GoalDistance(self.goal(tensordict), self.summed, metric=self.metric, **options)  # pyright: ignore[reportArgumentType]
+
+    def goal(self, tensordict: TensorDictBase) -> Tensor:
+        """Embedding (E, D) of the goal of the present decision.
 
         Raises:
             ValueError: the observation has no image of the goal.
@@ -234,11 +254,15 @@ class GoalImage(Objective):
                     f"the observation has no {self.goals[key]!r}, the image of the goal to plan towards: "
                     "add goal_pixels to env.observations"
                 )
-        observation = TensorDict(images, batch_size=tensordict.batch_size)
-        return GoalDistance(self.encode_goal(observation), self.summed, metric=self.metric, embed=self.embed)
+        return self.encode_goal(TensorDict(images, batch_size=tensordict.batch_size))
 
     def __call__(self, trajectory: Tensor, actions: Tensor) -> Tensor:
         raise ValueError("a GoalImage has no goal yet: plan with its bind(tensordict)")
+
+
+def goal_images(keys: Iterable[str]) -> dict[str, str]:
+    """Key of an image that a model reads -> that of the same camera's image of the goal."""
+    return {key: f"goal_{key}" for key in keys}
 
 
 class Sum(Objective):

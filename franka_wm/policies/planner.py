@@ -6,6 +6,7 @@ Both explore when TorchRL's exploration type is RANDOM, as it is inside a collec
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from functools import partial
 
 import torch
 from tensordict import TensorDict, TensorDictBase
@@ -15,8 +16,15 @@ from torch import Tensor, nn
 
 from franka_wm.models.base import WorldModel
 from franka_wm.options import PRECISIONS
-from franka_wm.planning.base import Planner
-from franka_wm.planning.objectives import Objective, RewardPlusValue, Score, as_objective
+from franka_wm.planning.base import Planner, Prior
+from franka_wm.planning.objectives import (
+    GoalImage,
+    Objective,
+    RewardPlusValue,
+    Score,
+    as_objective,
+    goal_images,
+)
 from franka_wm.policies.capture import GraphCache
 from franka_wm.policies.graph_key import graph_key
 from franka_wm.seeding import share_of_worlds
@@ -65,6 +73,31 @@ class Guide:
         return torch.cat((self.policy(z[:, :1], deterministic=True), self.policy(z[:, 1:])), dim=1)
 
 
+class GoalGuide:
+    """The same of a policy towards goals, whose images each decision reads.
+
+    Args:
+        model: has `goal_policy`, and reads images.
+    """
+
+    def __init__(self, model: WorldModel) -> None:
+        self.policy = model.goal_policy
+        self.reader = GoalImage(model.encode_goal, goals=goal_images(model.image_sizes))
+        self.in_keys = self.reader.in_keys
+
+    def bind(self, tensordict: TensorDictBase) -> Prior:
+        """What makes the candidates of the present decision, towards its goal."""
+        return partial(self.act, self.reader.goal(tensordict))
+
+    def act(self, goal: Tensor, z: Tensor, deterministic: bool = False) -> Tensor:
+        """Goals (E, D) and latents (E, S, Z) of S candidates -> actions (E, S, A); of (E, Z) only `deterministic`."""
+        if deterministic:
+            return self.policy(z, goal, deterministic=True)
+        goals = goal.unsqueeze(1).expand(*z.shape[:2], -1)
+        first = self.policy(z[:, :1], goals[:, :1], deterministic=True)
+        return torch.cat((first, self.policy(z[:, 1:], goals[:, 1:])), dim=1)
+
+
 def captures(wanted: bool | None, observation: Tensor) -> bool:
     """Whether decisions are captured: where the observations are on CUDA, unless it is not wanted.
 
@@ -74,6 +107,15 @@ def captures(wanted: bool | None, observation: Tensor) -> bool:
     if wanted and not observation.is_cuda:
         raise ValueError(f"capture=True needs observations on CUDA, these are on {observation.device}")
     return observation.is_cuda if wanted is None else wanted
+
+
+def _guide(model: WorldModel, objective: Objective) -> Prior | GoalGuide | None:
+    if model.has_policy:
+        return Guide(model).act
+    if not model.has_goal_policy or not model.image_sizes:
+        return None
+    guide = GoalGuide(model)
+    return guide if {*guide.in_keys} <= {*objective.in_keys} else None
 
 
 def _explores(explore: bool | None) -> bool:
@@ -106,7 +148,7 @@ class PlannerPolicy(TensorDictModuleBase):
         objective: see `franka_wm.planning.objectives`.
         observation_keys: what `encode` reads.
         observe: (observation, latent before, action, is_init) -> latents (E, Z), of a model with memory.
-        prior: a policy z -> action for some of the candidates.
+        prior: a policy z -> action for some of the candidates, or one towards goals.
         explore: whether to add noise to the action; None follows TorchRL's exploration type.
         model: the module behind the callables, so that collectors find its parameters and move it along. If
             the policy is to be copied (as collectors do for other processes), pass bound methods and objects,
@@ -130,7 +172,7 @@ class PlannerPolicy(TensorDictModuleBase):
         objective: Objective | Score,
         observation_keys: Sequence[str],
         observe: Observe | None = None,
-        prior: Callable[[Tensor], Tensor] | None = None,
+        prior: Prior | GoalGuide | None = None,
         explore: bool | None = None,
         model: nn.Module | None = None,
         capture: bool | None = None,
@@ -142,7 +184,8 @@ class PlannerPolicy(TensorDictModuleBase):
             raise ValueError(f"precision={precision!r}: must be one of {', '.join(PRECISIONS)}")
         if compile:
             next = torch.compile(next, dynamic=False)
-            prior = prior if prior is None else torch.compile(prior, dynamic=False)
+            if prior is not None and not isinstance(prior, GoalGuide):
+                prior = torch.compile(prior, dynamic=False)
             objective = as_objective(objective).compiled()
         self.precision = precision
         self.objective = as_objective(objective)
@@ -173,7 +216,8 @@ class PlannerPolicy(TensorDictModuleBase):
             objective: rewards plus value of the model, with its `discount`, when None.
             explore, capture, precision, compile: see the class.
 
-        A model with `policy` supplies the prior, see :class:`Guide`.
+        A model with `policy` supplies the prior, see :class:`Guide`; so does one with `goal_policy`, where the
+        objective reads images of goals.
 
         Raises:
             ValueError: the model lacks what a default needs.
@@ -194,7 +238,7 @@ class PlannerPolicy(TensorDictModuleBase):
             objective=objective,
             observation_keys=observation_keys,
             observe=model.observe if model.has_memory else None,
-            prior=Guide(model).act if model.has_policy else None,
+            prior=_guide(model, as_objective(objective)),
             explore=explore,
             model=model,
             capture=capture,
@@ -236,6 +280,10 @@ class PlannerPolicy(TensorDictModuleBase):
             decision = self._decide(inputs, explore)
         return tensordict.update(decision)
 
+    def bound_prior(self, tensordict: TensorDictBase) -> Prior | None:
+        """The prior of the present decision."""
+        return self.prior.bind(tensordict) if isinstance(self.prior, GoalGuide) else self.prior
+
     def _captures(self, inputs: TensorDictBase) -> bool:
         return captures(self.capture, inputs[self.in_keys[0]])
 
@@ -251,7 +299,7 @@ class PlannerPolicy(TensorDictModuleBase):
                 z,
                 self._next_in_float32 if low else self.next,
                 self.objective.bind(tensordict),
-                prior=self.prior,
+                prior=self.bound_prior(tensordict),
                 previous=tensordict.get("plan", None),
                 is_init=is_init,
                 explore=explore,
@@ -272,11 +320,12 @@ class ModelPolicy(TensorDictModuleBase):
 
     Args:
         encode: observation TensorDict -> latents (..., D).
-        policy: called as `policy(z, deterministic=...)` -> actions (..., A).
+        policy: called as `policy(z, deterministic=...)` -> actions (..., A); with `goals` as `policy(z, goal, …)`.
         observation_keys: what `encode` reads.
         observe: (observation, latent before, action, is_init) -> latents (E, D), of a model with memory.
         explore: True samples, False takes the mode; None follows TorchRL's exploration type.
         model: see `PlannerPolicy`.
+        goals: reads the images of the goal, for a policy towards goals.
     """
 
     def __init__(
@@ -288,20 +337,25 @@ class ModelPolicy(TensorDictModuleBase):
         observe: Observe | None = None,
         explore: bool | None = None,
         model: nn.Module | None = None,
+        goals: GoalImage | None = None,
     ) -> None:
         super().__init__()
         remembers = observe is not None
-        self.in_keys = [*observation_keys, *(["is_init"] if remembers else [])]
+        self.goals = goals
+        read = () if goals is None else goals.in_keys
+        self.in_keys = [*observation_keys, *read, *(["is_init"] if remembers else [])]
         self.out_keys = ["action", *(CONTEXT if remembers else ())]
         self.encode, self.policy, self.explore, self.model = encode, policy, explore, model
         self.observe = observe
 
     @classmethod
     def for_model(cls, model: WorldModel, *, explore: bool | None = None) -> ModelPolicy:
-        """The policy of a model that has one."""
+        """The policy of a model that has one, or its policy towards goals."""
+        towards = None if model.has_policy else GoalGuide(model)
         return cls(
             encode=model.encode,
-            policy=model.policy,
+            policy=model.policy if towards is None else towards.policy,
+            goals=None if towards is None else towards.reader,
             observation_keys=model.observation_keys,
             observe=model.observe if model.has_memory else None,
             explore=explore,
@@ -312,7 +366,8 @@ class ModelPolicy(TensorDictModuleBase):
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write `action`."""
         z = latent_of(tensordict, self.encode, self.observe)
-        action = self.policy(z, deterministic=not _explores(self.explore))
+        goal = () if self.goals is None else (self.goals.goal(tensordict),)
+        action = self.policy(z, *goal, deterministic=not _explores(self.explore))
         if self.observe is not None:
             tensordict.set("context", z).set("context_action", action)
         return tensordict.set("action", action)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from functools import partial
 from inspect import signature
 from typing import TYPE_CHECKING, Any, cast
@@ -27,7 +27,7 @@ from franka_wm.errors import UserError
 from franka_wm.planning import registry
 from franka_wm.planning.base import Planner
 from franka_wm.planning.mcts import MCTS
-from franka_wm.planning.objectives import Objective
+from franka_wm.planning.objectives import Objective, goal_images
 from franka_wm.policies import ExploringPolicy, ModelPolicy, PlannerPolicy, SearchPolicy
 from franka_wm.policies.expert import ExpertPolicy, TaskwisePolicy
 from franka_wm.policies.scripted import (
@@ -168,11 +168,6 @@ def make_planner(run: RunSettings, actions: int) -> Planner | MCTS:
         raise UserError(f"planner={name}: {error}") from error
 
 
-def goal_images(keys: Iterable[str]) -> dict[str, str]:
-    """Key of an image that a model reads → that of the same camera's image of the goal."""
-    return {key: f"goal_{key}" for key in keys}
-
-
 def make_objective(run: RunSettings, model: WorldModel) -> Objective | None:
     """What the planner maximises, by ``run.objective``."""
     o = run.objective
@@ -189,12 +184,16 @@ def make_objective(run: RunSettings, model: WorldModel) -> Objective | None:
             raise UserError(
                 f"objective=goal_image: model={run.model.name} has no encode_goal; use objective=reward_value"
             )
+        if o.steps_weight and not model.has_goal_steps:
+            raise UserError(f"objective.steps_weight={o.steps_weight}: needs model.goal_steps_coef above 0")
         chosen = planning.GoalImage(
             model.encode_goal,
             embed=model.embed,
             goals=goal_images(model.image_sizes),
             metric=o.metric,  # pyright: ignore[reportArgumentType]  # one of its choices
             summed=o.summed,
+            steps=model.goal_steps if o.steps_weight else None,
+            steps_weight=o.steps_weight,
         )
     parts: list[tuple[float, Objective]] = [(1.0, chosen)]
     if o.action_penalty:
@@ -244,7 +243,8 @@ def make_policies(
             precision=precision,
             compile=compile,
         )
-    if model.has_policy:
+    goals = {*goal_images(model.image_sizes).values()}
+    if model.has_policy or (model.has_goal_policy and set() < goals <= {*env.observation_spec.keys()}):
         policies["policy"] = ModelPolicy.for_model(model)
     return policies | make_scripted_policies(env, seed=seed, smoothness=smoothness)
 

@@ -15,6 +15,7 @@ from franka_wm.models import WorldModel
 from franka_wm.models.vision import ViT
 from franka_wm.options import OF_ONES_OWN
 from franka_wm.planning import registry
+from franka_wm.planning.objectives import goal_images
 from franka_wm.training import build
 from franka_wm.training.demos import check_demonstrations
 from franka_wm.training.loggers import check_loggers
@@ -190,7 +191,7 @@ def _check_parts(run: RunSettings) -> None:
     if model is None:
         model = build.make_model(run, spaces)
     if run.objective_name == "goal_image":
-        goals = build.goal_images(model.image_sizes).values()
+        goals = goal_images(model.image_sizes).values()
         if not goals or any(goal not in spaces.image_sizes for goal in goals):
             raise UserError(
                 "planning to a goal image needs goal_pixels among env.observations="

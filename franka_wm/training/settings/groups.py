@@ -115,6 +115,7 @@ class ObjectiveSettings:
     name: str = choice("auto", of=("auto", "reward_value", "goal_image"))
     metric: str = choice("l2", of=("l2", "l1", "cosine"))
     summed: bool = flag(True)
+    steps_weight: float = real(0.0, least=0)
     action_penalty: float = real(0.0, least=0)
     smoothness_penalty: float = real(0.0, least=0)
     policy_penalty: float = real(0.0, least=0)

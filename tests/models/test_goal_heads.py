@@ -1,0 +1,151 @@
+"""Heads for goals: they learn where an action leads and how far it is, shape what they should, and plans use them."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+import torch
+from tensordict import TensorDict
+from torch import Tensor
+
+from franka_wm.models import make
+from franka_wm.models.goal_heads import GoalHeads
+from franka_wm.planning import CEM, GoalImage
+from franka_wm.policies.planner import ModelPolicy, PlannerPolicy
+
+SMALL: dict[str, dict[str, Any]] = {
+    "lewm": dict(
+        embed_dim=16, encoder_width=16, encoder_depth=1, encoder_heads=2, projector_hidden=32, predictor_depth=1,
+        predictor_heads=2, predictor_head_dim=8, predictor_mlp=32, dropout=0.0, sigreg_directions=32,
+    ),
+    "action_world_model": dict(
+        encoder_width=16, encoder_depth=1, encoder_heads=2, grid=2, predictor_width=16, predictor_depth=1,
+        predictor_heads=2, guard_directions=32,
+    ),
+}  # fmt: skip
+
+
+@pytest.fixture(autouse=True)
+def _seed() -> None:
+    torch.manual_seed(0)
+
+
+def small(name: str, **options: Any) -> Any:
+    return make(name, image_sizes={"pixels": (16, 16, 3)}, action_dim=2, **SMALL[name], **options)
+
+
+def windows(batch: int, horizon: int) -> TensorDict:
+    images = torch.randint(0, 256, (batch, horizon + 1, 16, 16, 3), dtype=torch.uint8)
+    action = torch.rand(batch, horizon, 2) * 2 - 1
+    after = TensorDict({"pixels": images[:, 1:]}, [batch, horizon])
+    return TensorDict({"pixels": images[:, :-1], "action": action, "next": after}, [batch, horizon])
+
+
+def walks(batch: int, horizon: int) -> tuple[Tensor, Tensor]:
+    """Places (B, H+1, 2) of walkers, each with one heading in its window, and the actions (B, H, 2)."""
+    angle = 2 * torch.pi * torch.rand(batch, 1)
+    action = 0.7 * torch.stack((angle.cos(), angle.sin()), -1).expand(batch, horizon, 2)
+    start = 4 * torch.rand(batch, 1, 2) - 2
+    return torch.cat((start, start + 0.2 * action.cumsum(1)), 1), action
+
+
+def test_they_learn_the_way_and_how_far_it_is() -> None:
+    heads = GoalHeads(2, 2, policy=True, distance=True, hidden=64)
+    optimiser = torch.optim.Adam(heads.parameters(), 3e-3)
+    for _ in range(300):
+        policy, distance = heads.losses(*walks(128, 8))
+        assert policy is not None and distance is not None
+        optimiser.zero_grad()
+        (policy + distance).backward()
+        optimiser.step()
+    places, action = walks(256, 8)
+    found = heads.act(places[:, 2], places[:, 7], deterministic=True)
+    assert (found - action[:, 0]).norm(dim=-1).mean() < 0.15
+    drawn = heads.act(places[:, 2], places[:, 7], deterministic=False)
+    assert 0.005 < (drawn - found).std() < 0.3
+    means = [heads.steps(places[:, 1], places[:, 1 + k]).mean() for k in (0, 2, 4, 7)]
+    assert means == sorted(means) and means[-1] - means[0] > 0.3
+    assert heads.steps(places[:, 0], places[:, 0].roll(1, 0)).mean() > means[-1]
+
+
+@pytest.mark.parametrize("name", SMALL)
+def test_the_distance_shapes_embeddings_and_the_policy_does_not(name: str) -> None:
+    batch = windows(8, 4)
+    for options, shapes in (({"goal_policy_coef": 1.0}, False), ({"goal_steps_coef": 1.0}, True)):
+        model = small(name, **options)
+        torch.nn.init.normal_(model.goal_heads.ruler[-1].weight) if shapes else None
+        losses = model.goal_losses(model.embed(model.history.start(frames(model, batch))), batch["action"])
+        [(_, loss)] = losses.items()
+        loss.backward()
+        reached = [p.grad is not None and bool(p.grad.any()) for p in model.encoder.parameters()]
+        assert any(reached) == shapes
+        assert all(p.grad is not None for p in model.goal_heads.parameters())
+
+
+def frames(model: Any, batch: TensorDict) -> Tensor:
+    images = torch.cat((batch["pixels"], batch["next", "pixels"][:, -1:]), 1)
+    return model.encode_frame(TensorDict({"pixels": images}, images.shape[:2]), batch_statistics=True)
+
+
+@pytest.mark.parametrize("name", SMALL)
+def test_they_are_part_of_the_loss_and_absent_by_default(name: str) -> None:
+    batch = windows(8, 4)
+    plain, both = small(name), small(name, goal_policy_coef=0.5, goal_steps_coef=2.0)
+    assert not plain.has_goal_policy and not plain.has_goal_steps and plain.goal_heads is None
+    with pytest.raises(NotImplementedError, match="goal_policy"):
+        plain.goal_policy(None, None)
+    assert "loss_goal_policy" not in plain.loss(batch).keys()  # noqa: SIM118
+    found = both.loss(batch)
+    half = small(name, goal_policy_coef=0.25, goal_steps_coef=1.0)
+    half.load_state_dict(both.state_dict())
+    torch.manual_seed(1)
+    found = both.loss(batch)
+    torch.manual_seed(1)
+    less = half.loss(batch)
+    for key in ("loss_goal_policy", "loss_goal_steps"):
+        assert torch.allclose(found[key], 2 * less[key])
+    extra = 0.5 * (found["loss_goal_policy"] + found["loss_goal_steps"])
+    assert torch.allclose(found["loss"] - less["loss"], extra, rtol=1e-3, atol=1e-5)
+
+
+def observed(envs: int) -> TensorDict:
+    images = torch.randint(0, 256, (2, envs, 16, 16, 3), dtype=torch.uint8)
+    init = torch.ones(envs, 1, dtype=torch.bool)
+    return TensorDict({"pixels": images[0], "goal_pixels": images[1], "is_init": init}, [envs])
+
+
+@pytest.mark.parametrize("name", SMALL)
+def test_plans_follow_the_policy_towards_the_goal(name: str) -> None:
+    """One candidate beside the plan of doing nothing, and an objective that likes large actions."""
+    model = small(name, goal_policy_coef=1.0).eval()
+    torch.nn.init.normal_(model.goal_heads.actor[-1].weight, std=0.5)
+    seen = observed(3)
+    alone = ModelPolicy.for_model(model, explore=False)
+    own = alone(seen.clone())["action"]
+    other = alone(seen.clone().set("goal_pixels", seen["goal_pixels"].flip(0)))["action"]
+    assert own.abs().max() > 0.1 and not torch.allclose(own, other)  # the goal counts
+
+    class Large(GoalImage):
+        def bind(self, tensordict: Any) -> Any:
+            return lambda trajectory, actions: actions.square().sum((-1, -2))
+
+    planner = CEM(action_dim=2, horizon=3, num_samples=2, num_policy_samples=1, num_elites=1, iterations=1)
+    objective = Large(model.encode_goal, embed=model.embed)
+    policy = PlannerPolicy.for_model(model, planner, objective=objective, explore=False)
+    assert torch.allclose(policy(seen.clone())["action"], own, atol=1e-6)
+    planner.num_policy_samples = 0
+    assert (policy(seen.clone())["action"] - own).abs().max() > 0.05
+
+
+def test_the_learned_distance_is_part_of_the_score() -> None:
+    model = small("lewm", goal_steps_coef=1.0).eval()
+    torch.nn.init.normal_(model.goal_heads.ruler[-1].weight)
+    seen, trajectory = observed(2), torch.randn(2, 5, 4, model.latent_dim)
+    goals = GoalImage(model.encode_goal, embed=model.embed)
+    plain = goals.bind(seen)(trajectory, trajectory)
+    goals = GoalImage(model.encode_goal, embed=model.embed, steps=model.goal_steps, steps_weight=2.0)
+    reached, goal = model.embed(trajectory[:, :, 1:]), goals.goal(seen)[:, None, None]
+    own = model.goal_steps(reached, goal.expand_as(reached)).sum(-1)
+    assert own.std() > 0.01
+    assert torch.allclose(goals.bind(seen)(trajectory, trajectory), plain - 2.0 * own, rtol=1e-5)
