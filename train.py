@@ -59,9 +59,7 @@ def main(cfg: DictConfig) -> None:
     found = None
     if eval_env is not None:  # all processes of a job play
         found = evaluate_run(run.settings, run.folder, eval_env, eval_policies, counters=trainer.counters)
-    if not processes.is_first():
-        return  # the first one speaks for all
-    if found is not None:
+    if processes.is_first() and found is not None:  # it speaks for all
         report_run(
             run.settings,
             run.folder,
@@ -72,9 +70,10 @@ def main(cfg: DictConfig) -> None:
             log=trainer.record,
             log_video=run.log_video,
         )
-    run.close()
-    say(f"page:    {write_page(run.folder)}")
-    run.export(trainer.experience)
+    if processes.is_first():
+        run.close()
+        say(f"page:    {write_page(run.folder)}")
+    run.export(trainer.experience)  # what each has gathered
     say(f"results: {run.folder}")
 
 

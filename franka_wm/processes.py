@@ -10,8 +10,11 @@ from __future__ import annotations
 import os
 import socket
 import sys
+import time
+import uuid
 from collections.abc import Iterable, Sequence
 from datetime import timedelta
+from pathlib import Path
 from typing import Any
 
 import torch
@@ -21,6 +24,13 @@ from franka_wm.errors import UserError
 
 TIMEOUT = timedelta(minutes=30)
 """How long a process waits for another one that lives: it may compile kernels, or write a large checkpoint."""
+
+LAST_WORDS = 1.0
+"""So long does the first process outlive what it refuses [s]: others that refuse the same ask its store who says so."""
+
+SEEN = ".seen"
+SOON = 90.0
+"""After so long every host sees what one has written to a disk of the network [s]."""
 
 MEETING = timedelta(minutes=10)
 """How long a process waits at the start for the others, which are started at the same time."""
@@ -141,6 +151,8 @@ def leave(status: int = 0) -> None:
     if _joined():
         sys.stdout.flush()
         sys.stderr.flush()
+        if status == 1 and is_first():
+            time.sleep(LAST_WORDS)
         os._exit(status)
 
 
@@ -265,6 +277,29 @@ def wait() -> None:
         agree([False], [])
 
 
+def require_seen(folder: Path, option: str) -> None:
+    """Checks that every process of the job sees what the first one writes into a folder, which ``option`` names.
+
+    Raises:
+        UserError: One does not.
+    """
+    if count() == 1:
+        return
+    mark = folder / SEEN
+    token = objects(uuid.uuid4().hex)[0]
+    if is_first():
+        mark.write_text(token)
+    wait()
+    until = time.monotonic() + SOON
+    while not (seen := mark.is_file() and mark.read_text() == token) and time.monotonic() < until:
+        time.sleep(0.1)
+    blind = [rank for rank, one in enumerate(objects(seen)) if not one]
+    if is_first():
+        mark.unlink()
+    if blind:
+        raise UserError(f"rank {blind[0]} does not see {folder}: give {option} on a disk that all hosts see")
+
+
 def require_same(tensors: dict[str, Tensor]) -> None:
     """Checks that the weights of all processes are the same, bit for bit; waits for the device.
 
@@ -311,5 +346,5 @@ def _together(what: Any) -> None:
         why = str(error).splitlines()[0][:120]
         raise UserError(
             f"process {os.environ.get('RANK', 0)} has lost another one of this run ({why}); what was saved is whole: "
-            "go on with resume=FOLDER"
+            "go on with resume=FOLDER, and collect with resume=true"
         ) from error

@@ -24,6 +24,9 @@ from franka_wm.errors import UserError
 
 FLAG = click.BOOL
 
+TYPED = "typed"
+"""What of click's context holds a verb's arguments as they were typed."""
+
 
 class _Real(click.FloatRange):
     """A finite number."""
@@ -99,6 +102,7 @@ class Verb(click.Command):
         if self.raw and not (self.add_help_option and args[:1] in (["--help"], ["-h"])):
             ctx.params["arguments"] = args
             return args
+        ctx.meta[TYPED] = list(args)
         if not args and any(one.required for one in self.params) and not ctx.resilient_parsing:
             click.echo(ctx.get_help())
             ctx.exit(2)

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NoReturn
 
 import click
 
-from franka_wm.commands.arguments import FLAG, check_run, plugins, real, verb, whole, word
+from franka_wm.commands.arguments import FLAG, TYPED, check_run, plugins, real, verb, whole, word
 from franka_wm.commands.overrides import compose, number
 from franka_wm.console import announced, say
 from franka_wm.data.lerobot.schema import FORMATS, schema_for
@@ -46,14 +46,65 @@ _PARTS = ("planner", "policy")
     click.Choice([*FORMATS]),
     "exact",
 )
-@word("num_envs", "worlds at once; collector.num_envs if not given", whole(1), metavar="N")
-@word("workers", "writing processes", whole(), 2)
+@word("num_envs", "worlds at once, on all GPUs; collector.num_envs if not given", whole(1), metavar="N")
+@word("gpus", "of this host, one process each; with device=cpu so many on the CPU", whole(1), 1)
+@word("workers", "writing processes, of each GPU", whole(), 2)
 @word("shard_frames", "steps in one file, at most", whole(1), metavar="N")
 @word("success_only", "keep only episodes that end in success", FLAG, False)
 @word("noise", "of the expert's actions, standard deviation; it recovers from that", real(0.0), metavar="X")
 @word("resume", "go on with an unfinished dataset, or add to a finished one", FLAG, False)
 @plugins
-def collect(
+def collect(gpus: int, overrides: Sequence[str], **options: Any) -> int:
+    """Gather a LeRobot dataset with any policy.
+
+    Ctrl-C stops and leaves a dataset of the whole episodes so far.
+    """
+    from franka_wm.commands import several
+    from franka_wm.data.lerobot.writer import check_out
+
+    if several.started_by_torchrun():
+        _in_a_job(overrides, options)
+    check_out(options["out"], resume=options["resume"])
+    if gpus == 1:
+        return _collect(overrides, **options)
+    check_policy(options["policy"], options["checkpoint"], overrides, noise=options["noise"])
+    _require_worlds(options["num_envs"] or options["episodes"], gpus)
+    several.launch_verb(["collect", *_typed()], gpus, _device(overrides), "collect goes on with resume=true")
+    return 0
+
+
+def _typed() -> list[str]:
+    return click.get_current_context().meta[TYPED]
+
+
+def _device(overrides: Sequence[str]) -> str:
+    return next((one.removeprefix("device=") for one in overrides if one.startswith("device=")), "auto")
+
+
+def _in_a_job(overrides: Sequence[str], options: dict[str, Any]) -> NoReturn:
+    """What each process of a job does that torchrun has started: its worlds' part of one dataset."""
+    from franka_wm import processes
+    from franka_wm.commands import several
+    from franka_wm.commands.entry import ends_together
+    from franka_wm.data.lerobot.writer import check_out
+
+    with ends_together():
+        several.meet(_typed(), _device(overrides))
+        if _device(overrides) != "cpu":
+            overrides = [one for one in overrides if not one.startswith("device=")]
+            overrides.append(f"device={processes.own_gpu()}")
+        options |= {"resume": options["resume"] or processes.restarted()}
+        if processes.is_first():
+            check_out(options["out"], resume=options["resume"])
+        status = _collect(overrides, **options)
+        processes.wait()
+        processes.leave(status)
+    raise AssertionError  # it has left
+
+
+def _collect(
+    overrides: Sequence[str],
+    *,
     out: str,
     episodes: int,
     policy: str,
@@ -61,16 +112,8 @@ def collect(
     format: str,
     num_envs: int | None,
     noise: float | None,
-    overrides: Sequence[str],
     **writing: Any,
 ) -> int:
-    """Gather a LeRobot dataset with any policy.
-
-    Ctrl-C stops and leaves a dataset of the whole episodes so far.
-    """
-    from franka_wm.data.lerobot.writer import check_out
-
-    check_out(out, resume=writing["resume"])
     source = open_source(
         policy, checkpoint, overrides, episodes=episodes, num_envs=num_envs, format=format, noise=noise
     )
@@ -111,6 +154,34 @@ def open_source(
     Raises:
         UserError: One line, for what cannot be built.
     """
+    name, checkpoint = check_policy(name, checkpoint, overrides, noise=noise)
+    if name in _SIMPLE:
+        return _simple(name, overrides, episodes, num_envs, format, noise or 0.0)
+    return _agent(name, str(checkpoint), overrides, num_envs or min(64, episodes))
+
+
+def _own(worlds: int) -> int:
+    """How many of the worlds are this process's."""
+    from franka_wm import processes
+
+    _require_worlds(worlds, processes.count())
+    return processes.own_part(worlds)[1]
+
+
+def _require_worlds(worlds: int, count: int) -> None:
+    if worlds < count:
+        raise UserError(
+            f"collect: {worlds} worlds for {count} processes: give num_envs={count}, or start fewer"
+        )
+
+
+def check_policy(
+    name: str, checkpoint: str | None, overrides: Sequence[str], *, noise: float | None
+) -> tuple[str, str | None]:
+    """Check who shall act, before anything heavy is imported: the policy or the part of an agent, and the agent.
+
+    Args and errors: as for :func:`open_source`.
+    """
     if not Path(name).exists():
         refuse_old_name("collect: policy", name)
     if name in _PARTS and not checkpoint:
@@ -130,8 +201,10 @@ def open_source(
     if noise and name != "expert":
         raise UserError(f"collect: noise={noise:g}: is for policy=expert")
     if name in _SIMPLE:
-        return _simple(name, overrides, episodes, num_envs, format, noise or 0.0)
-    return _agent(name, str(checkpoint), overrides, num_envs or min(64, episodes))
+        cfg = compose(overrides, tuple(collect.words))
+        for key, kind in (("seed", int), ("collector.smoothness", float), ("collector.num_envs", int)):
+            number(cfg, key, kind)
+    return name, checkpoint
 
 
 def _simple(
@@ -139,15 +212,13 @@ def _simple(
 ) -> Source:
     from omegaconf import OmegaConf
 
-    cfg = compose(overrides, tuple(collect.words))  # checked before anything heavy is imported
-    seed, smoothness = number(cfg, "seed"), number(cfg, "collector.smoothness", float)
-    number(cfg, "collector.num_envs")
     from franka_wm.commands.entry import with_scale
     from franka_wm.envs import FrankaConfig, FrankaEnv
     from franka_wm.training.storage_budget import check_worlds
 
     cfg = compose(with_scale(list(overrides), quiet=True))
-    worlds = num_envs or min(number(cfg, "collector.num_envs"), episodes)
+    seed, smoothness = number(cfg, "seed"), number(cfg, "collector.smoothness", float)
+    worlds = _own(num_envs or min(number(cfg, "collector.num_envs"), episodes))
     if cfg.env.kind != "franka":
         raise UserError(
             f"collect: env.kind={cfg.env.kind!r}: datasets are gathered from the arm (env=reach, …)"
@@ -230,6 +301,7 @@ def _agent(part: str, checkpoint: str, overrides: Sequence[str], worlds: int) ->
     from franka_wm.training.load import load_agent
     from franka_wm.training.storage_budget import check_worlds
 
+    worlds = _own(worlds)
     check_worlds("num_envs", worlds, device)
     with announced(f"loading {checkpoint}"):
         agent = load_agent(checkpoint, num_envs=worlds, device=device, env_changes=changes, seed=seed)

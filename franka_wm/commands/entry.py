@@ -48,6 +48,20 @@ def run_command(main: Callable[[], object], arguments: list[str] | None = None) 
 
 
 @contextmanager
+def ends_together() -> Iterator[None]:
+    """Around what a process does that torchrun has started for a verb: what ends one ends all, and is said once."""
+    try:
+        with one_line_refusals():
+            try:
+                yield
+            except FrankaError as error:
+                fail(str(error))
+    except BaseException as error:
+        several.part(error)
+        raise
+
+
+@contextmanager
 def one_line_refusals() -> Iterator[None]:
     """What the machine has no more of (room on the disk, descriptors, memory) is one line, too."""
     try:

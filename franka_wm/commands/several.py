@@ -43,13 +43,27 @@ def wanted(overrides: list[str]) -> tuple[int, str]:
 
 
 def launch(flags: list[str], overrides: list[str], gpus: int, device: str) -> None:
-    """Starts so many processes of this command on this host, and waits for them.
+    """Starts so many processes of a training on this host, and waits for them.
 
     Args:
         flags: Hydra's.
         overrides: Checked.
+        gpus, device, and what is raised: As for :func:`launch_verb`.
+    """
+    folder = run_folder(overrides)
+    fixed = [one for one in overrides if not one.startswith("hydra.run.dir=")]
+    command = ["train", *flags, *fixed, f"hydra.run.dir={quoted(str(folder))}"]
+    launch_verb(command, gpus, device, f"go on from the last checkpoint: {resuming(folder, {})}")
+
+
+def launch_verb(command: list[str], gpus: int, device: str, advice: str) -> None:
+    """Starts so many processes of a command on this host, and waits for them.
+
+    Args:
+        command: The verb and its arguments, checked.
         gpus: How many.
         device: The configuration's.
+        advice: What to do where a process was killed.
 
     Raises:
         UserError: This host has fewer GPUs, or a process was killed.
@@ -61,12 +75,9 @@ def launch(flags: list[str], overrides: list[str], gpus: int, device: str) -> No
     from torch.distributed.launcher.api import LaunchConfig, elastic_launch
 
     logging.getLogger("torch.distributed").setLevel(logging.CRITICAL)  # ours say what happened
-    folder = run_folder(overrides)
-    fixed = [one for one in overrides if not one.startswith("hydra.run.dir=")]
     os.environ.setdefault("OMP_NUM_THREADS", str(max(1, (os.cpu_count() or 1) // gpus)))
     places = [str(conf.FOLDER.parents[1]), *filter(None, [os.environ.get("PYTHONPATH")])]
     os.environ["PYTHONPATH"] = os.pathsep.join(places)
-    command = ["-m", "franka_wm", "train", *flags, *fixed, f"hydra.run.dir={quoted(str(folder))}"]
     try:
         with tempfile.TemporaryDirectory(prefix="franka_wm-") as logs, patience():
             config = LaunchConfig(
@@ -80,7 +91,7 @@ def launch(flags: list[str], overrides: list[str], gpus: int, device: str) -> No
                 max_restarts=0,
                 logs_specs=DefaultLogsSpecs(log_dir=logs),
             )
-            elastic_launch(config, sys.executable)(*command)
+            elastic_launch(config, sys.executable)("-m", "franka_wm", *command)
     except SignalException as stopped:  # the processes have saved, and said so
         sys.exit(INTERRUPTED if stopped.sigval == signal.SIGINT else 128 + stopped.sigval)
     except ChildFailedError as error:
@@ -89,7 +100,7 @@ def launch(flags: list[str], overrides: list[str], gpus: int, device: str) -> No
             sys.exit(failure.exitcode)
         raise UserError(
             f"process {rank} of the run (pid {failure.pid}) was ended by {failure.signal_name()}, the others with it; "
-            f"go on from the last checkpoint: {resuming(folder, {})}"
+            f"{advice}"
         ) from None
 
 
@@ -151,21 +162,33 @@ def run_folder(overrides: list[str]) -> Path:
 
 
 def enter(overrides: list[str]) -> list[str]:
-    """Meets the other processes of the job; the overrides of this one.
-
-    All write into one folder, the first one's. All but the first one are silent, unless they end first.
+    """Meets the other processes of the job; the overrides of this one. All write into one folder, the first one's.
 
     Raises:
         UserError: The others cannot be met, versions or options differ, or a host has too few GPUs.
     """
     from franka_wm import processes
 
+    own = [one for one in overrides if not one.startswith(("hydra.run.dir=", "gpus="))]
+    meet(own, wanted(overrides)[1])
+    folder = processes.objects(str(run_folder(overrides)))[0]
+    own += [f"gpus={processes.count()}", f"hydra.run.dir={quoted(folder)}"]
+    return own if processes.is_first() else [*own, "hydra.output_subdir=null"]
+
+
+def meet(options: list[str], device: str) -> None:
+    """Meets the other processes of the job. All but the first one are silent, unless they end first.
+
+    Raises:
+        UserError: As for :func:`enter`.
+    """
+    from franka_wm import processes
+
     if os.environ["RANK"] != "0":
         sys.stdout = open(os.devnull, "w")  # noqa: SIM115  # as long as the process
-    processes.join(cuda=wanted(overrides)[1] != "cpu")
-    own = [one for one in overrides if not one.startswith(("hydra.run.dir=", "gpus="))]
+    processes.join(cuda=device != "cpu")
     decisive = ("franka_wm", "python", "commit", *PACKAGES)
-    same = {"options": " ".join(own)} | {k: v for k, v in versions().items() if k in decisive}
+    same = {"options": " ".join(options)} | {k: v for k, v in versions().items() if k in decisive}
     for rank, theirs in enumerate(processes.objects(same)):
         for name, value in theirs.items():
             if value != same.get(name):
@@ -173,9 +196,6 @@ def enter(overrides: list[str]) -> list[str]:
                     f"process {processes.rank()} has {name} {same.get(name)}, process {rank} {value}; start all of a "
                     "job with the same command in the same environment"
                 )
-    folder = processes.objects(str(run_folder(overrides)))[0]
-    own += [f"gpus={processes.count()}", f"hydra.run.dir={quoted(folder)}"]
-    return own if processes.is_first() else [*own, "hydra.output_subdir=null"]
 
 
 def go_on(cfg: DictConfig, folder: Path) -> None:

@@ -11,6 +11,7 @@ from torch import Tensor
 
 from franka_wm.options import COEFFICIENT, FRACTION, POSITIVE, Bounds, check_arguments
 from franka_wm.planning.tree import Recurrent, Tree
+from franka_wm.seeding import of_worlds
 
 
 @dataclass(kw_only=True, eq=False)
@@ -173,8 +174,11 @@ class _Puct:
     def _dirichlet(self, like: Tensor) -> Tensor:
         """Dirichlet noise of the shape of `like` (E, M)."""
         # torch.distributions takes no generator. A draw may underflow, hence the smallest number.
-        draw = torch._standard_gamma(  # pyright: ignore[reportPrivateImportUsage]
-            torch.full_like(like, self.settings.dirichlet_alpha), generator=self.generator
+        draw = of_worlds(
+            lambda shape: torch._standard_gamma(  # pyright: ignore[reportPrivateImportUsage]
+                like.new_full(shape, self.settings.dirichlet_alpha), generator=self.generator
+            ),
+            like.shape,
         ).clamp_min(torch.finfo(like.dtype).tiny)
         return draw / draw.sum(-1, keepdim=True)
 
@@ -320,7 +324,7 @@ def sequential_halving(considered: int, simulations: int) -> list[int]:
 def _gumbel_noise(like: Tensor, generator: torch.Generator | None) -> Tensor:
     """Standard Gumbel noise of the shape of `like`: -log of an exponential draw."""
     # The draw may be 0 in float32, whose logarithm would beat everything.
-    draw = torch.empty_like(like).exponential_(generator=generator)
+    draw = of_worlds(lambda shape: like.new_empty(shape).exponential_(generator=generator), like.shape)
     return -draw.clamp_min(torch.finfo(like.dtype).tiny).log()
 
 

@@ -52,7 +52,8 @@ def explored(
 ) -> Tensor:
     """The action (E, A) within its bounds, with Gaussian noise of `std` if `explore`."""
     if explore:
-        noise = torch.randn(action.shape, device=action.device, dtype=action.dtype, generator=generator)
+        like: dict = {"device": action.device, "dtype": action.dtype}
+        noise = of_worlds(lambda shape: torch.randn(shape, generator=generator, **like), action.shape)
         action = action + std * noise
     return action.clamp(low, high)
 

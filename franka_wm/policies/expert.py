@@ -16,6 +16,7 @@ from franka_wm.envs.tasks import Task
 from franka_wm.envs.tasks.manipulation import Aim, Sight
 from franka_wm.errors import UserError
 from franka_wm.policies.scripted import DrawingPolicy, ScriptedPolicy
+from franka_wm.seeding import of_worlds
 
 FAST, SLOW = 0.5, 0.15
 """Speed of the hand [m/s]: on its way, and within :data:`NEAR` of where it shall be."""
@@ -84,7 +85,9 @@ class ExpertPolicy(DrawingPolicy):
         else:
             action = (joints - target) / c.action_scale
         if self.noise:
-            drawn = torch.randn(action.shape, device=action.device, generator=self.generator)
+            drawn = of_worlds(
+                lambda shape: torch.randn(shape, device=action.device, generator=self.generator), action.shape
+            )
             way = (aim.tool - sight.tool).norm(dim=-1, keepdim=True)
             action = action + self.noise * (way / QUIET).clamp_max(1.0).square() * drawn
         grip = 2 * aim.opening / MOST_OPEN - 1

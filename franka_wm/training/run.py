@@ -7,8 +7,6 @@ import importlib
 import logging
 import sys
 import tempfile
-import time
-import uuid
 from collections.abc import Callable, Iterable
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
@@ -44,10 +42,6 @@ from franka_wm.versions import FINISHED, write_finished, write_versions
 
 STOPPED = "stopped.txt"
 """Says in the folder of a run that it was asked to stop; while it is there, torchrun does not begin the run again."""
-
-SEEN = ".seen"
-SOON = 90.0
-"""After so long every host sees what one has written to a disk of the network [s]."""
 
 SMALL_FILES = 65536
 """Room for a run's configuration and first lines, which are written before there is anything to lose [bytes]."""
@@ -239,6 +233,8 @@ class Run:
     def export(self, experience: Callable[[], TensorDictBase | None]) -> None:
         """What ``export`` in the configuration asks for: the replay's whole episodes as a LeRobot dataset.
 
+        Each process of a job calls this.
+
         Args:
             experience: Gives the replay, oldest step first; called only if something is exported.
         """
@@ -255,7 +251,7 @@ def start(cfg: DictConfig) -> Run:
     """
     told = HydraConfig.get()
     folder = Path(told.runtime.output_dir)
-    require_seen(folder)
+    processes.require_seen(folder, "hydra.run.dir")
     checkpoint, again = None, False
     import_plugins(cfg.plugins)  # those of the command line: what a checkpoint names is never imported
     if cfg.resume is not None:
@@ -288,31 +284,6 @@ def start(cfg: DictConfig) -> Run:
     if checkpoint is not None:
         say(f"going on from update {int(checkpoint.counters.get('updates', 0))} of {checkpoint.folder}")
     return Run(settings, folder, checkpoint, open_loggers(settings, folder))
-
-
-def require_seen(folder: Path) -> None:
-    """Checks that every process of the job sees what the first one writes into the run's folder.
-
-    Raises:
-        UserError: One does not.
-    """
-    if processes.count() == 1:
-        return
-    mark = folder / SEEN
-    token = processes.objects(uuid.uuid4().hex)[0]
-    if processes.is_first():
-        mark.write_text(token)
-    processes.wait()
-    until = time.monotonic() + SOON
-    while not (seen := mark.is_file() and mark.read_text() == token) and time.monotonic() < until:
-        time.sleep(0.1)
-    blind = [rank for rank, one in enumerate(processes.objects(seen)) if not one]
-    if processes.is_first():
-        mark.unlink()
-    if blind:
-        raise UserError(
-            f"rank {blind[0]} does not see {folder}: give hydra.run.dir on a disk that all hosts see"
-        )
 
 
 def _require_same(checkpoint: Checkpoint) -> None:

@@ -174,6 +174,35 @@ def spare() -> Spare:
     return Spare()
 
 
+def job_in_fork(count: int, *arguments: str, cwd: Path) -> subprocess.CompletedProcess[str]:
+    """The same by so many processes, as torchrun starts them on one host; exit status: the first that is not 0."""
+    return spare().fork(functools.partial(_job, count, arguments), cwd)
+
+
+def _job(count: int, arguments: tuple[str, ...]) -> None:
+    with socket.socket() as one:
+        one.bind(("localhost", 0))
+        port = one.getsockname()[1]
+    common = {"WORLD_SIZE": count, "LOCAL_WORLD_SIZE": count, "TORCHELASTIC_RUN_ID": "forks"}
+    common |= {"MASTER_ADDR": "localhost", "MASTER_PORT": port}
+    forks = []
+    for rank in range(count):
+        pid = os.fork()
+        if pid == 0:
+            status = 1
+            try:
+                own = {"RANK": rank, "LOCAL_RANK": rank}
+                os.environ.update({name: str(value) for name, value in (common | own).items()})
+                _script(TRAIN, arguments)
+            except BaseException:  # a job ends by os._exit
+                traceback.print_exc()
+            finally:
+                os._exit(status)
+        forks.append(pid)
+    found = [os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1]) for pid in forks]
+    sys.exit(next(filter(None, found), 0))
+
+
 def train_in_fork(*arguments: str, cwd: Path) -> subprocess.CompletedProcess[str]:
     """``python train.py ARGUMENT …`` in a fork of a process that has run no test yet."""
     return spare().fork(script(TRAIN, *arguments), cwd)

@@ -146,16 +146,16 @@ def test_the_first_process_decides_whether_a_job_goes_on(monkeypatch, second, tm
 
 
 def test_a_folder_that_another_process_does_not_see_is_one_line(monkeypatch, second, tmp_path) -> None:
-    monkeypatch.setattr(run, "SOON", 0.3)
+    monkeypatch.setattr(processes, "SOON", 0.3)
     monkeypatch.setattr(
         processes, "objects", lambda mine: ["word", mine] if isinstance(mine, str) else [True, mine]
     )
     with pytest.raises(
         UserError, match=f"rank 1 does not see {tmp_path}: give hydra.run.dir on a disk that all"
     ):
-        run.require_seen(tmp_path)
-    (tmp_path / run.SEEN).write_text("word")
-    run.require_seen(tmp_path)
+        processes.require_seen(tmp_path, "hydra.run.dir")
+    (tmp_path / processes.SEEN).write_text("word")
+    processes.require_seen(tmp_path, "hydra.run.dir")
 
 
 def test_processes_that_shall_stop_may_take_long_to_save(monkeypatch) -> None:

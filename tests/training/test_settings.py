@@ -224,7 +224,6 @@ def test_settings_are_what_several_options_make_of_them() -> None:
         ),
         (["gpus=3"], "collector.num_envs=8: 3 GPUs cannot share it"),
         (["gpus=4", "collector.planner_worlds=2"], "collector.planner_worlds=2: 4 GPUs cannot share it"),
-        (["gpus=2", "export=lerobot"], "export=lerobot: needs gpus=1"),
     ],
 )
 def test_what_several_gpus_cannot_share_is_refused(overrides: list[str], says: str) -> None:

@@ -16,7 +16,7 @@ from franka_wm.data.lerobot.schema import SEED, SUCCESS, schema_for
 from franka_wm.data.lerobot.writer import DatasetWriter, default_shard_frames
 from franka_wm.errors import UserError
 from franka_wm.interrupt import interruptible
-from franka_wm.seeding import derive_seed
+from franka_wm.seeding import derive_seed, drawing_for, seeded
 
 BATCH = 8192
 """Steps of all worlds in one batch of the collector, about."""
@@ -30,7 +30,7 @@ class Source:
     """Who acts where.
 
     Attributes:
-        env: The worlds.
+        env: The worlds; of several processes, this one's.
         policy: Writes ``action``.
         config: The resolved configuration, plain.
         name: Name of the policy, for the dataset's provenance.
@@ -58,6 +58,9 @@ def gather(
 ) -> tuple[Path, bool]:
     """Runs the policy until there are so many episodes, and writes them.
 
+    Each process of a job calls this with worlds of its own. World k of the job plays the same episodes, and its policy
+    draws the same numbers, whatever the number of processes; they gather batch by batch together.
+
     Every world contributes the same number of episodes (one more or less), its first ones: whoever ends early
     does not fill the dataset with short episodes.
 
@@ -78,11 +81,15 @@ def gather(
     """
     from torchrl.collectors import Collector
 
+    from franka_wm import processes
+
     base = getattr(source.env, "base_env", source.env)
+    numbers = processes.objects(base.num_envs)
+    first, whole_job = sum(numbers[: processes.rank()]), sum(numbers)
     schema = schema_for(base.config, format=format)
     worlds, length = base.num_envs, base.config.episode_length
     if shard_frames is None and workers:  # few episodes: still something for every process to do
-        shard_frames = min(default_shard_frames(schema), -(-episodes * length // workers))
+        shard_frames = min(default_shard_frames(schema), -(-episodes * length // (workers * len(numbers))))
     provenance = describe(policy=source.name, seed=source.seed, config=source.config)
     with DatasetWriter(
         out,
@@ -98,67 +105,76 @@ def gather(
             return writer.finish(), True
         writer.start()
         seed = derive_seed("collection", source.seed, writer.resumed)
+        base.simulation.set_first_world(first)
         source.env.set_seed(seed)
-        chosen = _Choice(np.full(worlds, left // worlds) + (np.arange(worlds) < left % worlds), success_only)
-        cutter = EpisodeCutter(schema, seed=seed, discrete=_table(source.env))
-        collector = Collector(
-            source.env,
-            source.policy,
-            frames_per_batch=worlds * max(1, min(length, BATCH // worlds)),
-            total_frames=-1,
-            track_traj_ids=False,
-            no_cuda_sync=True,
-            trust_policy=True,
-        )
-        started = said = time.perf_counter()
-        before, steps = writer.episodes, 0
-        with interruptible() as stop:
+        quota = np.full(whole_job, left // whole_job) + (np.arange(whole_job) < left % whole_job)
+        chosen = _Choice(quota, success_only)
+        wanted = int(quota[first : first + worlds].sum())
+        cutter = EpisodeCutter(schema, seed=seed, first_world=first, discrete=_table(source.env))
+        # From here on: a collector tries its policy. Planners draw from torch's generator.
+        with interruptible() as stop, seeded(seed), drawing_for(first, worlds, whole_job):
+            collector = Collector(
+                source.env,
+                source.policy,
+                frames_per_batch=worlds * max(1, min(length, BATCH // worlds)),
+                total_frames=-1,
+                track_traj_ids=False,
+                no_cuda_sync=True,
+                trust_policy=True,
+            )
+            started = said = time.perf_counter()
+            done, steps, stopped = 0, 0, False
             batches = iter(collector)
-            while writer.episodes < episodes and not stop():
-                batch = next(batches)
-                steps += batch.numel()
-                writer.add(episode for episode in cutter.push(batch) if chosen.takes(episode))
+            while done < left and not stopped:
+                if chosen.taken < wanted:
+                    batch = next(batches)
+                    steps += batch.numel()
+                    writer.add(episode for episode in cutter.push(batch) if chosen.takes(episode))
+                told = processes.objects((chosen.taken, chosen.seen, steps, stop()))
+                done, seen, all_steps, stopped = (sum(one) for one in zip(*told, strict=True))
+                if success_only and seen >= HOPELESS and not done:
+                    raise UserError(
+                        f"collect: none of {seen} episodes succeeded; success_only=true would never end: "
+                        "take another policy, or success_only=false"
+                    )
                 now = time.perf_counter()
-                if now - said >= every or writer.episodes >= episodes:
-                    rate = (writer.episodes - before) / (now - started)
-                    rest = f"   left {duration((episodes - writer.episodes) / rate)}" if rate else ""
+                if now - said >= every or done >= left:
+                    rate = done / (now - started)
+                    rest = f"   left {duration((left - done) / rate)}" if rate else ""
                     say(
-                        f"episodes {writer.episodes}/{episodes}   steps {count(steps)} "
-                        f"({count(steps / (now - started))}/s){rest}"
+                        f"episodes {writer.resumed + done}/{episodes}   steps {count(all_steps)} "
+                        f"({count(all_steps / (now - started))}/s){rest}"
                     )
                     said = now
-            whole = writer.episodes >= episodes
         collector.shutdown()
-        return writer.finish(), whole
+        return writer.finish(), done >= left
 
 
 class _Choice:
     """The first episodes of each world, or the first that succeed.
 
     Args:
-        quota: (worlds,) how many of each.
+        quota: (worlds,) how many of each, of the whole job.
         success_only: Whether others do not count.
+
+    Attributes:
+        seen, taken: How many episodes it was asked for, and how many it took.
     """
 
     def __init__(self, quota: np.ndarray, success_only: bool):
         self._left, self._success_only = quota.copy(), success_only
-        self._seen = self._taken = 0
+        self.seen = self.taken = 0
 
     def takes(self, episode: Episode) -> bool:
         """Whether this one is kept; called for all in the order of their ends."""
-        self._seen += 1
+        self.seen += 1
         if self._success_only and not episode.rows[SUCCESS][-1, 0]:
-            if self._seen >= HOPELESS and not self._taken:
-                raise UserError(
-                    f"collect: none of {self._seen} episodes succeeded; success_only=true would never end: "
-                    "take another policy, or success_only=false"
-                )
             return False
         world = episode.rows[SEED][0][1]
         if self._left[world] <= 0:
             return False
         self._left[world] -= 1
-        self._taken += 1
+        self.taken += 1
         return True
 
 

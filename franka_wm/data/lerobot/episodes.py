@@ -62,6 +62,7 @@ class EpisodeCutter:
     Args:
         schema: What is kept.
         seed: Seed of the run: the first number of the feature ``seed``.
+        first_world: Number of the first world of the batches.
         first_episode: (worlds,) numbers of the episodes that the first batch starts with; 0 if not given.
         discrete: Table (number of actions, A) that an integer action is a row of; for continuous actions ``None``.
     """
@@ -71,11 +72,13 @@ class EpisodeCutter:
         schema: Schema,
         *,
         seed: int,
+        first_world: int = 0,
         first_episode: np.ndarray | None = None,
         discrete: torch.Tensor | None = None,
     ):
         self.schema = schema
         self.seed = seed
+        self.first_world = first_world
         self._table = None if discrete is None else discrete.cpu().numpy()
         self._numbers = first_episode
         self._open: dict[str, np.ndarray] | None = None
@@ -162,7 +165,7 @@ class EpisodeCutter:
         for name in (ACTION, REWARD, DONE, TERMINATED, TRUNCATED, SUCCESS):
             if name in arrays:
                 rows[name] = arrays[name][world, begin:end].copy()
-        return complete(rows, terminal, seed=(self.seed, world, number))
+        return complete(rows, terminal, seed=(self.seed, self.first_world + world, number))
 
 
 def complete(
@@ -186,6 +189,7 @@ def cut_replay(
     *,
     seed: int,
     episode_length: int,
+    first_world: int = 0,
     discrete: torch.Tensor | None = None,
 ) -> tuple[list[Episode], int]:
     """Whole episodes of a replay buffer, which keeps no flag for the end by time.
@@ -200,6 +204,7 @@ def cut_replay(
         schema: What is kept.
         seed: Seed of the run.
         episode_length: Steps of the environment's episodes.
+        first_world: Number of the first world.
         discrete: As for :class:`EpisodeCutter`.
 
     Returns:
@@ -221,7 +226,11 @@ def cut_replay(
     data["next"] = after
     worlds = first.shape[0]
     cutter = EpisodeCutter(
-        schema, seed=seed, first_episode=np.full(worlds, UNKNOWN_EPISODE, np.int64), discrete=discrete
+        schema,
+        seed=seed,
+        first_world=first_world,
+        first_episode=np.full(worlds, UNKNOWN_EPISODE, np.int64),
+        discrete=discrete,
     )
     # Every step of an episode that is not whole belongs to a start without an end, or to none.
     pieces = first.clone()

@@ -83,9 +83,15 @@ def export_replay(
         seed: Seed of the run.
         policy, settings: Who acted, and the resolved configuration, for the provenance.
 
+    Each process of a job calls this with its own worlds; the dataset has the episodes of all.
+
+    Returns:
+        What became of all of it.
+
     Raises:
         UserError: There is no whole episode, or it cannot be written.
     """
+    from franka_wm import processes
     from franka_wm.envs.discretize import discrete_action_table
 
     if config.frame_stack > 1:  # a replay keeps each image once, and so does a dataset
@@ -115,9 +121,12 @@ def export_replay(
         schema,
         seed=seed,
         episode_length=config.episode_length,
+        first_world=processes.rank() * len(data),
         discrete=discrete,
     )
-    if not episodes:
+    counts = processes.objects((len(episodes), sum(e.length for e in episodes), partial))
+    whole, frames, partial = (sum(one) for one in zip(*counts, strict=True))
+    if not whole:
         raise UserError(
             f"export: the buffer holds no whole episode of {config.episode_length} steps, only {partial} partial "
             "ones; gather more first"
@@ -125,11 +134,11 @@ def export_replay(
     provenance = describe(policy=policy, seed=seed, config=settings)
     with DatasetWriter(out, schema, provenance=provenance, workers=workers, resumable=False) as writer:
         writer.add(episodes)
-        return Exported(writer.finish(), len(episodes), sum(e.length for e in episodes), partial)
+        return Exported(writer.finish(), whole, frames, partial)
 
 
 def export_run(settings: Mapping[str, Any], data: TensorDictBase | None, *, folder: Path) -> Exported | None:
-    """The end of a training run: what ``export`` in its configuration asks for.
+    """The end of a training run: what ``export`` in its configuration asks for. Each process of a job calls this.
 
     Args:
         settings: The run's resolved configuration, plain; ``export`` has ``kind`` (none, lerobot), ``out`` (``None``:
@@ -155,7 +164,9 @@ def export_run(settings: Mapping[str, Any], data: TensorDictBase | None, *, fold
         workers=int(wanted["workers"]),
     )
     tell(done)
-    if wanted["repo_id"]:
+    from franka_wm import processes
+
+    if wanted["repo_id"] and processes.is_first():
         from franka_wm.data.lerobot.publish import publish_dataset
 
         publish_dataset(done.out, wanted["repo_id"])

@@ -8,12 +8,13 @@ While a dataset is gathered, everything is in ``OUT.writing``:
     merged                 all of them in one; becomes OUT by a rename
 
 So OUT is there whole or not at all, a kill at any moment loses no shard that was finished, and going on needs
-nothing but the folder.
+nothing but the folder. Several processes of one job write shards side by side, which the first one merges.
 """
 
 from __future__ import annotations
 
 import json
+import math
 import os
 import re
 import shutil
@@ -75,6 +76,8 @@ def _shards(working: Path) -> list[Path]:
 class DatasetWriter:
     """Gathers episodes into a dataset. Use it as a context manager; leaving it stops the writing processes.
 
+    Each process of a job makes one and calls :meth:`finish`: of all their episodes becomes one dataset.
+
     Args:
         out: The dataset's folder; appears when :meth:`finish` returns.
         schema: What an episode holds.
@@ -85,7 +88,7 @@ class DatasetWriter:
         resumable: Whether whoever gathers it has ``resume``; an export does not, and is made again instead.
 
     Attributes:
-        episodes, frames: Written or waiting to be, with those of earlier sessions.
+        episodes, frames: Written or waiting to be, with those of earlier sessions; of several processes, this one's.
         resumed: How many of the episodes were there already.
 
     Raises:
@@ -116,7 +119,16 @@ class DatasetWriter:
         self._number_of_workers = workers
         self._resumable = resumable
         self._lock = None
-        self._open(resume)
+        from franka_wm import processes  # here: it imports torch
+
+        if processes.is_first():
+            self._open(resume)
+        found = (self.resumed, self.frames, self._next_shard) if processes.is_first() else None
+        self.resumed, self.frames, first = processes.objects(found)[0]
+        self.episodes = self.resumed
+        processes.require_seen(self.working, "out")
+        self._next_shard, self._apart = first + processes.rank(), processes.count()
+        self._first_worker = processes.rank() * workers
 
     # -- before ------------------------------------------------------------------------------------------------
 
@@ -161,7 +173,7 @@ class DatasetWriter:
             UntrustedFolder(self.out).check_links()
             check_finite(self.out)
         totals = [_totals(folder) for folder in ([self.out] if self.out.exists() else []) + kept]
-        self.resumed = self.episodes = sum(episodes for episodes, _ in totals)
+        self.resumed = sum(episodes for episodes, _ in totals)
         self.frames = sum(frames for _, frames in totals)
         self._next_shard = 1 + max((_number(folder) for folder in kept), default=-1)
         earlier = state["sessions"] if kept else []
@@ -211,7 +223,7 @@ class DatasetWriter:
         """
         if not self._workers:
             numbers = range(self._number_of_workers)
-            self._workers = [Worker(self.working, number) for number in numbers] or [InProcess()]
+            self._workers = [Worker(self.working, self._first_worker + n) for n in numbers] or [InProcess()]
         if wait:
             for worker in self._workers:
                 worker.send(("nothing",))
@@ -238,7 +250,7 @@ class DatasetWriter:
         self.start()
         folder = self.working / "shards" / f"shard-{self._next_shard:05d}"
         self._idle_worker().send(("shard", folder, self.schema, self._buffer))
-        self._next_shard += 1
+        self._next_shard += self._apart
         self._buffer, self._buffered = [], 0
 
     def _idle_worker(self) -> Worker | InProcess:
@@ -271,12 +283,24 @@ class DatasetWriter:
         Raises:
             UserError: There is no episode, or writing failed. What is finished stays in ``OUT.writing``.
         """
+        from franka_wm import processes
+
         self.flush()
+        if processes.is_first():
+            processes.wait()
+            self._merge()
+        else:
+            self.close()  # the first one removes the folder
+            processes.wait()
+        processes.wait()
+        return self.out
+
+    def _merge(self) -> None:
         shards = _shards(self.working)
         if not shards:
             self._remove_working()
             if self.out.exists():  # resumed, with nothing to add
-                return self.out
+                return
             raise UserError("no episode was gathered, so there is no dataset to write")
         self.start()
         roots = ([self.out] if self.out.exists() else []) + shards
@@ -291,13 +315,12 @@ class DatasetWriter:
             os.rename(self.out, self.working / "previous")
         os.rename(merged, self.out)
         self._remove_working()
-        return self.out
 
     def _sessions_with_episodes(self, shards: list[Path]) -> list[dict[str, Any]]:
         """Every session with the number of its episodes; those without any are left out."""
         earlier = read_provenance(self.out) if self.out.exists() else None
         out = [] if earlier is None else list(earlier["sessions"])
-        first = [session["first_shard"] for session in self._sessions] + [self._next_shard]
+        first = [session["first_shard"] for session in self._sessions] + [math.inf]
         for session, low, high in zip(self._sessions, first[:-1], first[1:], strict=True):
             episodes = sum(_totals(folder)[0] for folder in shards if low <= _number(folder) < high)
             if episodes:

@@ -178,10 +178,6 @@ class RunSettings:
                     f"collector.num_envs={c.num_envs}: on each of {parts} GPUs as many worlds must have each of the "
                     f"{tasks} tasks; use a multiple of {parts * tasks}"
                 )
-        if parts > 1 and self.export.kind != "none":
-            raise UserError(
-                f"export={self.export.kind}: needs gpus=1; franka-wm collect records with the trained agent"
-            )
         return replace(
             self,
             collector=replace(c, num_envs=c.num_envs // parts, planner_worlds=c.planner_worlds // parts),
