@@ -213,7 +213,7 @@ class _Ends:
         """Where it lies."""
         return tuple(x.data_ptr() for x in (self.slots, *self.images.values()))
 
-    def add(self, begins: torch.Tensor, led_to: dict[str, torch.Tensor], *, skipped: int = 0) -> None:
+    def add(self, begins: torch.Tensor, led_to: dict[str, torch.Tensor], *, skipped: int) -> None:
         """Keeps the last images of episodes that end, and the newest.
 
         Args:
@@ -224,8 +224,8 @@ class _Ends:
         steps, times = len(begins), len(self.slots)
         start = (self.start + skipped) % times
         time = (torch.arange(steps, device=self.device) + start) % times
-        self._make_room(begins)
         self._give_back(self.slots[time])
+        self._make_room(begins)
         if self.filled and steps < times:  # the newest step so far has a following one now
             newest = (start - 1) % times
             image = {key: x[self.NEWEST].clone().unsqueeze(0) for key, x in self.images.items()}

@@ -134,9 +134,9 @@ def synthetic(worlds: int, steps: int, ends: float, seed: int) -> TensorDict:
 @pytest.mark.parametrize("ends", [0.0, 0.1, 0.5, 1.0])
 def test_whatever_comes_is_given_back(ends: float) -> None:
     """Compared with a storage that keeps everything twice: all chunks, wrapped around many times, ends of all kinds."""
-    worlds, times = 5, 13
-    for seed in range(4):
-        data = synthetic(worlds, 120, ends, seed)
+    worlds, times, steps = 5, 41, 400
+    for seed in range(3):
+        data = synthetic(worlds, steps, ends, seed)
         options = {
             "capacity": worlds * times,
             "num_envs": worlds,
@@ -148,7 +148,7 @@ def test_whatever_comes_is_given_back(ends: float) -> None:
         sizes = torch.randint(1, 2 * times, (20,), generator=torch.Generator().manual_seed(seed)).tolist()
         start = 0
         for size in [1, 1, times, times - 1, *sizes]:
-            if start + size > 120:
+            if start + size > steps:
                 break
             replay.extend(data[:, start : start + size])
             start += size
@@ -165,6 +165,22 @@ def test_whatever_comes_is_given_back(ends: float) -> None:
         free = len(replay.storage._ends.images["pixels"]) - 2 - taken
         assert torch.equal(replay.storage._ends.count, free)
         assert ((taken > 0) & (taken < times - 1)).any() or ends in (0.0, 1.0)
+
+
+def test_room_is_made_for_the_ends_that_come() -> None:
+    """Not for as many as there might be: a checkpoint brings thousands of steps at once."""
+    data = synthetic(5, 2000, 0.02, 0)
+    options = {"capacity": 5 * 2000, "num_envs": 5, "window": 2, "batch_size": 4, "device": "cpu"}
+    replay = make_replay(**options, episode_length=100)
+    replay.extend(data[:, :1000])
+    before = replay.storage.memory
+    replay.extend(data[:, 1000:1001])
+    assert replay.storage.memory == before  # nothing moved: what was captured of it still holds
+    replay.extend(data[:, 1001:])
+    assert replay.storage.memory != before
+    most = int(data["is_init"].sum(1).max())
+    assert most <= len(replay.storage._ends.images["pixels"]) <= 1.3 * most + 10
+    assert (replay[:] == data).all()
 
 
 def test_emptied_it_begins_anew() -> None:
