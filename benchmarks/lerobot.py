@@ -1,12 +1,16 @@
 """LeRobot datasets: frames per second written, beside LeRobot's own recorder in the same run.
 
     python benchmarks/lerobot.py                          writing, 64 × 64, every format
+    python benchmarks/lerobot.py --part collecting        an expert's episodes, beside its worlds alone
     python benchmarks/lerobot.py --part reading …         see lerobot_reading.py
     python benchmarks/lerobot.py --episodes 100 --length 60 --formats exact
 
 Images are rendered by the environment: noise or a constant would compress like nothing that is recorded. Writing
 counts from the first episode to the finished dataset, the merge and the check of decoded frames included; the start
 of the writing processes, which a collection hides, is in a column of its own.
+
+*collecting* plays the same number of episodes in three ways, in turns: given actions alone, with the expert that
+decides them, and into a dataset, from the first step to the finished folder.
 """
 
 from __future__ import annotations
@@ -18,6 +22,7 @@ import shutil
 import sys
 import tempfile
 import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -26,6 +31,7 @@ sys.path.append(sys.path.pop(0))  # this folder last: `lerobot` is the package, 
 
 import torch
 from common import publish
+from tensordict import TensorDictBase
 from torchrl.collectors import Collector
 
 from franka_wm.commands.collect import open_source
@@ -155,14 +161,68 @@ def writing(arguments: argparse.Namespace) -> list[dict[str, Any]]:
     return rows
 
 
+def collecting(arguments: argparse.Namespace) -> list[dict[str, Any]]:
+    torch.set_num_threads(1)
+    source = open_source(
+        "expert",
+        overrides=[f"env={arguments.env}"],
+        num_envs=arguments.worlds,
+        episodes=arguments.episodes,
+    )
+    env, actions = source.env, []
+    each = -(-arguments.episodes // env.num_envs)  # episodes of each world
+    length = each * env.config.episode_length
+
+    def play(decide: Callable[[TensorDictBase, int], TensorDictBase]) -> float:
+        env.set_seed(0)
+        now, begin = env.reset(), time.perf_counter()
+        for t in range(length):
+            now = env.step_and_maybe_reset(decide(now, t))[1]
+        return time.perf_counter() - begin
+
+    def note(now: TensorDictBase, _: int) -> TensorDictBase:
+        actions.append(source.policy(now)["action"].clone())
+        return now.set("action", actions[-1])
+
+    def collect() -> float:
+        begin = time.perf_counter()
+        gather(source, out=place / "set", episodes=each * env.num_envs, workers=arguments.workers)
+        seconds = time.perf_counter() - begin
+        shutil.rmtree(place / "set")
+        return seconds
+
+    play(note)
+    ways: dict[str, Callable[[], float]] = {
+        "stepping and rendering alone": lambda: play(lambda now, t: now.set("action", actions[t])),
+        "with the expert": lambda: play(lambda now, _: source.policy(now)),
+        "into a dataset": collect,
+    }
+    place, rows = Path(tempfile.mkdtemp()), []
+    try:
+        for turn in range(arguments.turns):
+            rates = {name: env.num_envs * length / way() for name, way in ways.items()}
+            alone = rates["stepping and rendering alone"]
+            for name, rate in rates.items():
+                row = {"env": arguments.env, "turn": turn, "what": name, "frames/s": rate}
+                rows.append(row | {"of alone": rate / alone})
+                print(rows[-1], flush=True)
+    finally:
+        shutil.rmtree(place)
+    return rows
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("--part", choices=["writing", "reading"], default="writing")
+    parser.add_argument("--part", choices=["writing", "collecting", "reading"], default="writing")
     parser.add_argument("--episodes", type=int, default=64)
     parser.add_argument("--length", type=int, default=60)
     parser.add_argument("--size", type=int, default=64, help="side of the images [px]")
+    parser.add_argument("--env", default="lift_pixels", help="collecting: whose expert")
+    parser.add_argument("--worlds", type=int, default=16, help="collecting: at once")
+    parser.add_argument("--workers", type=int, default=2, help="collecting: writing processes")
+    parser.add_argument("--turns", type=int, default=3, help="collecting: how often")
     parser.add_argument("--formats", nargs="+", choices=list(FORMATS), default=list(FORMATS))
     parser.add_argument("--out", help="write the numbers as JSON")
     arguments, rest = parser.parse_known_args()
@@ -173,7 +233,8 @@ def main() -> None:
         return
     if rest:
         parser.error(f"unknown: {' '.join(rest)}")
-    publish("writing LeRobot datasets", writing(arguments), arguments.out)
+    measure = collecting if arguments.part == "collecting" else writing
+    publish(f"{arguments.part} LeRobot datasets", measure(arguments), arguments.out)
 
 
 if __name__ == "__main__":
