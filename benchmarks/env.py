@@ -2,6 +2,7 @@
 
     python benchmarks/env.py                              what this machine can do
     python benchmarks/env.py --worlds 4096 16384 --cases state pixels --out env.json
+    python benchmarks/env.py --cases lift stack --contacts mujoco newton      who finds contacts, and what it costs
 
 *raw Newton* is physics (and rendering) alone in one graph, without task, reset or TorchRL: the ceiling.
 Worlds are diverged in all three: each is at another point of its episode, so that resets happen in every step. Where
@@ -161,8 +162,10 @@ def collector(env: FrankaEnv, steps: int, seconds: float, actions: Actions) -> f
     return result
 
 
-def measure(name: str, worlds: int, device: str, seconds: float) -> dict:
+def measure(name: str, worlds: int, device: str, seconds: float, contacts: str) -> dict:
     config = CASES[name]
+    if contacts != "mujoco":
+        config, name = replace(config, collision_pipeline=contacts), f"{name}, contacts of {contacts}"
     on_gpu = device.startswith("cuda")
     if on_gpu:
         torch.cuda.empty_cache()
@@ -200,6 +203,7 @@ def main() -> None:
     parser.add_argument("--device", default="auto")
     parser.add_argument("--worlds", type=int, nargs="+")
     parser.add_argument("--cases", nargs="+", choices=list(CASES), default=["state", "pixels"])
+    parser.add_argument("--contacts", nargs="+", choices=["mujoco", "newton"], default=["mujoco"])
     parser.add_argument("--seconds", type=float, default=2.0)
     parser.add_argument("--out")
     arguments = parser.parse_args()
@@ -208,8 +212,9 @@ def main() -> None:
     rows = []
     for name in arguments.cases:
         for n in worlds:
-            rows.append(measure(name, n, device, arguments.seconds))
-            print(rows[-1], flush=True)
+            for contacts in arguments.contacts:
+                rows.append(measure(name, n, device, arguments.seconds, contacts))
+                print(rows[-1], flush=True)
     publish("environment", rows, arguments.out)
 
 

@@ -78,6 +78,8 @@ class FrankaConfig:
             the task's. With objects or obstacles there are contacts; they need the gripper.
         collisions: What of the robot touches the scene: ``"hand"`` (fingers and palm), ``"arm"`` (all links) or
             ``"self"`` (all links, and these one another, but not those next to each other).
+        collision_pipeline: Who finds contacts: ``"mujoco"``, or ``"newton"``, Newton's own ``CollisionPipeline``.
+            Their forces are MuJoCo's either way.
         max_contacts: Contacts for which there is room in each world, on average. ``None``: by the scene.
         end_when_lost: End the episode where an object has left the table.
         drawer_opening: ``task="drawer"`` is solved where the drawer is open so far [m]. ``None``: 90 % of its travel.
@@ -142,6 +144,7 @@ class FrankaConfig:
     gripper_force: float = 20.0
     scene: Scene | None = None
     collisions: str = "hand"
+    collision_pipeline: str = "mujoco"
     max_contacts: int | None = None
     end_when_lost: bool = True
     drawer_opening: float | None = None
@@ -354,6 +357,11 @@ class FrankaConfig:
         if self.collisions != "hand" and not self.resolved_scene:
             raise UserError(
                 f"collisions={self.collisions}: task={self.task} touches nothing; give a scene, {{}} is a table alone"
+            )
+        self._check_choice("collision_pipeline", ("mujoco", "newton"))
+        if self.collision_pipeline != "mujoco" and not self.resolved_scene:
+            raise UserError(
+                f"collision_pipeline={self.collision_pipeline}: task={self.task} touches nothing; leave it at mujoco"
             )
         if self.max_contacts is not None:
             self._check_whole("max_contacts", 1, 10_000, "contacts of a world")

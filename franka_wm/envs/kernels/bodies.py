@@ -274,6 +274,18 @@ def note_overflow(now: wp.array[int], capacity: int, overflow: wp.array[int]):
 
 
 @wp.kernel(enable_backward=False)
+def note_lost(count: wp.array[int], most: int, overflow: wp.array[int]):
+    """Notes in every world that there were more contacts than the ``most`` that all of them have room for."""
+    if count[0] > most:
+        overflow[wp.tid()] = 1
+
+
+@wp.kernel(enable_backward=False)
+def cap(most: int, count: wp.array[int]):
+    count[0] = wp.min(count[0], most)
+
+
+@wp.kernel(enable_backward=False)
 def cut_short(
     objects: wp.array2d[float],
     count: int,

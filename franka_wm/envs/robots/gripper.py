@@ -66,8 +66,8 @@ def speed_limit(builder: newton.ModelBuilder) -> float:
     return float(builder.joint_velocity_limit[NUM_JOINTS])
 
 
-def add_colliders(builder: newton.ModelBuilder, tool_body: int) -> list[int]:
-    """Boxes around both fingers and the palm, unseen; nothing else of the arm is touched. Returns the shapes."""
+def add_colliders(builder: newton.ModelBuilder, tool_body: int) -> None:
+    """Boxes around both fingers and the palm, unseen; nothing else of the arm is touched."""
     config = newton.ModelBuilder.ShapeConfig(
         density=0.0, mu=FRICTION, gap=0.0, is_visible=False, has_particle_collision=False
     )
@@ -91,4 +91,3 @@ def add_colliders(builder: newton.ModelBuilder, tool_body: int) -> list[int]:
     for k, one in enumerate(shapes):
         for other in shapes[k + 1 :]:
             builder.add_shape_collision_filter_pair(one, other)
-    return shapes

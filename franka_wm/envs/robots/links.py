@@ -49,8 +49,8 @@ def _embedded() -> tuple[Robot, tuple[Part, ...]]:
     return robot, tuple(parts)
 
 
-def add_link_colliders(builder: newton.ModelBuilder, robot: Robot, *, itself: bool) -> list[int]:
-    """Capsules and boxes around all links, unseen, where hand and fingers have theirs already. Returns the shapes.
+def add_link_colliders(builder: newton.ModelBuilder, robot: Robot, *, itself: bool) -> None:
+    """Capsules and boxes around all links, unseen, where hand and fingers have theirs already.
 
     Args:
         builder: It holds one world's arm with its gripper, and the scene.
@@ -74,7 +74,6 @@ def add_link_colliders(builder: newton.ModelBuilder, robot: Robot, *, itself: bo
         for shape, label in enumerate(builder.shape_label)
         if label in ("palm", "pad0", "pad1")
     }
-    added = []
     for k, part in enumerate(parts):
         body, label = bodies[part.link], f"link{part.link}_{k}"
         a, b, c = part.scale
@@ -88,5 +87,3 @@ def add_link_colliders(builder: newton.ModelBuilder, robot: Robot, *, itself: bo
             if not itself or abs(part.link - link) <= NEIGHBOURS:
                 builder.add_shape_collision_filter_pair(shape, other)
         links[shape] = part.link
-        added.append(shape)
-    return added

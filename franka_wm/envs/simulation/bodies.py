@@ -36,7 +36,7 @@ def contact_options(config: FrankaConfig) -> dict[str, object]:
     meshes |= any(isinstance(one, ArticulatedFile) and one.mechanism.has_meshes for one in scene.articulated)
     return {
         "enable_multiccd": meshes or None,  # one contact of a mesh and a box is too few to stand on
-        "use_mujoco_contacts": True,
+        "use_mujoco_contacts": config.collision_pipeline == "mujoco",
         "cone": "elliptic",
         "impratio": 10.0,
         "integrator": "implicitfast",

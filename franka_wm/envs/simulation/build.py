@@ -15,10 +15,11 @@ from franka_wm.envs.camera import GOAL_MARKER, GROUND, wrist_mount
 from franka_wm.envs.config import FrankaConfig
 from franka_wm.envs.constants import NUM_JOINTS
 from franka_wm.envs.robots import SOURCES, Robot, add_robot, arm_builder
+from franka_wm.envs.robots.links import add_link_colliders
 from franka_wm.envs.robots.sources import detail
 from franka_wm.envs.scene import FLOOR
 from franka_wm.envs.simulation.bodies import contact_options
-from franka_wm.envs.simulation.scene import add_links, add_scene
+from franka_wm.envs.simulation.scene import add_scene, harden
 
 FORWARD_ONLY = (
     "mujoco_warp._src.set_const",
@@ -46,7 +47,10 @@ def build_model(
     if config.resolved_scene:
         add_scene(arm, config.resolved_scene, robot.tool_body, detail(SOURCES[config.robot], config))
         if config.collisions != "hand":
-            add_links(arm, robot, itself=config.collisions == "self")
+            add_link_colliders(arm, robot, itself=config.collisions == "self")
+        if config.collision_pipeline == "newton":
+            arm.approximate_meshes(raise_on_failure=True)  # hulls, as MuJoCo takes them, not triangles
+        harden(arm, 1.0 / (config.fps * config.substeps))
     scene = newton.ModelBuilder()
     newton.solvers.SolverMuJoCo.register_custom_attributes(scene)
     if config.show_goal:

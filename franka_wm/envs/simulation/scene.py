@@ -17,15 +17,16 @@ from franka_wm.envs.articulated import Articulated
 from franka_wm.envs.articulated_file import ArticulatedFile
 from franka_wm.envs.mechanisms import Mechanism, Part, Point
 from franka_wm.envs.mesh_solids import MOST_CORNERS, Surface
-from franka_wm.envs.robots import Robot
 from franka_wm.envs.robots.gripper import add_colliders
-from franka_wm.envs.robots.links import add_link_colliders
 from franka_wm.envs.robots.meshes import Piece, simplify
 from franka_wm.envs.scene import Scene, Solid
 from franka_wm.envs.solids import Box
 
 SOLREF, SOLIMP = (0.02, 1.0), (0.95, 0.99, 0.001, 0.5, 2.0)
 """How stiff contacts are, as MuJoCo says it: 0.7 mm of penetration where 20 N hold a 4 cm cube of 50 g."""
+
+STEPS = 2.4
+"""Least time constant of a contact, in steps of the physics; MuJoCo takes no less than two."""
 
 
 def add_scene(builder: newton.ModelBuilder, scene: Scene, tool_body: int, cell: float) -> None:
@@ -37,8 +38,7 @@ def add_scene(builder: newton.ModelBuilder, scene: Scene, tool_body: int, cell: 
         tool_body: The link that carries the hand.
         cell: Details of meshes smaller than this are not drawn [m].
     """
-    for shape in add_colliders(builder, tool_body):
-        _harden(builder, shape)
+    add_colliders(builder, tool_body)
     still = []
     for one in (scene.table, *scene.obstacles):
         x, y, z = one.at
@@ -54,12 +54,6 @@ def add_scene(builder: newton.ModelBuilder, scene: Scene, tool_body: int, cell: 
         for shape in _add_articulated(builder, one, scene.top, cell):
             for other in still:  # it slides or turns free of what it stands on and among
                 builder.add_shape_collision_filter_pair(shape, other)
-
-
-def add_links(builder: newton.ModelBuilder, robot: Robot, *, itself: bool) -> None:
-    """Makes the whole arm touch the scene, and ``itself``, in a builder that has both."""
-    for shape in add_link_colliders(builder, robot, itself=itself):
-        _harden(builder, shape)
 
 
 def _add_shape(
@@ -84,7 +78,6 @@ def _add_shape(
         shape = builder.add_shape_cylinder(body, radius=size[0], half_height=0.5 * size[1], **more)
     else:
         shape = builder.add_shape_capsule(body, radius=size[0], half_height=0.5 * size[1], **more)
-    _harden(builder, shape)
     return [shape]
 
 
@@ -111,8 +104,6 @@ def _add_mesh(
             builder.add_shape_convex_hull(body, mesh=_hull(corners), cfg=config, **more)
             for corners in solid.hulls
         ]
-    for shape in shapes:
-        _harden(builder, shape)
     return shapes
 
 
@@ -155,7 +146,6 @@ def _add_boxes(
         more: dict[str, Any] = {"cfg": config, "color": color, "label": solid.name}
         frame = frame if at is None else at * frame
         shapes.append(builder.add_shape_box(body, xform=frame, hx=hx, hy=hy, hz=hz, **more))
-        _harden(builder, shapes[-1])
     return shapes
 
 
@@ -197,7 +187,6 @@ def _add_parts(
         else:
             shape = builder.add_shape_capsule(body, radius=part.size[0], half_height=part.size[1], **more)
         if part.touched:
-            _harden(builder, shape)
             shapes.append(shape)
     return shapes
 
@@ -255,15 +244,22 @@ def _weigh(builder: newton.ModelBuilder, body: int, m: Mechanism, origin: Point)
     builder.body_inv_inertia[body] = wp.mat33(*np.linalg.inv(m.inertia).flatten().tolist())
 
 
-def _harden(builder: newton.ModelBuilder, shape: int) -> None:
-    """MuJoCo's contact parameters of one shape, as they are: Newton would make others of stiffness and damping."""
+def harden(builder: newton.ModelBuilder, step: float) -> None:
+    """MuJoCo's contact parameters of all that is touched, as they are: Newton would make others of its own.
+
+    Args:
+        builder: It has everything that is touched.
+        step: Length of a physics step [s]: the shorter, the stiffer.
+    """
     values = {
         "mujoco:condim": 3,
         "mujoco:geom_solimp": wp.types.vector(length=5, dtype=wp.float32)(*SOLIMP),
-        "mujoco:solref": wp.vec2(*SOLREF),
+        "mujoco:solref": wp.vec2(min(SOLREF[0], STEPS * step), SOLREF[1]),
         "mujoco:solref_mode": 1,
     }
-    _set(builder, shape, values)
+    for shape, flags in enumerate(builder.shape_flags):
+        if flags & newton.ShapeFlags.COLLIDE_SHAPES:
+            _set(builder, shape, values)
 
 
 def _set(builder: newton.ModelBuilder, index: int, values: dict[str, object]) -> None:

@@ -30,6 +30,7 @@ from franka_wm.envs.simulation.bodies import Bodies
 from franka_wm.envs.simulation.build import Chain, build_model, make_solver
 from franka_wm.envs.simulation.demonstrated import DemonstratedStarts
 from franka_wm.envs.simulation.graph import Recorder, Recording
+from franka_wm.envs.simulation.pipeline import Pipeline
 from franka_wm.envs.simulation.rendering import Renderer
 from franka_wm.envs.tasks import Task, make_task
 
@@ -90,6 +91,7 @@ class Simulation:
             draws=draws,
         )
         self.bodies = Bodies(self) if config.has_gripper else None
+        self.pipeline = Pipeline(self) if config.collision_pipeline == "newton" else None
         self.randomizer = Randomizer(self)
         self.starts: DemonstratedStarts | None = None
         self.recorder = Recorder(device)
@@ -281,7 +283,8 @@ class Simulation:
                 q = w.joint_q if spare is None else state.joint_q.reshape((self.num_envs, NUM_JOINTS))
                 self._launch_joints(servo.limit_speed, w.target, self.chain.lead, q, w.control)
             if spare is None:
-                self.solver.step(state, state, self.control, None, self._dt)
+                contacts = self.pipeline.find() if self.pipeline else None
+                self.solver.step(state, state, self.control, contacts, self._dt)
                 if self.bodies:
                     self.bodies.after_substep()
             else:
