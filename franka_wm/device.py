@@ -28,6 +28,6 @@ def resolve_device(device: torch.device | str | None) -> torch.device:
                 f"device={asked}: this machine has {count} usable CUDA devices; use device=cpu or auto"
             )
         return torch.device("cuda", index)
-    if device.type != "cpu":
-        raise UserError(f"device={device}: Newton runs on cpu and cuda")
+    if device.type != "cpu" or device.index:
+        raise UserError(f"device={device}: Newton runs on cpu, which has no number, and cuda")
     return torch.device("cpu")

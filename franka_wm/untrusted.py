@@ -6,11 +6,13 @@ whatever is no ordinary file. Sizes are checked before anything is allocated.
 
 import json
 import math
+import xml.etree.ElementTree as ET
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
+from xml.parsers import expat
 
 import yaml
 
@@ -20,6 +22,8 @@ MOST_JSON = 32 * 2**20
 MOST_YAML = 2**20
 MOST_TEXT = 32 * 2**20
 """Largest file of each kind that is read [bytes]."""
+MOST_ELEMENTS, DEEPEST = 20_000, 100
+"""Most elements of an XML file, and levels of elements."""
 MOST_PIXELS = 40_000_000
 """Largest image [px]: an image of 60000 × 60000 fits into a few kB and fills the memory of whoever opens it."""
 
@@ -177,6 +181,38 @@ def _there[T](path: Path, found: T | None) -> T:
     if found is None:
         raise UserError(f"{path} is missing; copy the folder again.")
     return found
+
+
+def xml_tree(content: bytes) -> ET.Element:
+    """The tree of an XML file, after a look at its size: a few bytes of entities or levels could fill the memory.
+
+    Raises:
+        UserError: It is no XML, declares a document type, or has too many elements or levels.
+    """
+    parser, depth, count = expat.ParserCreate(), 0, 0
+
+    def start(_name: str, _attributes: object) -> None:
+        nonlocal depth, count
+        depth, count = depth + 1, count + 1
+        if depth > DEEPEST or count > MOST_ELEMENTS:
+            raise UserError(f"has more than {MOST_ELEMENTS} elements, or {DEEPEST} levels of them")
+
+    def end(_name: str) -> None:
+        nonlocal depth
+        depth -= 1
+
+    def doctype(*_: object) -> None:
+        raise UserError("declares a document type, which may hide entities; remove <!DOCTYPE …>")
+
+    parser.StartElementHandler, parser.EndElementHandler = start, end
+    parser.StartDoctypeDeclHandler = doctype
+    try:
+        parser.Parse(content, True)
+        return ET.fromstring(content)
+    except UserError:
+        raise
+    except (expat.ExpatError, ET.ParseError, ValueError, LookupError) as error:
+        raise UserError(f"not readable XML ({error})") from error
 
 
 @contextmanager

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import functools
+import math
 import os
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, nullcontext
+from itertools import islice
 from pathlib import Path
 from typing import Any, NoReturn, TextIO
 
@@ -25,6 +27,8 @@ from franka_wm.console import say, terminal_log
 from franka_wm.errors import REFUSALS, FrankaError, machine_refused
 from franka_wm.interrupt import INTERRUPTED
 
+MOST_JOBS = 1000
+"""Most runs of one sweep: each is checked before the first begins."""
 _sweep: Sweep | None = None
 """That of this process; jobs in processes of other launchers have a copy."""
 
@@ -148,12 +152,22 @@ def swept(overrides: list[str]) -> Iterator[list[str]]:
     except OverrideParseException as error:
         fail(explain(str(error)))
     known = [o for o in parsed if not o.is_sweep_override() or o.is_choice_sweep() or o.is_range_sweep()]
-    values = [
-        [f"{str(o.input_line).partition('=')[0]}={value}" for value in o.sweep_string_iterator()]
-        if o.is_sweep_override()
-        else [str(o.input_line)]
-        for o in known
-    ]
+    try:
+        values = [
+            [
+                f"{str(o.input_line).partition('=')[0]}={value}"
+                for value in islice(o.sweep_string_iterator(), MOST_JOBS + 1)
+            ]
+            if o.is_sweep_override()
+            else [str(o.input_line)]
+            for o in known
+        ]
+    except ValueError as error:  # range(0,5,0)
+        fail(f"a list of the sweep has no values: {error}")
+    if not all(values):
+        fail("a list of the sweep has no values")
+    if math.prod(map(len, values)) > MOST_JOBS:
+        fail(f"a sweep of more than {MOST_JOBS} jobs, the most that are checked at once; make several of it")
     first = [choices[0] for choices in values]
     yield first
     for k, o in enumerate(known):

@@ -15,6 +15,7 @@ import numpy as np
 
 from franka_wm.envs.articulated import Standing
 from franka_wm.envs.mechanisms import Mechanism, read_mechanism
+from franka_wm.envs.solids import EDGES, short
 from franka_wm.errors import UserError
 from franka_wm.options import is_real
 
@@ -65,15 +66,16 @@ class ArticulatedFile(Standing):
     def _take_file(self) -> None:
         """What moves and what stands from the file."""
         where = self._where
-        if self.shape != "box":
-            raise UserError(f"{where}.shape={self.shape!r}: follows from the file; leave it out")
+        for name, unsaid in (("shape", "box"), ("parts", None)):
+            if (given := getattr(self, name)) != unsaid:
+                raise UserError(f"{where}.{name}={short(given)}: follows from the file; leave it out")
         if not isinstance(self.file, str) or not self.file:
             raise UserError(f"{where}.file={self.file!r}: must be the path of a .urdf or .xml file")
         if self.joint is not None and not isinstance(self.joint, str):
             raise UserError(f"{where}.joint={self.joint!r}: must be the name of a joint")
         if isinstance(self.handle, Sequence) and not isinstance(self.handle, str):
             self._numbers("handle", 3, "a point, or the name of a link or site")
-        elif not isinstance(self.handle, str):
+        elif not isinstance(self.handle, str) or not self.handle:
             raise UserError(f"{where}.handle={self.handle!r}: give the name of a link or site, or a point")
         if not is_real(self.scale) or not 1e-3 <= self.scale <= 1e3:
             raise UserError(f"{where}.scale={self.scale!r}: must be one number from 0.001 to 1000")
@@ -82,6 +84,10 @@ class ArticulatedFile(Standing):
             size = self.mechanism.size
         except UserError as error:
             raise UserError(f"{where}.file={error}") from error
+        if not isinstance(self.size, Sequence) or tuple(self.size) not in (EDGES, size):
+            raise UserError(
+                f"{where}.size={short(self.size)}: follows from the file; leave it out, give scale"
+            )
         if not all(0.01 <= s <= 5.0 for s in size):
             sides = " × ".join(f"{s:.4g}" for s in size)
             raise UserError(f"{where}: its case is {sides} m; it must be from 0.01 to 5 m each: change scale")

@@ -213,6 +213,10 @@ class FrankaConfig:
             self._check_real(name, low, high, unit)
         if self.mesh_detail is not None:
             self._check_real("mesh_detail", 0.0, 0.1, "m")
+        if self.drawer_opening is not None:
+            self._check_real(
+                "drawer_opening", 0.0, math.tau, "m, or rad of a door; for task=drawer", open_low=True
+            )
         if (self.camera_distance, self.camera_height) == (
             self.camera_target_distance,
             self.camera_target_height,

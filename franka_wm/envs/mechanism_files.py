@@ -4,23 +4,27 @@ from __future__ import annotations
 
 import math
 import os
+import re
 import xml.etree.ElementTree as ET
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from xml.parsers import expat
 
 from franka_wm.errors import UserError
+from franka_wm.untrusted import xml_tree
 
 MOST_BYTES = 8 * 2**20
 """Largest file that is read; meshes are files of their own."""
 MOST_MESH_BYTES = 64 * 2**20
 """Most of all its meshes together."""
-MOST_ELEMENTS, DEEPEST = 20_000, 100
-"""Most elements of a file, and levels of elements."""
+MOST_CORNERS, MOST_SIDES = 600_000, 1000
+"""Most corners of all its meshes together, those of triangles counted each, and of one polygon: they cost time."""
 MESHES = ("obj", "stl")
 LARGEST = 1e9
 """Largest number."""
+NOT_FINITE = re.compile(r"[+-]?(nan|inf)", re.IGNORECASE)
+"""What C reads as a number that is none, also where Python does not: nan(1)."""
+OBJ_LINE = re.compile(rb"(?:^|[\r\n])[ \t]*([vf])[ \t]([^\r\n]*)")
 
 BODY = {"body", "frame", "geom", "joint", "site", "inertial"}
 """What a body of MJCF may have."""
@@ -61,7 +65,7 @@ def read_source(file: str) -> Source:
     if not os.path.isfile(path):  # unlike Path.is_file, it takes names that no file can have
         raise UserError(f"{path}: no such file")
     try:
-        root = _parse(_content(path, MOST_BYTES))
+        root = xml_tree(_content(path, MOST_BYTES))
         if root.tag == "robot":
             return _urdf(root, path)
         if root.tag == "mujoco":
@@ -82,32 +86,6 @@ def _content(path: Path, most: int) -> bytes:
     return content
 
 
-def _parse(content: bytes) -> ET.Element:
-    """The tree, after a look at its size: a few bytes of entities or levels could fill the memory."""
-    parser, depth, count = expat.ParserCreate(), 0, 0
-
-    def start(_name: str, _attributes: object) -> None:
-        nonlocal depth, count
-        depth, count = depth + 1, count + 1
-        if depth > DEEPEST or count > MOST_ELEMENTS:
-            raise UserError(f"has more than {MOST_ELEMENTS} elements, or {DEEPEST} levels of them")
-
-    def end(_name: str) -> None:
-        nonlocal depth
-        depth -= 1
-
-    def doctype(*_: object) -> None:
-        raise UserError("declares a document type, which may hide entities; remove <!DOCTYPE …>")
-
-    parser.StartElementHandler, parser.EndElementHandler = start, end
-    parser.StartDoctypeDeclHandler = doctype
-    try:
-        parser.Parse(content, True)
-        return ET.fromstring(content)
-    except (expat.ExpatError, ET.ParseError, ValueError, LookupError) as error:
-        raise UserError(f"not readable XML ({error})") from error
-
-
 def _check_numbers(root: ET.Element) -> None:
     for element in root.iter():
         for name, text in element.attrib.items():
@@ -115,12 +93,13 @@ def _check_numbers(root: ET.Element) -> None:
                 continue
             for word in text.split():
                 try:
-                    value = float(word)
+                    value = math.nan if NOT_FINITE.match(word) else float(word)
                 except ValueError:
                     continue
-                if not math.isfinite(value) or abs(value) > LARGEST:
+                least = 0.0 if name in ("mass", "density") else -LARGEST  # MuJoCo passes over negative ones
+                if not least <= value <= LARGEST:
                     raise UserError(
-                        f"<{element.tag[:40]} {name}={text[:80]!r}>: must be numbers to {LARGEST:g}"
+                        f"<{element.tag[:40]} {name}={text[:80]!r}>: must be numbers from {least:g} to {LARGEST:g}"
                     )
 
 
@@ -177,6 +156,9 @@ def _mjcf(root: ET.Element, path: Path) -> Source:
     for world in bare.findall("worldbody"):
         _check_body(world)
     _check_numbers(bare)
+    for element in bare.iter("mesh"):
+        if "builtin" in element.attrib or len(element):
+            raise UserError("<mesh> with builtin= or <plugin>: must come from a file, or from vertex=")
     for element in bare.iter("material"):
         element.attrib.pop("texture", None)
         for layer in element.findall("layer"):
@@ -193,6 +175,10 @@ def _mjcf(root: ET.Element, path: Path) -> Source:
                 element.attrib.setdefault("name", Path(name).stem)
                 element.attrib.pop("content_type", None)
                 element.set("file", meshes.add(name, folder))
+            else:
+                meshes.count(
+                    len(element.get("vertex", "").split()) // 3 + len(element.get("face", "").split())
+                )
     return Source(ET.tostring(bare, encoding="unicode"), meshes.found, hides_colliders=False)
 
 
@@ -219,6 +205,7 @@ class _Meshes:
     def __init__(self, file: Path):
         self._folder = file.parent
         self._names: dict[Path, str] = {}
+        self._corners = 0
         self.found: dict[str, bytes] = {}
 
     def add(self, name: str, below: str = "") -> str:
@@ -237,9 +224,33 @@ class _Meshes:
             if real not in self._names:
                 left = MOST_MESH_BYTES - sum(map(len, self.found.values()))
                 self._names[real] = f"mesh{len(self._names)}.{suffix}"
-                self.found[self._names[real]] = _content(real, left)
+                content = self.found[self._names[real]] = _content(real, left)
+                try:
+                    (self._count_obj if suffix == "obj" else self._count_stl)(content)
+                except UserError as error:
+                    raise UserError(f"mesh {name[:200]!r}: {error}") from error
             return self._names[real]
         raise UserError(f"mesh {name[:200]!r}: no such file in {self._folder}")
+
+    def count(self, corners: int) -> None:
+        """Adds the corners of a mesh; too many are refused before anything is made of them."""
+        self._corners += corners
+        if self._corners > MOST_CORNERS:
+            raise UserError(
+                f"meshes with more than {MOST_CORNERS} corners, those of triangles counted each; thin them"
+            )
+
+    def _count_obj(self, content: bytes) -> None:
+        for line in OBJ_LINE.finditer(content):
+            sides = len(line[2].split()) if line[1] == b"f" else 1
+            if sides > MOST_SIDES:
+                raise UserError(
+                    f"has a polygon of {sides} corners, the most is {MOST_SIDES}; cut it into triangles"
+                )
+            self.count(sides)
+
+    def _count_stl(self, content: bytes) -> None:
+        self.count(6 * int.from_bytes(content[80:84], "little"))
 
     def _candidates(self, name: str, below: str) -> Iterator[tuple[Path, Path]]:
         """Folders that a mesh must not leave, and where it may be."""

@@ -349,9 +349,15 @@ def _compile(source: Source) -> mujoco.MjModel:
 
 def _color(m: mujoco.MjModel, geom: int) -> tuple[float, ...]:
     """Red, green, blue and opacity of a geometry: its own, else its material's."""
-    own = tuple(float(c) for c in m.geom_rgba[geom])
+    color = tuple(float(c) for c in m.geom_rgba[geom])
     material = int(m.geom_matid[geom])
-    return own if own != UNSAID or material < 0 else tuple(float(c) for c in m.mat_rgba[material])
+    if color == UNSAID and material >= 0:
+        color = tuple(float(c) for c in m.mat_rgba[material])
+    if not all(0 <= c <= 1 for c in color):
+        raise UserError(
+            f"geom {m.geom(geom).name!r} has a colour of {', '.join(f'{c:g}' for c in color)}: must be from 0 to 1"
+        )
+    return color
 
 
 def _vertices(m: mujoco.MjModel, number: int) -> np.ndarray:

@@ -16,6 +16,7 @@ from scipy.sparse.csgraph import connected_components
 
 from franka_wm.errors import UserError
 
+INSTALL = "pip install 'franka-wm[meshes]'"
 FORMATS = ("obj", "stl", "ply")
 PARTS_FORMATS = ("obj", "ply")
 """Formats of files with parts: an STL does not say which triangles belong together."""
@@ -163,8 +164,6 @@ def _read(path: Path, scale: tuple[float, float, float], _changed: int, _size: i
 
 def _triangles(path: Path) -> tuple[np.ndarray, np.ndarray]:
     """Vertices (V, 3) and faces (F, 3) as the file has them."""
-    from franka_wm.envs.robots.meshes import INSTALL  # here: robots need this module's
-
     try:
         import trimesh
     except ImportError as error:

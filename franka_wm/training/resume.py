@@ -6,9 +6,12 @@ from collections.abc import Mapping
 from typing import Any
 
 import torch
+from tensordict import TensorDictBase
+from torch import Tensor
 
 from franka_wm import processes
 from franka_wm.console import say
+from franka_wm.data.stacks import CHANNELS
 from franka_wm.seeding import derive_seed
 from franka_wm.training.checkpoint import Checkpoint
 from franka_wm.training.moment import go_on_drawing, put_back, restorable, same_worlds
@@ -45,12 +48,13 @@ def restore(trainer: Trainer, checkpoint: Checkpoint) -> None:
         fits = env is None or there == here
         experience = own_experience(checkpoint, env.device) if env is not None and fits else None
         if experience is not None:
-            assert env is not None
-            gathered = env.fake_tensordict()
-            for key, saved in experience.items(True, True):
-                if saved.dtype != gathered.get(key, saved).dtype:
-                    raise ValueError(f"experience of {key} is {saved.dtype}")
-            fill(trainer.replay, experience, settings, updates=learner.updates, restored=True)
+            fill(
+                trainer.replay,
+                _fitting(trainer, experience),
+                settings,
+                updates=learner.updates,
+                restored=True,
+            )
         elif env is not None and learner.updates < settings.trainer.updates:
             why = "holds no experience" if fits else f"is of collector.num_envs={there}, this run has {here}"
             say(f"  the checkpoint {why}: this run gathers anew and will not be the same")
@@ -66,6 +70,32 @@ def restore(trainer: Trainer, checkpoint: Checkpoint) -> None:
                 "numbers start anew; this run will not be the same"
             )
             torch.manual_seed(derive_seed("process", settings.seed, processes.rank(), learner.updates))
+
+
+def _fitting(trainer: Trainer, experience: TensorDictBase) -> TensorDictBase:
+    """What of saved experience (worlds, time) this run gathers, too.
+
+    Raises:
+        ValueError, KeyError: An entry is missing, or of another type or size; it would be noticed much later.
+    """
+    assert trainer.env is not None
+    gathered = trainer.env.fake_tensordict()
+    experience = experience.select(*trainer.kept)
+    for key in trainer.kept:
+        saved, like = (
+            experience.get(key),
+            gathered.get(key, None),
+        )  # a model's own entries come from its policy
+        if not isinstance(saved, Tensor) or (like is not None and saved.dtype != like.dtype):
+            raise ValueError(f"experience of {key} is {saved.dtype}")
+        if like is None:
+            continue
+        sizes = [like.shape[1:]]
+        if like.ndim == 4 and trainer.settings.env.frame_stack > 1:  # of stacked images the newest is kept
+            sizes.append(torch.Size((*like.shape[1:-1], CHANNELS)))
+        if saved.shape[2:] not in sizes:
+            raise ValueError(f"experience of {key} is of shape {tuple(saved.shape)}")
+    return experience
 
 
 def _restore_moment(trainer: Trainer, checkpoint: Checkpoint, moment: Mapping[str, Any]) -> None:

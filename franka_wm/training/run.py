@@ -7,7 +7,8 @@ import importlib
 import logging
 import sys
 import tempfile
-from collections.abc import Callable, Iterable
+import traceback
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -47,12 +48,16 @@ SMALL_FILES = 65536
 """Room for a run's configuration and first lines, which are written before there is anything to lose [bytes]."""
 
 
-def import_plugins(names: Iterable[str]) -> None:
+def import_plugins(names: object) -> None:
     """Imports modules, those of ``plugins``; they register tasks, models and planners of the user's.
 
     Raises:
-        UserError: There is no such module.
+        UserError: These are no names, there is no such module, or it fails.
     """
+    if not isinstance(names, Sequence) or isinstance(names, str) or not all(map(_names_module, names)):
+        raise UserError(
+            f"plugins={names}: must be a list of modules, named as in `import`: plugins=[my_tasks]"
+        )
     for name in names:
         if str(Path.cwd()) not in sys.path:
             sys.path.insert(0, str(Path.cwd()))  # as for python -m: modules beside the one who starts the run
@@ -62,6 +67,20 @@ def import_plugins(names: Iterable[str]) -> None:
             raise UserError(
                 f"plugins: no module {error.name!r}; name modules as in `import`, from {Path.cwd()}"
             ) from error
+        except FrankaError:
+            raise
+        except (Exception, SystemExit) as error:
+            # Where: a SyntaxError says it itself, of others the last call does.
+            last = traceback.extract_tb(error.__traceback__)[-1]
+            place = "" if isinstance(error, SyntaxError) else f" ({last.filename}, line {last.lineno})"
+            reason = (str(error).strip() or "no reason given").splitlines()[0]
+            raise UserError(
+                f"plugins: {name} fails: {type(error).__name__}: {reason}{place}; mend it"
+            ) from error
+
+
+def _names_module(name: object) -> bool:
+    return isinstance(name, str) and all(part.isidentifier() for part in name.split("."))
 
 
 def unwritable(folder: Path, option: str = "hydra.run.dir") -> str | None:

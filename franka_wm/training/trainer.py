@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from tensordict import TensorDictBase
+from tensordict import NestedKey, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torchrl.collectors import Collector
 from torchrl.record.loggers import Logger
@@ -214,6 +214,12 @@ class Trainer:
         device = self.learner.device
         self.model.set_observation_statistics(mean.to(device), std.to(device).clamp_min(1e-3))
 
+    @property
+    def kept(self) -> list[NestedKey]:
+        """Keys of a step that go into the replay."""
+        after = [("next", key) for key in (*self._keys, "reward", "terminated")]
+        return [*self._keys, "action", "is_init", *self._extra, *after]
+
     def gather(self) -> None:
         """One batch of the collector into the replay."""
         if self._starts is not None:
@@ -223,9 +229,7 @@ class Trainer:
         assert self._experience is not None
         batch = next(self._experience)
         self.env_steps += batch.numel() * processes.count()
-        keys = [*self._keys, "action", "is_init", *self._extra]
-        after = [("next", key) for key in (*self._keys, "reward", "terminated")]
-        batch = batch.select(*keys, *after)
+        batch = batch.select(*self.kept)
         if len(self.replay) == 0:
             fill(self.replay, batch, self.settings, updates=self.learner.updates)
         else:

@@ -14,6 +14,7 @@ import torch
 from omegaconf import OmegaConf
 
 from forks import TRAIN, Fork, script, train_in_fork
+from franka_wm.commands import entry
 from franka_wm.commands.several import spread
 from franka_wm.errors import UserError
 from franka_wm.training.checkpoint import latest_checkpoint, load_checkpoint
@@ -135,3 +136,19 @@ def test_ctrl_c_ends_the_sweep(tmp_path: Path) -> None:
     assert f"hydra.sweep.dir={tmp_path}/sweep runs what is missing" in done.stdout
     assert latest_checkpoint(tmp_path / "sweep" / "0-reach")
     assert not (tmp_path / "sweep" / "1-reach").exists()
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["seed=range(0,5,0)"], "has no values"),
+        (["seed=range(5,0)"], "has no values"),
+        (["seed=range(0,1000000000000)"], "more than 1000 jobs"),
+        (["seed=range(0,40)", "trainer.lr=range(1,40)"], "more than 1000 jobs"),
+    ],
+)
+def test_lists_that_are_empty_or_endless(words: list[str], said: str, capsys) -> None:
+    with pytest.raises(SystemExit):
+        list(entry.swept(words))
+    told = capsys.readouterr().err
+    assert told.startswith("error: ") and said in told and told.count("\n") == 1

@@ -20,6 +20,10 @@ BALL = '<body name="ball"><joint name="b" type="ball"/><geom size="0.1 0.1 0.1"/
 SECOND = '<body name="flap"><joint name="flap" range="0 1"/><geom size="0.1 0.1 0.1"/></body>'
 
 
+def asset(element: str) -> str:
+    return MJCF.replace("<asset>", f"<asset>{element}")
+
+
 def refused(path: Path, **changes) -> str:
     values = {"name": "cabinet", "file": str(path), "handle": "handle", "at": [0.82, 0.0]} | changes
     with pytest.raises(UserError) as caught:
@@ -51,6 +55,13 @@ def refused(path: Path, **changes) -> str:
         ("</robot>", MESH.format("http://a.b/c.obj") + "</robot>", "only local files are read"),
         ("</robot>", MESH.format("a.dae") + "</robot>", "must be a file that ends in .obj, .stl"),
         ("</robot>", MESH.format("torn.obj") + "</robot>", "MuJoCo cannot read it"),
+        (
+            "</robot>",
+            MESH.format("polygon.obj") + "</robot>",
+            "has a polygon of 1001 corners, the most is 1000",
+        ),
+        ("</robot>", MESH.format("many.obj") + "</robot>", "meshes with more than 600000 corners"),
+        ("</robot>", MESH.format("many.stl") + "</robot>", "meshes with more than 600000 corners"),
         ("</robot>", "<a>" * 101 + "</a>" * 101 + "</robot>", "100 levels"),
         ("</robot>", "<a/>" * 20_001 + "</robot>", "more than 20000 elements"),
         ("</robot>", " " * 8 * 2**20 + "</robot>", "larger than 8 MiB"),
@@ -61,6 +72,9 @@ def test_urdf_that_cannot_be(old: str, new: str, said: str, tmp_path: Path) -> N
     folder.mkdir()
     for place in (tmp_path / "b.obj", folder / "torn.obj"):
         place.write_text("v 0 0 0\nv 1 0 0\nf 1 2 3\n")
+    (folder / "polygon.obj").write_text("f" + " 1" * 1001)
+    (folder / "many.obj").write_text("v 0 0 0\r" * 600_001)  # a line's end, too
+    (folder / "many.stl").write_bytes(bytes(80) + (100_001).to_bytes(4, "little"))
     (folder / "link.obj").symlink_to(tmp_path / "b.obj")
     assert old in URDF
     (folder / "a.urdf").write_text(URDF.replace(old, new, 1))
@@ -78,7 +92,13 @@ def test_urdf_that_cannot_be(old: str, new: str, said: str, tmp_path: Path) -> N
         (cabinets.mjcf(body=BALL), "joint 'b' neither slides nor turns"),
         (cabinets.mjcf(body=SECOND), "has 2 joints that move; say which one opens: joint: slide, flap"),
         (cabinets.mjcf(body='<geom type="ellipsoid" size="1 1 1"/>'), "must be one of sphere, capsule"),
-        (cabinets.mjcf(body='<geom size="1 nan 1"/>'), "must be numbers to 1e+09"),
+        (cabinets.mjcf(body='<geom size="1 nan 1"/>'), "must be numbers from -1e+09 to 1e+09"),
+        (cabinets.mjcf(body='<geom size="1 nan(1) 1"/>'), "must be numbers from -1e+09 to 1e+09"),
+        (MJCF.replace('mass="1.2"', 'mass="-1"'), "<inertial mass='-1'>: must be numbers from 0 to"),
+        (MJCF.replace('rgba="0.6', 'rgba="7.6'), "has a colour of 7.6, 0.4, 0.2, 1: must be from 0 to 1"),
+        (asset('<mesh name="m" builtin="cone" params="100000000 1"/>'), "<mesh> with builtin="),
+        (asset('<mesh name="m"><plugin plugin="x"/></mesh>'), "<mesh> with builtin="),
+        (asset(f'<mesh name="m" vertex="{"0 " * 1_800_003}"/>'), "meshes with more than 600000 corners"),
         (cabinets.mjcf(body='<geom size="1e8 1 1"/>'), "reaches more than 10 m away"),
         (cabinets.mjcf(body='<geom size="0 0 0"/>'), "MuJoCo cannot read it"),
         (cabinets.mjcf(body='<geom size="1 1 1" material="gold"/>'), "MuJoCo cannot read it"),
@@ -102,6 +122,10 @@ def test_mjcf_that_cannot_be(text: str, said: str, tmp_path: Path) -> None:
     ("changes", "said"),
     [
         ({"handle": None}, "give the name of a link or site, or a point"),
+        ({"handle": ""}, "give the name of a link or site, or a point"),
+        ({"size": [1, 1, 1]}, "follows from the file; leave it out, give scale"),
+        ({"size": 1}, "follows from the file; leave it out, give scale"),
+        ({"parts": "b.obj"}, "follows from the file; leave it out"),
         ({"handle": "case"}, "is nothing that moves; there are drawer, handle"),
         ({"handle": [1.0]}, "give 3 numbers"),
         ({"joint": "hinge"}, "has no joint 'hinge' that moves; there are slide"),

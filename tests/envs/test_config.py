@@ -151,7 +151,7 @@ def test_goal_out_of_reach() -> None:
     assert "reach" in one_line(caught.value)
 
 
-@pytest.mark.parametrize("device", ["tpu", "meta", "mps"])
+@pytest.mark.parametrize("device", ["tpu", "meta", "mps", "cpu:7"])
 def test_impossible_device(device: str) -> None:
     with pytest.raises(UserError) as caught:
         resolve_device(device)

@@ -14,6 +14,7 @@ from scipy.spatial.transform import Rotation
 from franka_wm.envs import FrankaConfig, FrankaEnv
 from franka_wm.envs.config import HOME
 from franka_wm.envs.kinematics import Kinematics
+from franka_wm.envs.robots.description import read_description
 from franka_wm.envs.robots.gripper import PAD, PAD_ALONG, PAD_AWAY
 from franka_wm.errors import UserError
 
@@ -222,6 +223,23 @@ def test_urdf_of_ones_own(tmp_path, urdf: ET.Element) -> None:
     path.write_text(ET.tostring(robot, encoding="unicode"))
     env = FrankaEnv(FrankaConfig(robot="urdf", observations=("state",)), device="cpu", urdf_path=path)
     assert (np.abs(env.model.body_mass.numpy() - 9.5) < 1e-6).any()
+
+
+BOMB = '<!DOCTYPE robot [<!ENTITY a "aaaaaaaa"><!ENTITY b "&a;&a;&a;&a;">]><robot name="&b;"/>'
+
+
+@pytest.mark.parametrize(
+    ("content", "said"),
+    [
+        (BOMB, "declares a document type"),
+        ("<robot>" + "<a>" * 200, "100 levels"),
+        ("<robot>" + "<a/>" * 20_001 + "</robot>", "more than 20000 elements"),
+    ],
+)
+def test_urdf_that_would_fill_the_memory(tmp_path, content: str, said: str) -> None:
+    (tmp_path / "bad.urdf").write_text(content)
+    with pytest.raises(UserError, match=said):
+        read_description(tmp_path / "bad.urdf")
 
 
 @pytest.mark.parametrize("content", ["not xml", "<robot name='r'><link name='base'/></robot>", None])

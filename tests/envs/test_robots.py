@@ -179,6 +179,37 @@ def test_file_that_is_no_mesh(tmp_path: Path, suffix: str) -> None:
     assert path.name in one_line(caught.value)
 
 
+def test_files_of_others_that_are_no_triangles_or_too_many(tmp_path: Path) -> None:
+    pytest.importorskip("trimesh", reason="needs pip install 'franka-wm[meshes]'")
+    archive, large = tmp_path / "a.zip", tmp_path / "large.stl"
+    archive.write_bytes(b"PK")
+    with large.open("wb") as file:
+        file.truncate(meshes.MOST_BYTES + 1)  # takes no room
+    for path, said in ((archive, "must be a file that ends in .dae, .obj"), (large, "larger than 64 MiB")):
+        with pytest.raises(UserError) as caught:
+            meshes.read(path)
+        assert said in one_line(caught.value)
+
+
+def test_a_texture_is_not_taken_from_elsewhere(tmp_path: Path) -> None:
+    pytest.importorskip("trimesh", reason="needs pip install 'franka-wm[meshes]'")
+    from PIL import Image
+
+    folder = tmp_path / "robot"
+    folder.mkdir()
+    for place in (tmp_path / "secret.png", folder / "own.png"):
+        Image.new("RGB", (2, 2), "red").save(place)
+    (folder / "a.obj").write_text(
+        "mtllib a.mtl\nv 0 0 0\nv 1 0 0\nv 0 1 0\nvt 0 0\nvt 1 0\nvt 0 1\nusemtl m\nf 1/1 2/2 3/3\n"
+    )
+    found = {}
+    for name in ("own.png", "../secret.png", str(tmp_path / "secret.png")):
+        (folder / "a.mtl").write_text(f"newmtl m\nmap_Kd {name}\n")
+        meshes.read.cache_clear()
+        found[name] = meshes.read(folder / "a.obj")[0].texture is not None
+    assert list(found.values()) == [True, False, False], found
+
+
 def grid(count: int) -> meshes.Piece:
     """A unit square of 2 · count² triangles that face +z."""
     x, y = np.meshgrid(np.linspace(0, 1, count + 1), np.linspace(0, 1, count + 1), indexing="ij")

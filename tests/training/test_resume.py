@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 import torch
 from safetensors.torch import load_file
-from tensordict import TensorDictBase
+from tensordict import TensorDict, TensorDictBase
 
 from forks import train_in_fork
 from franka_wm import processes
@@ -192,6 +192,43 @@ def test_worlds_of_other_libraries_go_on_unlike_on_each_gpu(monkeypatch) -> None
         resume._begin_new_episodes(trainer)  # pyright: ignore[reportArgumentType]
         seeds.append(trainer.env.seed)
     assert seeds[0] != seeds[1]
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "said"),
+    [
+        (("next", "reward"), None, "reward"),
+        ("state", torch.zeros(2, 4, 3, dtype=torch.float64), "experience of state is torch.float64"),
+        ("state", torch.zeros(2, 4, 5), "experience of state is of shape"),
+        ("state", torch.zeros(2, 4), "experience of state is of shape"),
+        ("state", TensorDict({}, [2, 4]), "experience of state is None"),
+        ("pixels", torch.zeros(2, 4, 8, 8, 4, dtype=torch.uint8), "experience of pixels is of shape"),
+    ],
+)
+def test_experience_of_another_form_is_refused(key: Any, value: Any, said: str) -> None:
+    """It would be noticed many steps later, in the words of a library."""
+
+    def steps(*size: int) -> TensorDict:
+        images = torch.zeros(*size, 8, 8, 6, dtype=torch.uint8)
+        after = {"reward": torch.zeros(*size, 1)}
+        return TensorDict({"state": torch.zeros(*size, 3), "pixels": images, "next": after}, size)
+
+    gathered = SimpleNamespace(fake_tensordict=lambda: steps(2))
+    settings = SimpleNamespace(env=SimpleNamespace(frame_stack=2))
+    trainer: Any = SimpleNamespace(
+        env=gathered, settings=settings, kept=["state", "pixels", ("next", "reward")]
+    )
+    whole = steps(2, 4)
+    assert set(resume._fitting(trainer, whole.set("other", whole["state"])).keys()) == {
+        "state",
+        "pixels",
+        "next",
+    }
+    whole["pixels"] = whole["pixels"][..., :3]  # as StackStorage keeps them
+    resume._fitting(trainer, whole)
+    other = whole.exclude(key) if value is None else whole.set(key, value)
+    with pytest.raises((ValueError, KeyError), match=said):
+        resume._fitting(trainer, other)
 
 
 # -- whole runs ------------------------------------------------------------------------------------------------

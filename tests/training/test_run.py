@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import multiprocessing
+import sys
 from pathlib import Path
 
 import pytest
@@ -10,7 +11,7 @@ import pytest
 from franka_wm.conf import compose
 from franka_wm.errors import UserError
 from franka_wm.training import build
-from franka_wm.training.run import Run
+from franka_wm.training.run import Run, import_plugins
 from franka_wm.training.settings import RunSettings
 
 
@@ -49,3 +50,29 @@ def test_recorded_data_are_opened_before_worlds_are_built(
     arguments = ("scale=smoke", "device=cpu", "dataset=lerobot", "dataset.root=there", "trainer=offline")
     with pytest.raises(UserError, match="damaged"):
         Run(RunSettings.of(compose(*arguments)), tmp_path).build_environments()
+
+
+@pytest.mark.parametrize(
+    ("names", "said"),
+    [
+        ("one", "must be a list of modules"),
+        (5, "must be a list of modules"),
+        (None, "must be a list of modules"),
+        ([5], "must be a list of modules"),
+        ([""], "must be a list of modules"),
+        ([".x"], "must be a list of modules"),
+        (["no_such_module_of_mine"], "no module 'no_such_module_of_mine'"),
+        (["torn"], "torn fails: SyntaxError: "),
+        (["raising"], r"raising fails: ValueError: boom \(.*raising.py, line 1\)"),
+        (["leaving"], "leaving fails: SystemExit: 3"),
+    ],
+)
+def test_plugins_that_cannot_be_imported_are_one_line(names, said: str, tmp_path: Path, monkeypatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("sys.path", [*sys.path])
+    texts = {"torn": "def f(:", "raising": "raise ValueError('boom')", "leaving": "raise SystemExit(3)"}
+    for name, text in texts.items():
+        (tmp_path / f"{name}.py").write_text(text)
+    with pytest.raises(UserError, match=said) as caught:
+        import_plugins(names)
+    assert "\n" not in str(caught.value)

@@ -21,9 +21,11 @@ import newton
 import numpy as np
 import warp as wp
 
+from franka_wm.envs.mesh_solids import INSTALL, MOST_BYTES
 from franka_wm.errors import UserError
 
-INSTALL = "pip install 'franka-wm[meshes]'"
+FORMATS = ("dae", "obj", "stl", "glb", "gltf", "ply")
+"""Files of triangles. The reader takes archives and voxels, too, of which a few bytes can become gigabytes."""
 
 Color = tuple[float, float, float]
 
@@ -154,8 +156,10 @@ def read(path: Path) -> tuple[Piece, ...]:
     """A mesh file (DAE, OBJ, STL, GLB, …), cut into its materials; memory is kept for the next environment.
 
     Raises:
-        UserError: If the reader is not installed, or the file is not a mesh.
+        UserError: If the reader is not installed, or the file is no mesh, too large or of another format.
     """
+    if path.suffix.lower().lstrip(".") not in FORMATS:
+        raise UserError(f"{path}: must be a file that ends in {', '.join(f'.{one}' for one in FORMATS)}")
     try:
         import trimesh
 
@@ -163,6 +167,8 @@ def read(path: Path) -> tuple[Piece, ...]:
             import collada  # noqa: F401  trimesh reads DAE through it, and returns nothing without it
     except ImportError as error:
         raise UserError(f"{path.name}: reading meshes needs {error.name}; {INSTALL}") from error
+    if path.stat().st_size > MOST_BYTES:
+        raise UserError(f"{path}: larger than {MOST_BYTES / 2**20:g} MiB, the most that a mesh may have")
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", DeprecationWarning)  # pycollada's, about NumPy

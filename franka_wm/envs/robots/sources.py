@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING
 
 import newton
 
-from franka_wm.envs.robots.meshes import INSTALL
+from franka_wm.envs.mesh_solids import INSTALL
 from franka_wm.errors import UserError
 
 if TYPE_CHECKING:
