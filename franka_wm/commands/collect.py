@@ -32,7 +32,7 @@ _PARTS = ("planner", "policy")
     ),
 )
 @word("out", "where the dataset goes; it appears whole, at the end", metavar="FOLDER", required=True)
-@word("episodes", "how many, with those of a resumed one", whole(1), 100)
+@word("episodes", "how many, with those of a resumed one", whole(1, 10**9), 100)
 @word(
     "policy",
     "random (smooth motion), noop, ik (inverse kinematics), expert (of tasks with a gripper), or an agent: a run's "
@@ -48,7 +48,7 @@ _PARTS = ("planner", "policy")
 )
 @word("num_envs", "worlds at once, on all GPUs; collector.num_envs if not given", whole(1), metavar="N")
 @word("gpus", "of this host, one process each; with device=cpu so many on the CPU", whole(1), 1)
-@word("workers", "writing processes, of each GPU", whole(), 2)
+@word("workers", "writing processes, of each GPU", whole(0, 256), 2)
 @word("shard_frames", "steps in one file, at most", whole(1), metavar="N")
 @word("success_only", "keep only episodes that end in success", FLAG, False)
 @word("noise", "of the expert's actions, standard deviation; it recovers from that", real(0.0), metavar="X")

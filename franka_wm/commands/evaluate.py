@@ -18,7 +18,7 @@ from franka_wm.errors import UserError
     required=True,
 )
 @word("out", "where results go (RUN/evaluation; for hf: outputs/evaluation/user--name)", metavar="FOLDER")
-@word("episodes", "per policy, on fixed held-out seeds", whole(2), 100)
+@word("episodes", "per policy, on fixed held-out seeds", whole(2, 10**6), 100)
 @word("device", "auto, cpu, cuda, cuda:K", default="auto")
 @word(
     "open_loop",

@@ -19,7 +19,7 @@ from franka_wm.errors import UserError
     click.Choice([*FORMATS]),
     "exact",
 )
-@word("workers", "writing processes", whole(), 2)
+@word("workers", "writing processes", whole(0, 256), 2)
 def export(source: str, out: str, format: str, workers: int) -> None:
     """Write a run's replay as a LeRobot dataset.
 

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from franka_wm import processes
 from franka_wm.console import say
-from franka_wm.data.stacks import CHANNELS
+from franka_wm.data.image_storage import CHANNELS
 from franka_wm.seeding import derive_seed
 from franka_wm.training.checkpoint import Checkpoint
 from franka_wm.training.moment import go_on_drawing, put_back, restorable, same_worlds
