@@ -1,10 +1,32 @@
 """Files that appear whole or not at all."""
 
+import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
 from franka_wm.errors import UserError
+
+
+def unwritable(folder: str | Path, size: int = 0) -> str | None:
+    """Why nothing can be written into `folder`, which need not be there, in a few words; None if something can.
+
+    Leaves nothing behind.
+
+    Args:
+        size: how much is tried [bytes].
+    """
+    place = Path(folder).absolute()
+    while not place.exists():
+        place = place.parent
+    if not place.is_dir():
+        return f"{place} is not a folder"
+    try:  # asking for permission is not enough: root has it everywhere
+        with tempfile.TemporaryDirectory(dir=place) as probe:
+            Path(probe, "probe").write_bytes(bytes(size))
+    except OSError as error:
+        return f"{place} is not writable ({error.strerror})"
+    return None
 
 
 @contextmanager

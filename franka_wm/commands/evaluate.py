@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
 from typing import Any
 
 from franka_wm.commands.arguments import FLAG, check_run, plugins, verb, whole, word
 from franka_wm.errors import UserError
+from franka_wm.files import unwritable
 
 
 @verb("evaluate", first="checkpoint")
@@ -58,11 +58,9 @@ def check_folder(folder: Path) -> None:
     Raises:
         UserError: It or what it lies in is a file, or may not be written to.
     """
-    there = next((f for f in (folder, *folder.absolute().parents) if f.exists()), Path("/"))
-    if not there.is_dir():
-        raise UserError(f"evaluate: out={folder}: {there} is a file; give a folder for the results")
-    if not os.access(there, os.W_OK | os.X_OK):
-        raise UserError(f"evaluate: out={folder}: {there} may not be written to; give another folder")
+    why = unwritable(folder)
+    if why is not None:
+        raise UserError(f"evaluate: out={folder}: {why}; give another folder for the results")
 
 
 def check_larger(folder: Path, episodes: int) -> None:

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from franka_wm.commands.arguments import check_run, did_you_mean, plugins, real, verb, whole, word
 from franka_wm.errors import UserError
+from franka_wm.files import unwritable
 from franka_wm.live.extras import import_rerun, import_viser
 from franka_wm.policies.names import POLICIES, refuse_old_name
 
@@ -89,6 +91,8 @@ def options_of(
 
     if rerun is not None and not rerun.endswith(".rrd"):
         raise UserError(f"view: rerun={rerun}: must end in .rrd")
+    if rerun is not None and (why := unwritable(Path(rerun).parent)) is not None:
+        raise UserError(f"view: rerun={rerun}: {why}; choose another place")
     try:
         changes: Any = OmegaConf.to_container(OmegaConf.from_dotlist(list(overrides)))
     except (YAMLError, OmegaConfBaseException) as error:

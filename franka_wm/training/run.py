@@ -6,7 +6,6 @@ import fcntl
 import importlib
 import logging
 import sys
-import tempfile
 import traceback
 from collections.abc import Callable, Sequence
 from contextlib import suppress
@@ -20,7 +19,7 @@ from omegaconf import DictConfig, OmegaConf
 from tensordict import TensorDictBase
 from torchrl.record.loggers import Logger
 
-from franka_wm import processes
+from franka_wm import files, processes
 from franka_wm.console import announced, log_to, resuming, say
 from franka_wm.data.lerobot.export import export_run
 from franka_wm.data.lerobot.windows import RecordedWindows
@@ -85,17 +84,8 @@ def _names_module(name: object) -> bool:
 
 def unwritable(folder: Path, option: str = "hydra.run.dir") -> str | None:
     """Why ``folder`` cannot be made or written, in one line; ``None`` if it can. Leaves nothing behind."""
-    place = folder.absolute()
-    while not place.exists():
-        place = place.parent
-    if not place.is_dir():
-        return f"{option}={folder}: {place} is not a folder; choose another place for the results"
-    try:  # asking for permission is not enough: root has it everywhere
-        with tempfile.TemporaryDirectory(dir=place) as probe:
-            Path(probe, "probe").write_bytes(bytes(SMALL_FILES))
-    except OSError as error:
-        return f"{option}={folder}: {place} is not writable ({error.strerror}); choose another place"
-    return None
+    why = files.unwritable(folder, SMALL_FILES)
+    return why and f"{option}={folder}: {why}; choose another place for the results"
 
 
 def occupied(folder: Path, resume: str | None) -> str | None:

@@ -113,7 +113,7 @@ def test_results_that_cannot_be_written_are_refused_before_playing(out: str, tmp
     arguments = [f"checkpoint={tmp_path}/nowhere", f"out={tmp_path / out}", "device=cpu"]
     assert cli.main(["evaluate", *arguments]) == 1  # before it even looks for the checkpoint
     captured = capsys.readouterr()
-    assert captured.err.count("\n") == 1 and "taken is a file; give a folder" in captured.err
+    assert captured.err.count("\n") == 1 and "taken is not a folder; give another folder" in captured.err
     assert captured.out == ""
     assert (tmp_path / "taken").read_text() == "mine"
 

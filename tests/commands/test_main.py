@@ -151,6 +151,11 @@ WRONG: list[tuple[list[str], str]] = [
     (["list", "hydra.searchpath=[file://nowhere]"], "nowhere is not a folder"),
     (["list", "plugin=x"], "did you mean plugins?"),
     (["evaluate", "checkpoint=x", "episode=3"], "did you mean episodes?"),
+    # also for root, who may write anywhere
+    (["evaluate", "checkpoint=x", "out=/proc/x"], "/proc is not writable"),
+    (["collect", "out=/proc/x"], "/proc is not writable"),
+    (["export", "source=.", "out=/proc/x"], "/proc is not writable"),
+    (["view", "rerun=/proc/x.rrd"], "/proc is not writable"),
     (["evaluate", "checkpoint=x", "episodes=10000000000"], "at most 1000000"),
     (["collect", "out=x", "workers=1000000"], "at most 256"),
     (["evaluate", "checkpoint=x", "episodes=1"], "episodes=1: must be a whole number of at least 2"),

@@ -40,6 +40,7 @@ from franka_wm.data.lerobot.shard_workers import (
 from franka_wm.data.lerobot.source import MOST_ROWS, check_finite
 from franka_wm.data.lerobot.terminal import TERMINAL_FOLDER
 from franka_wm.errors import UserError
+from franka_wm.files import unwritable
 from franka_wm.options import is_whole, whole_rule
 from franka_wm.untrusted import UntrustedFolder, linked_json, values_of
 
@@ -63,6 +64,9 @@ def check_out(out: str | Path, *, resume: bool = False, resumable: bool = True) 
     if _shards(working) and not resume:
         more = "go on with resume=true, or " if resumable else ""
         raise UserError(f"{working} holds an unfinished dataset; {more}remove {working}")
+    why = unwritable(working)
+    if why is not None:
+        raise UserError(f"out={out}: {why}; choose another folder")
 
 
 def _working(out: Path) -> Path:
