@@ -185,6 +185,12 @@ class MultiTaskEnv(EnvBase):
         return max(env.action_dim for env in self.envs.values())
 
     @property
+    def action_masks(self) -> list[list[float]] | None:
+        """For each task 1 where it has the entry of an action, else 0; ``None`` where all have the same."""
+        sizes, most = [env.action_dim for env in self.envs.values()], self.action_dim
+        return None if min(sizes) == most else [[float(k < size) for k in range(most)] for size in sizes]
+
+    @property
     def terminates(self) -> bool:
         """Whether episodes may end by more than their length."""
         return self.config.terminate_on_success

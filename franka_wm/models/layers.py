@@ -355,8 +355,8 @@ class GaussianPolicy(nn.Module):
         mean, log_std = self.distribution(z)
         return torch.tanh(mean if deterministic else mean + log_std.exp() * normal_like(mean))
 
-    def sample(self, z: Tensor) -> tuple[Tensor, Tensor]:
-        """A reparameterised action (..., action_dim) and its log-density (..., 1).
+    def sample(self, z: Tensor, used: Tensor | None = None) -> tuple[Tensor, Tensor]:
+        """A reparameterised action (..., action_dim) and its log-density (..., 1), of the entries `used` alone.
 
         Averaged and negated, the second estimates the entropy [nat] of the actions.
         """
@@ -366,7 +366,10 @@ class GaussianPolicy(nn.Module):
         log_prob = -0.5 * (noise.square() + math.log(2.0 * math.pi)) - log_std
         # log(1 - tanh(u)^2), in the form that stays exact where tanh saturates
         log_slope = 2.0 * (math.log(2.0) - raw - F.softplus(-2.0 * raw))
-        return torch.tanh(raw), (log_prob - log_slope).sum(-1, keepdim=True)
+        density = log_prob - log_slope
+        if used is not None:
+            density = density * used
+        return torch.tanh(raw), density.sum(-1, keepdim=True)
 
     def imitation_error(self, z: Tensor, action: Tensor, shown: Tensor) -> Tensor:
         """Squared error (,) of the mode against actions (..., action_dim), 0 where not `shown` (..., 1): the mean."""

@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import torch
 from tensordict import TensorDictBase
 from torch import Tensor, nn
 
@@ -39,6 +40,8 @@ class SimplicialWorldModel(WorldModel):
         random_shift: pixels by which images are shifted at most while training, in each direction.
         encoder_from, encoder_architecture, encoder_grid, freeze_encoder: of a pretrained vision transformer, see
             `ImageEncoder`.
+        action_masks: of K tasks (K, A), 1 where a task has the entry of an action. Then `task` (..., K), one-hot, is
+            among the observations, and z carries its mask behind the `latent_dim` features. None: one task.
 
     Raises:
         ValueError: nothing to read.
@@ -47,6 +50,7 @@ class SimplicialWorldModel(WorldModel):
     observation_mean: Tensor
     observation_std: Tensor
     two_hot: TwoHotSymlog
+    action_masks: Tensor | None
 
     def __init__(
         self,
@@ -63,6 +67,7 @@ class SimplicialWorldModel(WorldModel):
         encoder_architecture: Sequence[int] | None = None,
         encoder_grid: int | None = None,
         freeze_encoder: bool = False,
+        action_masks: Sequence[Sequence[float]] | None = None,
     ) -> None:
         super().__init__()
         self.observation_sizes = check_sizes(observation_sizes)
@@ -90,6 +95,10 @@ class SimplicialWorldModel(WorldModel):
             self.encoder = mlp(observation_dim, hidden, latent_dim, output=SimNorm(simnorm_dim))
         self.random_shift = RandomShift(random_shift)
         register_statistics(self, observation_dim)
+        if action_masks is None:
+            self.action_masks = None
+        else:
+            self.register_buffer("action_masks", torch.tensor(action_masks), persistent=False)
 
     @classmethod
     def validate(cls, options: Mapping[str, Any], *, window: int | None = None) -> None:
@@ -123,9 +132,37 @@ class SimplicialWorldModel(WorldModel):
 
     def encode_parts(self, images: Mapping[str, Tensor], vectors: Tensor | None) -> Tensor:
         """Latents (..., latent_dim) of images by key and of all vectors side by side (..., observation_dim)."""
+        raw = vectors
         if vectors is not None:
             vectors = standardize(vectors, self.observation_mean, self.observation_std)
-        return self.encoder(images, vectors) if self.image_sizes else self.encoder(vectors)
+        z = self.encoder(images, vectors) if self.image_sizes else self.encoder(vectors)
+        if self.action_masks is None or raw is None:
+            return z
+        sizes = list(self.observation_sizes.values())
+        task = raw.split(sizes, dim=-1)[list(self.observation_sizes).index("task")]
+        return torch.cat((z, task.to(z.dtype) @ self.action_masks.to(z.dtype)), dim=-1)
+
+    # Where tasks have actions of different sizes: what a task's action lacks counts nowhere.
+
+    def features(self, z: Tensor) -> Tensor:
+        """The features (..., latent_dim) of z, without the mask that it may carry."""
+        return z if self.action_masks is None else z[..., : self.latent_dim]
+
+    def used(self, z: Tensor) -> Tensor | None:
+        """1 where the task of z has the entry of an action, else 0 (..., A); None: all have all."""
+        return None if self.action_masks is None else z[..., self.latent_dim :]
+
+    def masked(self, z: Tensor, action: Tensor) -> Tensor:
+        """Actions (..., A) with 0 in the entries that the task of z has not."""
+        return action if self.action_masks is None else action * z[..., self.latent_dim :]
+
+    def joined(self, z: Tensor, action: Tensor) -> Tensor:
+        """What networks over both read: the features of z and the action, masked."""
+        return torch.cat((self.features(z), self.masked(z, action)), dim=-1)
+
+    def following(self, z: Tensor, features: Tensor) -> Tensor:
+        """The next z: new features (..., latent_dim), and the mask of z."""
+        return features if self.action_masks is None else torch.cat((features, z[..., self.latent_dim :]), -1)
 
     def rebuild_overrides(self) -> dict[str, Any]:
         """Constructor arguments that replace a pretrained encoder's file, and the range of rewards and values."""

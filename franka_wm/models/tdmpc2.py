@@ -64,8 +64,7 @@ class TDMPC2(SimplicialWorldModel):
         discount: per step, in [0, 1).
         latent_dim: size of z.
         simnorm_dim: features per simplex; divides `latent_dim`.
-        encoder_dim: width of the encoder's hidden layers.
-        encoder_layers: layers of the encoder, its output layer included.
+        encoder_dim, encoder_layers: width of the encoder's hidden layers; its layers, the output layer included.
         hidden_dim: width of the two hidden layers of every other network.
         num_q: members of the Q-ensemble, at least 2.
         value_members: how many of them `value` averages in evaluation mode, always the first; None: all. The
@@ -91,6 +90,7 @@ class TDMPC2(SimplicialWorldModel):
         encoder_architecture: the transformer's numbers; only to rebuild from a checkpoint.
         encoder_grid: average its tokens to so many rows and columns.
         freeze_encoder: keep it as it is; what joins its features into z is still trained.
+        action_masks: of several tasks whose actions differ, see `SimplicialWorldModel`.
 
     Raises:
         ValueError: a size or coefficient that cannot work, or neither `episode_length` nor `discount`.
@@ -149,6 +149,7 @@ class TDMPC2(SimplicialWorldModel):
         encoder_architecture: Sequence[int] | None = None,
         encoder_grid: int | None = 4,
         freeze_encoder: bool = False,
+        action_masks: Sequence[Sequence[float]] | None = None,
     ) -> None:
         self.validate(locals())
         pretrained = encoder_from is not None or encoder_architecture is not None
@@ -167,6 +168,7 @@ class TDMPC2(SimplicialWorldModel):
             encoder_architecture=encoder_architecture,
             encoder_grid=encoder_grid,
             freeze_encoder=freeze_encoder,
+            action_masks=action_masks,
         )
         self.discount = discount_per_step(discount, episode_length)
         self.action_dim, self.num_q, self.value_members = action_dim, num_q, value_members
@@ -209,11 +211,11 @@ class TDMPC2(SimplicialWorldModel):
 
     def next(self, z: Tensor, action: Tensor) -> Tensor:
         """Latents (..., latent_dim) and actions (..., action_dim) -> next latents (..., latent_dim)."""
-        return self.dynamics(torch.cat((z, action), dim=-1))
+        return self.following(z, self.dynamics(self.joined(z, action)))
 
     def reward(self, z: Tensor, action: Tensor) -> Tensor:
         """Expected reward (..., 1) of an action (..., action_dim) in z (..., latent_dim)."""
-        return self.two_hot.decode(self.reward_head(torch.cat((z, action), dim=-1)))
+        return self.two_hot.decode(self.reward_head(self.joined(z, action)))
 
     def q(
         self,
@@ -234,9 +236,10 @@ class TDMPC2(SimplicialWorldModel):
                 device, afresh at each call.
             dropout: whether to drop activations, as while fitting.
         """
-        members = first if reduce == "mean" else self._random_pair(z.device)
-        x = torch.cat((z, action), dim=-1)
-        values = self.two_hot.decode(self.q_ensemble(x, weights=weights, members=members, dropout=dropout))
+        # Ranking noise draws without replacement, on the device; torch.randperm may wait for the host.
+        members = first if reduce == "mean" else torch.rand(self.num_q, device=z.device).topk(2).indices
+        logits = self.q_ensemble(self.joined(z, action), weights=weights, members=members, dropout=dropout)
+        values = self.two_hot.decode(logits)
         return values.amin(0) if reduce == "pair_min" else values.mean(0)
 
     def value(self, z: Tensor, *, deterministic: bool | None = None) -> Tensor:
@@ -261,21 +264,21 @@ class TDMPC2(SimplicialWorldModel):
         """
         if self.termination_head is None:
             raise ValueError("this model was built without terminates=True: it does not predict ends")
-        return self.termination_head(z) > 0.0
+        return self.termination_head(self.features(z)) > 0.0
 
     def policy(self, z: Tensor, deterministic: bool = False) -> Tensor:
         """Actions (..., action_dim) in [-1, 1] for z (..., latent_dim): a sample, or the mode."""
-        return self.policy_head(z, deterministic=deterministic)
+        return self.masked(z, self.policy_head(self.features(z), deterministic=deterministic))
 
     def policy_sample(self, z: Tensor) -> tuple[Tensor, Tensor]:
         """A reparameterised action (..., action_dim) and its log-density (..., 1), see `GaussianPolicy.sample`."""
-        return self.policy_head.sample(z)
+        action, log_prob = self.policy_head.sample(self.features(z), self.used(z))
+        return self.masked(z, action), log_prob
 
     # ------------------------------------------------------------------ training
 
     parts_of_loss = ("_encode_window", "_td_target", "_unroll", "_model_losses", "_policy_loss", "_metrics")
-    """Methods that `loss` calls. They are compiled one by one, because what runs side by side on a GPU must not become
-    one program."""
+    """Methods that `loss` calls, compiled one by one: what runs side by side on a GPU must not become one program."""
 
     def loss(
         self, batch: TensorDictBase, *, parts: Mapping[str, Callable[..., Any]] | None = None
@@ -328,7 +331,7 @@ class TDMPC2(SimplicialWorldModel):
         policy.join(policy_loss, entropy)
         shown = batch.get("demonstrated", None)
         if self.imitation_coef and shown is not None:
-            # Values that have seen demonstrations alone know nothing of other actions: then the policy imitates alone,
+            # Values that have seen demonstrations alone know no other actions: then the policy imitates alone,
             # and the encoder learns for it, too (MoDem's first phase).
             alone = shown.all()
             z = torch.where(alone, encoded[:-1], detached[:-1])
@@ -343,7 +346,7 @@ class TDMPC2(SimplicialWorldModel):
         )
         ends = {}
         if self.termination_head is not None:  # every step weighs the same, as published
-            logits = self.termination_head(predicted[1:])
+            logits = self.termination_head(self.features(predicted[1:]))
             loss = F.binary_cross_entropy_with_logits(logits, terminated.to(logits.dtype))
             total, ends = total + self.termination_coef * loss, {"loss_termination": loss.detach()}
         with torch.no_grad():
@@ -401,10 +404,6 @@ class TDMPC2(SimplicialWorldModel):
         images = {key: self.random_shift(image).transpose(0, 1) for key, image in images.items()}
         return self.encode_parts(images, vectors)
 
-    def _random_pair(self, device: torch.device) -> Tensor:
-        # Ranking noise draws without replacement, on the device; torch.randperm may wait for the host.
-        return torch.rand(self.num_q, device=device).topk(2).indices
-
     def _unroll(self, z: Tensor, actions: Tensor) -> Tensor:
         """Latents (H+1, B, D) from the first one (B, D) and actions (H, B, A)."""
         latents = [z]
@@ -416,10 +415,11 @@ class TDMPC2(SimplicialWorldModel):
         self, predicted: Tensor, after: Tensor, action: Tensor, reward: Tensor, target: Tensor, weight: Tensor
     ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
         """Losses of consistency, reward and value, and the logits of values (num_q, H, B, bins) and rewards."""
-        before = torch.cat((predicted[:-1], action), dim=-1)
+        before = self.joined(predicted[:-1], action)
         reward_logits = self.reward_head(before)
         q_logits = self.q_ensemble(before, dropout=self.training)
-        consistency = (weight * F.mse_loss(predicted[1:], after, reduction="none")).mean()
+        error = F.mse_loss(self.features(predicted[1:]), self.features(after), reduction="none")
+        consistency = (weight * error).mean()
         reward_loss = (weight * self.two_hot.loss(reward_logits, reward)).mean()
         value_loss = (weight * self.two_hot.loss(q_logits, target)).mean()
         return consistency, reward_loss, value_loss, q_logits, reward_logits

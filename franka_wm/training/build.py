@@ -127,7 +127,7 @@ def make_model(
     sizes: dict[str, Any] = {"observation_sizes": spaces.observation_sizes}
     if spaces.image_sizes:
         sizes["image_sizes"] = spaces.image_sizes
-    known = {"reward_bounds": spaces.reward_bounds, "terminates": spaces.terminates}
+    known = {name: getattr(spaces, name) for name in ("reward_bounds", "terminates", "action_masks")}
     takes = signature(run.model.family).parameters
     further = {key: value for key, value in known.items() if key in takes}
     try:

@@ -30,6 +30,7 @@ class Spaces:
         episode_length: Steps, at most.
         reward_bounds: The least and the largest reward of a step; ``None`` where unknown.
         terminates: Whether episodes may end by more than their length.
+        action_masks: For each of several tasks 1 where it has the entry of an action, else 0; ``None``: all have all.
     """
 
     observation_sizes: Mapping[str, int] = field(default_factory=dict)
@@ -39,6 +40,7 @@ class Spaces:
     episode_length: int = 50
     reward_bounds: tuple[float, float] | None = None
     terminates: bool = False
+    action_masks: Sequence[Sequence[float]] | None = None
 
     def only(self, keys: Sequence[str] | None, reader: str) -> Spaces:
         """The same with the observations ``keys`` alone; with every vector but the goal if ``None``.
@@ -132,6 +134,7 @@ class Spaces:
             episode_length=env.config.episode_length,
             reward_bounds=env.reward_bounds,
             terminates=env.terminates,
+            action_masks=getattr(env, "action_masks", None),
         )
 
 

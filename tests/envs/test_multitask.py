@@ -1,5 +1,8 @@
 """Several tasks at once: every world is as it would be alone, and each task is judged by itself."""
 
+import json
+from typing import Any
+
 import pytest
 import torch
 from tensordict import TensorDict
@@ -18,6 +21,7 @@ from franka_wm.report.table import evaluation_tables
 from franka_wm.seeding import derive_seed
 from franka_wm.training import build
 from franka_wm.training.settings import RunSettings
+from franka_wm.training.spaces import Spaces
 
 STEPS = 9
 SHORT = {"reach": 4, "push": 6}
@@ -96,6 +100,15 @@ def test_it_is_an_environment_of_torchrls(env) -> None:
             assert abs(float(data["next", "episode_reward"][world, t]) - total) < 1e-4
             if data["next", "done"][world, t]:
                 total = 0.0
+
+
+def test_a_model_of_them_knows_what_their_actions_lack(env) -> None:
+    assert env.action_masks == [[1.0] * 7 + [0.0], [1.0] * 8]
+    spaces = Spaces.from_dict(json.loads(json.dumps(Spaces.of_env(env).as_dict())))
+    run = RunSettings.of(conf.compose("env=multitask", "scale=smoke", "device=cpu"))
+    model: Any = build.make_model(run, spaces, "cpu").eval()
+    action = model.policy(model.encode(env.reset()), deterministic=True)
+    assert (action[0::2, 7] == 0).all() and (action[1::2, 7] != 0).all()
 
 
 def test_statistics_tell_tasks_apart(env) -> None:

@@ -17,6 +17,7 @@ NOT_IN_FILES = {
     "action_dim",
     "episode_length",
     "reward_bounds",
+    "action_masks",
     "terminates",
     "encoder_architecture",
     "huggingface_config",
