@@ -148,9 +148,10 @@ def test_each_task_has_its_expert(env) -> None:
     for k, (name, one) in enumerate(env.envs.items()):
         own = build.make_scripted_policies(one)
         alone = own.get("expert", own.get("ik"))(env.split(now)[name])["action"]
-        assert torch.equal(acted[k::2, : alone.shape[-1]], alone)
+        assert torch.allclose(acted[k::2, : alone.shape[-1]], alone, atol=1e-5)
     for count in (1, 4):  # an evaluation may play some of the worlds
-        assert torch.equal(policies["expert"](now[:count].clone())["action"], acted[:count])
+        some = policies["expert"](now[:count].clone())["action"]
+        assert torch.allclose(some, acted[:count], atol=1e-5)  # another batch, other roundings
 
 
 def test_success_of_a_task_counts_its_own_worlds_alone(env, monkeypatch) -> None:
