@@ -245,16 +245,19 @@ class Checkpoint:
         with damaged(self.folder, "rng.json"):
             restore_random_state(state)
 
-    def replay(self, device: torch.device | str | None = None, rank: int | None = None) -> TensorDict | None:
+    def replay(
+        self, device: torch.device | str | None = None, rank: int | Sequence[int] | None = None
+    ) -> TensorDict | None:
         """The saved replay, with its batch dimensions, on `device` (the CPU if None); None if none was saved.
 
         Args:
-            rank: only what this process had; None: of all of them, one behind the other.
+            rank: only what this process had, or these; None: all of them, one behind the other.
 
         Raises:
             UserError: its file is damaged.
         """
-        found = [self._replay(k) for k in (range(self.processes) if rank is None else [rank])]
+        ranks = range(self.processes) if rank is None else [rank] if isinstance(rank, int) else rank
+        found = [self._replay(k) for k in ranks]
         whole = [one for one in found if one is not None]
         if len(whole) < len(found):
             return None

@@ -61,8 +61,16 @@ def own_experience(checkpoint: Checkpoint, device: torch.device) -> TensorDictBa
     """This process's worlds of a checkpoint's experience, (worlds, time), whatever number of processes has saved it."""
     if checkpoint.processes == processes.count():
         return checkpoint.replay(device, processes.rank())
-    whole = checkpoint.replay("cpu")
-    return None if whole is None else whole.chunk(processes.count())[processes.rank()].to(device)
+    saved, count, rank = checkpoint.processes, processes.count(), processes.rank()
+    read = range(
+        rank * saved // count, -(-(rank + 1) * saved // count)
+    )  # who has its worlds: no others are read
+    some = checkpoint.replay("cpu", read)
+    if some is None:
+        return None
+    each = len(some) // len(read)
+    own, before = each * saved // count, each * read[0]
+    return some[rank * own - before : (rank + 1) * own - before].to(device)
 
 
 def own_moment(checkpoint: Checkpoint) -> dict[str, Any]:

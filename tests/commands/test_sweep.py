@@ -92,23 +92,35 @@ def test_a_job_is_refused_before_anything_is_written(swept, tmp_path: Path) -> N
     assert list(tmp_path.iterdir()) == []
 
 
+LAUNCHERS = {
+    "joblib": ["hydra.launcher.n_jobs=2"],
+    "submitit_local": [],
+    "ray": [
+        "+hydra.launcher.ray.init.num_cpus=2",
+        "+hydra.launcher.ray.remote.num_cpus=1",
+    ],  # a cluster of one node
+}
+
+
 @pytest.mark.slow
-def test_jobs_of_other_processes_are_looked_after_as_well(tmp_path: Path) -> None:
-    """Two at a time by joblib: who failed is named, and what is missing runs when it is asked for again."""
-    pytest.importorskip("hydra_plugins.hydra_joblib_launcher")
-    command = [sys.executable, str(TRAIN), "--multirun", "hydra/launcher=joblib", "hydra.launcher.n_jobs=2"]
-    command += [*SMOKE, *SMALL, "trainer.lr=1e30,1e-3", f"hydra.sweep.dir={tmp_path}/sweep"]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=240)
+@pytest.mark.parametrize("launcher", LAUNCHERS)
+def test_jobs_of_other_processes_are_looked_after_as_well(tmp_path: Path, launcher: str) -> None:
+    """Two at a time: who failed is named, the others finish, and what is missing runs when it is asked for again."""
+    plugin = f"hydra_plugins.hydra_{launcher.partition('_')[0]}_launcher"
+    pytest.importorskip(plugin, reason=f"hydra/launcher={launcher} is not installed")
+    rates = "trainer.lr=1e30,1e-3" if launcher == "joblib" else "trainer.lr=1e30,1e-3,2e-3"
+    command = [sys.executable, str(TRAIN), "--multirun", f"hydra/launcher={launcher}", *LAUNCHERS[launcher]]
+    command += [*SMOKE, *SMALL, rates, f"hydra.sweep.dir={tmp_path}/sweep"]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=400)
     assert done.returncode == 1 and "Traceback" not in done.stderr, done.stderr
-    assert (
-        done.stderr.strip()
-        .splitlines()[-1]
-        .startswith("error: 1 of 2 jobs failed: job 0 (trainer.lr=1e+30): see ")
-    )
-    logs = [(tmp_path / "sweep" / job / "train.log").read_text() for job in ("0-reach", "1-reach")]
-    assert "training broke" in logs[0] and "results: " in logs[1]
-    again = subprocess.run(command, capture_output=True, text=True, timeout=240)
-    assert again.returncode == 1 and "job 1 (trainer.lr=0.001) was finished before" in again.stdout
+    failed = [line for line in done.stderr.splitlines() if line.startswith("error: ")]
+    count = 1 + rates.count(",")
+    assert failed[-1].startswith(f"error: 1 of {count} jobs failed: job 0 (trainer.lr=1e+30): see ")
+    logs = [(tmp_path / "sweep" / f"{k}-reach" / "train.log").read_text() for k in range(count)]
+    assert "training broke" in logs[0] and all("results: " in log for log in logs[1:])
+    if launcher == "joblib":
+        again = subprocess.run(command, capture_output=True, text=True, timeout=240)
+        assert again.returncode == 1 and "job 1 (trainer.lr=0.001) was finished before" in again.stdout
 
 
 def test_jobs_take_the_gpus_in_turn(monkeypatch: pytest.MonkeyPatch) -> None:

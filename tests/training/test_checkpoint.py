@@ -293,6 +293,12 @@ def test_parts_of_several_processes_are_one_checkpoint(
     own = own_experience(found, torch.device("cpu"))
     assert own is not None and torch.equal(own["state"], whole["state"][4:8])
     assert own_moment(found)["worlds"]["state"]["q"][:, 0].tolist() == [0.0, 0.0, 1.0, 1.0]
+    (
+        tmp_path / "a" / "replay.safetensors"
+    ).unlink()  # of the first process: the last of three has no need of it
+    monkeypatch.setattr("franka_wm.processes.rank", lambda: 2)
+    own = own_experience(found, torch.device("cpu"))
+    assert own is not None and torch.equal(own["state"], whole["state"][8:])
 
 
 def test_parts_that_do_not_fit_together_are_damage(tmp_path: Path) -> None:
