@@ -6,11 +6,14 @@
 
 *environment* is the simulator alone, one process for each GPU. The others are whole training by ``train.py gpus=N``:
 gathering, resets, sampling, updates and the averaging of gradients; the first third of the updates is warm-up.
+*predicted* is the cost model of `docs/scale.md`, from one GPU's time of an update and that of adding up its gradients
+(`benchmarks/all_reduce.py`).
 """
 
 from __future__ import annotations
 
 import argparse
+import json
 import subprocess
 import sys
 import tempfile
@@ -23,6 +26,7 @@ from common import publish
 
 from franka_wm import conf
 from franka_wm.training.checkpoint import latest_checkpoint, load_checkpoint
+from franka_wm.training.tree import read_tensors
 
 ROOT = Path(__file__).resolve().parents[1]
 
@@ -91,8 +95,23 @@ def worker(device: str, worlds: int, seconds: float) -> None:
     print(steps(seconds), flush=True)
 
 
-def training(arguments: list[str], gpus: int, updates: int) -> tuple[float, int]:
-    """Updates per second of a whole job in which each GPU has the work of the configuration, and its batch."""
+def all_reduce(gpus: int, device: str, megabytes: float) -> float:
+    """Seconds that so many GPUs take to add up gradients of this size."""
+    if gpus == 1:
+        return 0.0
+    with tempfile.NamedTemporaryFile(suffix=".json") as file:
+        command = [sys.executable, "-m", "torch.distributed.run", "--standalone", f"--nproc-per-node={gpus}"]
+        command += [str(ROOT / "benchmarks" / "all_reduce.py"), f"--device={device}", f"--out={file.name}"]
+        subprocess.run([*command, "--megabytes", str(megabytes)], check=True, capture_output=True, cwd=ROOT)
+        return json.loads(Path(file.name).read_text())["rows"][0]["ms"] / 1e3
+
+
+def training(arguments: list[str], gpus: int, updates: int) -> tuple[float, int, float]:
+    """A whole job in which each GPU has the work of the configuration.
+
+    Returns:
+        Updates per second, its batch, and the gradients of an update [MB].
+    """
     alone = conf.compose(*arguments)
     grown = {
         "collector.num_envs": alone.collector.num_envs,
@@ -107,12 +126,15 @@ def training(arguments: list[str], gpus: int, updates: int) -> tuple[float, int]
         done = subprocess.run(command, capture_output=True, text=True, cwd=ROOT)
         if done.returncode:
             raise SystemExit(f"{' '.join(command)}\n{done.stdout[-2000:]}\n{done.stderr[-4000:]}")
-        rows = (load_checkpoint(latest_checkpoint(f"{folder}/run")).extra() or {})["rows"]
+        place = latest_checkpoint(f"{folder}/run")
+        rows = (load_checkpoint(place).extra() or {})["rows"]
+        # Adam keeps a mean of each gradient.
+        kept = read_tensors(place, "optimizer").items()
+        gradients = sum(x.numel() for name, x in kept if name.endswith("exp_avg")) * 4 / 1e6
     later = [row for row in rows if "updates_per_s" in row and row["updates"] >= updates / 3]
     first, last = later[0], later[-1]
-    return (last["updates"] - first["updates"]) / (last["time_s"] - first["time_s"]), grown[
-        "replay.batch_size"
-    ] * gpus
+    rate = (last["updates"] - first["updates"]) / (last["time_s"] - first["time_s"])
+    return rate, grown["replay.batch_size"] * gpus, gradients
 
 
 def main() -> None:
@@ -137,17 +159,21 @@ def main() -> None:
     numbers = args.gpus or [n for n in (1, 2, 4, 8) if n <= there]
     rows: list[dict[str, Any]] = []
     for case in args.cases:
-        alone = 0.0
+        alone, update = 0.0, 0.0
         for gpus in numbers:
             row: dict[str, Any] = {"case": case, "GPUs": gpus}
             if case == "environment":
                 done = environment(gpus, args.device, args.worlds, args.seconds)
-                row |= {"updates/s": float("nan"), "windows/s": float("nan"), "env steps/s": done}
+                unknown = ("updates/s", "windows/s", "gradients [MB]", "all-reduce [ms]")
+                row |= dict.fromkeys(unknown, float("nan")) | {"env steps/s": done, "predicted": float(gpus)}
             else:
                 arguments = [*TRAINING[case], f"scale={args.scale}", f"device={args.device}"]
-                updates, batch = training(arguments, gpus, args.updates)
-                done = updates * batch
-                row |= {"updates/s": updates, "windows/s": done, "env steps/s": float("nan")}
+                updates, batch, gradients = training(arguments, gpus, args.updates)
+                done, message = updates * batch, all_reduce(gpus, args.device, gradients)
+                update = update or 1 / updates  # of the fewest GPUs, which should be one
+                row |= {"updates/s": updates, "windows/s": done, "gradients [MB]": gradients}
+                row |= {"all-reduce [ms]": 1e3 * message, "env steps/s": float("nan")}
+                row["predicted"] = gpus * update / (update + message)
             alone = alone or done / gpus
             row["times one GPU"] = done / alone
             rows.append(row)

@@ -10,10 +10,9 @@
     extra.json              likewise: whatever else the caller wants back
     replay1.json, …         of a run of several processes: the parts of process 1 and those that follow
 
-**Replacing a checkpoint.** A folder cannot replace a non-empty folder in one system call, so it takes three
-steps: write and sync `NAME.writing`; rename `NAME` to `NAME.old`; rename `NAME.writing` to `NAME`. A kill
-between the renames leaves no `NAME`, but a whole `NAME.old`, and that is what `load_checkpoint(NAME)` then
-reads. `NAME.old` is removed only while a whole `NAME` exists.
+**Replacing a checkpoint.** A folder cannot replace a non-empty folder in one system call, so it takes three steps:
+write and sync `NAME.writing`; rename `NAME` to `NAME.old`; rename `NAME.writing` to `NAME`. A kill between the renames
+leaves no `NAME`, but a whole `NAME.old`, which `load_checkpoint(NAME)` then reads. It is removed once there is `NAME`.
 """
 
 import json
@@ -256,10 +255,9 @@ class Checkpoint:
         Raises:
             UserError: its file is damaged.
         """
-        ranks = range(self.processes) if rank is None else [rank] if isinstance(rank, int) else rank
-        found = [self._replay(k) for k in ranks]
-        whole = [one for one in found if one is not None]
-        if len(whole) < len(found):
+        some = [rank] if isinstance(rank, int) else range(self.processes) if rank is None else rank
+        found = [self._replay(k) for k in some]
+        if len(whole := [one for one in found if one is not None]) < len(found):
             return None
         with damaged(self.folder, "one of its replays"):
             joined: Any = whole[0] if len(whole) == 1 else torch.cat(whole)  # pyright: ignore[reportArgumentType]
