@@ -19,15 +19,23 @@ if TYPE_CHECKING:
 def summary(folders: tuple[str, ...]) -> None:
     """Show runs of several seeds in one table.
 
-    Runs that differ in more than their seed get a table for each configuration.
+    Runs that differ in more than their seed get a table for each configuration. Of a sweep, runs that have not been
+    evaluated yet, or failed, are named and left out.
     """
+    from franka_wm.evaluation.results import results
     from franka_wm.report.run import but_for_the_seed, malformed, read_config
     from franka_wm.report.seeds import read_evaluation, runs_of
     from franka_wm.untrusted import values_of
 
     groups: dict[str, dict[Path, Result]] = {}
     for folder in folders:
-        for run in runs_of(folder):
+        runs = runs_of(folder)
+        missing = [run for run in runs if len(runs) > 1 and not results(run)]
+        if 0 < len(missing) < len(runs):
+            names = ", ".join(run.name for run in missing)
+            print(f"{len(missing)} of {len(runs)} runs have no result (yet; train.log says more): {names}\n")
+            runs = [run for run in runs if run not in missing]
+        for run in runs:
             with malformed(run):
                 groups.setdefault(but_for_the_seed(read_config(run)), {})[run] = read_evaluation(run)
     for group in groups.values():

@@ -51,7 +51,7 @@ def test_a_run_without_evaluation_is_refused(tmp_path, capsys):
 
 
 def test_a_sweep_stands_for_its_runs(tmp_path, capsys):
-    """Those of Hydra's numbers, in that order; one that was not finished is refused, not left out."""
+    """Those of Hydra's numbers, in that order; of one that runs or failed a line says that it is left out."""
     (tmp_path / "multirun.yaml").touch()
     assert main(["summary", str(tmp_path)]) == 1
     assert "without runs" in capsys.readouterr().err
@@ -63,8 +63,14 @@ def test_a_sweep_stands_for_its_runs(tmp_path, capsys):
     assert main(["summary", str(tmp_path)]) == 0
     assert "7.00 (2.00 – 10.00)" in capsys.readouterr().out
     (tmp_path / "9-reach" / "evaluation.json").unlink()
+    assert main(["summary", str(tmp_path)]) == 0
+    said = capsys.readouterr().out
+    assert "1 of 3 runs have no result (yet; train.log says more): 9-reach\n" in said
+    assert "2 runs of " in said and "6.00 (2.00 – 10.00)" in said
+    for k in (10, 2):
+        (tmp_path / f"{k}-reach" / "evaluation.json").unlink()
     assert main(["summary", str(tmp_path)]) == 1
-    assert "9-reach: no evaluation" in capsys.readouterr().err
+    assert "2-reach: no evaluation" in capsys.readouterr().err
 
 
 def test_runs_of_different_tasks_are_not_averaged(tmp_path, capsys):
