@@ -220,7 +220,9 @@ def main() -> None:
     parser.add_argument("--length", type=int, default=60)
     parser.add_argument("--size", type=int, default=64, help="side of the images [px]")
     parser.add_argument("--env", default="lift_pixels", help="collecting: whose expert")
-    parser.add_argument("--worlds", type=int, default=16, help="collecting: at once")
+    parser.add_argument(
+        "--worlds", type=int, default=64, help="collecting: at once, as `franka-wm collect` has them"
+    )
     parser.add_argument("--workers", type=int, default=2, help="collecting: writing processes")
     parser.add_argument("--turns", type=int, default=3, help="collecting: how often")
     parser.add_argument("--formats", nargs="+", choices=list(FORMATS), default=list(FORMATS))
