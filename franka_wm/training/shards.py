@@ -62,9 +62,8 @@ def own_experience(checkpoint: Checkpoint, device: torch.device) -> TensorDictBa
     if checkpoint.processes == processes.count():
         return checkpoint.replay(device, processes.rank())
     saved, count, rank = checkpoint.processes, processes.count(), processes.rank()
-    read = range(
-        rank * saved // count, -(-(rank + 1) * saved // count)
-    )  # who has its worlds: no others are read
+    # Who has its worlds: no others are read.
+    read = range(rank * saved // count, -(-(rank + 1) * saved // count))
     some = checkpoint.replay("cpu", read)
     if some is None:
         return None
