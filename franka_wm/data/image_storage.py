@@ -245,7 +245,7 @@ class _Ends:
     ) -> None:
         """Images (T, worlds, …) of some times into free slots, where the episode has ended (T, worlds)."""
         order = ended.cumsum(0)
-        taken = self.free.gather(0, (self.count - order).clamp_min(0))
+        taken = self.free.gather(0, self.count - order)
         slot = torch.where(ended, taken, self.WASTE).long()
         self.count -= order[-1:].sum(0)
         for key, x in images.items():
