@@ -197,7 +197,10 @@ def test_a_crowd_neither_ends_nor_fills_the_page(tmp_path: Path) -> None:
         crowd = Crowd(address)
         memory = asyncio.run(crowd.gather(CLIENTS, SECONDS, fork.pid))
         after = Crowd(address)
-        asyncio.run(after.gather(1, 2.0, fork.pid))
+        for _ in range(15):  # a busy machine takes its time to forget a hundred clients
+            asyncio.run(after.gather(1, 2.0, fork.pid))
+            if after.counts["heard"] > 1:
+                break
         assert after.counts["heard"] > 1, "nobody is heard any more"
         time.sleep(1.0)
         grown = resident(fork.pid) - before
