@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 import warp as wp
 
-from franka_wm.envs.simulation.build import FORWARD_ONLY
+from franka_wm.envs.simulation.compiling import FORWARD_ONLY
 
 MAKE = """
 import json, os, sys

@@ -21,22 +21,6 @@ from franka_wm.envs.scene import FLOOR
 from franka_wm.envs.simulation.bodies import contact_options
 from franka_wm.envs.simulation.scene import add_scene, harden
 
-FORWARD_ONLY = (
-    "mujoco_warp._src.set_const",
-    "newton._src.sim.articulation",
-    "newton._src.solvers.featherstone.kernels",
-    "newton._src.solvers.mujoco.kernels",
-    "newton._src.viewer.kernels",
-)
-"""Warp modules whose kernels are compiled without a backward pass.
-
-Nothing here runs it, and it takes most of the time that they take to compile. A Warp tape over one of their kernels
-raises an error; to differentiate through them, set the option again after the import of this module.
-"""
-
-for _name in FORWARD_ONLY:
-    wp.set_module_options({"enable_backward": False}, module=_name)
-
 
 def build_model(
     config: FrankaConfig, num_envs: int, device: str, urdf_path: str | Path | None = None

@@ -28,6 +28,13 @@ from franka_wm.envs.simulation import state as worlds
 from franka_wm.envs.simulation.arrays import STATISTICS, allocate, as_int32
 from franka_wm.envs.simulation.bodies import Bodies
 from franka_wm.envs.simulation.build import Chain, build_model, make_solver
+from franka_wm.envs.simulation.compiling import (
+    Compiler,
+    compile_collisions,
+    physics_modules,
+    solver_modules,
+    step_modules,
+)
 from franka_wm.envs.simulation.demonstrated import DemonstratedStarts
 from franka_wm.envs.simulation.graph import Recorder, Recording
 from franka_wm.envs.simulation.pipeline import Pipeline
@@ -71,36 +78,47 @@ class Simulation:
         self.config = config
         self.num_envs = num_envs
         self.device = device
-        self.model, self.robot = build_model(config, num_envs, device, urdf_path)
-        self.solver = make_solver(self.model, config)
-        self._in_place = isinstance(self.solver, newton.solvers.SolverMuJoCo)
-        self.newton_state = self.model.state()
-        self._spare_state = None if self._in_place else self.model.state()
-        self.control = self.model.control()
-        self.kinematics = Kinematics(self.robot, device)
-        self.chain = Chain.of(self.robot, config, device)
-        self.task = make_task(config) if task is None else task
-        draws = self.task.num_draws
-        self.tensors, self.warp = allocate(
-            config,
-            self.model,
-            self.newton_state,
-            self.control,
-            seed=seed,
-            first_world=first_world,
-            draws=draws,
-        )
-        self.bodies = Bodies(self) if config.has_gripper else None
-        self.pipeline = Pipeline(self) if config.collision_pipeline == "newton" else None
-        self.randomizer = Randomizer(self)
-        self.starts: DemonstratedStarts | None = None
-        self.recorder = Recorder(device)
-        self.renderer = Renderer(self)
         self._dt = 1.0 / (config.fps * config.substeps)
-        newton.eval_fk(self.model, self.model.joint_q, self.model.joint_qd, self.newton_state)
         self._step_graphs: dict[bool, Recording] = {}
         self._reset_graph: Recording | None = None
         self._overflowed = False
+        with Compiler(device) as compiler:
+            loading = compiler.begin(solver_modules(config))
+            self.model, self.robot = build_model(config, num_envs, device, urdf_path)
+            compiler.finish(loading)
+            around = compiler.begin(step_modules(config, config.task_class if task is None else type(task)))
+            self.solver = make_solver(self.model, config)
+            self._in_place = isinstance(self.solver, newton.solvers.SolverMuJoCo)
+            compiler.finish(around)
+            physics = compiler.begin(physics_modules(self.solver) if self._in_place else [])
+            self.newton_state = self.model.state()
+            self._spare_state = None if self._in_place else self.model.state()
+            self.control = self.model.control()
+            self.kinematics = Kinematics(self.robot, device)
+            self.chain = Chain.of(self.robot, config, device)
+            self.task = make_task(config) if task is None else task
+            draws = self.task.num_draws
+            self.tensors, self.warp = allocate(
+                config,
+                self.model,
+                self.newton_state,
+                self.control,
+                seed=seed,
+                first_world=first_world,
+                draws=draws,
+            )
+            self.bodies = Bodies(self) if config.has_gripper else None
+            self.pipeline = Pipeline(self) if config.collision_pipeline == "newton" else None
+            self.randomizer = Randomizer(self)
+            self.starts: DemonstratedStarts | None = None
+            self.recorder = Recorder(device)
+            self.renderer = Renderer(self)
+            newton.eval_fk(self.model, self.model.joint_q, self.model.joint_qd, self.newton_state)
+            if self.renderer.images:
+                self.renderer.show_all()
+            if config.resolved_scene and not self.pipeline:
+                compile_collisions(self.solver)
+            compiler.finish(physics)
 
     # -- what a user of this class calls ------------------------------------------------------------------
 
