@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import fcntl
+import gc
 import importlib
 import logging
 import sys
@@ -258,6 +259,9 @@ def start(cfg: DictConfig) -> Run:
     Raises:
         UserError: One line, before anything is built or written.
     """
+    if not gc.isenabled():  # since the command began
+        gc.freeze()  # what was imported stays
+        gc.enable()
     told = HydraConfig.get()
     folder = Path(told.runtime.output_dir)
     processes.require_seen(folder, "hydra.run.dir")

@@ -10,6 +10,7 @@ import os
 import sys
 from collections.abc import Callable, Iterable
 from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import suppress
 from dataclasses import replace
 
 import mujoco_warp
@@ -136,8 +137,10 @@ def physics_modules(solver: newton.solvers.SolverMuJoCo) -> list[Variant]:
     model, data = solver.mjw_model, solver.mjw_data
     once = replace(model.opt, graph_conditional=False, iterations=1)  # a loop over worlds that are not solved
     start = wp.clone(data.qacc_warmstart)  # the one array of worlds that is copied into, not launched upon
-    with wp.Tape() as tape, wp.ScopedDevice(solver.model.device):
-        mujoco_warp.step(replace(model, opt=once), replace(data, nworld=0, naconmax=0, qacc_warmstart=start))
+    alone = replace(data, nworld=0, naconmax=0, qacc_warmstart=start)
+    # With many joints MuJoCo divides by the number of worlds: what it launches after that is compiled then.
+    with wp.Tape() as tape, wp.ScopedDevice(solver.model.device), suppress(ZeroDivisionError):
+        mujoco_warp.step(replace(model, opt=once), alone)
     launches = [(kernel, dim, threads) for kernel, dim, _, _, _, _, threads, _ in tape.launches]
     found = {(kernel.module, threads): None for kernel, dim, threads in launches if list(dim).count(0) == 1}
     return list(found)
