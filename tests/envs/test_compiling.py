@@ -106,7 +106,8 @@ def test_an_error_of_a_compiler_is_raised_where_it_is_waited_for(monkeypatch: py
         compiler.finish(compiler.begin([("no.such.module", None)]))
 
 
-def test_one_core_loads_nothing_ahead(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(os, "sched_getaffinity", lambda _: {0}, raising=False)
-    with Compiler("cpu") as compiler:
-        assert compiler.begin([("no.such.module", None)]) == []
+@pytest.mark.parametrize(("cores", "device"), [({0}, "cpu"), ({0, 1}, "cuda:0")])
+def test_nothing_is_loaded_ahead(cores: set[int], device: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(os, "sched_getaffinity", lambda _: cores, raising=False)
+    with Compiler(device) as compiler:
+        assert not compiler.ahead and compiler.begin([("no.such.module", None)]) == []

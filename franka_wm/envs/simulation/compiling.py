@@ -65,7 +65,8 @@ STEP = (
 class Compiler:
     """Threads that load Warp modules, compiled where the disk does not have them. Ends with a ``with`` block.
 
-    The thread that waits compiles, too. With one core there are no others, and nothing is loaded ahead.
+    The thread that waits compiles, too. With one core there are no others, and nothing is loaded ahead; nor is it on
+    CUDA, where this has not been tried: Warp compiles there as modules are launched.
 
     Args:
         device: ``"cpu"`` or ``"cuda:k"``.
@@ -74,7 +75,12 @@ class Compiler:
     def __init__(self, device: str):
         self.device = device
         cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-        self._pool = ThreadPoolExecutor(cores - 1) if cores > 1 else None
+        self._pool = ThreadPoolExecutor(cores - 1) if cores > 1 and device == "cpu" else None
+
+    @property
+    def ahead(self) -> bool:
+        """Whether anything is loaded before it is launched."""
+        return self._pool is not None
 
     def __enter__(self) -> Compiler:
         return self

@@ -90,7 +90,9 @@ class Simulation:
             self.solver = make_solver(self.model, config)
             self._in_place = isinstance(self.solver, newton.solvers.SolverMuJoCo)
             compiler.finish(around)
-            physics = compiler.begin(physics_modules(self.solver) if self._in_place else [])
+            physics = compiler.begin(
+                physics_modules(self.solver) if self._in_place and compiler.ahead else []
+            )
             self.newton_state = self.model.state()
             self._spare_state = None if self._in_place else self.model.state()
             self.control = self.model.control()
@@ -114,9 +116,9 @@ class Simulation:
             self.recorder = Recorder(device)
             self.renderer = Renderer(self)
             newton.eval_fk(self.model, self.model.joint_q, self.model.joint_qd, self.newton_state)
-            if self.renderer.images:
+            if self.renderer.images and compiler.ahead:
                 self.renderer.show_all()
-            if config.resolved_scene and not self.pipeline:
+            if config.resolved_scene and not self.pipeline and compiler.ahead:
                 compile_collisions(self.solver)
             compiler.finish(physics)
 
