@@ -40,11 +40,12 @@ def summary(folders: tuple[str, ...]) -> None:
                 groups.setdefault(but_for_the_seed(read_config(run)), {})[run] = read_evaluation(run)
     for group in groups.values():
         with values_of(" or ".join(map(str, group)), "measure the run again."):
-            show(group, several=len(groups) > 1)
+            text = table(group, several=len(groups) > 1)
+        print(text)
 
 
-def show(group: Mapping[Path, Result], *, several: bool) -> None:
-    """Print the table of runs that differ in their seed alone; with their names where there are several tables."""
+def table(group: Mapping[Path, Result], *, several: bool) -> str:
+    """The table of runs that differ in their seed alone; with their names where there are several tables."""
     from franka_wm.report.seeds import seeds_table
 
     found = list(group.values())
@@ -54,9 +55,9 @@ def show(group: Mapping[Path, Result], *, several: bool) -> None:
         runs += f" ({', '.join(run.name for run in group)})"
     episodes = f"{counts[0]}" if len(counts) == 1 else f"{counts[0]} to {counts[-1]}"
     by = sorted({str(one.protocol.get("by", one.path)) for one in found})
-    table = seeds_table([one.policies for one in found])
-    print(f"{runs} of {episodes} episodes each: mean over runs (lowest – highest run)")
-    print(f"measured by {' and '.join(by)}; of a run measured twice, what rests on more episodes\n")
-    print(table)
-    if several:
-        print()
+    return (
+        f"{runs} of {episodes} episodes each: mean over runs (lowest – highest run)\n"
+        f"measured by {' and '.join(by)}; of a run measured twice, what rests on more episodes\n\n"
+        + seeds_table([one.policies for one in found])
+        + "\n" * several
+    )

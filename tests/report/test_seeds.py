@@ -5,6 +5,7 @@ import json
 import pytest
 
 from franka_wm.commands.main import main
+from franka_wm.commands.summary import summary
 from franka_wm.errors import UserError
 from franka_wm.evaluation.results import END
 from franka_wm.report.seeds import read_evaluation, runs_of, seeds_table
@@ -38,6 +39,18 @@ def test_summary_reads_folders(tmp_path, capsys):
         (tmp_path / str(k) / "evaluation.json").write_text(written(distance, 1.0))
     assert main(["summary", str(tmp_path / "0"), str(tmp_path / "1")]) == 0
     assert "2 runs of 64 episodes" in (out := capsys.readouterr().out) and "1.50" in out
+
+
+def test_a_closed_pipe_is_not_the_runs_fault(tmp_path, monkeypatch):
+    """`franka-wm summary RUN | head -1`: main ends that without a word."""
+
+    def closed(*_: object) -> None:
+        raise BrokenPipeError
+
+    (tmp_path / "evaluation.json").write_text(written(0.01, 1.0))
+    monkeypatch.setattr("builtins.print", closed)
+    with pytest.raises(BrokenPipeError):
+        summary.callback((str(tmp_path),))
 
 
 def test_a_run_without_evaluation_is_refused(tmp_path, capsys):
