@@ -84,7 +84,7 @@ def test_no_episode_of_the_evaluation_occurs_in_training(run: Run, worlds, train
 
 def test_seeds_of_a_whole_run(train, monkeypatch, tmp_path: Path) -> None:
     """Worlds of training get training's seed, worlds of the evaluation held-out ones; the run's own: nobody."""
-    given: dict[int, set[int]] = {2: set(), 3: set(), 4: set()}
+    given: dict[int, set[int]] = {1: set(), 2: set(), 3: set()}
     set_seed = Simulation.set_seed
     monkeypatch.setattr(
         Simulation, "set_seed", lambda self, seed: (given[self.num_envs].add(seed), set_seed(self, seed))[1]
@@ -92,7 +92,7 @@ def test_seeds_of_a_whole_run(train, monkeypatch, tmp_path: Path) -> None:
     train("seed=5", "evaluation.during=[policy]", "evaluation.every=10", "evaluation.video_episodes=4")
     training, evaluation = derive_seed("training", 5), evaluation_seed(5)
     held_out = held_out_seeds(1)[0]
-    assert given == {3: {training}, 2: {evaluation, held_out}, 4: {held_out}}
+    assert given == {3: {training}, 2: {evaluation, held_out}, 1: {held_out}}  # the film has one world
     assert len({5, training, evaluation, *held_out_seeds(3), ROLLOUT_SEED}) == 7
 
 

@@ -319,6 +319,6 @@ def test_a_video_that_lost_frames_is_noticed(tmp_path, monkeypatch, make_schema,
 def test_no_writing_without_room_says_so(tmp_path, make_schema) -> None:
     blocked = tmp_path / "file"
     blocked.write_text("")
-    with pytest.raises(UserError, match="cannot write there"):
+    with pytest.raises(UserError, match="file is not a folder; choose another folder"):
         DatasetWriter(blocked / "set", make_schema(), provenance={})
     shutil.rmtree(tmp_path, ignore_errors=True)
