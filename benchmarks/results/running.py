@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
 from queue import Queue
+from threading import Lock
 
 from benchmarks.results.records import PLACE, record_benchmark, record_run, write
 from benchmarks.results.rows import Row
@@ -109,6 +110,7 @@ def run(
     for slot in slots_of[0]:
         slots.put(slot)
     jobs = min(machine.jobs, len(line)) + machine.beside
+    writing = Lock()  # runs of the same code write the same file of it
 
     def one(run: tuple[Row, int]) -> str | None:
         (row, seed), slot = run, slots.get()
@@ -130,7 +132,9 @@ def run(
             ]
             failure = _call(command, environment, folder / f"seed-{seed}.log")
             if failure is None:
-                print(write(record_run(row, target, jobs=jobs), place), flush=True)
+                record = record_run(row, target, jobs=jobs)
+                with writing:
+                    print(write(record, place), flush=True)
             return failure
         except UserError as error:
             return str(error)
