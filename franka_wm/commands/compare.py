@@ -11,10 +11,13 @@ from franka_wm.errors import UserError
 
 
 @verb("compare")
-@click.argument("runs", nargs=-1, required=True, metavar="RUN RUN …")
+@click.argument("runs", nargs=-1, required=True, metavar="RUN RUN …|SWEEP")
 @word("out", "the page to write", default="compare.html")
 def compare(runs: tuple[str, ...], out: str) -> None:
-    """Show several runs side by side on one page."""
+    """Show several runs side by side on one page.
+
+    Of a sweep, runs that have not been evaluated yet, or failed, are named and left out.
+    """
     check_page("compare", out)
     for one in runs:
         if not Path(one).is_dir():
@@ -22,8 +25,10 @@ def compare(runs: tuple[str, ...], out: str) -> None:
     from franka_wm.report.compare import compare_page
     from franka_wm.report.document import write_document
     from franka_wm.report.run import read_run
+    from franka_wm.report.seeds import evaluated
 
-    print(write_document(compare_page([read_run(folder) for folder in runs]), Path(out)))
+    found = [read_run(run) for folder in runs for run in evaluated(folder, print)]
+    print(write_document(compare_page(found), Path(out)))
 
 
 def check_page(verb: str, out: str | None) -> None:

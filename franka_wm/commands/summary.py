@@ -22,20 +22,13 @@ def summary(folders: tuple[str, ...]) -> None:
     Runs that differ in more than their seed get a table for each configuration. Of a sweep, runs that have not been
     evaluated yet, or failed, are named and left out.
     """
-    from franka_wm.evaluation.results import results
     from franka_wm.report.run import but_for_the_seed, malformed, read_config
-    from franka_wm.report.seeds import read_evaluation, runs_of
+    from franka_wm.report.seeds import evaluated, read_evaluation
     from franka_wm.untrusted import values_of
 
     groups: dict[str, dict[Path, Result]] = {}
     for folder in folders:
-        runs = runs_of(folder)
-        missing = [run for run in runs if len(runs) > 1 and not results(run)]
-        if 0 < len(missing) < len(runs):
-            names = ", ".join(run.name for run in missing)
-            print(f"{len(missing)} of {len(runs)} runs have no result (yet; train.log says more): {names}\n")
-            runs = [run for run in runs if run not in missing]
-        for run in runs:
+        for run in evaluated(folder, print):
             with malformed(run):
                 groups.setdefault(but_for_the_seed(read_config(run)), {})[run] = read_evaluation(run)
     for group in groups.values():
@@ -46,7 +39,7 @@ def summary(folders: tuple[str, ...]) -> None:
 
 def table(group: Mapping[Path, Result], *, several: bool) -> str:
     """The table of runs that differ in their seed alone; with their names where there are several tables."""
-    from franka_wm.report.seeds import seeds_table
+    from franka_wm.report.seeds import cells_told, seeds_table
 
     found = list(group.values())
     counts = sorted({one.episodes for one in found})
@@ -56,7 +49,7 @@ def table(group: Mapping[Path, Result], *, several: bool) -> str:
     episodes = f"{counts[0]}" if len(counts) == 1 else f"{counts[0]} to {counts[-1]}"
     by = sorted({str(one.protocol.get("by", one.path)) for one in found})
     return (
-        f"{runs} of {episodes} episodes each: mean over runs (lowest – highest run)\n"
+        f"{runs} of {episodes} episodes each: {cells_told(len(found))}\n"
         f"measured by {' and '.join(by)}; of a run measured twice, what rests on more episodes\n\n"
         + seeds_table([one.policies for one in found])
         + "\n" * several

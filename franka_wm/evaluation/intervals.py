@@ -12,13 +12,15 @@ Science 16 (2001).
 
 import warnings
 from collections.abc import Callable, Sequence
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from torch import Tensor
 
 from franka_wm.errors import UserError
+
+if TYPE_CHECKING:  # a table over seeds need not wait for torch
+    from torch import Tensor
 
 type Values = Tensor | NDArray[np.floating] | Sequence[float]
 
@@ -151,7 +153,7 @@ def _bootstrap(
 
 def _samples(*values: Values) -> list[NDArray[np.float64]]:
     """Vectors of one length, finite; otherwise a `UserError`."""
-    found = [np.asarray(x.cpu() if isinstance(x, Tensor) else x, dtype=np.float64) for x in values]
+    found = [np.asarray(getattr(x, "cpu", lambda x=x: x)(), dtype=np.float64) for x in values]
     shapes = [x.shape for x in found]
     if found[0].ndim != 1 or found[0].size == 0 or len(set(shapes)) > 1:
         raise UserError(f"values have shape {shapes}; give vectors of one length, one value per episode.")

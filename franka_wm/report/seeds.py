@@ -1,12 +1,16 @@
-"""Several runs in one table: the mean over seeds, and the lowest and highest."""
+"""Several runs in one table: the mean over seeds, its interval, and the lowest and highest."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from franka_wm.errors import UserError
+from franka_wm.evaluation.intervals import bootstrap_mean
 from franka_wm.evaluation.results import Result, results
 from franka_wm.report.style import centimetres
+
+ENOUGH = 3
+"""Fewest runs whose mean gets an interval."""
 
 
 def read_evaluation(run: str | Path) -> Result:
@@ -37,8 +41,30 @@ def runs_of(folder: str | Path) -> list[Path]:
     return [path for _, path in numbered]
 
 
+def evaluated(folder: str | Path, say: Callable[[str], object]) -> list[Path]:
+    """The runs of a folder, see :func:`runs_of`. Of several, those without a result are named and left out."""
+    runs = runs_of(folder)
+    missing = [run for run in runs if len(runs) > 1 and not results(run)]
+    if not 0 < len(missing) < len(runs):
+        return runs
+    names = ", ".join(run.name for run in missing)
+    say(f"{len(missing)} of {len(runs)} runs have no result (yet; train.log says more): {names}\n")
+    return [run for run in runs if run not in missing]
+
+
+def cells_told(runs: int) -> str:
+    """What the cells of :func:`seeds_table` hold of so many runs."""
+    if runs < ENOUGH:
+        return "mean over runs (lowest – highest run)"
+    return "mean over runs (its bootstrap 95 % interval over seeds); below, lowest – highest run"
+
+
 def seeds_table(evaluations: Sequence[Mapping[str, Any]]) -> str:
-    """Markdown: one row per policy, `mean over runs (lowest – highest)` in every cell."""
+    """Markdown: one row per policy, `mean over runs (lowest – highest)` in every cell.
+
+    From :data:`ENOUGH` runs on, `mean (low – high)` of a percentile bootstrap that draws runs, since the episodes of
+    one run share its weights; a second row has the lowest and highest run.
+    """
     policies = [p for p in evaluations[0] if all(p in e for e in evaluations)]
     columns = _columns(evaluations[0][policies[0]])
     lines = [
@@ -46,13 +72,16 @@ def seeds_table(evaluations: Sequence[Mapping[str, Any]]) -> str:
         "|---|" + "---:|" * len(columns),
     ]
     for policy in policies:
-        cells = []
+        cells, ranges = [], []
         for _, path, scale, digits in columns:
             values = [scale * _mean(e[policy], path) for e in evaluations]
-            low, high = min(values), max(values)
-            mean = f"{sum(values) / len(values):.{digits}f}"
-            cells.append(mean if len(values) == 1 else f"{mean} ({low:.{digits}f} – {high:.{digits}f})")
+            mean, low, high = bootstrap_mean(values)
+            ranges.append(f"{min(values):.{digits}f} – {max(values):.{digits}f}")
+            spread = f"{low:.{digits}f} – {high:.{digits}f}" if len(values) >= ENOUGH else ranges[-1]
+            cells.append(f"{mean:.{digits}f}" + f" ({spread})" * (len(values) > 1))
         lines.append(f"| {policy} | " + " | ".join(cells) + " |")
+        if len(evaluations) >= ENOUGH:
+            lines.append("| | " + " | ".join(ranges) + " |")
     return "\n".join(lines)
 
 

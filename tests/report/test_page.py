@@ -433,6 +433,16 @@ def test_runs_of_several_families_begin_with_a_table_of_tasks(make_run) -> None:
         assert words in reader.text
 
 
+def test_a_sweep_is_compared_by_its_runs(make_run, tmp_path: Path, capsys) -> None:
+    runs = [make_run(f"sweep/{k}-reach", seed=k, distance=k / 100) for k in (1, 2, 3)]
+    (runs[0].parent / "multirun.yaml").touch()
+    (runs[1] / "evaluation.json").unlink()
+    out = tmp_path / "c.html"
+    assert cli.main(["compare", str(runs[0].parent), f"out={out}"]) == 0
+    assert "1 of 3 runs have no result (yet; train.log says more): 2-reach" in capsys.readouterr().out
+    assert "1-reach (2 runs)" in Reader(out.read_text()).text
+
+
 def test_comparing_needs_runs(make_run, capsys) -> None:
     assert cli.main(["compare", str(make_run())]) == 1
     assert "at least two runs, got 1" in capsys.readouterr().err

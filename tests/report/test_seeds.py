@@ -7,8 +7,10 @@ import pytest
 from franka_wm.commands.main import main
 from franka_wm.commands.summary import summary
 from franka_wm.errors import UserError
+from franka_wm.evaluation.intervals import bootstrap_mean
 from franka_wm.evaluation.results import END
-from franka_wm.report.seeds import read_evaluation, runs_of, seeds_table
+from franka_wm.report.seeds import cells_told, read_evaluation, runs_of, seeds_table
+from light import answers
 
 
 def evaluation(distance: float, success: float) -> dict:
@@ -31,6 +33,26 @@ def written(distance: float, success: float) -> str:
 def test_mean_and_range_over_runs():
     table = seeds_table([evaluation(0.01, 1.0), evaluation(0.03, 0.5)])
     assert "| planner | 2.00 (1.00 – 3.00) | 75 (50 – 100) |" in table
+
+
+def test_three_runs_have_an_interval_of_their_mean():
+    """Of runs, not of episodes: that of the same numbers as a sample; the range stands below it."""
+    distances = (0.01, 0.02, 0.03, 0.06)
+    _, low, high = bootstrap_mean([100 * d for d in distances])
+    assert 1.0 < low < 3.0 < high < 6.0
+    table = seeds_table([evaluation(d, 1.0) for d in distances])
+    assert f"| planner | 3.00 ({low:.2f} – {high:.2f}) | 100 (100 – 100) |" in table
+    assert "\n| | 1.00 – 6.00 | 100 – 100 |" in table
+    assert "interval" in cells_told(3) and "interval" not in cells_told(2)
+    assert seeds_table([evaluation(0.01, 1.0), evaluation(0.03, 0.5)]).count("\n") == 2
+
+
+def test_a_table_does_not_wait_for_torch(tmp_path):
+    for k in range(3):
+        (tmp_path / str(k)).mkdir()
+        (tmp_path / str(k) / "evaluation.json").write_text(written(k / 100, 1.0))
+    (done,) = answers([("-m", "franka_wm", "summary", "0", "1", "2")], tmp_path).values()
+    assert "| planner | 1.00 (" in done.stdout and "torch" not in done.loaded, done.stderr
 
 
 def test_summary_reads_folders(tmp_path, capsys):
@@ -74,7 +96,9 @@ def test_a_sweep_stands_for_its_runs(tmp_path, capsys):
     (tmp_path / "figures").mkdir()
     assert [path.name for path in runs_of(tmp_path)] == ["2-reach", "9-reach", "10-reach"]
     assert main(["summary", str(tmp_path)]) == 0
-    assert "7.00 (2.00 – 10.00)" in capsys.readouterr().out
+    said = capsys.readouterr().out
+    assert "of 64 episodes each: mean over runs (its bootstrap 95 % interval over seeds); below, " in said
+    assert "| planner | 7.00 (" in said and "\n| | 2.00 – 10.00 | 100 – 100 |" in said
     (tmp_path / "9-reach" / "evaluation.json").unlink()
     assert main(["summary", str(tmp_path)]) == 0
     said = capsys.readouterr().out
