@@ -200,15 +200,26 @@ def one_line_errors(main: Callable[[DictConfig], object]) -> Callable[[DictConfi
             with one_line_refusals():
                 return main(cfg)
         except FrankaError as error:
+            _discard()
             fail(str(error))
+        except SystemExit:  # what the machine refused; or a run that has saved
+            _discard()
+            raise
         except KeyboardInterrupt:
-            print(
-                "stopped; what was saved is in the run's folder: franka-wm train resume=FOLDER",
-                file=sys.stderr,
-            )
+            saved = "what was saved is in the run's folder: franka-wm train resume=FOLDER"
+            print(f"stopped; {'nothing was saved yet' if _discard() else saved}", file=sys.stderr)
             sys.exit(INTERRUPTED)
 
     return wrapped
+
+
+def _discard() -> bool:
+    """A run that was refused late leaves no folder; those of a sweep stay, for the same command to go on there."""
+    if _sweep is not None:
+        return False
+    from franka_wm.training.run import discard
+
+    return discard()
 
 
 def check_overrides(arguments: list[str]) -> None:

@@ -28,15 +28,22 @@ class Demonstrations:
         window: Transitions per window, H.
         most: How many windows of a batch are replaced at most.
         hindsight: Relabels a share of them; `None`: none.
+        states: Where worlds may begin, (T,): what a simulation restores a state from; `None`: nowhere.
 
     Raises:
         UserError: No episode is as long as a window.
     """
 
     def __init__(
-        self, transitions: TensorDictBase, *, window: int, most: int, hindsight: Hindsight | None = None
+        self,
+        transitions: TensorDictBase,
+        *,
+        window: int,
+        most: int,
+        hindsight: Hindsight | None = None,
+        states: Any = None,
     ):
-        self.transitions, self.most, self.hindsight = transitions, most, hindsight
+        self.transitions, self.most, self.hindsight, self.states = transitions, most, hindsight, states
         device = transitions.device
         episode = transitions.get(BOUNDARY).flatten().cumsum(0)
         within = episode[window - 1 :] == episode[: len(episode) - window + 1]

@@ -23,6 +23,7 @@ from franka_wm.envs.discretize import DiscreteActions
 from franka_wm.envs.external import ExternalEnv
 from franka_wm.envs.external_config import ExternalConfig
 from franka_wm.envs.multitask_config import MultiTaskConfig
+from franka_wm.envs.tasks import make_task
 from franka_wm.errors import UserError
 from franka_wm.planning import registry
 from franka_wm.planning.base import Planner
@@ -347,23 +348,12 @@ HINDSIGHT = 0.5
 """Share of windows that ``replay.hindsight=null`` relabels, where that can be done."""
 
 
-def make_hindsight(run: RunSettings, env: Environment) -> Hindsight | None:
-    """Goals in hindsight for the share of windows that ``run.replay.hindsight`` asks for; ``None``: for none.
-
-    Raises:
-        UserError: The share is none, or it is asked for where goals cannot be exchanged.
-    """
+def make_hindsight(run: RunSettings) -> Hindsight | None:
+    """Goals in hindsight for the share of windows that ``run.replay.hindsight`` asks for; ``None``: for none."""
     share = run.replay.hindsight
-    if share == 0:
+    if share == 0 or no_hindsight(run) is not None:
         return None
-    why = no_hindsight(run, env)
-    if why is not None:
-        if share is not None:
-            raise UserError(f"replay.hindsight={share}: {why}; leave it at null")
-        return None
-    arm = arm_of(env)
-    assert arm is not None
-    task = arm.simulation.task
+    task = make_task(run.env.arm)
     assert task.relabel is not None
     share = HINDSIGHT if share is None else share
     say(f"hindsight: {100 * share:.0f} % of the windows get a goal that their episode reached later")
@@ -372,24 +362,24 @@ def make_hindsight(run: RunSettings, env: Environment) -> Hindsight | None:
         achieved=task.achieved,
         reads=task.relabel_reads,
         share=share,
-        episode_length=arm.config.episode_length,
+        episode_length=run.env.episode_length,
     )
 
 
-def no_hindsight(run: RunSettings, env: Environment) -> str | None:
+def no_hindsight(run: RunSettings) -> str | None:
     """Why windows cannot be given other goals, or gain nothing from them; ``None``: they can."""
-    arm = arm_of(env)
-    if arm is None or run.is_discrete:
+    if not run.is_arm or run.is_discrete:
         return "only the arm with continuous actions has goals to exchange"
-    config, keys = arm.config, run.model.observations
-    if not arm.simulation.task.relabels():
+    config, keys = run.env.arm, run.model.observations
+    task = make_task(config)
+    if not task.relabels():
         return f"env.task={config.task} does not say what another goal changes (Task.relabel)"
     noise = config.randomization.observation_noise or config.randomization.object_noise
     if config.reward == "normalized" or noise:
         return "rewards of another goal are exact without observation noise and with reward=dense or sparse alone"
     if config.fixed_goal:
         return "there is one goal (env.goal_sampling=fixed)"
-    for key in arm.simulation.task.relabel_reads:
+    for key in task.relabel_reads:
         if key not in config.observations:
             return f"it reads {key}; add it to env.observations"
     if keys is not None and not {"state", "goal"} & set(keys):

@@ -34,6 +34,7 @@ def check(run: RunSettings) -> None:
     check_loggers(run.logger.names, **run.logger.options)
     _check_windows(run)
     _check_evaluation(run)
+    _check_planner(run)
     if run.collector.planner_worlds > run.collector.num_envs:
         raise UserError(
             f"collector.planner_worlds={run.collector.planner_worlds}: must be a whole number of at most "
@@ -52,6 +53,7 @@ def check(run: RunSettings) -> None:
         )
     else:
         _ = run.actor
+    _check_hindsight(run)
     _check_demonstrations(run)
     _check_export(run)
     if run.pretrain.kind != "none" and "encoder_from" not in run.model.options:
@@ -67,7 +69,6 @@ def check(run: RunSettings) -> None:
         )
     if run.pretrain.kind != "none":
         _check_first_stage(run)
-    _check_planner(run)
     _check_parts(run)
 
 
@@ -99,10 +100,13 @@ def _check_windows(run: RunSettings) -> None:
         )
     if capacity < c.num_envs * c.steps_per_batch:
         raise UserError(f"replay.capacity={capacity}: smaller than one batch of the collector")
-    if run.replay.hindsight and run.is_offline:
-        raise UserError(
-            f"replay.hindsight={run.replay.hindsight}: recorded data keep their goals; leave it at null"
-        )
+
+
+def _check_hindsight(run: RunSettings) -> None:
+    if run.replay.hindsight:
+        why = "recorded data keep their goals" if run.is_offline else build.no_hindsight(run)
+        if why is not None:
+            raise UserError(f"replay.hindsight={run.replay.hindsight}: {why}; leave it at null")
 
 
 def _check_demonstrations(run: RunSettings) -> None:

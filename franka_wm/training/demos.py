@@ -8,6 +8,8 @@ from tensordict import TensorDict
 
 from franka_wm.data.demonstrations import Demonstrations
 from franka_wm.data.hindsight import Hindsight
+from franka_wm.data.image_storage import BOUNDARY
+from franka_wm.device import resolve_device
 from franka_wm.envs import Environment
 from franka_wm.envs.simulation.demonstrated import READS
 from franka_wm.errors import UserError
@@ -26,18 +28,20 @@ UNSEEN = ("object_size", "table_height", "observation_noise", "object_noise", "a
 
 
 def open_demonstrations(
-    run: RunSettings, env: Environment, hindsight: Hindsight | None
+    run: RunSettings, spaces: Spaces, hindsight: Hindsight | None
 ) -> Demonstrations | None:
-    """The episodes that ``run.replay.demos`` names, on the environment's device; ``None`` where it names none.
+    """The episodes that ``run.replay.demos`` names, on the run's device; ``None`` where it names none.
+
+    Args:
+        spaces: Those of the environment, which need not be there yet.
 
     Raises:
-        UserError: They do not fit the task: other observations, actions, rate, task or reward.
+        UserError: They cannot be read, or have other observations or fewer steps than the run, or no rewards.
     """
     if run.replay.demos is None:
         return None
     from franka_wm.data.lerobot import open_dataset
 
-    spaces = Spaces.of_env(env)
     read = spaces.only(run.model.observations, f"model={run.model.name}")
     vectors = {*read.observation_sizes, *(() if hindsight is None else hindsight.reads)}
     wanted: dict[str, Any] = {key: spaces.observation_sizes[key] for key in sorted(vectors)} | dict(
@@ -47,7 +51,7 @@ def open_demonstrations(
         run.replay.demos,
         window=1,
         batch_size=1,
-        device=env.device,
+        device=resolve_device(run.device),
         validation_fraction=0.0,
         keys=list({**wanted, **dict.fromkeys(READS if run.replay.demo_resets else ())}),
         frame_stack=run.env.frame_stack,
@@ -64,14 +68,24 @@ def open_demonstrations(
         raise UserError("replay.demos: these episodes have no rewards; record them with franka-wm collect")
     keys = [*wanted, "action", "is_init", *(("next", key) for key in (*wanted, "reward", "terminated"))]
     starts = READS if run.replay.demo_resets else ()
-    transitions: Any = TensorDict.cat([one.select(*keys, *starts) for one in recorded.batches(4096)])
-    if starts:
-        arm, steps = build.arm_of(env), transitions.squeeze(1)
-        assert arm is not None
-        arm.simulation.start_along(steps, steps["is_init"].squeeze(-1), run.replay.demo_resets)
-        transitions = transitions.select(*keys)
+    steps: Any = TensorDict.cat([one.select(*keys, *starts) for one in recorded.batches(4096)])
     most = max(run.demo_windows(update) for update in (0, run.replay.demo_updates, run.trainer.updates))
-    return Demonstrations(transitions, window=run.window, most=most, hindsight=hindsight)
+    return Demonstrations(
+        steps.select(*keys),
+        window=run.window,
+        most=most,
+        hindsight=hindsight,
+        states=steps.select(*starts).squeeze(1) if starts else None,
+    )
+
+
+def start_along(env: Environment, shown: Demonstrations, share: float) -> None:
+    """Lets a share of the episodes that the arm's worlds begin from now on start in a demonstrated state."""
+    arm = build.arm_of(env)
+    assert arm is not None and shown.states is not None
+    begins = shown.transitions.get(BOUNDARY).flatten()
+    arm.simulation.start_along(shown.states, begins, share)
+    shown.states = None  # the simulation has its own
 
 
 def check_demonstrations(run: RunSettings) -> None:

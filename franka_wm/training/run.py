@@ -6,11 +6,13 @@ import fcntl
 import gc
 import importlib
 import logging
+import shutil
 import sys
 import traceback
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from pathlib import Path
 from typing import IO, NoReturn
 
@@ -22,6 +24,8 @@ from torchrl.record.loggers import Logger
 
 from franka_wm import files, processes
 from franka_wm.console import announced, log_to, resuming, say
+from franka_wm.data.demonstrations import Demonstrations
+from franka_wm.data.hindsight import Hindsight
 from franka_wm.data.lerobot.export import export_run
 from franka_wm.data.lerobot.windows import RecordedWindows
 from franka_wm.data.replay import WindowReplay
@@ -34,7 +38,7 @@ from franka_wm.seeding import derive_seed, seeded
 from franka_wm.training import build
 from franka_wm.training.check import check
 from franka_wm.training.checkpoint import Checkpoint, latest_checkpoint, load_checkpoint
-from franka_wm.training.demos import open_demonstrations
+from franka_wm.training.demos import open_demonstrations, start_along
 from franka_wm.training.loggers import close_loggers, log_config, log_video, make_loggers
 from franka_wm.training.settings import RunSettings, plain
 from franka_wm.training.spaces import Spaces
@@ -147,6 +151,7 @@ class Run:
     validation: RecordedWindows | None = None
     """Windows of recorded episodes that training never sees."""
     _recorded: RecordedWindows | None = None
+    _shown: Demonstrations | None = None
 
     def build_environments(self) -> tuple[Environment | None, Environment | None]:
         """The training worlds and the evaluation worlds, compiled and ready; ``None`` where there are none.
@@ -155,8 +160,11 @@ class Run:
         several processes each has as many evaluation worlds as one may have to play.
         """
         gathers = not self.settings.is_offline
-        if not gathers:  # what is wrong with the data is said before minutes go into building worlds
+        # What is wrong with the data is said before minutes go into building worlds.
+        if not gathers:
             self.recorded()
+        elif self.settings.is_arm:
+            self.demonstrations(Spaces.of_config(self.settings.env.arm, discrete=self.settings.is_discrete))
         if self.settings.env.kind == "none":
             return None, None
         worlds = f"{self.settings.evaluation.episodes} evaluation worlds"
@@ -187,10 +195,13 @@ class Run:
     def build_experience(self, env: Environment | None) -> tuple[WindowReplay | RecordedWindows, Spaces]:
         """Where batches come from, and what a model must know of it: ``sample()`` and its :class:`Spaces`."""
         if env is not None:
-            hindsight = build.make_hindsight(self.settings, env)
-            shown = open_demonstrations(self.settings, env, hindsight)
-            replay = build.make_replay_buffer(self.settings, env.device, hindsight, shown)
-            return replay, self.as_saved(Spaces.of_env(env))
+            spaces = Spaces.of_env(env)
+            shown = self.demonstrations(spaces)
+            if self.settings.replay.demo_resets:
+                assert shown is not None
+                start_along(env, shown, self.settings.replay.demo_resets)
+            replay = build.make_replay_buffer(self.settings, env.device, self.hindsight, shown)
+            return replay, self.as_saved(spaces)
         windows = self.recorded()
         spaces = Spaces(
             observation_sizes=dict(windows.observation_sizes),
@@ -202,6 +213,17 @@ class Run:
             terminates=windows.terminates,
         )
         return windows, self.as_saved(spaces)
+
+    @cached_property
+    def hindsight(self) -> Hindsight | None:
+        """What gives windows other goals."""
+        return build.make_hindsight(self.settings)
+
+    def demonstrations(self, spaces: Spaces) -> Demonstrations | None:
+        """The episodes that ``replay.demos`` names, for an environment of these sizes; opened once."""
+        if self._shown is None:
+            self._shown = open_demonstrations(self.settings, spaces, self.hindsight)
+        return self._shown
 
     def recorded(self) -> RecordedWindows:
         """Windows to train on of the datasets that ``dataset`` names; opened once."""
@@ -262,8 +284,11 @@ def start(cfg: DictConfig) -> Run:
     if not gc.isenabled():  # since the command began
         gc.freeze()  # what was imported stays
         gc.enable()
+    global _begun
     told = HydraConfig.get()
     folder = Path(told.runtime.output_dir)
+    hydras = {".hydra", f"{told.job.name}.log"}
+    _begun = (folder, _files(folder), []) if {one.name for one in folder.iterdir()} <= hydras else None
     processes.require_seen(folder, "hydra.run.dir")
     checkpoint, again = None, False
     import_plugins(cfg.plugins)  # those of the command line: what a checkpoint names is never imported
@@ -296,7 +321,37 @@ def start(cfg: DictConfig) -> Run:
     say(f"device {device}   seed {settings.seed}   results in {folder}")
     if checkpoint is not None:
         say(f"going on from update {int(checkpoint.counters.get('updates', 0))} of {checkpoint.folder}")
-    return Run(settings, folder, checkpoint, open_loggers(settings, folder))
+    run = Run(settings, folder, checkpoint, open_loggers(settings, folder))
+    if _begun is not None:
+        _begun = (folder, _files(folder), run.loggers)
+    return run
+
+
+_begun: tuple[Path, set[Path], list[Logger]] | None = None
+"""Of this process's run, if its folder was new: the folder, what :func:`start` wrote into it, the loggers."""
+
+
+def discard() -> bool:
+    """Removes the folder of a run that has ended with nothing but what :func:`start` wrote; whether it did.
+
+    Also those above it that are then empty, below the working directory.
+    """
+    if _begun is None or _files(_begun[0]) != _begun[1]:
+        return False
+    folder, _, loggers = _begun
+    close_loggers(loggers)
+    shutil.rmtree(folder, ignore_errors=True)
+    here = Path.cwd()
+    with suppress(OSError):  # not empty
+        for above in folder.parents:
+            if here not in above.parents:
+                break
+            above.rmdir()
+    return True
+
+
+def _files(folder: Path) -> set[Path]:
+    return {one.relative_to(folder) for one in folder.rglob("*") if not one.is_dir()}
 
 
 def _require_same(checkpoint: Checkpoint) -> None:

@@ -355,7 +355,7 @@ def test_runs_of_before_an_option_was_there_go_on(settled, capsys) -> None:
 def hindsight(settled):
     def make(*overrides: str):
         cfg = settled("scale=smoke", "device=cpu", *overrides)
-        return build.make_hindsight(cfg, build.make_env(cfg, num_envs=2))
+        return build.make_hindsight(cfg)
 
     return make
 
@@ -378,11 +378,11 @@ def test_hindsight_is_used_where_goals_change_and_rewards_are_known(hindsight) -
     ],
 )
 def test_elsewhere_hindsight_is_none_and_refused_where_it_is_asked_for(
-    overrides: list[str], hindsight
+    overrides: list[str], hindsight, settled
 ) -> None:
     assert hindsight(*overrides) is None
     with pytest.raises(UserError, match=r"replay\.hindsight=0\.5: .*leave it at null"):
-        hindsight(*overrides, "replay.hindsight=0.5")
+        check(settled("scale=smoke", "device=cpu", *overrides, "replay.hindsight=0.5"))
 
 
 @pytest.mark.parametrize("share", ["1.5", "-0.1", "true", "some"])

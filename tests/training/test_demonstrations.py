@@ -1,8 +1,12 @@
 """Runs with demonstrations: what fits is mixed in, what does not is refused, and none is an evaluation's episode."""
 
+import shutil
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
 import pytest
 import torch
 from safetensors.torch import load_file
@@ -14,6 +18,8 @@ from franka_wm.training import build
 from franka_wm.training.check import check
 from franka_wm.training.demos import open_demonstrations
 from franka_wm.training.learner import Learner
+from franka_wm.training.run import Run
+from franka_wm.training.spaces import Spaces
 from franka_wm.training.trainer import Trainer
 
 ARM = ("env=reach", "env.substeps=1", "env.episode_length=8", "seed=0", "device=cpu")
@@ -128,11 +134,31 @@ def test_none_is_an_episode_of_the_evaluation(demos: Path, settled) -> None:
     assert torch.cdist(starts, first).min() > 1e-3
 
 
+def test_those_that_are_not_finite_are_refused_before_worlds_are_built(
+    demos: Path, settled, tmp_path: Path, monkeypatch
+) -> None:
+    damaged = tmp_path / "damaged"
+    shutil.copytree(demos, damaged)
+    rows = min((damaged / "data").rglob("*.parquet"))
+    table = pq.read_table(rows)
+    at = table.column_names.index("action")
+    actions = np.array(table["action"].to_pylist(), dtype=np.float32)
+    actions[3, 2] = np.nan
+    column = pa.array(actions.tolist(), type=table.schema.field(at).type)
+    pq.write_table(table.set_column(at, table.schema.field(at), column), rows)
+    monkeypatch.setattr(build, "make_evaluation_env", lambda *_, **__: pytest.fail("built"))
+    run = settled("scale=smoke", *ARM, f"replay.demos={damaged}")
+    check(run)
+    with pytest.raises(UserError, match="not finite") as refused:
+        Run(run, tmp_path).build_environments()
+    assert "\n" not in str(refused.value)
+
+
 def test_short_ones_are_refused_in_a_line(demos: Path, settled) -> None:
     longer = ("replay.window=20", "env.episode_length=30")
     run = settled("scale=smoke", *ARM, *longer, f"replay.demos={demos}")
     with pytest.raises(UserError, match="no demonstration has 20 steps") as refused:
-        open_demonstrations(run, build.make_env(run), None)
+        open_demonstrations(run, Spaces.of_config(run.env.arm), None)
     assert "\n" not in str(refused.value)
 
 
@@ -142,7 +168,7 @@ def test_episodes_without_rewards_are_refused(demos: Path, settled, monkeypatch)
     monkeypatch.setattr(RecordedWindows, "reward_bounds", None)
     run = settled("scale=smoke", *ARM, f"replay.demos={demos}")
     with pytest.raises(UserError, match="no rewards"):
-        open_demonstrations(run, build.make_env(run), None)
+        open_demonstrations(run, Spaces.of_config(run.env.arm), None)
 
 
 @pytest.mark.parametrize(

@@ -87,7 +87,7 @@ def make(kind: str, settled, tiny: list[str], tmp_path_factory) -> Callable[...,
         return Trainer(
             env=env,
             learner=Learner(model, lr=1e-3, schedule="cosine", warmup=5, total_updates=2 * HALF),
-            replay=build.make_replay_buffer(mine, env.device, build.make_hindsight(mine, env)),
+            replay=build.make_replay_buffer(mine, env.device, build.make_hindsight(mine)),
             policies=build.make_agent_policies(mine, model, env, spaces, purpose="training"),
             actor=mine.actor,
             settings=mine,

@@ -210,7 +210,7 @@ def _trainer(settings: Any, folder: Path) -> Any:
     env.step_and_maybe_reset(env.rand_action(env.reset()))
     spaces = Spaces.of_env(env)
     model = build.make_model(settings, spaces, resolve_device("cpu"))
-    hindsight = build.make_hindsight(settings, env)
+    hindsight = build.make_hindsight(settings)
     return Trainer(
         env=env,
         learner=Learner(model, **settings.learner_options),

@@ -1,0 +1,80 @@
+"""A run that is refused after its folder was made: nothing is left of it, unless something was written."""
+
+from __future__ import annotations
+
+import runpy
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+from hydra.core.global_hydra import GlobalHydra
+
+from forks import TRAIN
+from franka_wm.errors import UserError
+from franka_wm.training.run import Run
+
+Refused = Callable[..., str]
+
+
+@pytest.fixture
+def refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]) -> Refused:
+    """``python train.py`` up to where worlds would be built; what it says on standard error."""
+
+    def refused(
+        *words: str, error: BaseException, status: int = 1, first: Callable[[Path], object] = Path.exists
+    ) -> str:
+        def build(run: Run) -> None:
+            assert (run.folder / "config.yaml").is_file()
+            first(run.folder)
+            raise error
+
+        monkeypatch.setattr(Run, "build_environments", build)
+        monkeypatch.chdir(tmp_path)
+        monkeypatch.setattr(sys, "argv", [str(TRAIN), "scale=smoke", "device=cpu", *words])
+        GlobalHydra.instance().clear()
+        with pytest.raises(SystemExit) as ended:
+            runpy.run_path(str(TRAIN), run_name="__main__")
+        assert ended.value.code == status
+        return capfd.readouterr().err
+
+    return refused
+
+
+@pytest.mark.parametrize(
+    ("error", "status", "said"),
+    [
+        (UserError("the data are damaged"), 1, "error: the data are damaged\n"),
+        (MemoryError("too much"), 1, "error: out of memory"),
+        (KeyboardInterrupt(), 130, "stopped; nothing was saved yet\n"),
+    ],
+)
+@pytest.mark.parametrize("words", [[], ["hydra.run.dir=mine/run"]])
+def test_nothing_is_left(
+    words: list[str], error: BaseException, status: int, said: str, refused: Refused, tmp_path: Path
+) -> None:
+    assert said in refused(*words, error=error, status=status)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_file_of_the_users_stays(refused: Refused, tmp_path: Path) -> None:
+    (tmp_path / "run").mkdir()
+    (tmp_path / "run" / "notes.txt").write_text("mine")
+    refused("hydra.run.dir=run", error=UserError("no"))
+    assert (tmp_path / "run" / "notes.txt").read_text() == "mine"
+
+
+def test_what_a_run_has_written_stays(refused: Refused, tmp_path: Path) -> None:
+    refused(
+        "hydra.run.dir=run", error=UserError("no"), first=lambda run: (run / "encoder").write_text("10 h")
+    )
+    assert {"encoder", "config.yaml", "train.log"} <= {one.name for one in (tmp_path / "run").iterdir()}
+
+
+def test_another_runs_folder_stays(refused: Refused, tmp_path: Path) -> None:
+    refused("hydra.run.dir=first", error=UserError("no"), first=lambda run: (run / "encoder").touch())
+    before = {one.name for one in (tmp_path / "first").iterdir()}
+    refused("hydra.run.dir=first", error=UserError("no"))
+    assert {one.name for one in (tmp_path / "first").iterdir()} == before
+    refused("hydra.run.dir=second", error=UserError("no"))
+    assert [one.name for one in tmp_path.iterdir()] == ["first"]
