@@ -15,12 +15,18 @@ from franka_wm.commands.entry import one_line_errors, run_command
 
 @hydra.main(version_base="1.3", config_path="pkg://franka_wm.conf", config_name="config")
 @one_line_errors
-def main(cfg: DictConfig) -> None:
-    """One run: build, pretrain if asked to, fit, evaluate, report, export."""
+def main(cfg: DictConfig) -> float | None:
+    """One run: build, pretrain if asked to, fit, evaluate, report, export.
+
+    Returns:
+        How well it did, for Hydra's sweepers: :func:`franka_wm.evaluation.results.score`; None where nothing was
+        evaluated.
+    """
     from franka_wm import processes
     from franka_wm.console import say
     from franka_wm.evaluation.health import diagnose_training
     from franka_wm.evaluation.protocol import during_training, evaluate_run
+    from franka_wm.evaluation.results import score
     from franka_wm.report.end_of_run import report_run
     from franka_wm.report.page import write_page
     from franka_wm.training import build
@@ -75,6 +81,7 @@ def main(cfg: DictConfig) -> None:
         say(f"page:    {write_page(run.folder)}")
     run.export(trainer.experience)  # what each has gathered
     say(f"results: {run.folder}")
+    return None if found is None else score(found.policies)
 
 
 def command(arguments: list[str] | None = None) -> None:

@@ -282,6 +282,10 @@ def with_scale(arguments: list[str], stream: TextIO | None = None, *, quiet: boo
 
 def check_sweep(overrides: list[str]) -> Sweep:
     """Checks every job of a sweep, and its folder, before the first one begins."""
+    if "hydra/sweeper=optuna" in overrides and "hydra.sweeper.direction=maximize" not in overrides:
+        fail(
+            "hydra/sweeper=optuna: a run returns what is better the higher; add hydra.sweeper.direction=maximize"
+        )
     try:
         found = jobs(overrides)
     except FrankaError as error:

@@ -41,6 +41,14 @@ def given(overrides: Sequence[str], key: str) -> str | None:
     return value.text if isinstance(value, QuotedString) else str(value)
 
 
+EXTRAS = {
+    "joblib": "joblib",
+    "submitit_slurm": "slurm",
+    "submitit_local": "slurm",
+    "ray": "ray",
+    "optuna": "optuna",
+}
+"""Launchers and sweepers of ``--multirun``, and the extra of this package that has each."""
 _MISSING = re.compile(r"Could not find '([^']+)/([^'/]+)'")
 _UNKNOWN = re.compile(r"Could not override '([^']+)'")
 
@@ -57,9 +65,9 @@ def explain(message: str, *, allowed: Sequence[str] = ()) -> str:
     if missing is not None:
         choices = [line for line in message.splitlines() if line.startswith("\t") and "provider=" not in line]
         names = [line.strip() for line in choices]
-        return (
-            f"{missing[1]}={missing[2]}: must be one of {', '.join(names)}{did_you_mean(missing[2], names)}"
-        )
+        extra = EXTRAS.get(missing[2]) if missing[1].startswith("hydra/") else None
+        hint = f"; pip install 'franka-wm[{extra}]'" if extra else did_you_mean(missing[2], names)
+        return f"{missing[1]}={missing[2]}: must be one of {', '.join(names)}{hint}"
     if unknown is not None:
         return no_such_option(unknown[1], allowed)
     noise = ("full_key:", "object_type", "Config search path", "provider=", "See https://", "Set the env")

@@ -88,12 +88,16 @@ class Sweep:
     ran: int = 0
     failed: dict[int, str] = field(default_factory=dict)
 
-    def run(self, main: Callable[[DictConfig], object], cfg: DictConfig) -> None:
+    def run(self, main: Callable[[DictConfig], object], cfg: DictConfig) -> object:
         """One job: skipped if it is done, gone on with if it was begun; if it fails, the others go on all the same.
+
+        Returns:
+            What ``main`` does, for sweepers that search; None of a job that failed.
 
         Raises:
             KeyboardInterrupt, SystemExit: Ctrl-C, which ends the sweep.
         """
+        from franka_wm.evaluation.results import FILE, read_result, score
         from franka_wm.training.run import left_by
 
         told = HydraConfig.get()
@@ -105,17 +109,18 @@ class Sweep:
             left = None if cfg.resume is not None else left_by(folder, cfg)
             if left == "finished":
                 say(f"{name} was finished before: {folder}")
-                return
+                return score(read_result(folder / FILE).policies) if (folder / FILE).is_file() else None
             if left is not None:
                 say(f"{name} goes on where it stopped")
                 cfg.resume = str(folder)
-            main(cfg)
+            return main(cfg)
         except (KeyboardInterrupt, SystemExit):  # the latter is how a run ends that has saved after Ctrl-C
             say(f"the sweep is stopped; {self.advice}")
             raise
         except Exception as error:
             self.failed[number] = f"{name}: {_in_words(error)}"
             print(f"error: {self.failed[number]}", file=sys.stderr, flush=True)
+            return None
         finally:
             log_anew()
             gc.collect()  # the next one needs the memory

@@ -37,6 +37,9 @@ FILE = "evaluation.json"
 END, COMMAND = "the end of training", "franka-wm evaluate"
 """Who measured, as ``protocol`` says under ``by``."""
 
+SHOWN = ("planner", "policy")
+"""Whose results count for a run, the first that there is."""
+
 EXTRAS = ("open_loop", "probes", "spectrum", "latents", "calibration", "robustness", "health")
 
 
@@ -130,6 +133,21 @@ def point(
         }
         numbers |= {f"eval/{name}/{key}": value["mean"] for key, value in found.items() if value is not None}
     return numbers
+
+
+def score(policies: Mapping[str, Mapping[str, Any]]) -> float | None:
+    """How well a run did, in one number, for a search over options; higher is better.
+
+    Of the planner, or of the policy where there is no planner: the share of episodes [0, 1] that end in success where
+    the task itself judges it; minus the mean final distance [m] where the goal is a place; else the mean return.
+    """
+    summary = next((policies[name] for name in SHOWN if name in policies), None)
+    if summary is None:
+        return None
+    success = summary.get("success") or {}
+    if "mean" in success:
+        return success["mean"]
+    return -summary["final_distance"]["mean"] if "final_distance" in summary else summary["return"]["mean"]
 
 
 def loggable(name: str) -> str:

@@ -10,6 +10,7 @@ from typing import Any
 from markupsafe import Markup
 
 from franka_wm.errors import UserError
+from franka_wm.evaluation.results import SHOWN
 from franka_wm.report import style
 from franka_wm.report.bars import bars_figure
 from franka_wm.report.curves import panels, seeds_figure
@@ -25,7 +26,6 @@ from franka_wm.report.document import (
     table,
 )
 from franka_wm.report.horizon import horizon_figure
-from franka_wm.report.outcome import SHOWN
 from franka_wm.report.run import RunFiles, but_for_the_seed, malformed
 from franka_wm.report.spectra import spectrum_figure
 from franka_wm.report.table import Table, evaluation_tables, is_interval

@@ -6,15 +6,12 @@ from typing import Any
 
 from markupsafe import Markup
 
-from franka_wm.evaluation.results import Result
+from franka_wm.evaluation.results import SHOWN, Result
 from franka_wm.report import style
 from franka_wm.report.bars import bars_figure
 from franka_wm.report.document import cards, chart, facts, folded, headed, paragraph, table, tiles, warning
 from franka_wm.report.run import RunFiles
 from franka_wm.report.table import Table, evaluation_tables, is_interval
-
-SHOWN = ("planner", "policy")
-"""Whose results stand at the top of the page, the first that there is."""
 
 
 def headline(run: RunFiles, warned: Sequence[str]) -> str:

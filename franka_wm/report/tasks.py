@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 
+from franka_wm.evaluation.results import SHOWN
 from franka_wm.report import style
-from franka_wm.report.outcome import SHOWN, success_rates
+from franka_wm.report.outcome import success_rates
 from franka_wm.report.run import RunFiles
 from franka_wm.report.table import Table, is_interval
 

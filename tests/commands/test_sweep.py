@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import pickle
 import signal
 import subprocess
 import sys
@@ -15,8 +16,10 @@ from omegaconf import OmegaConf
 
 from forks import TRAIN, Fork, script, train_in_fork
 from franka_wm.commands import entry
+from franka_wm.commands.overrides import explain
 from franka_wm.commands.several import spread
 from franka_wm.errors import UserError
+from franka_wm.evaluation.results import read_result, score
 from franka_wm.training.checkpoint import latest_checkpoint, load_checkpoint
 
 SMOKE = [
@@ -29,12 +32,18 @@ SMOKE = [
 ]
 SMALL = ["evaluation.episodes=2", "evaluation.video_episodes=0", "logger.names=[csv]"]
 BREAKS = "trainer.lr=1e30,1e-3"
+KEEPS = "+hydra.callbacks.kept._target_=hydra.experimental.callbacks.PickleJobInfoCallback"
+"""What each job returns to Hydra's sweeper."""
 
 
 def sweep(place: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
     return train_in_fork(
-        "--multirun", *SMOKE, *SMALL, *arguments, f"hydra.sweep.dir={place / 'sweep'}", cwd=place
+        "--multirun", *SMOKE, *SMALL, KEEPS, *arguments, f"hydra.sweep.dir={place / 'sweep'}", cwd=place
     )
+
+
+def returned(job: Path) -> float | None:
+    return pickle.loads((job / ".hydra" / "job_return.pickle").read_bytes()).return_value
 
 
 def state(place: Path) -> dict[Path, int]:
@@ -58,6 +67,9 @@ def test_a_job_that_fails_does_not_end_the_others(swept) -> None:
     assert (place / "sweep/1-reach/finished.json").is_file()
     logs = [(place / "sweep" / job / "train.log").read_text() for job in ("0-reach", "1-reach")]
     assert first in logs[0] and "training broke" not in logs[1]
+    assert returned(place / "sweep/0-reach") is None
+    planner = read_result(place / "sweep/1-reach/evaluation.json").policies["planner"]
+    assert returned(place / "sweep/1-reach") == pytest.approx(-planner["final_distance"]["mean"])
 
 
 def test_the_same_sweep_again_runs_what_is_missing(swept) -> None:
@@ -74,6 +86,7 @@ def test_the_same_sweep_again_runs_what_is_missing(swept) -> None:
     done = sweep(place, BREAKS)
     assert f"job 1 (trainer.lr=0.001) was finished before: {job}" in done.stdout, done.stdout + done.stderr
     assert done.returncode == 1 and state(job / "checkpoints") == weights
+    assert returned(job) == score(read_result(job / "evaluation.json").policies)
 
 
 def test_a_job_is_refused_before_anything_is_written(swept, tmp_path: Path) -> None:
@@ -90,6 +103,24 @@ def test_a_job_is_refused_before_anything_is_written(swept, tmp_path: Path) -> N
     done = sweep(tmp_path, "seed=0,1", "hydra.sweep.subdir=one")
     assert "jobs 0 and 1 would both write into" in done.stderr and done.stderr.count("\n") == 1
     assert list(tmp_path.iterdir()) == []
+
+
+def test_a_search_needs_its_plugin_and_its_direction(tmp_path: Path, capsys) -> None:
+    said = explain("Could not find 'hydra/sweeper/optuna'\n\nAvailable options:\n\tbasic\n")
+    assert said == "hydra/sweeper=optuna: must be one of basic; pip install 'franka-wm[optuna]'"
+    with pytest.raises(SystemExit):
+        entry.check_sweep(["hydra/sweeper=optuna", "hydra.sweeper.direction=minimize"])
+    assert "better the higher; add hydra.sweeper.direction=maximize" in capsys.readouterr().err
+    assert entry.check_sweep(["hydra/sweeper=optuna", "hydra.sweeper.direction=maximize"]).names == []
+
+
+def test_what_a_run_returns_is_better_the_higher() -> None:
+    rate, distance, gain = ({"mean": x, "low": 0.0, "high": 1.0} for x in (0.25, 0.3, 7.0))
+    assert score({"planner": {"success": rate, "return": gain}, "policy": {"return": gain}}) == 0.25
+    reach = {"success": {"0.05": rate}, "final_distance": distance, "return": gain}
+    assert score({"noop": {"return": gain}, "policy": reach}) == -0.3
+    assert score({"planner": {"return": gain}}) == 7.0
+    assert score({"noop": {"return": gain}}) is None
 
 
 LAUNCHERS = {

@@ -123,22 +123,25 @@ def commands(program: str) -> Iterator[tuple[str, list[str]]]:
                     yield name, shlex.split(line, comments=True)[len(program.split()) :]
 
 
-LAUNCHERS = {
-    "joblib": "hydra_plugins.hydra_joblib_launcher",
-    "ray": "hydra_plugins.hydra_ray_launcher",
-    "submitit_slurm": "hydra_plugins.hydra_submitit_launcher",
+PLUGINS = {
+    "hydra/launcher=joblib": "hydra_plugins.hydra_joblib_launcher",
+    "hydra/launcher=ray": "hydra_plugins.hydra_ray_launcher",
+    "hydra/launcher=submitit_slurm": "hydra_plugins.hydra_submitit_launcher",
+    "hydra/sweeper=optuna": "hydra_plugins.hydra_optuna_sweeper",
 }
-"""Packages that Hydra finds its launchers in."""
+"""Packages that Hydra finds its launchers and sweepers in."""
 
 TRAIN = [*commands("python train.py"), *commands("franka-wm train")]
 VERBS = list(commands("franka-wm"))
 
 
 def choices(overrides: list[str]) -> Iterator[list[str]]:
-    """What a sweep would run: every value of a list ``a=1,2``, the other lists at their first."""
+    """What a sweep would run: every value of a list ``a=1,2``, the other lists at their first; intervals, too."""
     parsed = OverridesParser.create().parse_overrides(overrides)
     values = [
-        [f"{o.input_line.partition('=')[0]}={v}" for v in o.sweep_string_iterator()]
+        [f"{o.input_line.partition('=')[0]}={o.value().start}"]
+        if o.is_interval_sweep()
+        else [f"{o.input_line.partition('=')[0]}={v}" for v in o.sweep_string_iterator()]
         if o.is_sweep_override()
         else [o.input_line]
         for o in parsed
@@ -158,11 +161,11 @@ def test_documented_training_composes(
     flags = [a for a in arguments if a.startswith("-")]
     assert set(flags) <= {"--multirun", "-m", "--help"}
     overrides = [a for a in arguments if not a.startswith("-")]
-    launcher = next((a.partition("=")[2] for a in overrides if a.startswith("hydra/launcher=")), None)
-    if launcher is not None and importlib.util.find_spec(LAUNCHERS[launcher]) is None:  # an extra of few
-        overrides = [
-            a for a in overrides if not a.lstrip("+").startswith(("hydra/launcher", "hydra.launcher"))
-        ]
+    for plugin in [a for a in overrides if a.startswith(("hydra/launcher=", "hydra/sweeper="))]:
+        if importlib.util.find_spec(PLUGINS[plugin]) is None:  # an extra of few
+            group = plugin.partition("=")[0]
+            prefixes = (group, group.replace("/", "."))
+            overrides = [a for a in overrides if not a.lstrip("+").startswith(prefixes)]
     for chosen in choices(overrides):
         assert "env" in composed(*chosen)
 
