@@ -15,6 +15,7 @@ from franka_wm import processes
 from franka_wm.data.memory import free_memory
 from franka_wm.device import resolve_device
 from franka_wm.errors import UserError
+from franka_wm.models import WorldModel
 from franka_wm.training.settings import RunSettings
 from franka_wm.training.spaces import Spaces
 
@@ -47,13 +48,13 @@ def check_worlds(option: str, worlds: int, device: torch.device | str) -> None:
         )
 
 
-def check_memory(run: RunSettings, model: torch.nn.Module, spaces: Spaces) -> None:
+def check_memory(run: RunSettings, model: WorldModel, spaces: Spaces) -> None:
     """Refuse what cannot fit into the memory that is free, before anything of it is built.
 
     Only what is known beforehand is counted, and little of that: a run that passes may still not fit.
 
     Args:
-        model: Only its shapes matter.
+        model: Only its shapes matter, and what it reads: experience is that alone, each image once.
         spaces: Sizes of observations and actions.
 
     Raises:
@@ -64,7 +65,9 @@ def check_memory(run: RunSettings, model: torch.nn.Module, spaces: Spaces) -> No
     if free is None:
         return
     c, e, r = run.collector, run.evaluation, run.replay
-    step = 4 * sum(spaces.observation_sizes.values()) + sum(map(math.prod, spaces.image_sizes.values()))
+    seen = _bytes(spaces)
+    kept = model if run.export.kind == "none" else spaces  # a dataset is for other models, too
+    step = _bytes(kept, stack=run.env.frame_stack)
     planned = math.prod(run.planner.options.get(name, 1) for name in ("num_samples", "horizon"))
     steps = c.num_envs * run.planned_steps() if device.type != "cuda" else r.capacity
     if device.type == "cpu":
@@ -77,9 +80,9 @@ def check_memory(run: RunSettings, model: torch.nn.Module, spaces: Spaces) -> No
     parts = {
         "the model and its optimiser (model, size)": 16 * sum(x.numel() for x in model.parameters()),
         f"experience (replay.capacity={r.capacity})": step * min(r.capacity, steps),
-        f"a batch (replay.batch_size={r.batch_size})": step * r.batch_size * run.window,
-        f"worlds (collector.num_envs={c.num_envs})": c.num_envs * (PER_WORLD + step * c.steps_per_batch),
-        f"worlds (evaluation.episodes={e.episodes})": played * (PER_WORLD + step),
+        f"a batch (replay.batch_size={r.batch_size})": _bytes(model) * r.batch_size * run.window,
+        f"worlds (collector.num_envs={c.num_envs})": c.num_envs * (PER_WORLD + seen * c.steps_per_batch),
+        f"worlds (evaluation.episodes={e.episodes})": played * (PER_WORLD + seen),
         "plans (planner.num_samples, planner.horizon)": 4 * played * planned * max(spaces.action_dim, 1),
         f"a video (evaluation.video_size={e.video_size})": film,
     }
@@ -90,6 +93,12 @@ def check_memory(run: RunSettings, model: torch.nn.Module, spaces: Spaces) -> No
             f"{name}: at least {most / 1e9:.1f} GB, of {needed / 1e9:.1f} GB in all, do not fit into the "
             f"{free / 1e9:.1f} GB that are free on {device}; lower it"
         )
+
+
+def _bytes(of: Spaces | WorldModel, stack: int = 1) -> int:
+    """Observations of one step; of stacked images one, if ``stack`` are."""
+    images = ((math.prod(size), key.startswith("pixels")) for key, size in of.image_sizes.items())
+    return 4 * sum(of.observation_sizes.values()) + sum(n // stack if stacked else n for n, stacked in images)
 
 
 def fill(

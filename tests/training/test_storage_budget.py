@@ -8,8 +8,11 @@ import torch
 from tensordict import TensorDict
 
 from franka_wm.data.replay import make_replay
+from franka_wm.envs import FrankaConfig
 from franka_wm.errors import UserError
 from franka_wm.training import storage_budget
+from franka_wm.training.build import make_model
+from franka_wm.training.spaces import Spaces
 
 
 def test_size_of_what_is_filled() -> None:
@@ -100,3 +103,31 @@ def test_what_cannot_be_allocated_is_one_line_as_well(monkeypatch, settled) -> N
 def test_free_memory_is_that_of_the_machine() -> None:
     free = storage_budget.free_memory(torch.device("cpu"))
     assert free is None or 1e7 < free < 1e14
+
+
+@pytest.mark.parametrize(
+    ("settings", "per_step"),
+    [
+        # Goal images are the worlds' alone, and no transition has one.
+        ("env=reach_fixed_goal_image model=lewm model.observations=[pixels,pixels_side]", 2 * 64 * 64 * 3),
+        ("env=reach_pixels env.frame_stack=3 model=tdmpc2_pixels model.observations=[pixels]", 64 * 64 * 3),
+        ("env=reach model=tdmpc2", 4 * FrankaConfig().state_dim),
+    ],
+)
+def test_before_anything_is_built_experience_is_what_the_model_reads(
+    settings: str, per_step: int, monkeypatch, settled
+) -> None:
+    run = settled(
+        *settings.split(),
+        *(["env.cameras=[front,side]"] if "pixels" in settings else []),
+        "scale=smoke",
+        "replay.capacity=1000000",
+        "trainer.updates=10000000",
+    )
+    spaces = Spaces.of_config(run.env.arm)
+    model = make_model(run, spaces, "meta")
+    monkeypatch.setattr(storage_budget, "free_memory", lambda device: 1e6 * per_step + 2e8)
+    storage_budget.check_memory(run, model, spaces)
+    monkeypatch.setattr(storage_budget, "free_memory", lambda device: 1e6 * per_step - 1)
+    with pytest.raises(UserError, match=r"replay\.capacity=1000000.*do not fit"):
+        storage_budget.check_memory(run, model, spaces)
