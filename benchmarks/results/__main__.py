@@ -80,6 +80,13 @@ def parse(arguments: list[str] | None) -> argparse.Namespace:
     )
     one.add_argument("--device", nargs="+", default=[], help="of a row on a GPU: cuda:0 cuda:1 …")
     one.add_argument("--threads", type=int, help="of each run; default: the row's, on a GPU torch's choice")
+    one.add_argument(
+        "--extra",
+        nargs="+",
+        default=[],
+        metavar="ARG",
+        help="of train.py, that change no number: evaluation.video_episodes=0 logger=none",
+    )
     one.add_argument("--out", type=Path, default=Path("outputs/results"), help="folder for the runs' folders")
     two = verbs.add_parser("collect", help="take a row's numbers from folders of finished runs")
     two.add_argument("row")
@@ -109,6 +116,7 @@ def main(arguments: list[str] | None = None) -> int:
                 devices=chosen.device,
                 threads=chosen.threads,
                 commit=chosen.commit,
+                extra=chosen.extra,
             )
             work = [(row, chosen.seeds or row.seeds) for row in (choose(rows, name) for name in chosen.rows)]
             if chosen.missing:

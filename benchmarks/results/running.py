@@ -15,7 +15,7 @@ from pathlib import Path
 from queue import Queue
 from threading import Lock
 
-from benchmarks.results.records import PLACE, record_benchmark, record_run, write
+from benchmarks.results.records import FREE, PLACE, record_benchmark, record_run, write
 from benchmarks.results.rows import Row
 from franka_wm.errors import UserError
 from franka_wm.source import ROOT
@@ -35,6 +35,7 @@ class Machine:
         threads: of each run; on CPU cores it has these to itself. ``None``: as many as the section says, and as torch
             chooses on a GPU.
         commit: of the code, where there is no repository.
+        extra: arguments of train.py beside the row's, which change no number: ``evaluation.video_episodes=0``.
     """
 
     jobs: int = 1
@@ -42,6 +43,13 @@ class Machine:
     devices: Sequence[str] = ()
     threads: int | None = None
     commit: str | None = None
+    extra: Sequence[str] = ()
+
+    def __post_init__(self) -> None:
+        if other := [one for one in self.extra if one.split("=", 1)[0] not in set(FREE) - {"seed", "device"}]:
+            raise UserError(
+                f"--extra {shlex.join(other)}: may be {', '.join(FREE[2:])} alone; others change the row"
+            )
 
     def slots(self, row: Row) -> list[Slot]:
         """One for each run at a time.
@@ -49,6 +57,7 @@ class Machine:
         Raises:
             UserError: There are too few cores for so many runs.
         """
+        extra = list(self.extra)
         further = os.environ.get("PYTHONPATH")
         environment = {"PYTHONPATH": os.pathsep.join([str(ROOT), further] if further else [str(ROOT)])}
         if self.commit:
@@ -57,7 +66,7 @@ class Machine:
             if self.threads:
                 environment["OMP_NUM_THREADS"] = str(self.threads)
             devices = [[f"device={device}"] for device in self.devices] or [[]]
-            return [([], device, environment) for device in devices for _ in range(self.jobs)]
+            return [([], [*device, *extra], environment) for device in devices for _ in range(self.jobs)]
         threads = self.threads or row.section.threads
         cores = sorted(os.sched_getaffinity(0))
         if threads * self.jobs > len(cores):
@@ -67,7 +76,7 @@ class Machine:
             )
         environment |= {"OMP_NUM_THREADS": str(threads), "CUDA_VISIBLE_DEVICES": ""}
         own = [cores[k * threads : (k + 1) * threads] for k in range(self.jobs)]
-        return [(["taskset", "-c", ",".join(map(str, some))], [], environment) for some in own]
+        return [(["taskset", "-c", ",".join(map(str, some))], extra, environment) for some in own]
 
 
 def run(

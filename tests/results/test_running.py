@@ -49,6 +49,16 @@ def test_packages_are_found_where_this_process_finds_them(monkeypatch) -> None:
     assert environment["PYTHONPATH"].split(os.pathsep) == [str(running.ROOT), "/some/site", "/another"]
 
 
+def test_arguments_beside_the_rows_change_no_number() -> None:
+    extra = ("evaluation.video_episodes=0", "logger=none")
+    for row in (ROW, GPU):
+        ((_, after, _),) = running.Machine(threads=1, extra=extra).slots(row)
+        assert tuple(after) == extra
+    for wrong in ("trainer.updates=5", "seed=3"):
+        with pytest.raises(UserError, match=f"--extra {wrong}: may be logger, evaluation"):
+            running.Machine(extra=(wrong,))
+
+
 def test_a_run_that_fails_is_told_and_leaves_no_file(tmp_path) -> None:
     row = replace(ROW, arguments="env=reach_fixed trainer.updatez=1")
     failed = running.run(
