@@ -292,7 +292,7 @@ def _agent(part: str, checkpoint: str, overrides: Sequence[str], worlds: int) ->
             raise UserError(
                 f"collect: {override}: an agent keeps its configuration; only seed=, device= and env.KEY= can change"
             )
-    if "observations" in changes:
+    if isinstance(changes.get("observations"), list):  # else it is refused where it is read
         changes["observations"] = [
             *changes["observations"],
             *(key for key in ("state", "joint_target") if key not in changes["observations"]),

@@ -26,6 +26,9 @@ from franka_wm.versions import PACKAGES, versions
 SAVING = 1800
 """How long processes that were asked to stop may take to save [s]."""
 
+MOST_ON_A_CORE = 8
+"""Processes with ``device=cpu``: they share cores, and each needs a gigabyte."""
+
 
 def started_by_torchrun() -> bool:
     """Whether this process is one of several that torchrun has started; asked before torch is imported."""
@@ -129,6 +132,12 @@ def patience() -> Iterator[None]:
 
 def _require_gpus(gpus: int, device: str) -> None:
     if device == "cpu":
+        cores = os.cpu_count() or 1
+        if gpus > MOST_ON_A_CORE * cores:
+            raise UserError(
+                f"gpus={gpus} with device=cpu: at most {MOST_ON_A_CORE * cores} processes on the {cores} cores of this "
+                "machine"
+            )
         return
     import torch
 

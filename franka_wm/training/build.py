@@ -85,18 +85,24 @@ def make_env(
 
 
 def make_evaluation_env(run: RunSettings, *, num_envs: int | None = None, **changes: Any) -> Environment:
-    """The same task for evaluation: with what ``ik`` and ``expert`` read, and the images that the model reads."""
+    """The same task for evaluation, with :func:`evaluation_changes`."""
     num_envs = run.evaluation.episodes if num_envs is None else num_envs
-    if run.is_arm:
-        read = run.model.observations or ()
-        goal = ("goal_pixels",) if run.objective_name == "goal_image" else ()
-        arm = run.env.arm
-        vectors = ["state", "joint_target"] + ["objects"] * (arm.object_dim > 0)
-        vectors += ["contacts"] * (arm.contact_dim > 0)
-        images = [o for o in run.env.arm.observations if o not in vectors]
-        used = [o for o in images if any(key == o or key.startswith(f"{o}_") for key in (*read, *goal))]
-        changes = {"observations": [*used, *vectors]} | changes
+    changes = evaluation_changes(run, changes)
     return make_env(run, num_envs=num_envs, seed=evaluation_seed(run.seed), **changes)
+
+
+def evaluation_changes(run: RunSettings, changes: Mapping[str, Any]) -> dict[str, Any]:
+    """``changes`` of the arm's config, and what ``ik`` and ``expert`` read, and the images that the model reads."""
+    if not run.is_arm:
+        return dict(changes)
+    read = run.model.observations or ()
+    goal = ("goal_pixels",) if run.objective_name == "goal_image" else ()
+    arm = run.env.arm
+    vectors = ["state", "joint_target"] + ["objects"] * (arm.object_dim > 0)
+    vectors += ["contacts"] * (arm.contact_dim > 0)
+    images = [o for o in arm.observations if o not in vectors]
+    used = [o for o in images if any(key == o or key.startswith(f"{o}_") for key in (*read, *goal))]
+    return {"observations": [*used, *vectors], **changes}
 
 
 # -- models -------------------------------------------------------------------------------------------------
@@ -171,11 +177,15 @@ def make_planner(run: RunSettings, actions: int) -> Planner | MCTS:
 
 def make_objective(run: RunSettings, model: WorldModel) -> Objective | None:
     """What the planner maximises, by ``run.objective``."""
-    o = run.objective
-    name = run.objective_name
+    o, name = run.objective, run.objective_name
     if name is None:
         return None
     if name == "reward_value":
+        for option, default in (("metric", "l2"), ("summed", True), ("steps_weight", 0)):
+            if (given := getattr(o, option)) != default:
+                raise UserError(
+                    f"objective.{option}={given}: is of objective=goal_image; leave it at {default}"
+                )
         try:
             chosen: Objective = planning.RewardPlusValue.of(model)
         except ValueError as error:

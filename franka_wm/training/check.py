@@ -111,11 +111,14 @@ def _check_hindsight(run: RunSettings) -> None:
 
 def _check_demonstrations(run: RunSettings) -> None:
     if run.replay.demos is None:
-        if run.replay.demo_resets:
-            raise UserError(
-                f"replay.demo_resets={run.replay.demo_resets}: needs demonstrations, replay.demos=FOLDER"
-            )
+        for option in ("demo_resets", "demo_reset_updates", "demo_updates"):
+            if given := getattr(run.replay, option):
+                raise UserError(f"replay.{option}={given}: needs demonstrations, replay.demos=FOLDER")
         return
+    if run.replay.demo_reset_updates and not run.replay.demo_resets:
+        raise UserError(
+            f"replay.demo_reset_updates={run.replay.demo_reset_updates}: needs replay.demo_resets above 0"
+        )
     if run.is_offline:
         raise UserError(
             "replay.demos: a run on recorded data gathers nothing to mix them with; add them to dataset.root"

@@ -109,7 +109,10 @@ def check_demonstrations(run: RunSettings) -> None:
     from franka_wm.data.lerobot.provenance import read_provenance
 
     arm = run.env.arm if run.is_arm else None
-    sources, _ = read_datasets(run.replay.demos, fps=arm and arm.fps, action_dim=arm and arm.action_dim)
+    try:
+        sources, _ = read_datasets(run.replay.demos, fps=arm and arm.fps, action_dim=arm and arm.action_dim)
+    except UserError as error:
+        raise UserError(str(error).replace("dataset.root=", "replay.demos=")) from error
     if arm is None:
         return
     for source in sources:

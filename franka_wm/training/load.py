@@ -79,8 +79,11 @@ def load_agent(
         raise UserError(
             f"{folder}: was trained on recorded data without an environment; there is nothing to act in"
         )
+    changes = dict(env_changes or {})
+    if changes and settings.is_arm:
+        _require_fit(settings, _saved_spaces(checkpoint), changes)
     model = _model(checkpoint, settings, resolve_device(settings.device))
-    env = build.make_evaluation_env(settings, num_envs=num_envs, **dict(env_changes or {}))
+    env = build.make_evaluation_env(settings, num_envs=num_envs, **changes)
     spaces = Spaces.of_env(env)
     policies = build.make_agent_policies(settings, model, env, spaces)
     planner = getattr(policies.get("planner"), "planner", None)
@@ -105,7 +108,23 @@ def find_checkpoint(folder: str | Path) -> Checkpoint:
     return load_checkpoint(latest_checkpoint(folder))
 
 
-def _model(checkpoint: Checkpoint, settings: RunSettings, device: torch.device) -> WorldModel:
+def _require_fit(settings: RunSettings, saved: Spaces, changes: dict[str, Any]) -> None:
+    """Refuses changes of the arm that leave it without what the model reads, or in another size."""
+    changed = settings.env.changed(**build.evaluation_changes(settings, changes))
+    here = Spaces.of_config(changed.arm, discrete=settings.is_discrete)
+    name = f"model={settings.model.name}"
+    read = saved.only(settings.model.observations, name)
+    wanted = {**read.observation_sizes, **read.image_sizes, "action": saved.action_dim or saved.num_actions}
+    there = {**here.observation_sizes, **here.image_sizes, "action": here.action_dim or here.num_actions}
+    for key, size in wanted.items():
+        if there.get(key) != size:
+            raise UserError(
+                f"{name} needs {key} of size {size}, with {', '.join(f'env.{one}' for one in changes)} as given it is "
+                f"{there.get(key, 'not there')}; leave that out, or train an agent with it"
+            )
+
+
+def _saved_spaces(checkpoint: Checkpoint) -> Spaces:
     extra = checkpoint.extra()
     saved = extra.get("spaces") if isinstance(extra, dict) else None
     if saved is None:
@@ -113,7 +132,12 @@ def _model(checkpoint: Checkpoint, settings: RunSettings, device: torch.device) 
             f"{checkpoint.folder}: does not say what sizes its model has; it was written by an older version"
         )
     with damaged(checkpoint.folder, "extra.json"):
-        spaces = Spaces.from_dict(saved)
+        return Spaces.from_dict(saved)
+
+
+def _model(checkpoint: Checkpoint, settings: RunSettings, device: torch.device) -> WorldModel:
+    spaces = _saved_spaces(checkpoint)
+    with damaged(checkpoint.folder, "extra.json"):
         shapes = sketch(settings, spaces)
         if shapes is not None:  # before anything of the sizes that config.yaml names is allocated
             checkpoint.check_model(shapes)

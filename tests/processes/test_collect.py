@@ -106,6 +106,7 @@ def test_a_killed_process_ends_the_others_and_leaves_no_dataset(tmp_path) -> Non
     [
         (["device=cuda"], "gpus=8: this machine has 0 usable CUDA devices"),
         (["device=cuda:1"], "device=cuda:1 with gpus=8: each process has a GPU of its own"),
+        (["gpus=1000", "num_envs=1000"], "gpus=1000 with device=cpu: at most "),
         (["num_envs=5"], "5 worlds for 8 processes: give num_envs=8, or start fewer"),
         (["episodes=7"], "7 worlds for 8 processes: give num_envs=8, or start fewer"),
         (["env.image_siz=8"], "env.image_siz: no such option"),

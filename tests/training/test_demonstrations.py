@@ -182,7 +182,8 @@ def test_episodes_without_rewards_are_refused(demos: Path, settled, monkeypatch)
         (("env=lift",), "the dataset's actions have 7 numbers, the environment's 8"),
         (("model=muzero", "planner=gumbel"), "learns from its own search"),
         (("replay.demo_updates=31",), "must be at most trainer.updates=30"),
-        (("replay.demos={demos}/nowhere",), "nowhere"),
+        (("replay.demos={demos}/nowhere",), r"replay\.demos=\S*/nowhere: no such folder"),
+        (("replay.demos=[]",), r"replay\.demos=\[\]: must be a folder"),
         (("replay.demo_share=1.5",), "replay.demo_share=1.5"),
         (
             ("env.terminate_on_success=true",),
@@ -190,6 +191,8 @@ def test_episodes_without_rewards_are_refused(demos: Path, settled, monkeypatch)
         ),
         (("replay.demo_resets=0.5",), "is for tasks with a gripper"),
         (("replay.demos=null", "replay.demo_resets=0.5"), "needs demonstrations"),
+        (("replay.demos=null", "replay.demo_updates=5"), "demo_updates=5: needs demonstrations"),
+        (("replay.demo_reset_updates=5",), r"needs replay\.demo_resets above 0"),
     ],
 )
 def test_what_cannot_be_is_refused_before_anything_is_built(demos: Path, settled, changes, message) -> None:

@@ -15,6 +15,7 @@ from torchrl.data import LazyTensorStorage
 
 import franka_wm
 from forks import run_in_fork
+from franka_wm.commands.demo import AGENT
 from franka_wm.errors import UserError
 from franka_wm.training import build
 from franka_wm.training.check import check
@@ -186,6 +187,25 @@ def test_no_checkpoint(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
+    ("changes", "said"),
+    [
+        ({"task": "lift"}, "model=tdmpc2 needs state of size 20, with env.task as given it is 28"),
+        ({"observations": ["joint_target"]}, "with env.observations as given it is not there"),
+        ({"action_mode": "ee_delta"}, "needs action of size 7, with env.action_mode as given it is 3"),
+        ({"observations": 5}, "observations"),
+        ({"observations": None}, "observations"),
+    ],
+)
+def test_an_environment_that_the_model_cannot_act_in_is_refused_before_it_is_built(
+    changes, said: str, monkeypatch
+) -> None:
+    monkeypatch.setattr(build, "make_evaluation_env", lambda *_, **__: pytest.fail("built"))
+    with pytest.raises(UserError) as refused:
+        load_agent(AGENT, device="cpu", env_changes=changes)
+    assert said in str(refused.value) and "\n" not in str(refused.value)
+
+
+@pytest.mark.parametrize(
     ("overrides", "named"),
     [
         (["planner=mcts"], "continuous"),
@@ -200,6 +220,8 @@ def test_no_checkpoint(tmp_path: Path) -> None:
         (["dataset=lerobot", "dataset.root=no/such/folder"], "no/such/folder"),
         (["dataset=lerobot"], "dataset.root"),
         (["objective.metric=l7"], "l7"),
+        (["objective.metric=cosine"], "metric=cosine: is of objective=goal_image"),
+        (["objective.steps_weight=1"], "steps_weight=1.0: is of objective=goal_image"),
         (["trainer.precision=int3"], "precision"),
         (["trainer.schedule=up"], "schedule"),
     ],

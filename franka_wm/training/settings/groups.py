@@ -40,7 +40,8 @@ MOST_UPDATES = 10**12
 
 
 def _is_names(given: object) -> bool:
-    return all(isinstance(one, str) for one in (given if isinstance(given, list | tuple) else [given]))
+    many = given if isinstance(given, list | tuple) else [given]
+    return bool(many) and all(isinstance(one, str) and one for one in many)
 
 
 _A_FOLDER, _A_NAME = "a folder or a list of them", "USER/NAME or a list of them"
