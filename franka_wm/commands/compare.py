@@ -8,6 +8,7 @@ import click
 
 from franka_wm.commands.arguments import verb, word
 from franka_wm.errors import UserError
+from franka_wm.files import unwritable
 
 
 @verb("compare")
@@ -32,10 +33,14 @@ def compare(runs: tuple[str, ...], out: str) -> None:
 
 
 def check_page(verb: str, out: str | None) -> None:
-    """Whether a page can have this name, asked before anything is read.
+    """Whether a page can be written there, asked before anything is read.
 
     Raises:
-        UserError: It does not end in .html.
+        UserError: The name does not end in .html, or the folder is not writable.
     """
-    if out is not None and not out.lower().endswith(".html"):
+    if out is None:
+        return
+    if not out.lower().endswith(".html"):
         raise UserError(f"{verb}: out={out}: the page must end in .html")
+    if (why := unwritable(Path(out).parent)) is not None:
+        raise UserError(f"{verb}: out={out}: {why}; choose another place")

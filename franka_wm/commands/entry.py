@@ -86,9 +86,11 @@ def one_line_refusals() -> Iterator[None]:
 def _run(main: Callable[[], Any], arguments: list[str]) -> None:
     global _sweep
     _sweep, asked = None, hydra_flags(arguments)
+    if asked.experimental_rerun:
+        fail("--experimental-rerun unpickles a file, which may run anything; resume=RUN goes on with a run")
     flags = [a for a in arguments if a not in asked.overrides]
     overrides = list(asked.overrides)
-    elsewhere = asked.config_dir or asked.config_name or asked.config_path or asked.experimental_rerun
+    elsewhere = asked.config_dir or asked.config_name or asked.config_path
     only_shows = asked.help or asked.hydra_help or asked.shell_completion or asked.info
     joins = several.started_by_torchrun() and not only_shows
     if not (elsewhere or asked.hydra_help or asked.shell_completion):
@@ -319,6 +321,9 @@ def check_command(arguments: list[str], folder: Path | None = None) -> str | Non
             return unwritable(folder, "hydra.sweep.dir")
     except FrankaError as error:
         return str(error)
-    place = folder or Path(given(arguments, "hydra.run.dir") or "outputs")
+    named = given(arguments, "hydra.run.dir")
+    if named == "":
+        return "hydra.run.dir=: names no folder; give one for the results, or leave it out"
+    place = folder or Path(named or "outputs")
     problem = unwritable(place)
     return problem if processes.restarted() else problem or occupied(place, cfg.resume)

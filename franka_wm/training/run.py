@@ -334,14 +334,14 @@ _begun: tuple[Path, set[Path], list[Logger]] | None = None
 def discard() -> bool:
     """Removes the folder of a run that has ended with nothing but what :func:`start` wrote; whether it did.
 
-    Also those above it that are then empty, below the working directory.
+    Also those above it that are then empty, below the working directory, which stays.
     """
-    if _begun is None or _files(_begun[0]) != _begun[1]:
+    here = Path.cwd()
+    if _begun is None or _begun[0].resolve() in (here, *here.parents) or _files(_begun[0]) != _begun[1]:
         return False
     folder, _, loggers = _begun
     close_loggers(loggers)
     shutil.rmtree(folder, ignore_errors=True)
-    here = Path.cwd()
     with suppress(OSError):  # not empty
         for above in folder.parents:
             if here not in above.parents:

@@ -156,6 +156,8 @@ WRONG: list[tuple[list[str], str]] = [
     (["collect", "out=/proc/x"], "/proc is not writable"),
     (["export", "source=.", "out=/proc/x"], "/proc is not writable"),
     (["view", "rerun=/proc/x.rrd"], "/proc is not writable"),
+    (["report", "RUN", "out=/proc/x.html"], "/proc is not writable"),
+    (["compare", "A", "B", "out=/proc/x.html"], "/proc is not writable"),
     (["evaluate", "checkpoint=x", "episodes=10000000000"], "at most 1000000"),
     (["collect", "out=x", "workers=1000000"], "at most 256"),
     (["evaluate", "checkpoint=x", "episodes=1"], "episodes=1: must be a whole number of at least 2"),

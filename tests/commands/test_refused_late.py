@@ -11,6 +11,7 @@ import pytest
 from hydra.core.global_hydra import GlobalHydra
 
 from forks import TRAIN
+from franka_wm.commands.entry import run_command
 from franka_wm.errors import UserError
 from franka_wm.training.run import Run
 
@@ -62,6 +63,29 @@ def test_a_file_of_the_users_stays(refused: Refused, tmp_path: Path) -> None:
     (tmp_path / "run" / "notes.txt").write_text("mine")
     refused("hydra.run.dir=run", error=UserError("no"))
     assert (tmp_path / "run" / "notes.txt").read_text() == "mine"
+
+
+@pytest.mark.parametrize(
+    ("word", "said"),
+    [
+        ("hydra.run.dir=", "hydra.run.dir=: names no folder"),
+        ("--experimental-rerun=job.pickle", "unpickles a file"),
+    ],
+)
+def test_what_hydra_would_take_is_refused_early(
+    word: str, said: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(SystemExit) as ended:
+        run_command(lambda: pytest.fail("begun"), ["scale=smoke", "device=cpu", word])
+    line = capfd.readouterr().err
+    assert ended.value.code == 1 and said in line and line.count("\n") == 1
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_the_working_directory_stays(refused: Refused, tmp_path: Path) -> None:
+    refused("hydra.run.dir=.", error=UserError("no"))
+    assert (tmp_path / "config.yaml").is_file()
 
 
 def test_what_a_run_has_written_stays(refused: Refused, tmp_path: Path) -> None:
