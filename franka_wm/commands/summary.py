@@ -24,7 +24,6 @@ def summary(folders: tuple[str, ...]) -> None:
     """
     from franka_wm.report.run import but_for_the_seed, malformed, read_config
     from franka_wm.report.seeds import evaluated, read_evaluation
-    from franka_wm.untrusted import values_of
 
     groups: dict[str, dict[Path, Result]] = {}
     for folder in folders:
@@ -32,7 +31,7 @@ def summary(folders: tuple[str, ...]) -> None:
             with malformed(run):
                 groups.setdefault(but_for_the_seed(read_config(run)), {})[run] = read_evaluation(run)
     for group in groups.values():
-        with values_of(" or ".join(map(str, group)), "measure the run again."):
+        with malformed(*group):
             text = table(group, several=len(groups) > 1)
         print(text)
 

@@ -4,7 +4,6 @@ import json
 import math
 import shlex
 from collections.abc import Mapping, Sequence
-from pathlib import Path
 from typing import Any
 
 from markupsafe import Markup
@@ -46,7 +45,7 @@ def compare_page(runs: Sequence[RunFiles]) -> str:
         raise UserError(
             f"compare needs at least two runs, got {len(runs)}: franka-wm compare outputs/RUN outputs/RUN"
         )
-    with malformed(Path(runs[0].folder)):
+    with malformed(*(run.folder for run in runs)):
         named = dict(zip(unique_names(runs), runs, strict=True))
         different = differences({name: run.config for name, run in named.items()})
         groups = repetitions(named)

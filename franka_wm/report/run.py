@@ -156,9 +156,9 @@ def but_for_the_seed(config: Mapping[str, object]) -> str:
     return json.dumps(kept, sort_keys=True, default=str) if kept else ""
 
 
-def malformed(folder: Path) -> AbstractContextManager[None]:
-    """Around the use of a run's values: those of another form than documented end in one line."""
-    return values_of(str(folder), "measure the run again.")
+def malformed(*folders: Path | str) -> AbstractContextManager[None]:
+    """Around the use of runs' values: those of another form than documented end in one line."""
+    return values_of(" or ".join(map(str, folders)), "measure the run again.")
 
 
 # -- files -----------------------------------------------------------------------------------------------

@@ -8,6 +8,7 @@ from franka_wm.errors import UserError
 from franka_wm.evaluation.intervals import bootstrap_mean
 from franka_wm.evaluation.results import Result, results
 from franka_wm.report.style import centimetres
+from franka_wm.untrusted import UntrustedFolder
 
 ENOUGH = 3
 """Fewest runs whose mean gets an interval."""
@@ -29,12 +30,14 @@ def runs_of(folder: str | Path) -> list[Path]:
     """The runs of a Hydra sweep (``train.py --multirun``), in the order in which they ran; else the folder itself.
 
     Raises:
-        UserError: The sweep has no runs.
+        UserError: The sweep has no runs, or one that is a link out of it.
     """
     folder = Path(folder)
     if not (folder / "multirun.yaml").is_file():
         return [folder]
     runs = {path: path.name.split("-")[0] for path in folder.iterdir() if path.is_dir()}
+    for path in runs:
+        UntrustedFolder(folder).below(path.name)
     numbered = sorted((int(number), path) for path, number in runs.items() if number.isdecimal())
     if not numbered:
         raise UserError(f"{folder}: a sweep without runs; give folders of runs that were finished")

@@ -121,3 +121,26 @@ def test_runs_of_different_tasks_are_not_averaged(tmp_path, capsys):
     out = capsys.readouterr().out
     assert "2 runs (0-reach, 2-reach)" in out and "2.00 (1.00 – 3.00)" in out
     assert "1 run (1-reach_fixed)" in out and "| planner | 2.00 | 100 |" in out
+
+
+def test_a_sweep_with_a_link_out_of_it_is_refused(tmp_path, capsys):
+    sweep, other = tmp_path / "sweep", tmp_path / "other"
+    for folder in (sweep, other):
+        folder.mkdir()
+    (sweep / "multirun.yaml").touch()
+    (other / "evaluation.json").write_text(written(0.01, 1.0))
+    (sweep / "0-reach").symlink_to(other)
+    assert main(["summary", str(sweep)]) == 1
+    assert f"0-reach is a link to {other}, outside of " in capsys.readouterr().err
+
+
+def test_compare_does_not_blame_the_first_run_for_another_ones_values(tmp_path, capsys):
+    for name in ("good", "bad"):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "evaluation.json").write_text(written(0.01, 1.0))
+    bad = json.loads((tmp_path / "bad" / "evaluation.json").read_text())
+    bad["policies"]["planner"]["final_distance"]["mean"] = "a word"
+    (tmp_path / "bad" / "evaluation.json").write_text(json.dumps(bad))
+    words = [str(tmp_path / "good"), str(tmp_path / "bad"), f"out={tmp_path}/page.html"]
+    assert main(["compare", *words]) == 1
+    assert f"{tmp_path}/good or {tmp_path}/bad holds values of another form" in capsys.readouterr().err
