@@ -41,9 +41,9 @@ def whole(least: int = 0, most: int | None = None) -> click.IntRange:
     return click.IntRange(least, most)
 
 
-def real(above: float) -> click.FloatRange:
-    """A finite number above ``above``."""
-    return _Real(min=above, min_open=True)
+def real(above: float, most: float | None = None) -> click.FloatRange:
+    """A finite number above ``above``, at most ``most``."""
+    return _Real(min=above, min_open=True, max=most)
 
 
 def wanted(kind: click.ParamType) -> str:
@@ -53,7 +53,10 @@ def wanted(kind: click.ParamType) -> str:
     if isinstance(kind, click.IntRange):
         most = "" if kind.max is None else f", at most {kind.max}"
         return f"a whole number of at least {kind.min}{most}"
-    return f"a finite number above {kind.min:g}" if isinstance(kind, click.FloatRange) else "true or false"
+    if isinstance(kind, click.FloatRange):
+        most = "" if kind.max is None else f", at most {kind.max:g}"
+        return f"a finite number above {kind.min:g}{most}"
+    return "true or false"
 
 
 class Word(click.Option):

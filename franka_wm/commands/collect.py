@@ -51,7 +51,9 @@ _PARTS = ("planner", "policy")
 @word("workers", "writing processes, of each GPU", whole(0, 256), 2)
 @word("shard_frames", "steps in one file, at most", whole(1), metavar="N")
 @word("success_only", "keep only episodes that end in success", FLAG, False)
-@word("noise", "of the expert's actions, standard deviation; it recovers from that", real(0.0), metavar="X")
+@word(
+    "noise", "of the expert's actions, standard deviation; it recovers from that", real(0.0, 2.0), metavar="X"
+)
 @word("resume", "go on with an unfinished dataset, or add to a finished one", FLAG, False)
 @plugins
 def collect(gpus: int, overrides: Sequence[str], **options: Any) -> int:

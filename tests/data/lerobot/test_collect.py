@@ -173,6 +173,10 @@ def test_ctrl_c_leaves_a_dataset(tmp_path, load) -> None:
         (["out=x", "policy=.", "env.goal=[1"], "is not a value as in YAML"),
         (["out=x", "env.fps=29.97"], "whole frames"),
         (["out=x", "env.observations=[depth]"], "depth has no place"),
+        (
+            ["out=x", "policy=expert", "noise=1e300"],
+            "noise=1e300: must be a finite number above 0, at most 2",
+        ),
         (["out=x", "policy=expert"], "policy=expert: task=reach has none; env=lift has one"),
         (
             ["out=x", "episodes=1000000000", "num_envs=1000000000", "device=cpu"],
