@@ -1,11 +1,12 @@
 """Other environments than the arm, through TorchRL's own wrappers: Gymnasium and the DeepMind Control Suite.
 
-They run on the CPU, one copy after the other (``SerialEnv``) or each in a process of its own (``ParallelEnv``).
+They run on the CPU, one copy after the other (``SerialEnv``), or in several processes (``ParallelEnv``).
 """
 
 from __future__ import annotations
 
 from functools import partial
+from typing import Any
 
 import torch
 from tensordict import TensorDictBase
@@ -13,6 +14,7 @@ from torchrl._utils import seed_generator
 from torchrl.envs import EnvBase, ParallelEnv, SerialEnv, TransformedEnv
 from torchrl.envs.transforms import (
     ActionScaling,
+    BatchSizeTransform,
     CatTensors,
     Compose,
     DoubleToFloat,
@@ -37,7 +39,8 @@ class ExternalEnv(TransformedEnv):
         num_envs: Copies, N.
         seed: Seed of all copies.
         device: Where the TensorDicts live; the simulators stay on the CPU.
-        parallel: Each copy in a process of its own; it plays the same episodes. ``close()`` ends the processes.
+        workers: Processes that share the copies equally, and play the same episodes; 0: this one does. ``close()`` ends
+            them.
 
     Raises:
         UserError: The extra is not installed, or there is no such environment or observation.
@@ -45,6 +48,7 @@ class ExternalEnv(TransformedEnv):
 
     device: torch.device
     reward_bounds = None  # of a step: neither library says them
+    action_masks = None  # all entries count
 
     def __init__(
         self,
@@ -53,7 +57,7 @@ class ExternalEnv(TransformedEnv):
         num_envs: int = 1,
         seed: int = 0,
         device: torch.device | str | None = None,
-        parallel: bool = False,
+        workers: int = 0,
     ):
         make = partial(_make_one, config)
         one = make()
@@ -69,12 +73,17 @@ class ExternalEnv(TransformedEnv):
             RewardSum(),
             InitTracker(),
         ]
-        # Daemons end with this process, however it ends.
-        base = (
-            ParallelEnv(num_envs, make, device=device, daemon=True)
-            if parallel
-            else SerialEnv(num_envs, make, device=device)
-        )
+        if workers:
+            share = partial(SerialEnv, num_envs // workers, make, device="cpu")
+            # Daemons end with this process, however it ends. It keeps its threads: TorchRL would take one for each
+            # worker, and with fewer the learner is slower and rounds otherwise.
+            keeps = {"daemon": True, "num_threads": torch.get_num_threads()}
+            base = ParallelEnv(workers, share, device=device, **keeps)
+            flat = BatchSizeTransform(reshape_fn=_flat)
+            flat.enable_inv_on_reset = True  # masks of a reset, too
+            base = TransformedEnv(base, flat)
+        else:
+            base = SerialEnv(num_envs, make, device=device)
         super().__init__(base, Compose(*transforms))
         self.config, self.num_envs = config, num_envs
         self._totals = torch.zeros(3, device=device)
@@ -91,6 +100,10 @@ class ExternalEnv(TransformedEnv):
     def set_first_world(self, number: int) -> None:
         """From the next :meth:`set_seed` on, these copies play the episodes of those from ``number``."""
         self._first_world = number
+
+    def rand_action(self, tensordict: TensorDictBase | None = None) -> TensorDictBase:
+        """Uniform actions; TorchRL's own refuses an environment of transformed ones, as with ``workers``."""
+        return EnvBase.rand_action(self, tensordict)
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
         out = super()._step(tensordict)
@@ -130,6 +143,11 @@ def check_external(config: ExternalConfig) -> None:
         _groups(config, env)
     finally:
         env.close()
+
+
+def _flat(data: Any) -> Any:
+    """(processes, copies of each, …) → (N, …)"""
+    return data.flatten(0, 1)
 
 
 def _make_one(config: ExternalConfig) -> EnvBase:

@@ -55,13 +55,14 @@ def make_env(
     num_envs: int | None = None,
     seed: int | None = None,
     first_world: int = 0,
-    parallel: bool = False,
+    workers: int = 0,
     **changes: object,
 ) -> Environment:
     """The environment that ``run.env`` describes; ``changes`` override fields of its config.
 
     For a model of discrete actions the arm takes numbers of rows of a table. Its episodes are those of training
-    unless ``seed`` says otherwise. Worlds of other libraries differ by the seed alone; ``parallel``: each in a process.
+    unless ``seed`` says otherwise. Worlds of other libraries differ by the seed alone; ``workers`` processes share
+    them.
     """
     described = run.env.changed(**changes)
     worlds = run.collector.num_envs if num_envs is None else num_envs
@@ -71,7 +72,7 @@ def make_env(
         return MultiTaskEnv(described.config, device=run.device, **many)
     if isinstance(described.config, ExternalConfig):
         device = resolve_device(run.device)
-        return ExternalEnv(described.config, num_envs=worlds, seed=start, device=device, parallel=parallel)
+        return ExternalEnv(described.config, num_envs=worlds, seed=start, device=device, workers=workers)
     config = described.arm
     env = FrankaEnv(
         config,

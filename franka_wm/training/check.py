@@ -40,10 +40,16 @@ def check(run: RunSettings) -> None:
             f"collector.planner_worlds={run.collector.planner_worlds}: must be a whole number of at most "
             f"collector.num_envs={run.collector.num_envs}; 0 leaves all worlds to the policy"
         )
-    if run.collector.parallel and not isinstance(run.env.config, ExternalConfig):
+    workers, worlds = run.collector.workers, run.collector.num_envs
+    if workers and not isinstance(run.env.config, ExternalConfig):
         raise UserError(
-            "collector.parallel=true: is for env=gym and env=dm_control, a process for each world; leave it out, since "
-            "the arm's worlds are one simulator"
+            f"collector.workers={workers}: is for env=gym and env=dm_control; leave it out, since the arm's worlds are "
+            "one simulator"
+        )
+    if workers and worlds % workers:
+        raise UserError(
+            f"collector.workers={workers}: cannot share collector.num_envs={worlds} worlds equally; use a number that "
+            "divides them"
         )
     if run.is_offline:
         _check_dataset(run)

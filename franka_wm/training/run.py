@@ -174,8 +174,8 @@ class Run:
         with announced(f"building {worlds}" + (f"; {compiling}" if self.settings.is_arm else "")):
             eval_env = build.make_evaluation_env(self.settings, num_envs=self._evaluation_worlds())
             own = processes.rank() * self.settings.collector.num_envs
-            parallel = self.settings.collector.parallel
-            env = build.make_env(self.settings, first_world=own, parallel=parallel) if gathers else None
+            workers = self.settings.collector.workers
+            env = build.make_env(self.settings, first_world=own, workers=workers) if gathers else None
             apart = () if self.settings.env.kind in ("franka", "multitask") else processes.parts()
             for one in (env, eval_env):
                 if one is not None:

@@ -100,24 +100,33 @@ def test_episodes_end_and_begin_on_the_gpu_as_on_the_cpu() -> None:
     torch.testing.assert_close(*rollouts)
 
 
-def test_processes_of_their_own_play_the_same_and_end() -> None:
-    """Episodes are drawn and end as in one process after the other."""
+def test_processes_of_their_own_play_the_same_and_end(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Episodes are drawn and end as in one process after the other, at different times in different worlds."""
     import multiprocessing
 
-    config = ExternalConfig(kind="gym", name="Pendulum-v1", episode_length=4)
+    monkeypatch.setattr(torch, "get_num_threads", lambda: 7)  # fewer are taken where there are more than one
+    said: list[int] = []
+    monkeypatch.setattr(torch, "set_num_threads", said.append)
+    env = ExternalEnv(ExternalConfig(kind="gym", name="Pendulum-v1"), num_envs=2, workers=1)
+    assert env.step(env.rand_action(env.reset()))["action"].shape == (2, 1)
+    assert said == []  # the learner keeps its own
+    env.close()
+    config = ExternalConfig(kind="gym", name="CartPole-v1", episode_length=30)
     rollouts = []
-    for parallel in (False, True):
-        env = ExternalEnv(config, num_envs=2, seed=3, parallel=parallel)
-        assert len(multiprocessing.active_children()) == (2 if parallel else 0)
-        actions = torch.linspace(-1, 1, 20).reshape(2, 10, 1)
+    for workers in (0, 2):
+        env = ExternalEnv(config, num_envs=4, seed=3, workers=workers)
+        assert len(multiprocessing.active_children()) == workers
         carry, steps = env.reset(), []
-        for k in range(10):
-            step, carry = env.step_and_maybe_reset(carry.set("action", actions[:, k]))
+        for _ in range(40):
+            step, carry = env.step_and_maybe_reset(carry.set("action", torch.tensor([0, 1, 1, 0])))
             steps.append(step)
+        carry = env.reset(carry.set("_reset", torch.tensor([[True], [False], [False], [True]])))
+        steps.append(env.step(carry.set("action", torch.tensor([1, 0, 1, 0]))))
         rollouts.append((torch.stack(steps).to_tensordict(), env.statistics()))
         env.close()
     (one, told), (other, said) = rollouts
-    assert told == said and told["episodes"] == 4
+    ends = one["next", "done"].sum(1)
+    assert told == said and told["episodes"] == ends.sum() and ((ends > 0) & (ends < 4)).any()
     for key in (
         "state",
         "is_init",

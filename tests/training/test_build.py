@@ -415,14 +415,21 @@ def test_the_models_policy_explores_and_others_act_as_they_are(settled) -> None:
         "collector.noise=some",
         "collector.planner_worlds=100000",
         "collector.planner_worlds=1.5",
-        "collector.parallel=true",
-        "collector.parallel=2",
+        "collector.workers=2",
+        "collector.workers=-1",
         "replay.hindsight=2",
     ],
 )
 def test_exploration_that_cannot_be_is_refused_before_anything_is_built(wrong: str, settled) -> None:
     with pytest.raises(UserError, match=wrong.split("=")[0]):
         check(settled("scale=smoke", "device=cpu", wrong))
+
+
+def test_processes_share_the_worlds_of_other_libraries_equally(settled) -> None:
+    with pytest.raises(
+        UserError, match=r"collector\.workers=3: cannot share collector\.num_envs=4 worlds equally"
+    ):
+        check(settled("env=gym", "scale=smoke", "device=cpu", "collector.num_envs=4", "collector.workers=3"))
 
 
 def test_plans_stay_near_the_policy_on_the_arm_and_are_the_published_ones_elsewhere(settled):

@@ -13,25 +13,25 @@ from franka_wm.errors import UserError
 from franka_wm.training import build
 from franka_wm.training.run import Run, import_plugins
 from franka_wm.training.settings import RunSettings
+from franka_wm.training.spaces import Spaces
 
 
-@pytest.mark.parametrize("parallel", [False, True])
-def test_worlds_of_other_libraries_have_processes_of_their_own_if_asked(
-    parallel: bool, tmp_path: Path
-) -> None:
+@pytest.mark.parametrize("workers", [0, 2])
+def test_worlds_of_other_libraries_have_processes_of_their_own_if_asked(workers: int, tmp_path: Path) -> None:
     """Those of training alone: the evaluation's worlds step in this one."""
     words = (
         "env=gym",
-        "collector.num_envs=2",
+        "collector.num_envs=4",
         "evaluation.episodes=2",
-        f"collector.parallel={str(parallel).lower()}",
+        f"collector.workers={workers}",
     )
     before = set(multiprocessing.active_children())
     settings = RunSettings.of(compose("scale=smoke", "device=cpu", *words))
     env, eval_env = Run(settings, tmp_path).build_environments()
     assert env is not None and eval_env is not None
     try:
-        assert len(set(multiprocessing.active_children()) - before) == (2 if parallel else 0)
+        assert len(set(multiprocessing.active_children()) - before) == workers
+        assert Spaces.of_env(env) == Spaces.of_env(eval_env)
     finally:
         env.close()
         eval_env.close()

@@ -58,7 +58,7 @@ class CollectorSettings:
     smoothness: float = real(0.7, least=0, below=1)
     noise: float = real(0.0, least=0, most=2, unit="units of the action")
     planner_worlds: int = whole(0, least=0)
-    parallel: bool = flag(False)
+    workers: int = whole(0, least=0)
 
 
 @dataclass(frozen=True)

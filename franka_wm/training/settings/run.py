@@ -167,7 +167,7 @@ class RunSettings:
         """What one of so many processes has of the whole run."""
         c, r = self.collector, self.replay
         divided = {"collector.num_envs": c.num_envs, "replay.batch_size": r.batch_size}
-        divided["collector.planner_worlds"] = c.planner_worlds
+        divided |= {"collector.planner_worlds": c.planner_worlds, "collector.workers": c.workers}
         for name, value in divided.items():
             if value % parts:
                 raise UserError(f"{name}={value}: {parts} GPUs cannot share it; use a multiple of {parts}")
@@ -180,7 +180,12 @@ class RunSettings:
                 )
         return replace(
             self,
-            collector=replace(c, num_envs=c.num_envs // parts, planner_worlds=c.planner_worlds // parts),
+            collector=replace(
+                c,
+                num_envs=c.num_envs // parts,
+                planner_worlds=c.planner_worlds // parts,
+                workers=c.workers // parts,
+            ),
             replay=replace(r, batch_size=r.batch_size // parts, capacity=r.capacity // parts),
         )
 
