@@ -128,9 +128,7 @@ def _run(main: Callable[[], Any], arguments: list[str]) -> None:
 
 def _launched(flags: list[str], overrides: list[str], multirun: bool) -> bool:
     """Runs a command that asks for several processes, which is not the business of this one; whether it does."""
-    if multirun:
-        if any(one.lstrip("+").startswith("gpus=") and one != "gpus=1" for one in overrides):
-            fail("gpus with --multirun: jobs of a sweep have one GPU each; leave one of the two out")
+    if multirun:  # its jobs may
         return False
     try:
         gpus, device = several.wanted(overrides)
@@ -217,7 +215,7 @@ def one_line_errors(main: Callable[[DictConfig], object]) -> Callable[[DictConfi
 
 def _discard() -> bool:
     """A run that was refused late leaves no folder; those of a sweep stay, for the same command to go on there."""
-    if _sweep is not None:
+    if _sweep is not None or several.JOB in os.environ:
         return False
     from franka_wm.training.run import discard
 
@@ -293,7 +291,7 @@ def check_sweep(overrides: list[str]) -> Sweep:
     except FrankaError as error:
         fail(str(error))
     for name, job in zip(names(found), found, strict=True):
-        problem = check_command(job.overrides, job.folder)
+        problem = check_command(job.overrides, job.folder) or several.refused_job(job.overrides)
         if problem is not None:
             fail(f"{name}: {problem}")
     return Sweep(names(found), [job.folder for job in found])

@@ -25,6 +25,8 @@ from franka_wm.versions import PACKAGES, versions
 
 SAVING = 1800
 """How long processes that were asked to stop may take to save [s]."""
+JOB = "FRANKA_WM_JOB"
+"""In the environment of a process: it is one of several of a sweep's job, whose folder this is."""
 
 MOST_ON_A_CORE = 8
 """Processes with ``device=cpu``: they share cores, and each needs a gigabyte."""
@@ -105,6 +107,55 @@ def launch_verb(command: list[str], gpus: int, device: str, advice: str) -> None
             f"process {rank} of the run (pid {failure.pid}) was ended by {failure.signal_name()}, the others with it; "
             f"{advice}"
         ) from None
+
+
+def refused_job(overrides: list[str]) -> str | None:
+    """Why a job of a sweep cannot have the processes that it asks for, in one line; ``None`` if it can.
+
+    Whether other hosts have the GPUs, only their jobs can say.
+    """
+    if not any(one.lstrip("+").startswith("gpus=") for one in overrides):
+        return None
+    gpus, device = wanted(overrides)
+    launcher = next((one for one in overrides if one.startswith("hydra/launcher=")), None)
+    if gpus > 1 and launcher == "hydra/launcher=joblib":
+        return f"gpus={gpus} with {launcher}: jobs at once would take the same GPUs; leave the launcher out"
+    try:
+        if gpus > 1 and launcher is None:
+            _require_gpus(gpus, device)
+    except UserError as error:
+        return str(error)
+    return None
+
+
+def launch_job(overrides: list[str], cfg: DictConfig, folder: Path) -> None:
+    """Starts the processes of one job of a sweep on this host, and waits for them.
+
+    Args:
+        overrides: Of the job; ``cfg`` may have more.
+        cfg: Its configuration.
+        folder: Where it writes.
+
+    Raises:
+        UserError: This host has fewer GPUs, or the job failed.
+        SystemExit: It was asked to stop, and has saved.
+    """
+    command = ["train", *overrides, f"hydra.run.dir={quoted(str(folder))}"]
+    if cfg.resume is not None:
+        command.append(f"resume={quoted(str(cfg.resume))}")
+    os.environ[JOB] = str(folder)
+    handlers = {one: signal.getsignal(one) for one in (signal.SIGINT, signal.SIGTERM)}
+    log = f"its lines above say why, or {folder / 'train.log'}"
+    try:
+        launch_verb(command, cfg.gpus, str(cfg.device), log)
+    except SystemExit as ended:
+        if ended.code in (INTERRUPTED, 128 + signal.SIGTERM):
+            raise
+        raise UserError(log) from None
+    finally:
+        del os.environ[JOB]
+        for one, handler in handlers.items():  # torchrun leaves its own
+            signal.signal(one, handler)
 
 
 @contextmanager

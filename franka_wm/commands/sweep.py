@@ -14,6 +14,7 @@ from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 
 from franka_wm import conf
+from franka_wm.commands import several
 from franka_wm.console import log_anew, say
 from franka_wm.errors import REFUSALS, FrankaError, UserError, machine_refused
 from franka_wm.versions import FINISHED
@@ -97,7 +98,6 @@ class Sweep:
         Raises:
             KeyboardInterrupt, SystemExit: Ctrl-C, which ends the sweep.
         """
-        from franka_wm.evaluation.results import FILE, read_result, score
         from franka_wm.training.run import left_by
 
         told = HydraConfig.get()
@@ -109,11 +109,14 @@ class Sweep:
             left = None if cfg.resume is not None else left_by(folder, cfg)
             if left == "finished":
                 say(f"{name} was finished before: {folder}")
-                return score(read_result(folder / FILE).policies) if (folder / FILE).is_file() else None
+                return _score(folder)
             if left is not None:
                 say(f"{name} goes on where it stopped")
                 cfg.resume = str(folder)
-            return main(cfg)
+            if cfg.gpus == 1:
+                return main(cfg)
+            several.launch_job(list(told.overrides.task), cfg, folder)
+            return _score(folder)
         except (KeyboardInterrupt, SystemExit):  # the latter is how a run ends that has saved after Ctrl-C
             say(f"the sweep is stopped; {self.advice}")
             raise
@@ -144,6 +147,13 @@ class Sweep:
             return None
         reasons = "; ".join(self.failed.values())
         return str(FrankaError(f"{len(self.failed)} of {self.ran} jobs failed: {reasons}; {self.advice}"))
+
+
+def _score(folder: Path) -> float | None:
+    """What the run in this folder has returned."""
+    from franka_wm.evaluation.results import FILE, read_result, score
+
+    return score(read_result(folder / FILE).policies) if (folder / FILE).is_file() else None
 
 
 def _in_words(error: Exception) -> str:

@@ -15,9 +15,9 @@ import torch
 from omegaconf import OmegaConf
 
 from forks import TRAIN, Fork, script, train_in_fork
-from franka_wm.commands import entry
+from franka_wm.commands import entry, several
 from franka_wm.commands.overrides import explain
-from franka_wm.commands.several import spread
+from franka_wm.commands.several import refused_job, spread
 from franka_wm.errors import UserError
 from franka_wm.evaluation.results import read_result, score
 from franka_wm.training.checkpoint import latest_checkpoint, load_checkpoint
@@ -152,6 +152,31 @@ def test_jobs_of_other_processes_are_looked_after_as_well(tmp_path: Path, launch
     if launcher == "joblib":
         again = subprocess.run(command, capture_output=True, text=True, timeout=240)
         assert again.returncode == 1 and "job 1 (trainer.lr=0.001) was finished before" in again.stdout
+
+
+@pytest.mark.slow
+def test_jobs_of_several_processes_are_looked_after_as_well(tmp_path: Path) -> None:
+    done = sweep(tmp_path, BREAKS, "gpus=2")
+    assert done.returncode == 1 and "Traceback" not in done.stderr, done.stderr
+    assert "training broke" in done.stderr
+    last = done.stderr.strip().splitlines()[-1]
+    assert last.startswith(
+        "error: 1 of 2 jobs failed: job 0 (trainer.lr=1e+30): its lines above say why, or "
+    )
+    assert (tmp_path / "sweep/0-reach/train.log").is_file()
+    job = tmp_path / "sweep/1-reach"
+    assert returned(job) == score(read_result(job / "evaluation.json").policies)
+    assert load_checkpoint(latest_checkpoint(job)).config["gpus"] == 2
+
+
+def test_jobs_of_several_processes_that_cannot_be(monkeypatch: pytest.MonkeyPatch) -> None:
+    several_gpus = ["scale=smoke", "gpus=2", "device=cuda"]
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    assert "gpus=2: this machine has 0 usable CUDA devices" in str(refused_job(several_gpus))
+    assert "would take the same GPUs" in str(refused_job([*several_gpus, "hydra/launcher=joblib"]))
+    assert refused_job(["scale=smoke", "gpus=2", "device=cpu"]) is None
+    monkeypatch.setattr(several, "wanted", lambda _: (2, "cuda"))  # the extra may be missing
+    assert refused_job([*several_gpus, "hydra/launcher=ray"]) is None  # its hosts may have them
 
 
 def test_jobs_take_the_gpus_in_turn(monkeypatch: pytest.MonkeyPatch) -> None:

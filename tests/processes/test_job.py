@@ -345,7 +345,10 @@ def test_an_exception_in_one_process_ends_all(tmp_path) -> None:
     ("overrides", "says"),
     [
         (["gpus=2", "device=auto"], "gpus=2: this machine has 0 usable CUDA devices"),
-        (["gpus=2", "seed=0,1", "--multirun"], "gpus with --multirun"),
+        (
+            ["gpus=2", "device=auto", "seed=0,1", "--multirun"],
+            "job 0 (seed=0): gpus=2: this machine has 0 usable CUDA",
+        ),
     ],
 )
 def test_what_cannot_be_started_is_one_line(tmp_path, overrides, says) -> None:
