@@ -61,7 +61,7 @@ def make_env(
     """The environment that ``run.env`` describes; ``changes`` override fields of its config.
 
     For a model of discrete actions the arm takes numbers of rows of a table. Its episodes are those of training
-    unless ``seed`` says otherwise. Worlds of other libraries differ by the seed alone; ``workers`` processes share them.
+    unless ``seed`` says otherwise. Worlds of other libraries differ by the seed alone; ``workers`` share them.
     """
     described = run.env.changed(**changes)
     worlds = run.collector.num_envs if num_envs is None else num_envs
