@@ -59,6 +59,7 @@ def main(cfg: DictConfig) -> float | None:
     )
     if run.checkpoint is not None:
         restore(trainer, run.checkpoint)
+    run.keep()
     trainer.fit()
     if trainer.interrupted:
         run.stop()

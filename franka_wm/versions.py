@@ -19,6 +19,11 @@ FINISHED = "finished.json"
 PACKAGES = ("torch", "torchrl", "tensordict", "newton", "warp-lang", "mujoco-warp", "lerobot", "numpy")
 
 
+def usable_cores() -> int:
+    """Cores that this process may use: fewer than the machine has, in a container or under ``taskset``."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
 def versions(device: Any = None) -> dict[str, Any]:
     """Versions of what decides numbers, and the machine they ran on.
 
@@ -38,7 +43,7 @@ def versions(device: Any = None) -> dict[str, Any]:
     found["system"] = platform.platform(terse=True)
     found["processors"] = os.cpu_count() or 0
     found["processor"] = processor()
-    found["cores"] = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
+    found["cores"] = usable_cores()
     if device is not None:
         import torch
 

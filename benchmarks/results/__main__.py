@@ -85,7 +85,7 @@ def parse(arguments: list[str] | None) -> argparse.Namespace:
         nargs="+",
         default=[],
         metavar="ARG",
-        help="of train.py, that change no number: evaluation.video_episodes=0 logger=none",
+        help="of train.py, that change no number but times: evaluation.video_episodes=0 logger=none",
     )
     one.add_argument("--out", type=Path, default=Path("outputs/results"), help="folder for the runs' folders")
     two = verbs.add_parser("collect", help="take a row's numbers from folders of finished runs")

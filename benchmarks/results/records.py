@@ -26,14 +26,10 @@ from franka_wm.versions import PACKAGES
 
 PLACE = ROOT / "docs" / "results"
 CODE = "code"
-FREE = (
-    "seed",
-    "device",
-    "logger",
-    "evaluation.video_episodes",
-    "trainer.checkpoint_replay",
-)
+BESIDE = ("logger", "evaluation.video_episodes", "trainer.checkpoint_replay")
 """Arguments that a run may have beside its row's, or lack: they change none of its numbers but times."""
+FREE = ("seed", "device", *BESIDE)
+"""What a run may say otherwise than its row."""
 
 
 def record_run(row: Row, folder: Path, *, jobs: int, commit: str | None = None) -> dict[str, Any]:

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks.results.confirm import confirmed
-from benchmarks.results.records import FREE, PLACE, read
+from benchmarks.results.records import BESIDE, PLACE, read
 from benchmarks.results.rows import Row
 from benchmarks.results.state import Record, numbers, state, unmeasured
 from franka_wm.errors import UserError
@@ -206,7 +206,7 @@ def part(row: Row, records: Sequence[Record], judged: tuple[str, list[str]], pla
     if missing := unmeasured(row, records):
         one = "seed" if len(missing) == 1 else "seeds"
         lines += [
-            f"**Not run: {one} {numbers(missing)}** of the {len(row.seeds)} that the row declares.",
+            f"**Missing: {one} {numbers(missing)}** of the {len(row.seeds)} that the row declares.",
             "",
         ]
     if row.script is not None:
@@ -305,9 +305,8 @@ def _provenance(row: Row, records: Sequence[Record]) -> str:
 def _beside(row: Row, record: Record) -> str:
     """Arguments in which the run's command differs from the row's; the seed and the device stand elsewhere."""
     typed = shlex.split(record["command"])[2:]
-    hidden = [name for name in FREE if name not in ("seed", "device")]
     more, less = (
-        [a for a in some if a.split("=", 1)[0] in hidden and a not in others]
+        [a for a in some if a.split("=", 1)[0] in BESIDE and a not in others]
         for some, others in ((typed, row.words), (row.words, typed))
     )
     parts = [f"{word} `{' '.join(some)}`" for word, some in (("with", more), ("without", less)) if some]
@@ -385,7 +384,8 @@ def readme_tables(rows: Mapping[str, Row], place: Path = PLACE) -> str:
             speed += [table(titles, cells), ""]
             continue
         policy = acting(records[0]["policies"])
-        where, runs = cores(row, records), f"{len(records)} seeds"
+        of = f" of {len(row.seeds)}" if unmeasured(row, records) else ""
+        where, runs = cores(row, records), f"{len(records)}{of} seeds"
         who = f"{row.title}{mark}"
         if columns(records) == [RETURN]:
             values = [RETURN.of(record, policy) for record in records]

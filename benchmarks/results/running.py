@@ -15,7 +15,7 @@ from pathlib import Path
 from queue import Queue
 from threading import Lock
 
-from benchmarks.results.records import FREE, PLACE, record_benchmark, record_run, write
+from benchmarks.results.records import BESIDE, PLACE, record_benchmark, record_run, write
 from benchmarks.results.rows import Row
 from franka_wm.errors import UserError
 from franka_wm.source import ROOT
@@ -35,7 +35,7 @@ class Machine:
         threads: of each run; on CPU cores it has these to itself. ``None``: as many as the section says, and as torch
             chooses on a GPU.
         commit: of the code, where there is no repository.
-        extra: arguments of train.py beside the row's, which change no number: ``evaluation.video_episodes=0``.
+        extra: arguments of train.py beside the row's that change no number but times: ``evaluation.video_episodes=0``.
     """
 
     jobs: int = 1
@@ -46,9 +46,9 @@ class Machine:
     extra: Sequence[str] = ()
 
     def __post_init__(self) -> None:
-        if other := [one for one in self.extra if one.split("=", 1)[0] not in set(FREE) - {"seed", "device"}]:
+        if other := [one for one in self.extra if not one.startswith(tuple(f"{name}=" for name in BESIDE))]:
             raise UserError(
-                f"--extra {shlex.join(other)}: may be {', '.join(FREE[2:])} alone; others change the row"
+                f"--extra {shlex.join(other)}: may be {'=…, '.join(BESIDE)}=… alone; others change the row"
             )
 
     def slots(self, row: Row) -> list[Slot]:
@@ -103,6 +103,10 @@ def run(
         UserError: Before anything runs.
     """
     begun, failed = time.monotonic(), []
+    if machine.extra and (scripts := [row.name for row, _ in work if row.script is not None]):
+        raise UserError(
+            f"--extra: {', '.join(scripts)}: benchmarks have no arguments of train.py; run them apart"
+        )
     slots_of = [machine.slots(row) for row, _ in work]
     if any(slots != slots_of[0] for slots in slots_of):
         raise UserError("these rows do not run on the same kind of device or cores; run them apart")

@@ -32,6 +32,8 @@ MOST_JOBS = 1000
 """Most runs of one sweep: each is checked before the first begins."""
 _sweep: Sweep | None = None
 """That of this process; jobs in processes of other launchers have a copy."""
+_there: frozenset[Path] | None = None
+"""Folders that stood before Hydra made the run's; ``None`` where nobody looked: then nothing is removed."""
 
 
 def run_command(main: Callable[[], object], arguments: list[str] | None = None) -> None:
@@ -84,8 +86,8 @@ def one_line_refusals() -> Iterator[None]:
 
 
 def _run(main: Callable[[], Any], arguments: list[str]) -> None:
-    global _sweep
-    _sweep, asked = None, hydra_flags(arguments)
+    global _sweep, _there
+    _sweep, _there, asked = None, None, hydra_flags(arguments)
     if asked.experimental_rerun:
         fail("--experimental-rerun unpickles a file, which may run anything; resume=RUN goes on with a run")
     flags = [a for a in arguments if a not in asked.overrides]
@@ -115,6 +117,9 @@ def _run(main: Callable[[], Any], arguments: list[str]) -> None:
             fail(problem)
         if not (joins or asked.cfg) and _launched(flags, overrides, asked.multirun):
             return
+        if not asked.multirun:  # a sweep's folders stay, for the same command to go on there
+            place = Path(given(overrides, "hydra.run.dir") or "outputs").resolve()
+            _there = frozenset(one for one in (place, *place.parents, *place.glob("*")) if one.is_dir())
     sys.argv[1:] = [*flags, *overrides]
     main()
     if joins:
@@ -214,12 +219,12 @@ def one_line_errors(main: Callable[[DictConfig], object]) -> Callable[[DictConfi
 
 
 def _discard() -> bool:
-    """A run that was refused late leaves no folder; those of a sweep stay, for the same command to go on there."""
-    if _sweep is not None or several.JOB in os.environ:
+    """A run that was refused late leaves no folder that was made for it."""
+    if _there is None or several.JOB in os.environ:
         return False
     from franka_wm.training.run import discard
 
-    return discard()
+    return discard(_there)
 
 
 def check_overrides(arguments: list[str]) -> None:
@@ -282,7 +287,10 @@ def with_scale(arguments: list[str], stream: TextIO | None = None, *, quiet: boo
 
 def check_sweep(overrides: list[str]) -> Sweep:
     """Checks every job of a sweep, and its folder, before the first one begins."""
-    if "hydra/sweeper=optuna" in overrides and "hydra.sweeper.direction=maximize" not in overrides:
+    if (
+        given(overrides, "hydra/sweeper") == "optuna"
+        and given(overrides, "hydra.sweeper.direction") != "maximize"
+    ):
         fail(
             "hydra/sweeper=optuna: a run returns what is better the higher; add hydra.sweeper.direction=maximize"
         )

@@ -34,7 +34,7 @@ def given(overrides: Sequence[str], key: str) -> str | None:
     from hydra.core.override_parser.overrides_parser import OverridesParser
     from hydra.core.override_parser.types import QuotedString
 
-    line = next((one for one in reversed(overrides) if one.startswith(f"{key}=")), None)
+    line = next((one for one in reversed(overrides) if one.lstrip("+").startswith(f"{key}=")), None)
     if line is None:
         return None
     value = OverridesParser.create().parse_override(line).value()

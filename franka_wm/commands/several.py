@@ -21,7 +21,7 @@ from franka_wm.console import quoted, resuming, say
 from franka_wm.errors import UserError
 from franka_wm.interrupt import INTERRUPTED
 from franka_wm.untrusted import UntrustedFolder
-from franka_wm.versions import PACKAGES, versions
+from franka_wm.versions import PACKAGES, usable_cores, versions
 
 SAVING = 1800
 """How long processes that were asked to stop may take to save [s]."""
@@ -80,7 +80,7 @@ def launch_verb(command: list[str], gpus: int, device: str, advice: str) -> None
     from torch.distributed.launcher.api import LaunchConfig, elastic_launch
 
     logging.getLogger("torch.distributed").setLevel(logging.CRITICAL)  # ours say what happened
-    os.environ.setdefault("OMP_NUM_THREADS", str(max(1, (os.cpu_count() or 1) // gpus)))
+    os.environ.setdefault("OMP_NUM_THREADS", str(max(1, usable_cores() // gpus)))
     places = [str(conf.FOLDER.parents[1]), *filter(None, [os.environ.get("PYTHONPATH")])]
     os.environ["PYTHONPATH"] = os.pathsep.join(places)
     try:
@@ -132,7 +132,7 @@ def launch_job(overrides: list[str], cfg: DictConfig, folder: Path) -> None:
     """Starts the processes of one job of a sweep on this host, and waits for them.
 
     Args:
-        overrides: Of the job; ``cfg`` may have more.
+        overrides: The job's; ``cfg`` may have more.
         cfg: Its configuration.
         folder: Where it writes.
 
@@ -183,7 +183,7 @@ def patience() -> Iterator[None]:
 
 def _require_gpus(gpus: int, device: str) -> None:
     if device == "cpu":
-        cores = os.cpu_count() or 1
+        cores = usable_cores()
         if gpus > MOST_ON_A_CORE * cores:
             raise UserError(
                 f"gpus={gpus} with device=cpu: at most {MOST_ON_A_CORE * cores} processes on the {cores} cores of this "

@@ -158,7 +158,8 @@ def but_for_the_seed(config: Mapping[str, object]) -> str:
 
 def malformed(*folders: Path | str) -> AbstractContextManager[None]:
     """Around the use of runs' values: those of another form than documented end in one line."""
-    return values_of(" or ".join(map(str, folders)), "measure the run again.")
+    some = [str(one) for one in folders[:3]] + [f"{len(folders) - 3} others"] * (len(folders) > 3)
+    return values_of(" or ".join(some), "measure the run again.")
 
 
 # -- files -----------------------------------------------------------------------------------------------

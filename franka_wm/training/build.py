@@ -181,11 +181,6 @@ def make_objective(run: RunSettings, model: WorldModel) -> Objective | None:
     if name is None:
         return None
     if name == "reward_value":
-        for option, default in (("metric", "l2"), ("summed", True), ("steps_weight", 0)):
-            if (given := getattr(o, option)) != default:
-                raise UserError(
-                    f"objective.{option}={given}: is of objective=goal_image; leave it at {default}"
-                )
         try:
             chosen: Objective = planning.RewardPlusValue.of(model)
         except ValueError as error:

@@ -60,6 +60,7 @@ def check(run: RunSettings) -> None:
     else:
         _ = run.actor
     _check_hindsight(run)
+    _check_objective(run)
     _check_demonstrations(run)
     _check_export(run)
     if run.pretrain.kind != "none" and "encoder_from" not in run.model.options:
@@ -115,8 +116,19 @@ def _check_hindsight(run: RunSettings) -> None:
             raise UserError(f"replay.hindsight={run.replay.hindsight}: {why}; leave it at null")
 
 
+def _check_objective(run: RunSettings) -> None:
+    """Options without effect; a run that goes on keeps those that it began with."""
+    if run.objective_name != "reward_value" or run.resume is not None:
+        return
+    for option, default in (("metric", "l2"), ("summed", True), ("steps_weight", 0)):
+        if (given := getattr(run.objective, option)) != default:
+            raise UserError(f"objective.{option}={given}: is of objective=goal_image; leave it at {default}")
+
+
 def _check_demonstrations(run: RunSettings) -> None:
     if run.replay.demos is None:
+        if run.resume is not None:  # it keeps what it began with
+            return
         for option in ("demo_resets", "demo_reset_updates", "demo_updates"):
             if given := getattr(run.replay, option):
                 raise UserError(f"replay.{option}={given}: needs demonstrations, replay.demos=FOLDER")

@@ -6,10 +6,9 @@ import fcntl
 import gc
 import importlib
 import logging
-import shutil
 import sys
 import traceback
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -262,6 +261,11 @@ class Run:
         close_loggers(self.loggers)
         write_finished(self.folder)
 
+    def keep(self) -> None:
+        """Keeps the folder from now on, whatever comes: training begins."""
+        global _begun
+        _begun = None
+
     def export(self, experience: Callable[[], TensorDictBase | None]) -> None:
         """What ``export`` in the configuration asks for: the replay's whole episodes as a LeRobot dataset.
 
@@ -328,30 +332,34 @@ def start(cfg: DictConfig) -> Run:
 
 
 _begun: tuple[Path, set[Path], list[Logger]] | None = None
-"""Of this process's run, if its folder was new: the folder, what :func:`start` wrote into it, the loggers."""
+"""The folder of this process's run, what :func:`start` wrote there, the loggers; ``None`` if it held more before."""
 
 
-def discard() -> bool:
+def discard(there: Collection[Path]) -> bool:
     """Removes the folder of a run that has ended with nothing but what :func:`start` wrote; whether it did.
 
-    Also those above it that are then empty, below the working directory, which stays.
+    Args:
+        there: Folders that stood before the command, resolved. Those stay, and so does all that was written into one.
     """
-    here = Path.cwd()
-    if _begun is None or _begun[0].resolve() in (here, *here.parents) or _files(_begun[0]) != _begun[1]:
+    if _begun is None:
         return False
-    folder, _, loggers = _begun
+    folder, (_, written, loggers) = _begun[0].resolve(), _begun
+    if folder in there or _files(folder) != written:
+        return False
     close_loggers(loggers)
-    shutil.rmtree(folder, ignore_errors=True)
-    with suppress(OSError):  # not empty
-        for above in folder.parents:
-            if here not in above.parents:
-                break
-            above.rmdir()
-    return True
+    for file in written:
+        (folder / file).unlink(missing_ok=True)
+    empty = sorted((one for one in folder.rglob("*") if one.is_dir()), reverse=True)
+    for one in (*empty, folder, *folder.parents):
+        if one in there:
+            break
+        with suppress(OSError):  # not empty: not ours
+            one.rmdir()
+    return not folder.exists()
 
 
 def _files(folder: Path) -> set[Path]:
-    return {one.relative_to(folder) for one in folder.rglob("*") if not one.is_dir()}
+    return {one.relative_to(folder) for one in folder.rglob("*") if one.is_symlink() or not one.is_dir()}
 
 
 def _require_same(checkpoint: Checkpoint) -> None:

@@ -67,6 +67,7 @@ def pretrain(
     if begun is not None:
         restore(trainer, begun)
         run.checkpoint = None
+    run.keep()
     trainer.fit()
     if trainer.interrupted:
         run.stop()

@@ -58,6 +58,34 @@ def test_nothing_is_left(
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.parametrize("linked", [False, True])
+def test_a_folder_that_stood_before_stays(linked: bool, refused: Refused, tmp_path: Path) -> None:
+    """With an old log of another program of that name, too, and where it is only a link to one."""
+    (tmp_path / "real" / "above").mkdir(parents=True)
+    if linked:
+        (tmp_path / "real" / "above" / "run").symlink_to(tmp_path / "real")
+    else:
+        (tmp_path / "real" / "above" / "run").mkdir()
+    (tmp_path / "real" / "train.log").write_text("old")
+    refused("hydra.run.dir=real/above/run", error=UserError("no"))
+    assert (tmp_path / "real" / "above" / "run" / "config.yaml").is_file()
+    assert (tmp_path / "real" / "train.log").read_text().startswith("old")
+
+
+def test_folders_above_that_stood_before_stay(refused: Refused, tmp_path: Path) -> None:
+    (tmp_path / "other").mkdir()
+    refused("hydra.run.dir=x/../other/a/b", error=UserError("no"))
+    assert list((tmp_path / "other").iterdir()) == []
+
+
+def test_what_training_has_begun_to_log_stays(refused: Refused, tmp_path: Path) -> None:
+    def begin(folder: Path) -> None:
+        Run.keep(None)  # type: ignore[arg-type]  # what train.py does before the first update
+
+    refused("hydra.run.dir=run", error=UserError("broke"), first=begin)
+    assert (tmp_path / "run" / "train.log").is_file()
+
+
 def test_a_file_of_the_users_stays(refused: Refused, tmp_path: Path) -> None:
     (tmp_path / "run").mkdir()
     (tmp_path / "run" / "notes.txt").write_text("mine")

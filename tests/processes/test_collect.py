@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 import torch
 
+from franka_wm.commands import several
 from franka_wm.commands.main import main
 from franka_wm.data.lerobot.schema import EPISODE_KEY, SEED
 
@@ -106,7 +107,7 @@ def test_a_killed_process_ends_the_others_and_leaves_no_dataset(tmp_path) -> Non
     [
         (["device=cuda"], "gpus=8: this machine has 0 usable CUDA devices"),
         (["device=cuda:1"], "device=cuda:1 with gpus=8: each process has a GPU of its own"),
-        (["gpus=1000", "num_envs=1000"], "gpus=1000 with device=cpu: at most "),
+        (["gpus=1000", "num_envs=1000"], "gpus=1000 with device=cpu: at most 16 processes on the 2 cores"),
         (["num_envs=5"], "5 worlds for 8 processes: give num_envs=8, or start fewer"),
         (["episodes=7"], "7 worlds for 8 processes: give num_envs=8, or start fewer"),
         (["env.image_siz=8"], "env.image_siz: no such option"),
@@ -115,6 +116,7 @@ def test_a_killed_process_ends_the_others_and_leaves_no_dataset(tmp_path) -> Non
 )
 def test_what_cannot_be_started_is_one_line(tmp_path, capsys, monkeypatch, words, says) -> None:
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    monkeypatch.setattr(several, "usable_cores", lambda: 2)
     default = [word for word in ("device=cpu", "gpus=8") if word.split("=")[0] not in " ".join(words)]
     assert main(["collect", f"out={tmp_path}/set", *words, *default]) == 1
     said = capsys.readouterr().err

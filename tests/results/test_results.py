@@ -211,7 +211,7 @@ def test_single_seeds_stand_below_and_not_in_the_readme(measured) -> None:
     assert "## Two CPU cores" not in text
     assert text.index("## Single seeds") < text.index("### One fixed goal")
     assert "| planner | 1.00 (0.50 – 2.00) |" in text  # the interval over its episodes
-    assert "**Not run: seed 101** of the 2 that" in text
+    assert "**Missing: seed 101** of the 2 that" in text
     assert "One fixed goal" not in render.readme_tables({"reach": ROW}, place)
 
 

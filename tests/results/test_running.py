@@ -54,9 +54,13 @@ def test_arguments_beside_the_rows_change_no_number() -> None:
     for row in (ROW, GPU):
         ((_, after, _),) = running.Machine(threads=1, extra=extra).slots(row)
         assert tuple(after) == extra
-    for wrong in ("trainer.updates=5", "seed=3"):
-        with pytest.raises(UserError, match=f"--extra {wrong}: may be logger, evaluation"):
+    for wrong in ("trainer.updates=5", "seed=3", "logger"):
+        with pytest.raises(UserError, match=f"--extra {wrong}: may be logger=…, evaluation"):
             running.Machine(extra=(wrong,))
+    with pytest.raises(UserError, match="--extra: reach: benchmarks have no arguments"):
+        running.run(
+            [(replace(ROW, script="benchmarks/env.py"), [])], running.Machine(extra=extra), out=Path()
+        )
 
 
 def test_a_run_that_fails_is_told_and_leaves_no_file(tmp_path) -> None:

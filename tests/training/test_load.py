@@ -221,7 +221,7 @@ def test_an_environment_that_the_model_cannot_act_in_is_refused_before_it_is_bui
         (["dataset=lerobot"], "dataset.root"),
         (["objective.metric=l7"], "l7"),
         (["objective.metric=cosine"], "metric=cosine: is of objective=goal_image"),
-        (["objective.steps_weight=1"], "steps_weight=1.0: is of objective=goal_image"),
+        (["objective.steps_weight=1"], "steps_weight=1: is of objective=goal_image"),
         (["trainer.precision=int3"], "precision"),
         (["trainer.schedule=up"], "schedule"),
     ],

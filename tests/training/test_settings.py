@@ -29,6 +29,7 @@ OUT_OF_RANGE = {
     "collector.smoothness": [-0.1, 1.0],
     "collector.noise": [-0.1, 2.1],
     "collector.planner_worlds": [-1],
+    "collector.workers": [-1],
     "replay.capacity": [0],
     "replay.batch_size": [0],
     "replay.window": [0],

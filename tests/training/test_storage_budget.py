@@ -123,10 +123,11 @@ def test_before_anything_is_built_experience_is_what_the_model_reads(
         "scale=smoke",
         "replay.capacity=1000000",
         "trainer.updates=10000000",
+        "evaluation.video_episodes=0",
     )
     spaces = Spaces.of_config(run.env.arm)
     model = make_model(run, spaces, "meta")
-    monkeypatch.setattr(storage_budget, "free_memory", lambda device: 1e6 * per_step + 2e8)
+    monkeypatch.setattr(storage_budget, "free_memory", lambda device: 1e6 * per_step + 3e7)
     storage_budget.check_memory(run, model, spaces)
     monkeypatch.setattr(storage_budget, "free_memory", lambda device: 1e6 * per_step - 1)
     with pytest.raises(UserError, match=r"replay\.capacity=1000000.*do not fit"):

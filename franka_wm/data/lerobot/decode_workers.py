@@ -16,6 +16,7 @@ from pathlib import Path
 
 from franka_wm.data.lerobot.decode import TableJob, VideoJob, to_line
 from franka_wm.errors import UserError
+from franka_wm.versions import usable_cores
 
 ROWS_WORTH_A_PROCESS = 4096
 """Fewer rows are decoded sooner than a process has started."""
@@ -30,7 +31,7 @@ def run_jobs(
     jobs: Sequence[tuple[TableJob | VideoJob, int]], total: int, workers: int | None, say: Say
 ) -> None:
     if workers is None:
-        cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+        cores = usable_cores()
         workers = min(cores, 16)
     workers = min(workers, len(jobs))
     progress = _Progress(total, say)

@@ -6,7 +6,6 @@ on disk, where the next start finds it.
 
 from __future__ import annotations
 
-import os
 import sys
 from collections.abc import Callable, Iterable
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -19,6 +18,7 @@ import warp as wp
 
 from franka_wm.envs.config import FrankaConfig
 from franka_wm.envs.tasks import Task
+from franka_wm.versions import usable_cores
 
 Loading = list[tuple[Future[None], Callable[[], None]]]
 Variant = tuple[str | wp.Module, int | None]
@@ -74,7 +74,7 @@ class Compiler:
 
     def __init__(self, device: str):
         self.device = device
-        cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+        cores = usable_cores()
         self._pool = ThreadPoolExecutor(cores - 1) if cores > 1 and device == "cpu" else None
 
     @property
