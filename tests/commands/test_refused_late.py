@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import runpy
 import sys
 from collections.abc import Callable
@@ -31,6 +32,8 @@ def refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.Captu
             raise error
 
         monkeypatch.setattr(Run, "build_environments", build)
+        # Hydra closes all handlers of this process, and absl's closes the stream that it was made with: pytest's own.
+        monkeypatch.setattr(logging, "_handlerList", [])
         monkeypatch.chdir(tmp_path)
         monkeypatch.setattr(sys, "argv", [str(TRAIN), "scale=smoke", "device=cpu", *words])
         GlobalHydra.instance().clear()
