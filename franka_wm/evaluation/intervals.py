@@ -153,7 +153,10 @@ def _bootstrap(
 
 def _samples(*values: Values) -> list[NDArray[np.float64]]:
     """Vectors of one length, finite; otherwise a `UserError`."""
-    found = [np.asarray(x.cpu() if hasattr(x, "cpu") else x, dtype=np.float64) for x in values]
+    found = [
+        np.asarray(x.cpu() if hasattr(x, "cpu") else x, dtype=np.float64)  # pyright: ignore[reportAttributeAccessIssue]
+        for x in values
+    ]
     shapes = [x.shape for x in found]
     if found[0].ndim != 1 or found[0].size == 0 or len(set(shapes)) > 1:
         raise UserError(f"values have shape {shapes}; give vectors of one length, one value per episode.")
