@@ -29,7 +29,7 @@ JOB = "FRANKA_WM_JOB"
 """In the environment of a process: it is one of several of a sweep's job, whose folder this is."""
 
 MOST_ON_A_CORE = 8
-"""Processes with ``device=cpu``: they share cores, and each needs a gigabyte."""
+"""Most processes with ``device=cpu`` for each core: they share cores and memory."""
 
 
 def started_by_torchrun() -> bool:

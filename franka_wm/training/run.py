@@ -291,6 +291,7 @@ def start(cfg: DictConfig) -> Run:
     global _begun
     told = HydraConfig.get()
     folder = Path(told.runtime.output_dir)
+    # With more than Hydra's, another run has begun here at the same time.
     hydras = {".hydra", f"{told.job.name}.log"}
     _begun = (folder, _files(folder), []) if {one.name for one in folder.iterdir()} <= hydras else None
     processes.require_seen(folder, "hydra.run.dir")

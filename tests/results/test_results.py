@@ -205,6 +205,13 @@ def test_success_where_a_task_says_what_it_is(measured) -> None:
     assert "| 30 s | 0.7 min | 80 | 70 | 100 |" in readme and "final distance" not in readme
 
 
+def test_the_readme_says_how_many_of_the_seeds_there_are(measured) -> None:
+    place = measured({"seed": 100}, {"seed": 101})
+    assert "One CPU core, 2 seeds |" in render.readme_tables({"reach": ROW}, place)
+    more = replace(ROW, seeds=(100, 101, 102))
+    assert "One CPU core, 2 of 3 seeds |" in render.readme_tables({"reach": more}, place)
+
+
 def test_single_seeds_stand_below_and_not_in_the_readme(measured) -> None:
     place = measured({"seed": 100})
     text = render.page({"reach": ROW}, place)
