@@ -126,6 +126,11 @@ def test_what_a_run_has_written_stays(refused: Refused, tmp_path: Path) -> None:
     assert {"encoder", "config.yaml", "train.log"} <= {one.name for one in (tmp_path / "run").iterdir()}
 
 
+def test_a_link_that_was_made_there_stays(refused: Refused, tmp_path: Path) -> None:
+    refused("hydra.run.dir=run", error=UserError("no"), first=lambda run: (run / "data").symlink_to(tmp_path))
+    assert (tmp_path / "run" / "data").is_symlink() and (tmp_path / "run" / "config.yaml").is_file()
+
+
 def test_another_runs_folder_stays(refused: Refused, tmp_path: Path) -> None:
     refused("hydra.run.dir=first", error=UserError("no"), first=lambda run: (run / "encoder").touch())
     before = {one.name for one in (tmp_path / "first").iterdir()}
