@@ -45,6 +45,8 @@ TRAINING = {
 QUIET = [
     "evaluation.during=[]",
     "evaluation.episodes=8",
+    "evaluation.video_episodes=0",
+    "logger=none",
     "trainer.checkpoint_replay=false",
     "trainer.log_every=1",
 ]

@@ -52,7 +52,7 @@ class Machine:
             )
 
     def slots(self, row: Row) -> list[Slot]:
-        """One for each run at a time.
+        """One for each run at a time, a round over the devices after the other.
 
         Raises:
             UserError: There are too few cores for so many runs.
@@ -66,7 +66,7 @@ class Machine:
             if self.threads:
                 environment["OMP_NUM_THREADS"] = str(self.threads)
             devices = [[f"device={device}"] for device in self.devices] or [[]]
-            return [([], [*device, *extra], environment) for device in devices for _ in range(self.jobs)]
+            return [([], [*device, *extra], environment) for _ in range(self.jobs) for device in devices]
         threads = self.threads or row.section.threads
         cores = sorted(os.sched_getaffinity(0))
         if threads * self.jobs > len(cores):

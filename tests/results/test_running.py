@@ -38,7 +38,7 @@ def test_runs_on_cores_have_them_alone() -> None:
 def test_runs_on_gpus_are_spread_over_them() -> None:
     row = replace(ROW, section=Section(title="One GPU", arguments="scale=gpu"))
     slots = running.Machine(jobs=2, devices=("cuda:0", "cuda:1"), commit="abc").slots(row)
-    assert [after for _, after, _ in slots] == [["device=cuda:0"]] * 2 + [["device=cuda:1"]] * 2
+    assert [after for _, after, _ in slots] == [["device=cuda:0"], ["device=cuda:1"]] * 2
     assert all(environment["FRANKA_WM_COMMIT"] == "abc" for _, _, environment in slots)
     assert all("OMP_NUM_THREADS" not in environment for _, _, environment in slots)
 
