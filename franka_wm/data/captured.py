@@ -88,8 +88,5 @@ class CapturedSampling:
         storage: Any = self.replay.storage
         self._batch = storage.windows(time, world)
         if isinstance(self.replay, WindowReplay):
-            if self.replay.hindsight is not None:
-                self.replay.hindsight(self._batch, data, time, world, self._newest)
-            if self.replay.demonstrations is not None:
-                self.replay.demonstrations(self._batch)
+            self.replay.complete(self._batch, time, world, self._newest)
         self._crossing = crossing

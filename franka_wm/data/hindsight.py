@@ -58,19 +58,39 @@ class Hindsight:
             time, world: Time and world of each step of the windows, (B, H).
             newest: Time of the step that was written last.
         """
-        capacity, device = data.shape[0], time.device
-        last, world = time[:, -1], world[:, 0]
-        ahead = torch.arange(self.episode_length, device=device)
-        later = (last.unsqueeze(1) + ahead) % capacity  # (B, L): the window's last step and what follows
-        # Of the same episode, and written: neither past the next episode's start nor past the newest step.
-        begins = data.get(BOUNDARY)[later, world.unsqueeze(1)].squeeze(-1)
-        begins[:, 0] = False
-        same = (begins.cumsum(1) == 0) & (ahead <= ((newest - last) % capacity).unsqueeze(1))
-        chosen = (torch.rand(last.shape, device=device) * same.sum(1)).long()
-        reached = data.get(("next", self.key))[later.gather(1, chosen.unsqueeze(1)).squeeze(1), world]
+        later, _ = reached_later(data, time, world, newest, most=self.episode_length)
+        reached = data.get(("next", self.key))[later, world[:, 0]]
         relabeled = self.relabel(batch, reached[..., self.columns])
-        mask = torch.rand(last.shape, device=device) < self.share
+        mask = torch.rand(later.shape, device=later.device) < self.share
         for key in relabeled.keys(True, True):
             new, old = relabeled.get(key), batch.get(key)
             batch.set(key, torch.where(mask.view(-1, *[1] * (old.dim() - 1)), new, old))
         return batch
+
+
+def reached_later(
+    data: Any, time: torch.Tensor, world: torch.Tensor, newest: int | torch.Tensor, *, most: int
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """A step of each window's episode, drawn uniformly from the window's last to the episode's last.
+
+    No operation waits for the device.
+
+    Args:
+        data: The storage, (time, worlds).
+        time, world: Time and world of each step of the windows, (B, H).
+        newest: Time of the step that was written last.
+        most: Steps of an episode, at most: how far to look ahead.
+
+    Returns:
+        Its time, and how many steps it comes after the window's last; (B,) both.
+    """
+    capacity, device = data.shape[0], time.device
+    last, world = time[:, -1], world[:, 0]
+    ahead = torch.arange(most, device=device)
+    later = (last.unsqueeze(1) + ahead) % capacity  # (B, L): the window's last step and what follows
+    # Of the same episode, and written: neither past the next episode's start nor past the newest step.
+    begins = data.get(BOUNDARY)[later, world.unsqueeze(1)].squeeze(-1)
+    begins[:, 0] = False
+    same = (begins.cumsum(1) == 0) & (ahead <= ((newest - last) % capacity).unsqueeze(1))
+    chosen = (torch.rand(last.shape, device=device) * same.sum(1)).long()
+    return later.gather(1, chosen.unsqueeze(1)).squeeze(1), chosen

@@ -11,6 +11,7 @@ from torchrl.data import ReplayBuffer
 from torchrl.data.replay_buffers import RoundRobinWriter, Sampler
 
 from franka_wm.data.demonstrations import Demonstrations
+from franka_wm.data.future import FutureFrames
 from franka_wm.data.hindsight import Hindsight
 from franka_wm.data.image_storage import BOUNDARY, ImageStorage
 from franka_wm.errors import UserError
@@ -158,6 +159,7 @@ class WindowReplay(ReplayBuffer):
 
     Args:
         hindsight: Relabels each batch in place; ``None``: batches are as they were gathered.
+        future: Adds frames that were reached later; ``None``: batches are windows alone.
         demonstrations: Replace windows in place; ``None``: batches are of this buffer alone.
         options: Options of TorchRL's buffer.
     """
@@ -166,20 +168,29 @@ class WindowReplay(ReplayBuffer):
         self,
         *,
         hindsight: Hindsight | None = None,
+        future: FutureFrames | None = None,
         demonstrations: Demonstrations | None = None,
         **options: Any,
     ):
         super().__init__(**options)
-        self.hindsight, self.demonstrations = hindsight, demonstrations
+        self.hindsight, self.future, self.demonstrations = hindsight, future, demonstrations
 
     def sample(self, batch_size: int | None = None, return_info: bool = False) -> Any:
         batch, info = super().sample(batch_size, return_info=True)
+        self.complete(batch, *info["index"], newest_step(self))
+        return (batch, info) if return_info else batch
+
+    def complete(
+        self, batch: Any, time: torch.Tensor, world: torch.Tensor, newest: int | torch.Tensor
+    ) -> None:
+        """What is done to windows (B, H) of these times and worlds; no operation waits for the device."""
+        storage = cast(Any, self.storage)
         if self.hindsight is not None:
-            (time, world), storage = info["index"], cast(Any, self.storage)
-            self.hindsight(batch, storage._storage, time, world, newest_step(self))
+            self.hindsight(batch, storage._storage, time, world, newest)
+        if self.future is not None:
+            self.future(batch, storage, time, world, newest)
         if self.demonstrations is not None:
             self.demonstrations(batch)
-        return (batch, info) if return_info else batch
 
 
 def newest_step(replay: ReplayBuffer) -> int:
@@ -199,6 +210,7 @@ def make_replay(
     frame_stack: int = 1,
     stacked: Sequence[str] = (),
     hindsight: Hindsight | None = None,
+    future: FutureFrames | None = None,
     demonstrations: Demonstrations | None = None,
     episode_length: int = 0,
 ) -> WindowReplay:
@@ -215,6 +227,7 @@ def make_replay(
             samples have stacks again.
         stacked: Keys of such observations.
         hindsight: Relabels a share of each batch with goals that were reached later.
+        future: Adds frames that were reached later.
         demonstrations: Take the place of a share of each batch.
         episode_length: Steps of an episode, where it is known: windows of more than half of it are seldom whole, so
             more of them must be drawn; and how many last images there is room for at first.
@@ -241,6 +254,7 @@ def make_replay(
     )
     return WindowReplay(
         hindsight=hindsight,
+        future=future,
         demonstrations=demonstrations,
         storage=storage,
         sampler=WindowSampler(

@@ -26,7 +26,7 @@ from franka_wm.models.regularizers import (
     participation_ratio,
 )
 from franka_wm.models.transformer import MLPDynamics, TokenDynamics
-from franka_wm.models.windows import check_windows, window_of
+from franka_wm.models.windows import check_windows, window_of, with_future
 from franka_wm.options import COEFFICIENT, DEPTH, FRACTION, POSITIVE, Bounds
 
 
@@ -57,7 +57,7 @@ class ActionWorldModel(HistoryWorldModel):
         observation_sizes: vector key -> size. The state token next to images; what is encoded for
             `encoder=state`. May be empty next to images.
         action_dim: size of an action.
-        episode_length: unused, accepted for the common signature.
+        episode_length: of distances to goals an episode away.
         encoder: `vit`, `conv` or `state`.
         encoder_size, encoder_width, encoder_depth, encoder_heads, patch_size: sizes of `vit`.
         channels: channels of `conv`.
@@ -210,7 +210,8 @@ class ActionWorldModel(HistoryWorldModel):
         )
         self.adapter = ProjectionMLP(self.token_dim, self.token_dim) if self.guard.acts else None
         self.target_encoder = frozen_copy(self.encoder) if self.guard.kind == "ema" else None
-        self.learn_goals(self.feature_dim, policy=goal_policy_coef, steps=goal_steps_coef)
+        goals = {"policy": goal_policy_coef, "steps": goal_steps_coef}
+        self.learn_goals(self.feature_dim, **goals, episode_length=episode_length)
 
     def train(self, mode: bool = True) -> ActionWorldModel:
         """Set the mode; a frozen encoder stays in evaluation mode."""
@@ -270,7 +271,8 @@ class ActionWorldModel(HistoryWorldModel):
         check_windows(batch)
         action = batch.get("action")
         window = window_of(batch, self.observation_keys)
-        frames = self.encode_frame(window, batch_statistics=self.training).float()  # (B, H+1, F)
+        encoded = self.encode_frame(with_future(window, batch), batch_statistics=self.training).float()
+        frames = encoded[:, : action.shape[1] + 1]  # (B, H+1, F)
         if self.target_encoder is None:
             targets = frames
         else:
@@ -291,7 +293,7 @@ class ActionWorldModel(HistoryWorldModel):
         # On what is predicted: on a projection of it, the guard would not see it collapse.
         guard = self.guard(self._pooled(frames).transpose(0, 1))
         total = prediction + state + rolled + rolled_state + guard
-        goals = self.goal_losses(frames[..., : self.feature_dim], action)
+        goals = self.goal_losses(encoded[..., : self.feature_dim], batch)
         for value in goals.values():
             total = total + value
         with torch.no_grad():

@@ -15,24 +15,35 @@ LOWEST, HIGHEST = -3.0, 0.0
 class GoalHeads(nn.Module):
     """A policy towards a goal and a distance in steps, learned from windows without rewards.
 
-    A pair is a step of a window and a later one of it, drawn uniformly, so both know goals at most a window ahead.
+    A pair is a step of a window and a later one of it, drawn uniformly, so both know goals at most a window ahead; with
+    frames that were reached later (`replay.future`), half of the goals are these.
 
     - *Policy*: an inverse-dynamics policy (GC-IDM, arXiv:2605.08732): a Gaussian over the action that was taken, its
       mean within [-1, 1]. No gradient reaches the embeddings: actions that were taken are no property of the scene.
-    - *Distance*: what share of a window lies between the two; 1 between embeddings of different windows (reachability,
-      RC-aux, arXiv:2605.07278). Its gradient shapes the embeddings, so that they tell what is far by actions.
+    - *Distance*: what share of a window lies between the two (with frames reached later: of an episode); 1 between
+      embeddings of different windows (reachability, RC-aux, arXiv:2605.07278). Its gradient shapes the embeddings, so
+      that they tell what is far by actions.
 
     Args:
         embed_dim: D.
         action_dim: A.
         policy, distance: which of the two there are.
+        episode_length: steps of an episode: the longest distance where goals are as far as that; None: unknown.
         hidden: width of two hidden layers.
     """
 
     def __init__(
-        self, embed_dim: int, action_dim: int, *, policy: bool, distance: bool, hidden: int = 512
+        self,
+        embed_dim: int,
+        action_dim: int,
+        *,
+        policy: bool,
+        distance: bool,
+        episode_length: int | None = None,
+        hidden: int = 512,
     ) -> None:
         super().__init__()
+        self.episode_length = episode_length
         self.actor = self.ruler = None
         if policy:
             self.actor = mlp(2 * embed_dim, (hidden, hidden), action_dim)
@@ -49,24 +60,38 @@ class GoalHeads(nn.Module):
         """Distance (...) in [0, 1] from embeddings (..., D) to goals (..., D)."""
         return self._logit(embedded, goal).sigmoid()
 
-    def losses(self, embedded: Tensor, action: Tensor) -> tuple[Tensor | None, Tensor | None]:
+    def losses(
+        self, embedded: Tensor, action: Tensor, later: Tensor | None = None, steps: Tensor | None = None
+    ) -> tuple[Tensor | None, Tensor | None]:
         """Negative log-likelihood of the actions and cross-entropy of the distances; None for a head that is absent.
 
         Args:
             embedded: (B, H+1, D), of the frames of windows.
             action: (B, H, A) between them.
+            later: (B, 1, D), of frames that were reached later; None: there are none.
+            steps: (B, H, 1), to these frames from each step.
+
+        Raises:
+            ValueError: `later` without `steps`, or distances of a model that was not told how long episodes are.
         """
         batch, horizon = action.shape[:2]
         now = torch.arange(horizon, device=action.device)
         ahead = (torch.rand(batch, horizon, device=action.device) * (horizon - now)).long() + 1  # 1 … H - t
-        later = (now + ahead).unsqueeze(-1).expand(-1, -1, embedded.shape[-1])
-        start, goal = embedded[:, :-1], embedded.gather(1, later)
+        within = (now + ahead).unsqueeze(-1).expand(-1, -1, embedded.shape[-1])
+        start, goal, longest = embedded[:, :-1], embedded.gather(1, within), horizon + 1
+        if later is not None:
+            if steps is None or (self.ruler is not None and self.episode_length is None):
+                raise ValueError("goals reached later need their steps, and distances to them episode_length")
+            far = torch.rand(batch, horizon, device=action.device) < 0.5
+            goal = torch.where(far.unsqueeze(-1), later, goal)
+            ahead = torch.where(far, steps.squeeze(-1), ahead)
+            longest = self.episode_length or longest
         policy = distance = None
         if self.actor is not None:
             mean, std = self._gaussian(start.detach(), goal.detach())
             policy = F.gaussian_nll_loss(mean.float(), action.float(), std.square().float().expand_as(mean))
         if self.ruler is not None:
-            share = ahead / (horizon + 1.0)
+            share = (ahead / longest).clamp(max=1.0)
             logits = [
                 self._logit(start, goal),
                 self._logit(start, start),

@@ -25,7 +25,7 @@ from franka_wm.models.regularizers import (
 )
 from franka_wm.models.transformer import CausalTransformer, block_causal_mask, hide_invalid
 from franka_wm.models.vision import ViT, vit_size
-from franka_wm.models.windows import check_windows, window_of
+from franka_wm.models.windows import check_windows, window_of, with_future
 from franka_wm.options import COEFFICIENT, DEPTH, FRACTION, POSITIVE, Bounds, with_defaults
 
 _COEFS = (
@@ -59,7 +59,7 @@ class LeWorldModel(HistoryWorldModel):
         image_sizes: image key -> (height, width, channels); several of one size share the encoder.
         observation_sizes: vector key -> size; may be empty if there are images.
         action_dim: size of an action.
-        episode_length: unused but for the discount's default.
+        episode_length: of the discount's default, and of distances to goals an episode away.
         embed_dim: size of the embedding of a frame's image.
         state_embed_dim: size of the embedding of a frame's state vector, next to images; without, it is `embed_dim`.
         state_hidden_dim: width of the state encoder's two hidden layers.
@@ -196,7 +196,8 @@ class LeWorldModel(HistoryWorldModel):
         if reward_head:
             self.two_hot = TwoHotSymlog()
             self.reward_probe = zero_head(self.latent_dim + action_dim, (256, 256), self.two_hot.bins)
-        self.learn_goals(self.image_part or frame, policy=goal_policy_coef, steps=goal_steps_coef)
+        goals = {"policy": goal_policy_coef, "steps": goal_steps_coef}
+        self.learn_goals(self.image_part or frame, **goals, episode_length=episode_length)
 
     @classmethod
     def validate(cls, options: Mapping[str, Any], *, window: int | None = None) -> None:
@@ -256,8 +257,9 @@ class LeWorldModel(HistoryWorldModel):
         """
         check_windows(batch)
         action = batch.get("action")
-        frames = self.encode_frame(window_of(batch, self.observation_keys), batch_statistics=self.training)
-        frames = frames.float()  # (B, H+1, F)
+        window = with_future(window_of(batch, self.observation_keys), batch)
+        encoded = self.encode_frame(window, batch_statistics=self.training).float()
+        frames = encoded[:, : action.shape[1] + 1]  # (B, H+1, F)
 
         cut = self.history.windows
         before, after, actions = cut(frames[:, :-1]), cut(frames[:, 1:]), cut(action)
@@ -278,7 +280,7 @@ class LeWorldModel(HistoryWorldModel):
             z = self.history.gather(frames[:, :-1].detach(), action)
             logits = self.reward_probe(torch.cat((z, action.to(z.dtype)), dim=-1))
             extra["loss_reward"] = self.two_hot.loss(logits.float(), batch.get(("next", "reward"))).mean()
-        extra |= self.goal_losses(self._comparable(frames), action)
+        extra |= self.goal_losses(self._comparable(encoded), batch)
         for value in extra.values():
             total = total + value
         with torch.no_grad():

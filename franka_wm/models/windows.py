@@ -22,3 +22,18 @@ def window_of(batch: TensorDictBase, keys: Iterable[str]) -> TensorDict:
     after, (count, horizon) = batch.get("next"), batch.batch_size
     window = {key: torch.cat((batch.get(key), after.get(key)[:, -1:]), dim=1) for key in keys}
     return TensorDict(window, batch_size=[count, horizon + 1])
+
+
+def with_future(window: TensorDict, batch: TensorDictBase) -> TensorDict:
+    """Observations of windows, and behind them the frame that was reached later where the batch has one.
+
+    Args:
+        window: (B, H+1), from :func:`window_of`.
+        batch: (B, H); ``future`` of it is that of `franka_wm.data.future`.
+
+    Returns:
+        (B, H+1), or (B, H+2).
+    """
+    if (future := batch.get("future", None)) is None:
+        return window
+    return torch.cat((window, future.select(*window.keys())[:, :1]), dim=1)

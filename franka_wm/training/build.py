@@ -14,6 +14,7 @@ from torchrl.envs import EnvBase, TransformedEnv
 from franka_wm import models, planning, processes
 from franka_wm.console import say
 from franka_wm.data.demonstrations import Demonstrations
+from franka_wm.data.future import FutureFrames
 from franka_wm.data.hindsight import Hindsight
 from franka_wm.data.lerobot.windows import RecordedWindows
 from franka_wm.data.replay import WindowReplay, make_replay
@@ -419,6 +420,7 @@ def make_replay_buffer(
         frame_stack=run.env.frame_stack,
         stacked=("pixels", *(f"pixels_{camera}" for camera in cameras)) if run.env.frame_stack > 1 else (),
         hindsight=hindsight,
+        future=FutureFrames(episode_length=run.env.episode_length) if run.replay.future else None,
         demonstrations=demonstrations,
         episode_length=run.env.shortest_episode,
     )
@@ -439,6 +441,7 @@ def open_recorded(run: RunSettings, device: torch.device) -> tuple[RecordedWindo
         device=device,
         keys=run.model.observations,
         frame_stack=run.env.frame_stack,
+        future=run.replay.future,
         fps=arm and arm.fps,
         action_dim=arm and arm.action_dim,
     )

@@ -60,6 +60,7 @@ def check(run: RunSettings) -> None:
     else:
         _ = run.actor
     _check_hindsight(run)
+    _check_future(run)
     _check_objective(run)
     _check_demonstrations(run)
     _check_export(run)
@@ -114,6 +115,18 @@ def _check_hindsight(run: RunSettings) -> None:
         why = "recorded data keep their goals" if run.is_offline else build.no_hindsight(run)
         if why is not None:
             raise UserError(f"replay.hindsight={run.replay.hindsight}: {why}; leave it at null")
+
+
+def _check_future(run: RunSettings) -> None:
+    if not run.replay.future:
+        return
+    if not any(run.model.options.get(key) for key in ("goal_policy_coef", "goal_steps_coef")):
+        raise UserError(
+            f"replay.future=true: goals an episode away are for heads that model={run.model.name} does not have here; "
+            "set model.goal_policy_coef or model.goal_steps_coef above 0 (lewm, action_world_model), or leave it at false"
+        )
+    if run.replay.demos is not None:
+        raise UserError("replay.future=true: does not go with replay.demos; train on the datasets, dataset.root=…")
 
 
 def _check_objective(run: RunSettings) -> None:

@@ -69,13 +69,62 @@ def test_they_learn_the_way_and_how_far_it_is() -> None:
     assert heads.steps(places[:, 0], places[:, 0].roll(1, 0)).mean() > means[-1]
 
 
+def test_with_frames_reached_later_they_know_goals_beyond_a_window() -> None:
+    heads = GoalHeads(2, 2, policy=True, distance=True, episode_length=40, hidden=64)
+    optimiser = torch.optim.Adam(heads.parameters(), 3e-3)
+    for _ in range(400):
+        places, action = walks(128, 40)
+        steps = torch.randint(4, 41, (128, 1)) - torch.arange(4)  # from each of four steps on
+        later = places.gather(1, steps[:, :1, None].expand(-1, -1, 2))
+        policy, distance = heads.losses(places[:, :5], action[:, :4], later, steps.unsqueeze(-1))
+        assert policy is not None and distance is not None
+        optimiser.zero_grad()
+        (policy + distance).backward()
+        optimiser.step()
+    places, action = walks(256, 40)
+    found = heads.act(places[:, 0], places[:, 30], deterministic=True)
+    assert (found - action[:, 0]).norm(dim=-1).mean() < 0.15
+    near, far = (heads.steps(places[:, 0], places[:, k]).mean() for k in (4, 30))
+    assert near < 0.5 and far > near + 0.3  # shares of an episode, no longer of a window
+
+
+@pytest.mark.parametrize("name", SMALL)
+def test_goals_reached_later_are_those_of_the_batch(name: str) -> None:
+    batch = windows(8, 4)
+    model = small(name, goal_policy_coef=1.0, goal_steps_coef=1.0, episode_length=20)
+
+    def losses(frame: Tensor | None, steps: int) -> dict[str, Tensor]:
+        given = batch.clone()
+        if frame is not None:
+            future = {"pixels": frame.expand(8, 4, 16, 16, 3), "steps": torch.full((8, 4, 1), steps)}
+            given["future"] = TensorDict(future, [8, 4])
+        torch.manual_seed(1)
+        found = model.eval().loss(given)
+        return {key: found[key] for key in ("loss_goal_policy", "loss_goal_steps", "loss_prediction")}
+
+    one, other = torch.randint(0, 256, (2, 8, 1, 16, 16, 3), dtype=torch.uint8)
+    torch.nn.init.normal_(model.goal_heads.ruler[-1].weight)
+    without, with_one = losses(None, 0), losses(one, 9)
+    assert torch.equal(without["loss_prediction"], with_one["loss_prediction"])
+    for changed in (losses(other, 9), without):
+        for key in ("loss_goal_policy", "loss_goal_steps"):
+            assert not torch.allclose(changed[key], with_one[key]), key
+    assert not torch.allclose(losses(one, 19)["loss_goal_steps"], with_one["loss_goal_steps"])
+    assert torch.equal(losses(one, 19)["loss_goal_policy"], with_one["loss_goal_policy"])
+    with pytest.raises(ValueError, match="episode_length"):
+        small(name, goal_steps_coef=1.0).loss(
+            batch.clone().set("future", TensorDict({"pixels": one.expand(8, 4, 16, 16, 3),
+                                                    "steps": torch.ones(8, 4, 1)}, [8, 4]))
+        )  # fmt: skip
+
+
 @pytest.mark.parametrize("name", SMALL)
 def test_the_distance_shapes_embeddings_and_the_policy_does_not(name: str) -> None:
     batch = windows(8, 4)
     for options, shapes in (({"goal_policy_coef": 1.0}, False), ({"goal_steps_coef": 1.0}, True)):
         model = small(name, **options)
         torch.nn.init.normal_(model.goal_heads.ruler[-1].weight) if shapes else None
-        losses = model.goal_losses(model.embed(model.history.start(frames(model, batch))), batch["action"])
+        losses = model.goal_losses(model.embed(model.history.start(frames(model, batch))), batch)
         [(_, loss)] = losses.items()
         loss.backward()
         reached = [p.grad is not None and bool(p.grad.any()) for p in model.encoder.parameters()]

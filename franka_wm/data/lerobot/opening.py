@@ -40,6 +40,7 @@ def open_dataset(
     in_memory: bool | None = None,
     workers: int | None = None,
     frame_stack: int = 1,
+    future: bool = False,
     fps: float | None = None,
     action_dim: int | None = None,
     say: Say = print,
@@ -65,7 +66,7 @@ def open_dataset(
         in_memory: Keep everything in the device's memory, else read from the disk's cache; ``None``: where it
             takes at most half of what is free.
         workers: Processes that decode; ``None``: all cores.
-        frame_stack: See :class:`RecordedWindows`.
+        frame_stack, future: See :class:`RecordedWindows`.
         fps, action_dim: Frames per second and size of actions of the environment that is to be acted in.
         say: Takes lines for the terminal.
 
@@ -116,6 +117,7 @@ def open_dataset(
         validation_fraction=validation_fraction,
         seed=seed,
         frame_stack=frame_stack,
+        future=future,
     )
     where = f"in {device} memory" if in_memory else "read from the disk's cache"
     size = sum(c.nbytes for c in caches)

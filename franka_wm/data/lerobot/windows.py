@@ -13,6 +13,7 @@ from tensordict import TensorDict
 from torch import Tensor
 
 from franka_wm import processes
+from franka_wm.data.future import FUTURE, future_frames
 from franka_wm.data.image_storage import CHANNELS
 from franka_wm.data.lerobot.cache import Cache
 from franka_wm.data.lerobot.mapping import FeatureMap
@@ -89,6 +90,7 @@ class RecordedWindows:
         seed: Draws the validation episodes and the windows.
         frame_stack: Images in each observation under ``pixels`` and ``pixels_…``: the present one and those before
             it in its episode, oldest first along the channels, the first one repeated (as ``env.frame_stack``).
+        future: Each window also has a frame that its episode reached later, see :mod:`franka_wm.data.future`.
 
     Attributes:
         observation_sizes: Vector key → size.
@@ -111,6 +113,7 @@ class RecordedWindows:
         validation_fraction: float = 0.1,
         seed: int = 0,
         frame_stack: int = 1,
+        future: bool = False,
     ):
         for name, value in (("window", window), ("batch_size", batch_size), ("frame_stack", frame_stack)):
             whole_rule(least=1).check(name, value)
@@ -120,7 +123,7 @@ class RecordedWindows:
             raise UserError(
                 f"dataset.validation_fraction={validation_fraction!r}: must be at least 0 and below 1"
             )
-        self.recording, self.seed = recording, seed
+        self.recording, self.seed, self.future = recording, seed, future
         self.window, self.batch_size = window, batch_size
         self.validation_fraction = validation_fraction
         self.device = recording.device
@@ -163,6 +166,7 @@ class RecordedWindows:
         shift = start[useful] - (np.cumsum(windows[useful]) - windows[useful])
         self._shift = torch.from_numpy(shift).to(self._home)
         self._first_rows = torch.from_numpy(start[useful]).to(self._home)
+        self._last_rows = torch.from_numpy((start + transitions)[useful]).to(self._home)
         self._steps = torch.arange(window + 1, device=self._home)
         self._generator = torch.Generator(device=self._home).manual_seed(derive_seed("windows", seed, split))
         self._bounds = torch.tensor([0, *np.cumsum([c.arrays["action"].shape[0] for c in recording.caches])])
@@ -197,7 +201,11 @@ class RecordedWindows:
         count = self.batch_size if batch_size is None else batch_size
         whole = (processes.count() * count,)
         draw = torch.randint(self._count, whole, device=self._home, generator=self._generator)
-        return self.windows(draw.chunk(processes.count())[processes.rank()])
+        mine, later = draw.chunk(processes.count())[processes.rank()], None
+        if self.future:
+            uniform = torch.rand(whole, device=self._home, generator=self._generator)
+            later = uniform.chunk(processes.count())[processes.rank()]
+        return self.windows(mine, later)
 
     def get_state(self) -> Tensor:
         """Where the generator of :meth:`sample` stands, on the CPU."""
@@ -207,11 +215,13 @@ class RecordedWindows:
         """The next samples are those after :meth:`get_state`; ``False`` if that was on another kind of device."""
         return restore_generator(self._generator, state)
 
-    def windows(self, indices: Tensor) -> TensorDict:
+    def windows(self, indices: Tensor, later: Tensor | None = None) -> TensorDict:
         """The windows of these numbers.
 
         Args:
             indices: (B,) int64, from 0 to ``len(self)`` − 1: episode by episode, by first step.
+            later: (B,) in [0, 1): how far from the windows' end to their episode's the frames under ``future`` are, of
+                windows that have any; ``None``: half the way.
 
         Returns:
             [B, H], on :attr:`device`.
@@ -223,10 +233,7 @@ class RecordedWindows:
         batch, h = indices.shape[0], self.window
         before, after = {}, {}
         for key in (*self.observation_sizes, *self.image_sizes):
-            if key in self._stacked:
-                values = self._stacks(f"observation.{key}", rows, self._first_rows[episode])
-            else:
-                values = self._gather(f"observation.{key}", rows)
+            values = self._frames(key, rows, episode)
             before[key], after[key] = values[:, :h], values[:, 1:]
         action = self._gather("action", rows[:, :h])
         if self._scale is not None:
@@ -242,6 +249,12 @@ class RecordedWindows:
             "is_init": is_init.to(self.device, non_blocking=True),
             "next": TensorDict(after, batch_size=[batch, h], device=self.device),
         }
+        if self.future:
+            end, left = rows[:, -1], self._last_rows[episode] - rows[:, -1]
+            part = 0.5 if later is None else later.to(self._home)
+            ahead = ((left + 1) * part).long()
+            frames = {key: self._frames(key, (end + ahead).unsqueeze(1), episode) for key in before}
+            root[FUTURE] = future_frames(frames, ahead.to(self.device, non_blocking=True), h)
         return TensorDict(root, batch_size=[batch, h], device=self.device)
 
     def batches(self, batch_size: int | None = None) -> Iterator[TensorDict]:
@@ -260,6 +273,7 @@ class RecordedWindows:
             validation_fraction=self.validation_fraction,
             seed=self.seed,
             frame_stack=self.frame_stack,
+            future=self.future,
         )
 
     def validation(self) -> RecordedWindows | None:
@@ -320,6 +334,12 @@ class RecordedWindows:
 
     def _whole(self, name: str) -> np.ndarray:
         return np.concatenate([part.cpu().numpy() for part in self.recording.arrays[name]])
+
+    def _frames(self, key: str, rows: Tensor, episode: Tensor) -> Tensor:
+        """Observations (B, T, …) at rows (B, T) of these episodes (B,)."""
+        if key in self._stacked:
+            return self._stacks(f"observation.{key}", rows, self._first_rows[episode])
+        return self._gather(f"observation.{key}", rows)
 
     def _stacks(self, name: str, rows: Tensor, first: Tensor) -> Tensor:
         """(B, T) rows of episodes that begin at ``first`` (B,) → (B, T, h, w, 3 · frame_stack)."""

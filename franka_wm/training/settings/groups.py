@@ -69,6 +69,7 @@ class ReplaySettings:
     batch_size: int = whole(least=1)
     window: int | None = whole(None, least=1, null=MODELS_OWN)
     hindsight: float | None = real(0.0, least=0, most=1, null="half, where goals can be exchanged")
+    future: bool = flag(False)
     demos: str | tuple[str, ...] | None = value(None, fits=_is_names, wanted=_A_FOLDER, null="none")
     demo_share: float = real(0.5, least=0, most=1)
     demo_share_end: float | None = real(None, least=0, most=1, null="demo_share to the end")

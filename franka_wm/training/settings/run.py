@@ -158,6 +158,7 @@ class RunSettings:
                 "whole_run": self.values,
                 "model": self.pretrain.model,
                 "trainer": {**self.values["trainer"], "updates": self.pretrain.updates},
+                "replay": {**self.values["replay"], "future": False},  # for the goals of the second stage
                 "export": {**self.values["export"], "kind": "none"},
             },
             saved=True,

@@ -76,6 +76,31 @@ def test_stacks_are_of_their_episode(
         opened(pictures, frame_stack=0)
 
 
+@pytest.mark.parametrize("in_memory", [True, False])
+def test_frames_reached_later(pictures: Path, foreign, opened: Callable, in_memory: bool) -> None:
+    """Of the window's episode, from its last frame on to the episode's; from half the way where nothing is drawn."""
+    windows = opened(pictures, window=2, frame_stack=2, in_memory=in_memory, future=True)
+    plain = opened(pictures, window=2, frame_stack=2, in_memory=in_memory)
+    seen: Counter = Counter()
+    for _ in range(20):
+        batch = windows.sample(50)
+        future, end = batch["future"], batch["next", "joints"][:, -1]
+        assert torch.equal(future["joints"][..., 0], batch["joints"][..., 0])
+        assert torch.equal(future["steps"].squeeze(-1), (future["joints"] - batch["joints"])[..., 1].long())
+        seen.update(map(tuple, torch.cat((end, future["joints"][:, 0, 1:2]), 1).int().tolist()))
+    ends = {(e, t) for e, length in enumerate(LENGTHS) for t in range(2, length)}
+    assert set(seen) == {(e, t, later) for e, t in ends for later in range(t, LENGTHS[e])}
+    for batch, same in zip(windows.batches(7), plain.batches(7), strict=True):
+        ((episode, frame),) = {tuple(pair) for pair in batch["future", "joints"][:1, 0].int().tolist()}
+        end = int(batch["next", "joints"][0, -1, 1])
+        assert frame == end + (LENGTHS[episode] - end) // 2
+        stack = [foreign.picture(episode, frame - back, 0) for back in (1, 0)]
+        assert np.array_equal(batch["future", "pixels"][0, 1], np.concatenate(stack, -1))
+        del batch["future"]
+        assert (batch == same).all()
+    assert windows.split("train").future and "future" not in plain.sample(3).keys()  # noqa: SIM118
+
+
 def test_video(video: Path, foreign, opened: Callable) -> None:
     """Every frame is closest to its own picture of all, and is what LeRobot's own reader gives."""
     from lerobot.datasets.lerobot_dataset import LeRobotDataset
