@@ -12,7 +12,7 @@ import warp as wp
 from franka_wm.envs.simulation.compiling import FORWARD_ONLY
 
 MAKE = """
-import json, os, sys
+import ctypes, json, os, sys
 sys.path.insert(0, sys.argv[1])
 from pathlib import Path
 import warp as wp
@@ -20,7 +20,12 @@ from forks import run_in_fork
 from franka_wm.envs import FrankaConfig, FrankaEnv
 
 def make():
-    FrankaEnv(FrankaConfig(substeps=2), num_envs=1, device="cpu")
+    config = FrankaConfig(substeps=2, solver_ls_iterations=1)  # every line search ends at its limit
+    env = FrankaEnv(config, num_envs=8, device="cpu", seed=0)
+    root = env.reset()
+    for _ in range(12):
+        root = env.step(root.set("action", env.action_spec.high))["next"]
+    ctypes.CDLL(None).fflush(None)  # what kernels printed
 
 def others():
     init = wp.init
@@ -51,7 +56,7 @@ def made(root: Path) -> dict[str, tuple[str, str]]:
     return {name: (out, err) for name, (_, out, err) in zip(("quiet", "others", "asked"), ends, strict=True)}
 
 
-def test_making_an_environment_is_quiet(made) -> None:
+def test_an_environment_is_quiet(made) -> None:
     assert made["quiet"] == ("", "")
 
 

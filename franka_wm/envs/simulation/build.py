@@ -10,6 +10,7 @@ from pathlib import Path
 import newton
 import torch
 import warp as wp
+from mujoco_warp import OverflowType
 
 from franka_wm.envs.camera import GOAL_MARKER, GROUND, wrist_mount
 from franka_wm.envs.config import FrankaConfig
@@ -70,8 +71,9 @@ def make_solver(model: newton.Model, config: FrankaConfig) -> newton.solvers.Sol
         disable_sensors=True,
         **options,
     )
-    if config.resolved_scene:  # overflow is counted, not printed by every thread
-        solver.mjw_model.opt.warn_overflow = 0
+    # Overflow is counted, not printed by every thread; nor is that a line search used all of solver_ls_iterations.
+    quiet = OverflowType.ALL if config.resolved_scene else OverflowType.LS_ITERATIONS
+    solver.mjw_model.opt.warn_overflow = int(solver.mjw_model.opt.warn_overflow & ~quiet)
     return solver
 
 
