@@ -68,7 +68,9 @@ def environment(gpus: int, device: str, worlds: int, seconds: float) -> float:
         assert one.stdin is not None
         one.stdin.write("go\n")
         one.stdin.flush()
-    return sum(float(one.communicate()[0].splitlines()[-1]) for one in workers)  # Warp may have printed before
+    return sum(
+        float(one.communicate()[0].splitlines()[-1]) for one in workers
+    )  # Warp may have printed before
 
 
 def worker(device: str, worlds: int, seconds: float) -> None:

@@ -11,7 +11,7 @@ from tensordict import TensorDict, TensorDictBase
 from franka_wm.data.hindsight import reached_later
 
 FUTURE = "future"
-"""Key of a batch's frames that were reached later, and under it ``steps``: how many steps later than each of the window."""
+"""Key of a batch's frames that were reached later; ``steps`` of it: how many steps after each of the window."""
 
 
 class FutureFrames:

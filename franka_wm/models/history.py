@@ -62,9 +62,7 @@ class HistoryWorldModel(WorldModel):
         pushed = self.history.push(previous_z, action, frame)
         return torch.where(is_init, self.history.start(frame), pushed)
 
-    def learn_goals(
-        self, embed_dim: int, *, policy: float, steps: float, episode_length: int | None
-    ) -> None:
+    def learn_goals(self, embed_dim: int, *, policy: float, steps: float, episode_length: int | None) -> None:
         """Adds the heads of `GoalHeads`, with these weights in the loss; 0: without. The last of a constructor."""
         self.has_goal_policy, self.has_goal_steps = policy > 0, steps > 0
         self._goal_coefs = (policy, steps)

@@ -123,10 +123,12 @@ def _check_future(run: RunSettings) -> None:
     if not any(run.model.options.get(key) for key in ("goal_policy_coef", "goal_steps_coef")):
         raise UserError(
             f"replay.future=true: goals an episode away are for heads that model={run.model.name} does not have here; "
-            "set model.goal_policy_coef or model.goal_steps_coef above 0 (lewm, action_world_model), or leave it at false"
+            "set model.goal_policy_coef or model.goal_steps_coef above 0 (lewm, action_world_model), or leave it false"
         )
     if run.replay.demos is not None:
-        raise UserError("replay.future=true: does not go with replay.demos; train on the datasets, dataset.root=…")
+        raise UserError(
+            "replay.future=true: does not go with replay.demos; train on the datasets, dataset.root=…"
+        )
 
 
 def _check_objective(run: RunSettings) -> None:

@@ -27,7 +27,12 @@ def experience(first: int, last: int) -> TensorDict:
         return {"where": vector, "pixels": vector.view(*time.shape, 1, 1, 3).to(torch.uint8)}
 
     next_ = TensorDict({**seen(within + 1), "reward": time.unsqueeze(-1).float()}, time.shape)
-    root = {**seen(within), "action": within.unsqueeze(-1), "is_init": (within == 0).unsqueeze(-1), "next": next_}
+    root = {
+        **seen(within),
+        "action": within.unsqueeze(-1),
+        "is_init": (within == 0).unsqueeze(-1),
+        "next": next_,
+    }
     return TensorDict(root, time.shape)
 
 

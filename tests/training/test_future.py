@@ -1,0 +1,41 @@
+"""``replay.future``: refused where nothing reads it, in the batches of a run, and not in those of a first stage."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+from franka_wm.errors import UserError
+from franka_wm.training import build
+from franka_wm.training.check import check
+
+GOALS = ("device=cpu", "scale=smoke", "env=reach_goal_image", "model=lewm", "replay.future=true")
+
+
+def test_it_needs_heads_that_read_it(settled) -> None:
+    with pytest.raises(
+        UserError, match=r"replay.future=true: .* model=lewm does not have here; set model.goal_"
+    ):
+        check(settled(*GOALS))
+    with pytest.raises(UserError, match="model=tdmpc2 does not have"):
+        check(settled("device=cpu", "scale=smoke", "env=reach", "replay.future=true"))
+    for option in ("goal_policy_coef", "goal_steps_coef"):
+        check(settled(*GOALS, f"model.{option}=1"))
+
+
+def test_not_beside_demonstrations(settled, tmp_path) -> None:
+    with pytest.raises(UserError, match=r"replay.future=true: does not go with replay.demos; train on"):
+        check(settled(*GOALS, "model.goal_policy_coef=1", f"replay.demos={tmp_path}"))
+
+
+def test_a_run_draws_them_to_the_end_of_its_episodes(settled) -> None:
+    run = settled(*GOALS, "model.goal_policy_coef=1")
+    replay = build.make_replay_buffer(run, torch.device("cpu"))
+    assert replay.future is not None and replay.future.episode_length == run.env.episode_length
+    assert build.make_replay_buffer(settled(*GOALS[:-1]), torch.device("cpu")).future is None
+
+
+def test_a_first_stage_has_no_goals(settled) -> None:
+    words = ("device=cpu", "scale=smoke", "env=reach_goal_image", "model=action_world_model", "pretrain=jepa")
+    run = settled(*words, "replay.future=true", "model.goal_policy_coef=1")
+    assert run.replay.future and not run.first_stage().replay.future
