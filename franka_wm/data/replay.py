@@ -177,7 +177,8 @@ class WindowReplay(ReplayBuffer):
 
     def sample(self, batch_size: int | None = None, return_info: bool = False) -> Any:
         batch, info = super().sample(batch_size, return_info=True)
-        self.complete(batch, *info["index"], newest_step(self))
+        time, world = info["index"]
+        self.complete(batch, time, world, newest_step(self))
         return (batch, info) if return_info else batch
 
     def complete(
