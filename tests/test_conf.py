@@ -23,6 +23,7 @@ ROWS = {
     "goal_image": "lewm-gpu",
     "two_stages": "action-world-model-gpu",
     "control_suite": "reacher-hard-gpu",
+    "demonstrations": "pick-demos-gpu",
 }
 """Experiment → the row of the results that measured it."""
 OF_MEASURING = ("evaluation.episodes", "trainer.checkpoint_replay", "device")
