@@ -1,5 +1,6 @@
 """Checkpoints: whole after a kill at any step, and clear about what is wrong."""
 
+import copy
 import hashlib
 import json
 import os
@@ -13,6 +14,7 @@ from torch import nn
 
 from franka_wm.errors import UserError
 from franka_wm.training.checkpoint import latest_checkpoint, load_checkpoint
+from franka_wm.training.optimizer_state import load_optimizer_state, optimizer_state
 from small_checkpoint import Small, save, some_replay, train
 
 
@@ -238,6 +240,37 @@ def test_another_optimizer_is_refused(tmp_path: Path) -> None:
         UserError, match=r"exp_avg of parameter 0 has shape \(16, 20\), the parameter \(8, 20\)"
     ):
         checkpoint.load_optimizer(torch.optim.Adam(Small(hidden=8).parameters()))
+
+
+@pytest.mark.parametrize(
+    ("damage", "says"),
+    [
+        (lambda group, _: group.update(lr="fast"), "lr is 'fast', here"),
+        (lambda group, _: group.update(lr=-1.0), "lr is -1.0, here"),
+        (lambda group, _: group.update(betas=(0.9,)), r"betas is \(0.9,\), here"),
+        (lambda group, _: group.pop("eps"), "eps is None, here"),
+        (lambda _, state: state.pop("exp_avg_sq"), r"of parameter 1 it holds \['exp_avg', 'step'\]"),
+        (
+            lambda _, state: state["exp_avg"].fill_(torch.nan),
+            "exp_avg of parameter 1 holds no finite numbers",
+        ),
+        (lambda _, state: state.update(step="2"), "step of parameter 1 holds no finite numbers"),
+        (lambda _, state: state.update(step=torch.ones(1)), r"step of parameter 1 has shape \(1,\)"),
+    ],
+)
+def test_a_damaged_state_of_an_optimizer_is_refused(damage: Callable[..., object], says: str) -> None:
+    model = Small()
+    optimizer = torch.optim.Adam(model.parameters())
+    train(model, optimizer, 2)
+    saved = copy.deepcopy(optimizer_state(optimizer))
+    held = saved["optimizer"]["state_dict"]
+    damage(held["param_groups"][0], held["state"][1])
+    other = torch.optim.Adam(Small().parameters())
+    with pytest.raises(UserError, match=rf"optimizer 'optimizer' of here does not fit: {says}"):
+        load_optimizer_state(saved, other, "here")
+    assert not other.state
+    load_optimizer_state(optimizer_state(optimizer), other, "here")
+    assert other.state
 
 
 def test_places_that_cannot_be_written(tmp_path: Path) -> None:
