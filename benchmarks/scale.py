@@ -68,9 +68,11 @@ def environment(gpus: int, device: str, worlds: int, seconds: float) -> float:
         assert one.stdin is not None
         one.stdin.write("go\n")
         one.stdin.flush()
-    return sum(
-        float(one.communicate()[0].splitlines()[-1]) for one in workers
-    )  # Warp may have printed before
+    said = [
+        one.communicate()[0].splitlines() for one in workers
+    ]  # the last line; Warp may have printed before
+    assert not any(one.returncode for one in workers), "a worker has failed"
+    return sum(float(lines[-1]) for lines in said)
 
 
 def worker(device: str, worlds: int, seconds: float) -> None:

@@ -59,14 +59,21 @@ def test_every_planner_and_first_stage_at_every_scale(scale: str) -> None:
             assert flat(compose(f"{group}={name}", f"scale={scale}"))["scale"] == scale
 
 
-@pytest.mark.parametrize("name", options("experiment"))
-def test_an_experiment_is_its_measured_row(name: str) -> None:
+@pytest.mark.parametrize(
+    ("name", "measured_by", "words"),
+    [
+        *((name, ROWS[name], ()) for name in options("experiment")),
+        ("demonstrations", "drawer-demos-gpu", ("env=drawer", "replay.demos=datasets/drawer")),
+        ("demonstrations", "push-demos-cpu", ("env=push", "replay.demos=datasets/push")),
+    ],
+)
+def test_an_experiment_is_its_measured_row(name: str, measured_by: str, words: tuple[str, ...]) -> None:
     rows = yaml.safe_load((ROOT / "benchmarks" / "results" / "rows.yaml").read_text(encoding="utf-8"))
-    row = rows["rows"][ROWS[name]]
+    row = rows["rows"][measured_by]
     section = shlex.split(rows["sections"][row["section"]]["arguments"])
     scale = next(word for word in section if word.startswith("scale="))
     measured = flat(compose(*section, *shlex.split(row["arguments"])))
-    named = flat(compose(f"experiment={name}", scale))
+    named = flat(compose(f"experiment={name}", scale, *words))
     assert {k: v for k, v in named.items() if k not in OF_MEASURING} == {
         k: v for k, v in measured.items() if k not in OF_MEASURING
     }

@@ -22,7 +22,7 @@ class FutureFrames:
     """
 
     ENDS = ("done", "terminated", "truncated")
-    """What steps begin with and lead to besides observations."""
+    """Flags of an episode's end: no observations."""
 
     def __init__(self, *, episode_length: int):
         self.episode_length = episode_length

@@ -184,7 +184,10 @@ class WindowReplay(ReplayBuffer):
     def complete(
         self, batch: Any, time: torch.Tensor, world: torch.Tensor, newest: int | torch.Tensor
     ) -> None:
-        """What is done to windows (B, H) of these times and worlds; no operation waits for the device."""
+        """Adds to windows (B, H) of these times and worlds goals in hindsight, later frames, demonstrations.
+
+        No operation waits for the device.
+        """
         storage = cast(Any, self.storage)
         if self.hindsight is not None:
             self.hindsight(batch, storage._storage, time, world, newest)

@@ -271,7 +271,8 @@ class ActionWorldModel(HistoryWorldModel):
         check_windows(batch)
         action = batch.get("action")
         window = window_of(batch, self.observation_keys)
-        encoded = self.encode_frame(with_future(window, batch), batch_statistics=self.training).float()
+        seen = window if self.goal_heads is None else with_future(window, batch)
+        encoded = self.encode_frame(seen, batch_statistics=self.training).float()
         frames = encoded[:, : action.shape[1] + 1]  # (B, H+1, F)
         if self.target_encoder is None:
             targets = frames

@@ -80,7 +80,8 @@ class HistoryWorldModel(WorldModel):
         return self.goal_heads.act(self.embed(z), goal, deterministic=deterministic)
 
     def goal_steps(self, embedded: Tensor, goal: Tensor) -> Tensor:
-        """Learned distance (...) in [0, 1] of embeddings (..., D) to goals (..., D); 1: a window or more."""
+        """Learned distance (...) in [0, 1] of embeddings (..., D) to goals (..., D); 1: a window or more (with
+        `replay.future`: an episode)."""
         if not self.has_goal_steps or self.goal_heads is None:
             raise self._lacks("goal_steps")
         return self.goal_heads.steps(embedded, goal)

@@ -257,7 +257,9 @@ class LeWorldModel(HistoryWorldModel):
         """
         check_windows(batch)
         action = batch.get("action")
-        window = with_future(window_of(batch, self.observation_keys), batch)
+        window = window_of(batch, self.observation_keys)
+        if self.goal_heads is not None:
+            window = with_future(window, batch)
         encoded = self.encode_frame(window, batch_statistics=self.training).float()
         frames = encoded[:, : action.shape[1] + 1]  # (B, H+1, F)
 

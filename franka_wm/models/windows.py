@@ -27,6 +27,8 @@ def window_of(batch: TensorDictBase, keys: Iterable[str]) -> TensorDict:
 def with_future(window: TensorDict, batch: TensorDictBase) -> TensorDict:
     """Observations of windows, and behind them the frame that was reached later where the batch has one.
 
+    Encoded with the window, it has the same batch statistics (and is part of them), or a head would tell it by these.
+
     Args:
         window: (B, H+1), from :func:`window_of`.
         batch: (B, H); ``future`` of it is that of `franka_wm.data.future`.
@@ -36,4 +38,5 @@ def with_future(window: TensorDict, batch: TensorDictBase) -> TensorDict:
     """
     if (future := batch.get("future", None)) is None:
         return window
-    return torch.cat((window, future.select(*window.keys())[:, :1]), dim=1)
+    joined = {key: torch.cat((frames, future.get(key)[:, :1]), dim=1) for key, frames in window.items()}
+    return TensorDict(joined, batch_size=[window.shape[0], window.shape[1] + 1])

@@ -8,6 +8,7 @@ import pytest
 import torch
 from tensordict import TensorDict
 from torch import Tensor
+from torch.utils._python_dispatch import TorchDispatchMode
 
 from franka_wm.models import make
 from franka_wm.models.goal_heads import GoalHeads
@@ -116,6 +117,24 @@ def test_goals_reached_later_are_those_of_the_batch(name: str) -> None:
             batch.clone().set("future", TensorDict({"pixels": one.expand(8, 4, 16, 16, 3),
                                                     "steps": torch.ones(8, 4, 1)}, [8, 4]))
         )  # fmt: skip
+
+
+class Captured(TorchDispatchMode):
+    """Refuses to ask the device for a number, as the capture of a CUDA graph does."""
+
+    def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        assert func is not torch.ops.aten._local_scalar_dense.default, "the host waits for the device"
+        return func(*args, **(kwargs or {}))
+
+
+@pytest.mark.parametrize("name", SMALL)
+def test_their_losses_can_be_captured(name: str) -> None:
+    batch = windows(8, 4)
+    images = torch.randint(0, 256, (8, 1, 16, 16, 3), dtype=torch.uint8).expand(8, 4, 16, 16, 3)
+    batch["future"] = TensorDict({"pixels": images, "steps": torch.full((8, 4, 1), 9)}, [8, 4])
+    model = small(name, goal_policy_coef=1.0, goal_steps_coef=1.0, episode_length=20)
+    with Captured():
+        model.loss(batch)["loss"].backward()
 
 
 @pytest.mark.parametrize("name", SMALL)
