@@ -338,6 +338,30 @@ class PolicyPenalty(Objective):
         return -self.weight * (actions[:, :, 0] - own).square().sum(-1)
 
 
+class GoalPolicyPenalty(Objective):
+    """The same of a policy towards goals; planning with its `bind(tensordict)` is a `PolicyPenalty`.
+
+    Args:
+        policy: z (..., Z), goals (..., D) -> actions (..., A), without noise.
+        reader: reads the goal of a decision.
+
+    Raises:
+        ValueError: a negative weight.
+    """
+
+    def __init__(self, policy: Callable[[Tensor, Tensor], Tensor], reader: GoalImage, weight: float) -> None:
+        self.policy, self.reader, self.weight = policy, reader, _penalty("PolicyPenalty", weight)
+        self.in_keys = reader.in_keys
+
+    def bind(self, tensordict: TensorDictBase) -> PolicyPenalty:
+        """The penalty of the present decision."""
+        goal = self.reader.goal(tensordict).unsqueeze(1)
+        return PolicyPenalty(lambda z: self.policy(z, goal), self.weight)
+
+    def __call__(self, trajectory: Tensor, actions: Tensor) -> Tensor:
+        raise ValueError("a GoalPolicyPenalty has no goal yet: plan with its bind(tensordict)")
+
+
 class Smoothness(Objective):
     """Minus `weight` times the squared changes of the action, Σ_{t>0} |a_t - a_{t-1}|².
 

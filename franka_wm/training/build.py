@@ -206,13 +206,14 @@ def make_objective(run: RunSettings, model: WorldModel) -> Objective | None:
     if o.action_penalty:
         parts.append((1.0, planning.ActionPenalty(o.action_penalty)))
     if o.policy_penalty:
-        if not model.has_policy:
-            raise UserError(
-                f"objective.policy_penalty: model={run.model.name} has no policy; use objective.policy_penalty=0"
-            )
-        parts.append(
-            (1.0, planning.PolicyPenalty(partial(model.policy, deterministic=True), o.policy_penalty))
-        )
+        if model.has_policy:
+            own = planning.PolicyPenalty(partial(model.policy, deterministic=True), o.policy_penalty)
+        elif model.has_goal_policy and isinstance(chosen, planning.GoalImage):
+            towards = partial(model.goal_policy, deterministic=True)
+            own = planning.GoalPolicyPenalty(towards, chosen, o.policy_penalty)
+        else:
+            raise UserError(f"objective.policy_penalty: model={run.model.name} has no policy; leave it at 0")
+        parts.append((1.0, own))
     if o.smoothness_penalty:
         parts.append((1.0, planning.Smoothness(o.smoothness_penalty)))
     return chosen if len(parts) == 1 else planning.Sum(parts)

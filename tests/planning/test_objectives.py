@@ -12,6 +12,7 @@ from franka_wm.planning import (
     ActionPenalty,
     GoalDistance,
     GoalImage,
+    GoalPolicyPenalty,
     PolicyPenalty,
     RewardPlusValue,
     Smoothness,
@@ -245,3 +246,18 @@ def test_smoothness_smooths_what_is_executed():
         return actions[:, 2:].diff(dim=1).square().mean().item()
 
     assert roughness(1.0) < 0.3 * roughness(0.0)
+
+
+def test_the_penalty_of_a_policy_towards_goals_is_that_of_the_decision_s_goal() -> None:
+    reader = GoalImage(lambda images: images["pixels"].float().flatten(1)[:, :2])
+    penalty = GoalPolicyPenalty(lambda z, goal: 0.1 * z + goal, reader, 2.0)
+    assert penalty.in_keys == ["goal_pixels"]
+    trajectory, actions = torch.randn(3, 5, 4, 2), torch.randn(3, 5, 3, 2)
+    images = torch.randint(0, 9, (3, 2, 2, 3), dtype=torch.uint8)
+    bound = penalty.bind(TensorDict({"goal_pixels": images}, [3]))
+    own = 0.1 * trajectory[:, :1, 0] + images.float().flatten(1)[:, None, :2]
+    torch.testing.assert_close(bound(trajectory, actions), -2.0 * (actions[:, :, 0] - own).square().sum(-1))
+    with pytest.raises(ValueError, match="no goal yet"):
+        penalty(trajectory, actions)
+    with pytest.raises(ValueError, match="PolicyPenalty"):
+        GoalPolicyPenalty(lambda z, goal: z, reader, -1.0)

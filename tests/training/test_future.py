@@ -1,4 +1,4 @@
-"""``replay.future``: refused where nothing reads it, in the batches of a run, and not in those of a first stage."""
+"""``replay.future``: refused where nothing reads it, in a run's batches, not in a first stage's; plans near its policy."""
 
 from __future__ import annotations
 
@@ -6,8 +6,10 @@ import pytest
 import torch
 
 from franka_wm.errors import UserError
+from franka_wm.planning import GoalImage, GoalPolicyPenalty, Sum
 from franka_wm.training import build
 from franka_wm.training.check import check
+from franka_wm.training.spaces import Spaces
 
 GOALS = ("device=cpu", "scale=smoke", "env=reach_goal_image", "model=lewm", "replay.future=true")
 
@@ -39,3 +41,17 @@ def test_a_first_stage_has_no_goals(settled) -> None:
     words = ("device=cpu", "scale=smoke", "env=reach_goal_image", "model=action_world_model", "pretrain=jepa")
     run = settled(*words, "replay.future=true", "model.goal_policy_coef=1")
     assert run.replay.future and not run.first_stage().replay.future
+
+
+def test_plans_are_kept_near_a_policy_towards_goals(settled) -> None:
+    words = ("device=cpu", "scale=smoke", "env=reach_goal_image", "model=lewm", "objective.policy_penalty=3")
+    run = settled(*words, "model.goal_policy_coef=1")
+    spaces = Spaces.of_config(run.env.arm, discrete=False)
+    objective = build.make_objective(run, build.make_model(run, spaces, torch.device("cpu")))
+    assert isinstance(objective, Sum)
+    image, penalty = (term for _, term in objective.terms)
+    assert isinstance(image, GoalImage) and isinstance(penalty, GoalPolicyPenalty)
+    assert penalty.weight == 3 and penalty.reader is image
+    run = settled(*words)
+    with pytest.raises(UserError, match="model=lewm has no policy; leave it at 0"):
+        build.make_objective(run, build.make_model(run, spaces, torch.device("cpu")))
