@@ -1,4 +1,4 @@
-"""``replay.future``: refused where nothing reads it, in a run's batches, not in a first stage's; plans near its policy."""
+"""``replay.future``: refused where nothing reads it, drawn in a run, not in its first stage; plans near its policy."""
 
 from __future__ import annotations
 
