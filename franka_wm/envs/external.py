@@ -1,6 +1,6 @@
 """Other environments than the arm, through TorchRL's own wrappers: Gymnasium and the DeepMind Control Suite.
 
-They run on the CPU, one copy after the other (``SerialEnv``), or in several processes (``ParallelEnv``).
+They run on the CPU, one copy after the other (``SerialEnv``), in several processes (``ParallelEnv``), or in Ray actors.
 """
 
 from __future__ import annotations
@@ -24,6 +24,7 @@ from torchrl.envs.transforms import (
 )
 
 from franka_wm.envs.external_config import ExternalConfig
+from franka_wm.envs.external_ray import RayEnv
 from franka_wm.errors import UserError
 
 
@@ -41,9 +42,10 @@ class ExternalEnv(TransformedEnv):
         device: Where the TensorDicts live; the simulators stay on the CPU.
         workers: Processes that share the copies equally, and play the same episodes; 0: this one does. ``close()`` ends
             them.
+        ray: These are Ray actors, also on other hosts.
 
     Raises:
-        UserError: The extra is not installed, or there is no such environment or observation.
+        UserError: The extra is not installed, there is no such environment or observation, or what Ray says.
     """
 
     device: torch.device
@@ -58,6 +60,7 @@ class ExternalEnv(TransformedEnv):
         seed: int = 0,
         device: torch.device | str | None = None,
         workers: int = 0,
+        ray: bool = False,
     ):
         make = partial(_make_one, config)
         one = make()
@@ -73,7 +76,9 @@ class ExternalEnv(TransformedEnv):
             RewardSum(),
             InitTracker(),
         ]
-        if workers:
+        if ray:
+            base = RayEnv(make, num_envs=num_envs, workers=workers, device=device)
+        elif workers:
             share = partial(SerialEnv, num_envs // workers, make, device="cpu")
             # Daemons end with this process, however it ends. It keeps its threads: TorchRL would take one for each
             # worker, and with fewer the learner is slower and rounds otherwise.

@@ -57,12 +57,13 @@ def make_env(
     seed: int | None = None,
     first_world: int = 0,
     workers: int = 0,
+    ray: bool = False,
     **changes: object,
 ) -> Environment:
     """The environment that ``run.env`` describes; ``changes`` override fields of its config.
 
     For a model of discrete actions the arm takes numbers of rows of a table. Its episodes are those of training
-    unless ``seed`` says otherwise. Worlds of other libraries differ by the seed alone; ``workers`` share them.
+    unless ``seed`` says otherwise. Other libraries' differ by the seed alone; ``workers`` (``ray``: actors) share them.
     """
     described = run.env.changed(**changes)
     worlds = run.collector.num_envs if num_envs is None else num_envs
@@ -71,8 +72,8 @@ def make_env(
         many: Any = {"num_envs": worlds, "seed": start, "first_world": first_world}
         return MultiTaskEnv(described.config, device=run.device, **many)
     if isinstance(described.config, ExternalConfig):
-        device = resolve_device(run.device)
-        return ExternalEnv(described.config, num_envs=worlds, seed=start, device=device, workers=workers)
+        shared: Any = {"workers": workers, "ray": ray, "device": resolve_device(run.device)}
+        return ExternalEnv(described.config, num_envs=worlds, seed=start, **shared)
     config = described.arm
     env = FrankaEnv(
         config,

@@ -8,6 +8,7 @@ from franka_wm import models
 from franka_wm.device import resolve_device
 from franka_wm.envs.external import check_external
 from franka_wm.envs.external_config import ExternalConfig
+from franka_wm.envs.external_ray import import_ray
 from franka_wm.envs.franka import check_robot
 from franka_wm.envs.multitask_config import MultiTaskConfig
 from franka_wm.errors import UserError
@@ -40,17 +41,7 @@ def check(run: RunSettings) -> None:
             f"collector.planner_worlds={run.collector.planner_worlds}: must be a whole number of at most "
             f"collector.num_envs={run.collector.num_envs}; 0 leaves all worlds to the policy"
         )
-    workers, worlds = run.collector.workers, run.collector.num_envs
-    if workers and not isinstance(run.env.config, ExternalConfig):
-        raise UserError(
-            f"collector.workers={workers}: is for env=gym and env=dm_control; leave it out, since the arm's worlds are "
-            "one simulator"
-        )
-    if workers and worlds % workers:
-        raise UserError(
-            f"collector.workers={workers}: cannot share collector.num_envs={worlds} worlds equally; use a number that "
-            "divides them"
-        )
+    _check_workers(run)
     if run.is_offline:
         _check_dataset(run)
     elif run.env.kind == "none":
@@ -78,6 +69,28 @@ def check(run: RunSettings) -> None:
     if run.pretrain.kind != "none":
         _check_first_stage(run)
     _check_parts(run)
+
+
+def _check_workers(run: RunSettings) -> None:
+    """Whether processes, or Ray's actors, can share the worlds."""
+    workers, worlds, ray = run.collector.workers, run.collector.num_envs, run.collector.ray
+    if (workers or ray) and not isinstance(run.env.config, ExternalConfig):
+        given = "collector=ray" if ray else f"collector.workers={workers}"
+        raise UserError(
+            f"{given}: is for env=gym and env=dm_control; leave it out, since the arm's worlds are one simulator"
+        )
+    if ray and not workers:
+        raise UserError(
+            f"collector=ray: say how many actors share the worlds: collector.workers=N, which divides "
+            f"collector.num_envs={worlds}; the cluster's cores, or fewer"
+        )
+    if workers and worlds % workers:
+        raise UserError(
+            f"collector.workers={workers}: cannot share collector.num_envs={worlds} worlds equally; use a number that "
+            "divides them"
+        )
+    if ray:
+        import_ray()
 
 
 def _check_windows(run: RunSettings) -> None:

@@ -13,7 +13,7 @@ from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
-from typing import IO, NoReturn
+from typing import IO, Any, NoReturn
 
 import torch
 from hydra.core.hydra_config import HydraConfig
@@ -173,8 +173,9 @@ class Run:
         with announced(f"building {worlds}" + (f"; {compiling}" if self.settings.is_arm else "")):
             eval_env = build.make_evaluation_env(self.settings, num_envs=self._evaluation_worlds())
             own = processes.rank() * self.settings.collector.num_envs
-            workers = self.settings.collector.workers
-            env = build.make_env(self.settings, first_world=own, workers=workers) if gathers else None
+            c = self.settings.collector
+            shared: Any = {"first_world": own, "workers": c.workers, "ray": c.ray}
+            env = build.make_env(self.settings, **shared) if gathers else None
             apart = () if self.settings.env.kind in ("franka", "multitask") else processes.parts()
             for one in (env, eval_env):
                 if one is not None:

@@ -30,6 +30,7 @@ OUT_OF_RANGE = {
     "collector.noise": [-0.1, 2.1],
     "collector.planner_worlds": [-1],
     "collector.workers": [-1],
+    "collector.ray": ["some"],
     "replay.capacity": [0],
     "replay.batch_size": [0],
     "replay.window": [0],

@@ -59,6 +59,7 @@ class CollectorSettings:
     noise: float = real(0.0, least=0, most=2, unit="units of the action")
     planner_worlds: int = whole(0, least=0)
     workers: int = whole(0, least=0)
+    ray: bool = flag(False)
 
 
 @dataclass(frozen=True)
