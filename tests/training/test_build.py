@@ -77,6 +77,7 @@ def test_every_scale(name: str, settled) -> None:
 
 
 NEEDS = {  # what else an option goes with
+    "collector": {"ray": ["env=gym", "env.name=Pendulum-v1", "collector.workers=2"]},
     "planner": {"mcts": ["model=muzero"], "gumbel": ["model=muzero"]},
     "model": {
         "muzero": ["planner=mcts"],
@@ -106,7 +107,7 @@ NEEDS = {  # what else an option goes with
     ],
 )
 def test_every_other_option(group: str, name: str, settled) -> None:
-    if group == "logger" and name in ("mlflow", "trackio"):
+    if name in ("mlflow", "trackio", "ray"):  # extras
         pytest.importorskip(name)
     others = NEEDS.get(group, {}).get(name, ["env=reach_pixels"] if group == "model" else [])
     check(settled(f"{group}={name}", *others))
