@@ -212,7 +212,7 @@ def _join(ray: Any) -> None:
 
 
 def _versions() -> dict[str, str]:
-    """Of what decides what a world does; what is not installed is left out."""
+    """Versions of what decides what a world does; what is not installed is left out."""
     found = {"franka_wm": __version__}
     for name in DECISIVE:
         with suppress(PackageNotFoundError):
