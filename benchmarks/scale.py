@@ -68,11 +68,9 @@ def environment(gpus: int, device: str, worlds: int, seconds: float) -> float:
         assert one.stdin is not None
         one.stdin.write("go\n")
         one.stdin.flush()
-    said = [
-        one.communicate()[0].splitlines() for one in workers
-    ]  # the last line; Warp may have printed before
+    said = [one.communicate()[0].splitlines() for one in workers]
     assert not any(one.returncode for one in workers), "a worker has failed"
-    return sum(float(lines[-1]) for lines in said)
+    return sum(float(lines[-1]) for lines in said)  # Warp may have printed before
 
 
 def worker(device: str, worlds: int, seconds: float) -> None:

@@ -119,6 +119,18 @@ def test_goals_reached_later_are_those_of_the_batch(name: str) -> None:
         )  # fmt: skip
 
 
+@pytest.mark.parametrize("name", SMALL)
+def test_a_model_without_them_does_not_read_frames_reached_later(name: str) -> None:
+    batch, model = windows(8, 4), small(name)
+    images = torch.randint(0, 256, (8, 1, 16, 16, 3), dtype=torch.uint8).expand(8, 4, 16, 16, 3)
+    given = batch.clone().set("future", TensorDict({"pixels": images, "steps": torch.ones(8, 4, 1)}, [8, 4]))
+    found = []
+    for one in (batch, given):
+        torch.manual_seed(1)
+        found.append(model.loss(one)["loss"])
+    assert torch.equal(*found)
+
+
 class Captured(TorchDispatchMode):
     """Refuses to ask the device for a number, as the capture of a CUDA graph does."""
 

@@ -71,7 +71,7 @@ def make_solver(model: newton.Model, config: FrankaConfig) -> newton.solvers.Sol
         disable_sensors=True,
         **options,
     )
-    # Overflow is counted, not printed by every thread; nor is that a line search used all of solver_ls_iterations.
+    # Kernels print neither: overflow in a scene is counted, and a line search may use all of solver_ls_iterations.
     quiet = OverflowType.ALL if config.resolved_scene else OverflowType.LS_ITERATIONS
     solver.mjw_model.opt.warn_overflow = int(solver.mjw_model.opt.warn_overflow & ~quiet)
     return solver

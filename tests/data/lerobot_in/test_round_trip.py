@@ -53,6 +53,22 @@ def test_bit_for_bit(exact: Any, opened: Callable) -> None:
     assert not theirs  # every window of the replay, the last action of each episode among them
 
 
+def test_a_run_gets_frames_reached_later_from_it(exact: Any, settled: Callable, tmp_path: Any) -> None:
+    words = ("scale=smoke", "device=cpu", "env=reach_goal_image", "model=lewm", "model.goal_policy_coef=1")
+    words += (
+        "dataset=lerobot",
+        "trainer=offline",
+        f"dataset.root={exact.root}",
+        f"dataset.cache_dir={tmp_path}",
+    )
+    for asked in (False, True):
+        cfg = settled(*words, "dataset.workers=1", f"replay.future={asked}", "env.image_size=64")
+        train, validation = build.open_recorded(cfg, torch.device("cpu"))
+        assert validation is not None
+        for windows in (train, validation):
+            assert ("future" in windows.sample(2).keys()) == asked  # noqa: SIM118
+
+
 def test_a_run_gets_stacks_from_it(exact: Any, settled: Callable, tmp_path: Any) -> None:
     """`env.frame_stack` with `dataset=lerobot`: what the model is built for is what batches hold."""
     overrides = (
