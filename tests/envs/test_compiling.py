@@ -4,12 +4,14 @@
 
 import importlib.util
 import os
+import threading
 from pathlib import Path
 
 import pytest
 import warp as wp
 
 from franka_wm.envs import FrankaConfig, FrankaEnv
+from franka_wm.envs.simulation import simulator
 from franka_wm.envs.simulation.compiling import (
     SOLVER,
     STEP,
@@ -106,8 +108,19 @@ def test_an_error_of_a_compiler_is_raised_where_it_is_waited_for(monkeypatch: py
         compiler.finish(compiler.begin([("no.such.module", None)]))
 
 
-@pytest.mark.parametrize(("cores", "device"), [({0}, "cpu"), ({0, 1}, "cuda:0")])
-def test_nothing_is_loaded_ahead(cores: set[int], device: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(os, "sched_getaffinity", lambda _: cores, raising=False)
-    with Compiler(device) as compiler:
+def test_one_core_loads_nothing_ahead(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(os, "sched_getaffinity", lambda _: {0}, raising=False)
+    with Compiler("cpu") as compiler:
         assert not compiler.ahead and compiler.begin([("no.such.module", None)]) == []
+        assert compiler.begin_calls([pytest.fail]) == []
+
+
+@pytest.mark.parametrize(("task", "times"), [("lift", 1), ("reach", 0)])
+def test_a_thread_of_its_own_compiles_what_finds_contacts(
+    task: str, times: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    threads = []
+    monkeypatch.setattr(os, "sched_getaffinity", lambda _: {0, 1}, raising=False)
+    monkeypatch.setattr(simulator, "compile_collisions", lambda _: threads.append(threading.current_thread()))
+    FrankaEnv(FrankaConfig(task=task, substeps=1), num_envs=1, device="cpu")
+    assert len(threads) == times and threading.main_thread() not in threads

@@ -65,8 +65,8 @@ STEP = (
 class Compiler:
     """Threads that load Warp modules, compiled where the disk does not have them. Ends with a ``with`` block.
 
-    The thread that waits compiles, too. With one core there are no others, and nothing is loaded ahead; nor is it on
-    CUDA, where this has not been tried: Warp compiles there as modules are launched.
+    The thread that waits compiles, too. With one core there are no others, and nothing is loaded ahead: Warp compiles
+    as modules are launched.
 
     Args:
         device: ``"cpu"`` or ``"cuda:k"``.
@@ -75,7 +75,7 @@ class Compiler:
     def __init__(self, device: str):
         self.device = device
         cores = usable_cores()
-        self._pool = ThreadPoolExecutor(cores - 1) if cores > 1 and device == "cpu" else None
+        self._pool = ThreadPoolExecutor(cores - 1) if cores > 1 else None
 
     @property
     def ahead(self) -> bool:
@@ -95,10 +95,11 @@ class Compiler:
         def loader(module: str | wp.Module, threads: int | None) -> Callable[[], None]:
             return lambda: wp.load_module(module, device=self.device, block_dim=threads)
 
-        if self._pool is None:
-            return []
-        loads = [loader(*variant) for variant in variants]
-        return [(self._pool.submit(load), load) for load in loads]
+        return self.begin_calls(loader(*variant) for variant in variants)
+
+    def begin_calls(self, loads: Iterable[Callable[[], None]]) -> Loading:
+        """The same for calls that load modules by launching their kernels."""
+        return [] if self._pool is None else [(self._pool.submit(load), load) for load in loads]
 
     def finish(self, loading: Loading) -> None:
         """Loads those of ``loading`` that no thread has begun, and waits for the others.
@@ -153,6 +154,8 @@ def physics_modules(solver: newton.solvers.SolverMuJoCo) -> list[Variant]:
 
 
 def compile_collisions(solver: newton.solvers.SolverMuJoCo) -> None:
-    """Compiles and launches what finds contacts, in no world: one kernel of it takes as long as all others together."""
-    with wp.ScopedDevice(solver.model.device):
-        mujoco_warp.collision(solver.mjw_model, replace(solver.mjw_data, nworld=0))
+    """Compiles and launches what finds contacts, in no world: one kernel of it takes as long as all others together.
+
+    A thread may do this where the solver's device is the default one: that is the whole process's.
+    """
+    mujoco_warp.collision(solver.mjw_model, replace(solver.mjw_data, nworld=0))

@@ -82,7 +82,8 @@ class Simulation:
         self._step_graphs: dict[bool, Recording] = {}
         self._reset_graph: Recording | None = None
         self._overflowed = False
-        with Compiler(device) as compiler:
+        # Warp's default device is one for all threads.
+        with wp.ScopedDevice(device), Compiler(device) as compiler:
             loading = compiler.begin(solver_modules(config))
             self.model, self.robot = build_model(config, num_envs, device, urdf_path)
             compiler.finish(loading)
@@ -90,9 +91,10 @@ class Simulation:
             self.solver = make_solver(self.model, config)
             self._in_place = isinstance(self.solver, newton.solvers.SolverMuJoCo)
             compiler.finish(around)
-            physics = compiler.begin(
-                physics_modules(self.solver) if self._in_place and compiler.ahead else []
-            )
+            modules = physics_modules(self.solver) if self._in_place and compiler.ahead else []
+            collide = bool(config.resolved_scene) and config.collision_pipeline == "mujoco"
+            slowest = [lambda: compile_collisions(self.solver)] if collide else []
+            physics = compiler.begin_calls(slowest) + compiler.begin(modules)
             self.newton_state = self.model.state()
             self._spare_state = None if self._in_place else self.model.state()
             self.control = self.model.control()
@@ -118,8 +120,6 @@ class Simulation:
             newton.eval_fk(self.model, self.model.joint_q, self.model.joint_qd, self.newton_state)
             if self.renderer.images and compiler.ahead:
                 self.renderer.show_all()
-            if config.resolved_scene and not self.pipeline and compiler.ahead:
-                compile_collisions(self.solver)
             compiler.finish(physics)
 
     # -- what a user of this class calls ------------------------------------------------------------------
