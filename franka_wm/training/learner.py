@@ -109,8 +109,10 @@ class Learner:
         """
         if self._scheduled:
             self._set_rates()
+        if self.capture:
+            batch = self._kept(batch, static)
         if self._graph is None and self.capture and self._seen >= self.EAGER_UPDATES:
-            self._record(batch, static)
+            self._record(batch)
         if self._graph is None:
             if self.capture:  # warm up on the kind of stream that the capture will use
                 stream = torch.cuda.Stream()
@@ -123,9 +125,6 @@ class Learner:
                 self.optimizer.zero_grad(set_to_none=True)
                 self._eager(batch)
         else:
-            assert self._batch is not None
-            if batch is not self._batch:
-                self._batch.update_(batch.select(*self._batch.keys(True, True)))
             self._graph.replay()
         self._seen += 1
         self._summed += 1
@@ -196,12 +195,24 @@ class Learner:
                 self._sums = torch.zeros_like(row)
             self._sums += row
 
-    def _record(self, batch: TensorDictBase, static: bool) -> None:
+    def _kept(self, batch: TensorDictBase, static: bool) -> TensorDictBase:
+        """The batch in the memory that a captured update reads.
+
+        Updates before it read it, too: a compiled loss is compiled again for other strides, which no capture allows.
+        """
+        if static and self._graph is None:
+            self._batch = batch
+        elif self._batch is None:
+            self._batch = batch.clone()
+        elif batch is not self._batch:
+            self._batch.update_(batch.select(*self._batch.keys(True, True)))
+        return self._batch
+
+    def _record(self, batch: TensorDictBase) -> None:
         """Captures the update. Capturing runs nothing, so no update is lost or counted twice."""
-        self._batch = batch if static else batch.clone()
         self.optimizer.zero_grad(set_to_none=True)
         graph = torch.cuda.CUDAGraph()
         # NCCL has a thread of its own, which looks after it meanwhile.
         with torch.cuda.graph(graph, capture_error_mode="thread_local"):
-            self._eager(self._batch)
+            self._eager(batch)
         self._graph = graph

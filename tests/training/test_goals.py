@@ -40,3 +40,19 @@ def test_a_policy_towards_goals_acts_where_their_images_are_seen(settled) -> Non
         policies["planner"](seen)
     model = build.make_model(settled(*words), env)
     assert "policy" not in build.make_agent_policies(run, model, env, Spaces.of_env(env))
+
+
+SMALL = ("scale=smoke", "device=cpu", "model=lewm", "planner=cem", "env.image_size=16")
+
+
+def test_a_policy_towards_goals_gathers_where_it_is_asked_to(settled) -> None:
+    words = (*SMALL, "env=reach_goal_image")
+    assert settled(*words, "model.goal_policy_coef=1").actor == "random"  # by auto, as without
+    run = settled(*words, "model.goal_policy_coef=1", "collector.policy=policy")
+    check(run)
+    assert run.actor == "policy"
+    without = settled(*words, "collector.policy=policy")
+    with pytest.raises(UserError, match=r"use collector\.policy=planner, or model\.goal_policy_coef above 0"):
+        check(without)
+    with pytest.raises(UserError, match="needs goal_pixels"):
+        check(settled(*SMALL, "env=reach_pixels", "model.goal_policy_coef=1", "collector.policy=policy"))

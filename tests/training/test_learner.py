@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from contextlib import nullcontext
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -99,6 +101,36 @@ def test_impossible_options(options: dict[str, float]) -> None:
 def test_capture_without_cuda() -> None:
     with pytest.raises(UserError, match="cuda"):
         Learner(Line(), capture=True)
+
+
+def test_what_is_captured_reads_the_memory_of_the_updates_before(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A compiled loss is compiled for strides: others while it is captured would compile it then; CUDA refuses that."""
+    stream = SimpleNamespace(wait_stream=lambda _: None)
+    for name, fake in {
+        "Stream": lambda: stream,
+        "current_stream": lambda: stream,
+        "stream": nullcontext,
+        "CUDAGraph": lambda: SimpleNamespace(replay=lambda: None),
+        "graph": lambda *_, **__: nullcontext(),
+    }.items():
+        monkeypatch.setattr(torch.cuda, name, fake)
+    model, seen = Line(), []
+    learner = Learner(model, lr=1e-3)
+    learner.capture = True
+
+    def loss(batch: TensorDict) -> TensorDict:
+        seen.append((batch["x"].stride(), batch["x"].data_ptr(), batch["x"][0, 0].item()))
+        return Line.loss(model, batch)
+
+    learner._loss = loss
+    for k in range(Learner.EAGER_UPDATES + 2):
+        one = torch.full((4, 1), float(k)).expand(
+            4, 2
+        )  # as one later frame stands for every step of a window
+        learner.update(TensorDict({"x": one}, batch_size=[4, 2]))
+    assert len({(strides, memory) for strides, memory, _ in seen}) == 1
+    assert [value for *_, value in seen] == [float(k) for k in range(Learner.EAGER_UPDATES + 1)]
+    assert learner._batch is not None and learner._batch["x"][0, 0].item() == Learner.EAGER_UPDATES + 1
 
 
 def test_every_part_of_the_world_model_moves(settled, small_env) -> None:

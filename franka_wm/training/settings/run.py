@@ -287,18 +287,21 @@ class RunSettings:
             UserError: The model's family does not have it.
         """
         policy, family = self.collector.policy, self.model.family
-        there = {"planner": family.has_next, "policy": family.has_policy}
+        towards_goals = bool(family.has_goal_policy and self.model.options.get("goal_policy_coef"))
+        there = {"planner": family.has_next, "policy": family.has_policy or towards_goals}
         searched = bool(family.replay_keys)  # the loss needs what the search found
         if policy == "auto":
             if searched:
                 return "planner"
-            if there["policy"]:
+            if family.has_policy:
                 return "policy"
             # A planner without a policy's candidates takes far longer to decide than the worlds to step, and a model
             # that is given goals by their images can learn from any motion.
             return "planner" if self.objective_name == "reward_value" else "random"
         if not there.get(policy, True) or (searched and policy != "planner"):
             fitting = "planner" if there["planner"] else "random"
+            if policy == "policy" and family.has_goal_policy:
+                fitting += ", or model.goal_policy_coef above 0"
             raise UserError(
                 f"collector.policy={policy}: model={self.model.name} cannot; use collector.policy={fitting}"
             )
