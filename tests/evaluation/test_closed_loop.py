@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import pytest
 import torch
 from tensordict import TensorDict
@@ -10,8 +12,10 @@ from tensordict.nn import TensorDictModule
 from franka_wm.envs import FrankaEnv
 from franka_wm.errors import UserError
 from franka_wm.evaluation.closed_loop import (
+    _Tasks,
     evaluating,
     play_episodes,
+    success_distance,
     summarize,
 )
 from franka_wm.evaluation.protocol import evaluate_policies, held_out_seeds
@@ -77,6 +81,46 @@ def test_episodes_differ_from_those_of_training(env: FrankaEnv) -> None:
     for _ in range(20):
         assert not torch.isclose(evaluated.unsqueeze(0), env.goal_distance().unsqueeze(1), atol=1e-5).any()
         env.reset()
+
+
+def test_a_part_of_the_worlds_plays_the_same_episodes(env: FrankaEnv, small_env) -> None:
+    """The first ones, for which alone is decided, and those from a number on."""
+    seen = []
+
+    def nothing(observation: TensorDict) -> TensorDict:
+        assert not torch.is_grad_enabled()
+        seen.append(len(observation))
+        return observation.set("action", torch.zeros(len(observation), 7))
+
+    every = play_episodes(env, nothing, seed=3)
+    some = play_episodes(env, nothing, seed=3, episodes=2)
+    assert seen == [5] * LENGTH + [2] * LENGTH
+    assert (some == every[:2]).all() and len(some) == 2
+    last = small_env(3, episode_length=LENGTH, goal_sampling="reachable")
+    assert (play_episodes(last, nothing, seed=3, first_world=2) == every[2:]).all()
+
+
+def test_where_success_is_a_distance(env: FrankaEnv, monkeypatch) -> None:
+    assert success_distance(env) == env.config.success_distance
+    monkeypatch.setattr(type(env.simulation.task), "goal_distance", False)
+    assert success_distance(env) is None
+
+
+def test_of_several_tasks_each_judges_the_first_episode_of_its_worlds() -> None:
+    env = SimpleNamespace(
+        envs={"a": None, "b": None}, one_hot=torch.eye(2)[[0, 1, 0]], num_envs=3, device=torch.device("cpu")
+    )
+    judged = _Tasks(env)
+    for running, success in (([1, 1, 1], [0, 1, 1]), ([1, 1, 1], [1, 0, 0]), ([1, 0, 0], [1, 1, 1])):
+        after = TensorDict({"success": torch.tensor(success, dtype=torch.bool).unsqueeze(-1)}, [3])
+        judged.see(torch.tensor(running, dtype=torch.bool), after)
+    found = judged.summary(torch.ones(3))
+    assert found["success"].tolist() == [1.0, 0.0, 0.0] and found["success_once"].tolist() == [1.0, 1.0, 1.0]
+    rows = TensorDict({**found, "return": torch.zeros(3)}, [3])
+    assert rows["task_success", "a"][[0, 2]].tolist() == [1.0, 0.0] and rows["task_success", "a"][1].isnan()
+    summary = summarize(rows)
+    rates = {name: interval["mean"] for name, interval in summary["task_success"].items()}
+    assert rates == {"a": 0.5, "b": 0.0} and summary["success_once"]["mean"] == 1.0
 
 
 def test_video_is_called_before_every_step(env: FrankaEnv) -> None:
