@@ -8,19 +8,17 @@ import signal
 from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
 import torch
 from safetensors.torch import load_file
-from tensordict import TensorDict, TensorDictBase
+from tensordict import TensorDictBase
 
 from forks import train_in_fork
-from franka_wm import processes
 from franka_wm.commands.main import main
-from franka_wm.training import build, resume
+from franka_wm.training import build
 from franka_wm.training.checkpoint import Checkpoint, latest_checkpoint, load_checkpoint
 from franka_wm.training.learner import Learner
 from franka_wm.training.moment import draws
@@ -174,61 +172,6 @@ def test_a_signal_changes_nothing(make: Callable[..., Trainer]) -> None:
     second.settings = second.settings.changed(seed=0)
     restore(second, load_checkpoint(latest_checkpoint(first.folder)))
     assert differing(play(second), expected) == []
-
-
-class Seeded:
-    """Worlds of another library, which keep the seed that they were given."""
-
-    def set_seed(self, seed: int) -> None:
-        self.seed = seed
-
-
-def test_worlds_of_other_libraries_go_on_unlike_on_each_gpu(monkeypatch) -> None:
-    seeds = []
-    for rank in range(2):
-        monkeypatch.setattr(processes, "count", lambda: 2)
-        monkeypatch.setattr(processes, "rank", lambda rank=rank: rank)
-        trainer = SimpleNamespace(env=Seeded(), settings=SimpleNamespace(seed=0), env_steps=100)
-        resume._begin_new_episodes(trainer)  # pyright: ignore[reportArgumentType]
-        seeds.append(trainer.env.seed)
-    assert seeds[0] != seeds[1]
-
-
-@pytest.mark.parametrize(
-    ("key", "value", "said"),
-    [
-        (("next", "reward"), None, "reward"),
-        ("state", torch.zeros(2, 4, 3, dtype=torch.float64), "experience of state is torch.float64"),
-        ("state", torch.zeros(2, 4, 5), "experience of state is of shape"),
-        ("state", torch.zeros(2, 4), "experience of state is of shape"),
-        ("state", TensorDict({}, [2, 4]), "experience of state is None"),
-        ("pixels", torch.zeros(2, 4, 8, 8, 4, dtype=torch.uint8), "experience of pixels is of shape"),
-    ],
-)
-def test_experience_of_another_form_is_refused(key: Any, value: Any, said: str) -> None:
-    """It would be noticed many steps later, in the words of a library."""
-
-    def steps(*size: int) -> TensorDict:
-        images = torch.zeros(*size, 8, 8, 6, dtype=torch.uint8)
-        after = {"reward": torch.zeros(*size, 1)}
-        return TensorDict({"state": torch.zeros(*size, 3), "pixels": images, "next": after}, size)
-
-    gathered = SimpleNamespace(fake_tensordict=lambda: steps(2))
-    settings = SimpleNamespace(env=SimpleNamespace(frame_stack=2))
-    trainer: Any = SimpleNamespace(
-        env=gathered, settings=settings, kept=["state", "pixels", ("next", "reward")]
-    )
-    whole = steps(2, 4)
-    assert set(resume._fitting(trainer, whole.set("other", whole["state"])).keys()) == {
-        "state",
-        "pixels",
-        "next",
-    }
-    whole["pixels"] = whole["pixels"][..., :3]  # as StackStorage keeps them
-    resume._fitting(trainer, whole)
-    other = whole.exclude(key) if value is None else whole.set(key, value)
-    with pytest.raises((ValueError, KeyError), match=said):
-        resume._fitting(trainer, other)
 
 
 # -- whole runs ------------------------------------------------------------------------------------------------

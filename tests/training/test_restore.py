@@ -1,0 +1,279 @@
+"""What of a checkpoint is put back, what is not, and what is said of that."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+import torch
+from tensordict import TensorDict
+
+from franka_wm import processes
+from franka_wm.envs import FrankaEnv
+from franka_wm.errors import UserError
+from franka_wm.seeding import derive_seed
+from franka_wm.training import build, resume, storage_budget
+from franka_wm.training.checkpoint import Checkpoint, latest_checkpoint, load_checkpoint
+from franka_wm.training.learner import Learner
+from franka_wm.training.resume import OTHER_DEVICE, restore
+from franka_wm.training.settings import RunSettings
+from franka_wm.training.trainer import Trainer
+
+WORLDS, UPDATES = 4, 2
+ANEW = "this run gathers anew and will not be the same"
+
+Make = Callable[..., Trainer]
+
+
+@pytest.fixture(scope="module")
+def cfg(settled, tiny: list[str]) -> RunSettings:
+    return settled(
+        *tiny, f"collector.num_envs={WORLDS}", f"trainer.updates={UPDATES}", "collector.seed_steps=12"
+    )
+
+
+@pytest.fixture(scope="module")
+def env(cfg: RunSettings) -> FrankaEnv:
+    return build.make_env(cfg)
+
+
+@pytest.fixture(scope="module")
+def make(cfg: RunSettings, env: FrankaEnv, tmp_path_factory) -> Make:
+    folder = tmp_path_factory.mktemp("runs")
+
+    def make(name: str = "second", **changes: Any) -> Trainer:
+        mine = cfg.changed(trainer={"updates": UPDATES + 10, **changes})
+        model = build.make_model(mine, env)
+        return Trainer(
+            env=env,
+            learner=Learner(model),
+            replay=build.make_replay_buffer(mine, env.device),
+            policies=build.make_policies(model, build.make_planner(mine, env.action_dim), env),
+            actor="policy",
+            settings=mine,
+            folder=folder / name,
+            loggers=[],
+            evaluate=dict,
+        )
+
+    return make
+
+
+@pytest.fixture(scope="module")
+def first(make: Make) -> Trainer:
+    """A run that has ended."""
+    trainer = make("first", updates=UPDATES)
+    trainer.fit()
+    return trainer
+
+
+@pytest.fixture
+def checkpoint(first: Trainer) -> Checkpoint:
+    return load_checkpoint(latest_checkpoint(first.folder))
+
+
+def said(capsys) -> list[str]:
+    return [line.strip() for line in capsys.readouterr().out.splitlines()]
+
+
+def test_all_of_it_and_nothing_is_said(
+    make: Make, first: Trainer, checkpoint: Checkpoint, env, capsys
+) -> None:
+    drawn = []
+    for seed in range(2):
+        second = make()
+        env.rollout(3)
+        torch.manual_seed(seed)
+        capsys.readouterr()
+        restore(second, checkpoint)
+        assert said(capsys) == []
+        drawn.append(torch.rand(3))
+    assert torch.equal(*drawn)
+    assert second.learner.updates == UPDATES and second.env_steps == first.env_steps > 0
+    assert second.seconds == first.seconds and second.rows == first.rows != []
+    assert (second.replay[:] == first.replay[:]).all()
+    saved = checkpoint.moment()["worlds"]["state"]
+    assert torch.equal(env.get_state()["episode"], saved["episode"]) and (saved["episode"] >= 0).all()
+
+
+def test_a_checkpoint_without_rows(make: Make, checkpoint: Checkpoint, monkeypatch) -> None:
+    """One that was saved without anything besides."""
+    monkeypatch.setattr(Checkpoint, "extra", lambda self: None)
+    second = make()
+    second.rows = [{"updates": 1.0}]
+    restore(second, checkpoint)
+    assert second.rows == []
+
+
+@pytest.mark.parametrize("updates", [UPDATES, UPDATES + 1])
+def test_experience_that_is_missing(
+    make: Make, checkpoint: Checkpoint, updates: int, monkeypatch, capsys
+) -> None:
+    """It is said where it would be needed: not of a run that has no updates left."""
+    monkeypatch.setattr(Checkpoint, "replay", lambda *_: None)
+    second = make(updates=updates)
+    restore(second, checkpoint)
+    assert len(second.replay) == 0
+    expected = f"the checkpoint holds no experience: {ANEW}"
+    assert said(capsys) == ([] if updates == UPDATES else [expected])
+
+
+def test_another_number_of_worlds(make: Make, checkpoint: Checkpoint, env: FrankaEnv, capsys) -> None:
+    checkpoint.config["collector"]["num_envs"] = WORLDS + 1
+    second = make()
+    restore(second, checkpoint)
+    why = f"is of collector.num_envs={WORLDS + 1}, this run has {WORLDS}"
+    assert said(capsys) == [f"the checkpoint {why}: {ANEW}"]
+    assert len(second.replay) == 0 and (env.get_state()["episode"] == -1).all()
+    assert second.learner.updates == UPDATES
+
+
+def test_another_number_of_processes(make: Make, checkpoint: Checkpoint, monkeypatch, capsys) -> None:
+    """Random numbers start anew, from a seed of the process."""
+    monkeypatch.setattr(resume, "own_experience", lambda one, device: one.replay(device, 0))
+    monkeypatch.setattr(resume, "own_moment", lambda one: one.moment())
+    monkeypatch.setattr(Checkpoint, "processes", 2)
+    second = make()
+    restore(second, checkpoint)
+    (line,) = said(capsys)
+    assert line.startswith("the checkpoint is of 2 processes, here are 1: random numbers start anew")
+    assert torch.initial_seed() == derive_seed("process", second.settings.seed, 0, UPDATES)
+    assert len(second.replay) > 0
+
+
+def test_room_is_for_what_comes_back_and_what_will_be_gathered(
+    make: Make, first: Trainer, checkpoint: Checkpoint, monkeypatch
+) -> None:
+    second = make()
+    ahead = WORLDS * second.settings.planned_steps(UPDATES)
+    step = first.replay.storage.bytes_per_step(checkpoint.replay())
+    room = step * (ahead + first.replay[:].numel())
+    assert ahead + first.replay[:].numel() < second.settings.replay.capacity
+    for free, fits in ((room, True), (room - step, False)):
+        monkeypatch.setattr(storage_budget, "free_memory", lambda device, free=free: free)
+        if fits:
+            restore(make(), checkpoint)
+        else:
+            with pytest.raises(UserError, match="do not fit"):
+                restore(make(), checkpoint)
+
+
+@pytest.mark.parametrize(
+    "why", ["the checkpoint holds none", "of another configuration", "of other libraries"]
+)
+def test_worlds_that_start_new_episodes(why: str, make: Make, checkpoint, env, monkeypatch, capsys) -> None:
+    if why == "of another configuration":
+        checkpoint.config["env"]["success_distance"] = 0.2
+    else:
+        monkeypatch.setattr(resume, "own_moment", lambda one: {})
+    if why == "of other libraries":
+        monkeypatch.setattr(resume, "restorable", lambda env: None)
+        why = "the simulators of other libraries cannot be put back"
+    restore(make(), checkpoint)
+    assert said(capsys) == [f"worlds: {why}; they start new episodes, and this run will not be the same"]
+    assert (env.get_state()["episode"] == -1).all()
+
+
+def test_policies_that_drew_on_another_kind_of_device(make: Make, checkpoint, monkeypatch, capsys) -> None:
+    monkeypatch.setattr(resume, "go_on_drawing", lambda *_: False)
+    restore(make(), checkpoint)
+    assert said(capsys) == [OTHER_DEVICE]
+
+
+@pytest.mark.parametrize("held_out", [True, False])
+def test_recorded_windows_are_put_back(held_out: bool, capsys) -> None:
+    """Those that were saved, of training and held out; without worlds there is nothing else."""
+
+    class Windows:
+        def __init__(self, fits: bool = True) -> None:
+            self.fits, self.given = fits, []
+
+        def set_state(self, state: str) -> bool:
+            self.given.append(state)
+            return self.fits
+
+    trainer: Any = SimpleNamespace(env=None, replay=Windows(), validation=Windows() if held_out else None)
+    resume._restore_moment(trainer, None, {"windows": "a", "validation": "b"})
+    assert trainer.replay.given == ["a"] and said(capsys) == []
+    assert not held_out or trainer.validation.given == ["b"]
+    resume._restore_moment(trainer, None, {})
+    assert trainer.replay.given == ["a"] and said(capsys) == []
+    trainer.replay = Windows(fits=False)
+    resume._restore_moment(trainer, None, {"windows": "a"})
+    assert said(capsys) == [OTHER_DEVICE]
+
+
+class Seeded:
+    """Worlds that keep the seed that they were given."""
+
+    def set_seed(self, seed: int) -> None:
+        self.seed = seed
+
+
+@pytest.mark.parametrize("arm", [True, False])
+def test_worlds_of_other_libraries_go_on_unlike_on_each_gpu(arm: bool, monkeypatch) -> None:
+    """Those of the arm are told apart by their numbers."""
+    seeds = []
+    monkeypatch.setattr(resume, "restorable", lambda env: env if arm else None)
+    for rank in range(2):
+        monkeypatch.setattr(processes, "count", lambda: 2)
+        monkeypatch.setattr(processes, "rank", lambda rank=rank: rank)
+        trainer: Any = SimpleNamespace(env=Seeded(), settings=SimpleNamespace(seed=0), env_steps=100)
+        resume._begin_new_episodes(trainer)
+        seeds.append(trainer.env.seed)
+    assert (seeds[0] == seeds[1]) == arm
+
+
+# -- the form of experience --------------------------------------------------------------------------------
+
+
+def steps(*size: int, channels: int = 6) -> TensorDict:
+    images = torch.zeros(*size, 8, 8, channels, dtype=torch.uint8)
+    after = {"reward": torch.zeros(*size, 1)}
+    return TensorDict({"state": torch.zeros(*size, 4), "pixels": images, "next": after}, size)
+
+
+def gathering(channels: int = 6, frame_stack: int = 2) -> Any:
+    """A trainer of two worlds that gathers such steps, and an entry of its model's own besides."""
+    return SimpleNamespace(
+        env=SimpleNamespace(fake_tensordict=lambda: steps(2, channels=channels)),
+        settings=SimpleNamespace(env=SimpleNamespace(frame_stack=frame_stack)),
+        kept=["plan", "state", "pixels", ("next", "reward")],
+    )
+
+
+def test_experience_that_fits() -> None:
+    whole = steps(2, 4).set("plan", torch.zeros(2, 4, 7, 7))
+    names = {"plan", "state", "pixels", "next"}
+    assert set(resume._fitting(gathering(), whole.set("other", whole["state"])).keys()) == names
+    whole["pixels"] = whole["pixels"][..., :3]  # as StackStorage keeps them
+    resume._fitting(gathering(), whole)
+    with pytest.raises(ValueError, match="experience of pixels is of shape"):
+        resume._fitting(gathering(frame_stack=1), whole)  # what is not stacked is kept whole
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "said"),
+    [
+        (("next", "reward"), None, "reward"),
+        ("state", torch.zeros(2, 4, 4, dtype=torch.float64), "experience of state is torch.float64"),
+        ("state", torch.zeros(2, 4, 5), "experience of state is of shape"),
+        (
+            "state",
+            torch.zeros(2, 4, 3),
+            "experience of state is of shape",
+        ),  # as many as an image has channels
+        ("state", torch.zeros(2, 4), "experience of state is of shape"),
+        ("state", TensorDict({}, [2, 4]), "experience of state is None"),
+        ("plan", TensorDict({}, [2, 4]), "experience of plan is None"),
+        ("pixels", torch.zeros(2, 4, 8, 8, 4, dtype=torch.uint8), "experience of pixels is of shape"),
+    ],
+)
+def test_experience_of_another_form_is_refused(key: Any, value: Any, said: str) -> None:
+    """It would be noticed many steps later, in the words of a library."""
+    whole = steps(2, 4).set("plan", torch.zeros(2, 4, 7))
+    other = whole.exclude(key) if value is None else whole.set(key, value)
+    with pytest.raises((ValueError, KeyError), match=said):
+        resume._fitting(gathering(), other)
