@@ -3,6 +3,7 @@
 import functools
 import random
 from collections.abc import Callable
+from dataclasses import FrozenInstanceError
 from pathlib import Path
 
 import numpy as np
@@ -142,6 +143,8 @@ def test_replay_comes_back_entry_by_entry(tmp_path: Path) -> None:
     for key, value in replay[:3].items(True, True):
         assert restored[key].dtype == value.dtype
         assert torch.equal(restored[key], value)
+    elsewhere = load_checkpoint(tmp_path / "a").replay("meta")
+    assert elsewhere is not None and elsewhere["state"].is_meta
     size = (tmp_path / "a" / "replay.safetensors").stat().st_size
     assert size < 1.2 * replay[:3].bytes() + 2000  # not the whole storage
 
@@ -153,6 +156,18 @@ def test_what_was_not_saved_is_none(tmp_path: Path) -> None:
     assert checkpoint.extra() is None
     with pytest.raises(UserError, match="without an optimizer"):
         checkpoint.load_optimizer(torch.optim.Adam(Small().parameters()))
+
+
+def test_a_checkpoint_without_random_numbers_is_of_one_process(root: Path) -> None:
+    """As the package's own agent is."""
+    checkpoint = load_checkpoint(root / "franka_wm" / "demo_agent")
+    assert checkpoint.processes == 1 and checkpoint.replay() is None
+
+
+def test_a_checkpoint_is_not_changed(tmp_path: Path) -> None:
+    save(tmp_path / "a")
+    with pytest.raises(FrozenInstanceError):
+        load_checkpoint(tmp_path / "a").counters = {}  # type: ignore[misc]
 
 
 def test_extra_keeps_types(tmp_path: Path) -> None:
@@ -292,6 +307,7 @@ def test_parts_of_several_processes_are_one_checkpoint(
     monkeypatch.setattr("franka_wm.processes.rank", lambda: 1)
     own = own_experience(found, torch.device("cpu"))
     assert own is not None and torch.equal(own["state"], whole["state"][4:8])
+    assert torch.equal(found.moment()["worlds"]["state"]["q"], moments[0]["worlds"]["state"]["q"])
     assert own_moment(found)["worlds"]["state"]["q"][:, 0].tolist() == [0.0, 0.0, 1.0, 1.0]
     (
         tmp_path / "a" / "replay.safetensors"
