@@ -160,6 +160,32 @@ def test_experience_is_whole(make: Make) -> None:
     assert torch.isfinite(data["next", "state"]).all() and (data["next", "state"] != 0).any(-1).all()
 
 
+def test_where_there_is_no_experience(make: Make) -> None:
+    """Before anything was gathered, and where windows are recorded."""
+    assert make().experience() is None
+    assert Trainer.experience(SimpleNamespace(env=None, replay=[0])) is None
+
+
+def test_steps_of_all_processes_are_counted(make: Make, monkeypatch) -> None:
+    trainer = make()
+    monkeypatch.setattr(processes, "count", lambda: 2)
+    trainer.gather()
+    assert trainer.env_steps == 2 * trainer.replay[:].numel() == 2 * 5 * N
+
+
+def test_room_for_the_experience_is_asked_for_once(make: Make, monkeypatch) -> None:
+    """Before the first batch; later what is free has shrunk by what was taken."""
+    trainer = make()
+    monkeypatch.setattr(storage_budget, "free_memory", lambda device: 1)
+    with pytest.raises(UserError, match="do not fit"):
+        trainer.gather()
+    monkeypatch.setattr(storage_budget, "free_memory", lambda device: None)
+    trainer.gather()
+    monkeypatch.setattr(storage_budget, "free_memory", lambda device: 1)
+    trainer.gather()
+    assert trainer.replay[:].shape == (N, 10)
+
+
 @pytest.mark.parametrize("updates", [20, 110])
 def test_going_on(make: Make, updates: int) -> None:
     """Also with a buffer that has wrapped around: all of it, in order, as windows of the same worlds."""
