@@ -10,7 +10,7 @@ import sys
 import traceback
 from collections.abc import Callable, Collection, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 from typing import IO, Any, NoReturn
@@ -41,6 +41,7 @@ from franka_wm.training.demos import open_demonstrations, start_along
 from franka_wm.training.loggers import close_loggers, log_config, log_video, make_loggers
 from franka_wm.training.settings import RunSettings, plain
 from franka_wm.training.spaces import Spaces
+from franka_wm.training.tree import damaged
 from franka_wm.untrusted import UntrustedFolder
 from franka_wm.versions import FINISHED, write_finished, write_versions
 
@@ -234,7 +235,15 @@ class Run:
     def as_saved(self, spaces: Spaces) -> Spaces:
         """``spaces`` with what decides on a model's parts as it was when the run that this one goes on from began."""
         saved = None if self.checkpoint is None else (self.checkpoint.extra() or {}).get("spaces")
-        return spaces if saved is None else replace(spaces, terminates=saved.get("terminates", False))
+        if self.checkpoint is None or saved is None:
+            return spaces
+        with damaged(self.checkpoint.folder, "extra.json"):
+            kept, other = spaces.as_built(Spaces.from_dict(saved))
+        if other:
+            say(
+                f"  the model keeps what it was built for, from which discount, values and distances follow: {other}"
+            )
+        return kept
 
     @property
     def device(self) -> torch.device:

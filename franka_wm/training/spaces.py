@@ -69,6 +69,17 @@ class Spaces:
         images = {key: self.image_sizes[key] for key in keys if key in self.image_sizes}
         return replace(self, observation_sizes=vectors, image_sizes=images)
 
+    def as_built(self, before: Spaces) -> tuple[Spaces, str]:
+        """Sizes of here, with what gives the numbers of a trained model their meaning as it was; and what differs.
+
+        The length of episodes is the unit of distances in steps. With the bounds of rewards it gives discount and range
+        of values. Another one would read the same weights otherwise.
+        """
+        kept = {name: getattr(before, name) for name in ("episode_length", "reward_bounds", "terminates")}
+        here = {name: getattr(self, name) for name in kept}
+        other = [f"{name}={kept[name]} (here {here[name]})" for name in kept if kept[name] != here[name]]
+        return replace(self, **kept), ", ".join(other)
+
     def as_dict(self) -> dict[str, Any]:
         """Plain, for a checkpoint."""
         values = asdict(self)
@@ -78,7 +89,9 @@ class Spaces:
     def from_dict(cls, values: Mapping[str, Any]) -> Spaces:
         """Inverse of :meth:`as_dict`; what an older version did not save has its default."""
         images = {key: (size[0], size[1], size[2]) for key, size in values["image_sizes"].items()}
-        bounds = values.get("reward_bounds")
+        bounds, length = values.get("reward_bounds"), values.get("episode_length", 1)
+        if type(length) is not int or length < 1:
+            raise ValueError(f"episode_length is {length!r}")
         return replace(
             cls(**values),
             image_sizes=images,

@@ -211,6 +211,9 @@ def test_spaces_of_an_older_checkpoint_know_no_bounds() -> None:
     values = Spaces(observation_sizes={"state": 20}, action_dim=7, reward_bounds=(-1.0, 0.0)).as_dict()
     del values["reward_bounds"], values["terminates"]
     assert Spaces.from_dict(values).reward_bounds is None and not Spaces.from_dict(values).terminates
+    for length in ("8", 8.0, 0):
+        with pytest.raises(ValueError, match="episode_length is"):
+            Spaces.from_dict(values | {"episode_length": length})
 
 
 def test_muzero_sees_ends_and_episodes_shorter_than_its_windows(settled) -> None:

@@ -6,9 +6,11 @@ import pytest
 import torch
 
 from franka_wm.errors import UserError
+from franka_wm.models.lewm import LeWorldModel
 from franka_wm.planning import GoalImage, GoalPolicyPenalty, Sum
 from franka_wm.training import build
 from franka_wm.training.check import check
+from franka_wm.training.load import load_model
 from franka_wm.training.spaces import Spaces
 
 GOALS = ("device=cpu", "scale=smoke", "env=reach_goal_image", "model=lewm", "replay.future=true")
@@ -55,3 +57,22 @@ def test_plans_are_kept_near_a_policy_towards_goals(settled) -> None:
     run = settled(*words)
     with pytest.raises(UserError, match="model=lewm has no policy; leave it at 0"):
         build.make_objective(run, build.make_model(run, spaces, torch.device("cpu")))
+
+
+def test_a_resumed_run_keeps_the_unit_of_distances(train, tmp_path, capsys) -> None:
+    words = (
+        "env=reach_goal_image",
+        "env.image_size=32",
+        "model=lewm",
+        "planner=icem",
+        "planner.iterations=1",
+    )
+    more = ("replay.future=true", "model.goal_steps_coef=1", "trainer.updates=2", "evaluation.during=[]")
+    train(*words, *more, folder=tmp_path / "first")
+    again = ("env.episode_length=12", "trainer.updates=4")
+    train(f"resume={tmp_path}/first", *again, folder=tmp_path / "second")
+    assert "follow: episode_length=8 (here 12)\n" in capsys.readouterr().out
+    for folder in ("first", "second"):
+        model = load_model(tmp_path / folder)
+        assert isinstance(model, LeWorldModel) and model.goal_heads is not None
+        assert model.goal_heads.episode_length == 8

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import multiprocessing
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -11,9 +12,11 @@ import pytest
 from franka_wm.conf import compose
 from franka_wm.errors import UserError
 from franka_wm.training import build
+from franka_wm.training.checkpoint import load_checkpoint
 from franka_wm.training.run import Run, import_plugins
 from franka_wm.training.settings import RunSettings
 from franka_wm.training.spaces import Spaces
+from small_checkpoint import save
 
 
 @pytest.mark.parametrize("workers", [0, 2])
@@ -50,6 +53,23 @@ def test_recorded_data_are_opened_before_worlds_are_built(
     arguments = ("scale=smoke", "device=cpu", "dataset=lerobot", "dataset.root=there", "trainer=offline")
     with pytest.raises(UserError, match="damaged"):
         Run(RunSettings.of(compose(*arguments)), tmp_path).build_environments()
+
+
+def test_values_of_a_resumed_run_keep_their_range(settled, tmp_path: Path, capsys) -> None:
+    """With another discount, or other bounds of rewards, the same outputs would stand for other values."""
+    settings = settled("scale=smoke", "device=cpu", "env=reach_fixed")
+    here = Spaces.of_config(settings.env.arm, discrete=False)
+    began = replace(here, episode_length=100, reward_bounds=(-9.0, 0.0))
+    saved = save(tmp_path / "checkpoint", extra={"spaces": began.as_dict()})
+    run = Run(settings, tmp_path, load_checkpoint(saved))
+    assert run.as_saved(here) == began
+    assert (
+        f"follow: episode_length=100 (here {here.episode_length}), reward_bounds=(" in capsys.readouterr().out
+    )
+    assert run.as_saved(began) == began and not capsys.readouterr().out
+    models = [build.make_model(settings, spaces) for spaces in (run.as_saved(here), began, here)]
+    assert models[0].two_hot.support.equal(models[1].two_hot.support)
+    assert not models[0].two_hot.support.equal(models[2].two_hot.support)
 
 
 @pytest.mark.parametrize(
