@@ -155,6 +155,36 @@ def test_jobs_of_other_processes_are_looked_after_as_well(tmp_path: Path, launch
 
 
 @pytest.mark.slow
+def test_a_search_goes_on_without_the_trial_that_fails(tmp_path: Path) -> None:
+    """The best of the others is in its file; a longer search of the same folder keeps what is done."""
+    pytest.importorskip("hydra_plugins.hydra_optuna_sweeper", reason="needs pip install 'franka-wm[optuna]'")
+    place = tmp_path / "sweep"
+    command = ["hydra/sweeper=optuna", "hydra.sweeper.direction=maximize", "hydra.sweeper.n_jobs=1"]
+    # Of this seed's trials the second alone breaks; the first and the third differ in the run's seed.
+    command += ["hydra.sweeper.sampler.seed=21", "trainer.lr=choice(1e30,1e-3)", "seed=choice(0,1)"]
+
+    def search(trials: int) -> subprocess.CompletedProcess[str]:
+        done = sweep(tmp_path, *command, f"hydra.sweeper.n_trials={trials}")
+        assert done.returncode == 1 and "Traceback" not in done.stderr, done.stderr
+        last = done.stderr.strip().splitlines()[-1]
+        assert last.startswith(f"error: 1 of {trials} jobs failed: job 1: training broke: "), last
+        return done
+
+    search(3)
+    assert not (place / "1-reach/finished.json").exists()
+    results = {k: read_result(place / f"{k}-reach/evaluation.json").policies for k in (0, 2)}
+    best = max(results, key=lambda k: score(results[k]) or -9.0)
+    chosen = {"seed": {0: 0, 2: 1}[best], "trainer.lr": 1e-3}
+    found = OmegaConf.load(place / "optimization_results.yaml")
+    assert found == {"name": "optuna", "best_params": chosen, "best_value": score(results[best])}
+    trained = {k: state(place / f"{k}-reach/checkpoints") for k in results}
+    longer = search(4)
+    assert longer.stdout.count("was finished before") == 2 and (place / "3-reach/finished.json").is_file()
+    assert {k: state(place / f"{k}-reach/checkpoints") for k in results} == trained
+    assert OmegaConf.load(place / "optimization_results.yaml") == found
+
+
+@pytest.mark.slow
 def test_jobs_of_several_processes_are_looked_after_as_well(tmp_path: Path) -> None:
     done = sweep(tmp_path, BREAKS, "gpus=2")
     assert done.returncode == 1 and "Traceback" not in done.stderr, done.stderr
