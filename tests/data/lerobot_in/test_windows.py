@@ -11,6 +11,7 @@ import pytest
 import torch
 from scipy.stats import chisquare
 
+from franka_wm import processes
 from franka_wm.errors import UserError
 
 LENGTHS = (5, 4, 7)
@@ -36,6 +37,21 @@ def test_within_episodes_and_uniform(pictures: Path, opened: Callable, window: i
         counts.update(tuple(pair) for pair in joints[:, 0].int().tolist())
     assert set(counts) == expected
     assert chisquare([counts[w] for w in sorted(expected)]).pvalue > 1e-3
+
+
+def test_processes_divide_each_batch(pictures: Path, opened: Callable, monkeypatch) -> None:
+    """Side by side their windows, and the frames reached later, are those that one process draws."""
+
+    def drawn(count: int, rank: int) -> list[torch.Tensor]:
+        monkeypatch.setattr(processes, "count", lambda: count)
+        monkeypatch.setattr(processes, "rank", lambda: rank)
+        windows = opened(pictures, keys=["joints"], batch_size=12 // count, future=True)
+        batches = [windows.sample() for _ in range(3)]
+        return [torch.cat((one["joints"], one["future", "joints"]), -1) for one in batches]
+
+    parts = zip(*(drawn(3, rank) for rank in range(3)), strict=True)
+    for part, whole in zip(parts, drawn(1, 0), strict=True):
+        assert [len(one) for one in part] == [4, 4, 4] and torch.equal(torch.cat(part), whole)
 
 
 def test_rewards_are_bounded_by_all_that_were_recorded(pictures: Path, opened: Callable) -> None:
