@@ -6,7 +6,7 @@ import os
 import random
 import signal
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -182,7 +182,7 @@ def weights(checkpoint: Checkpoint) -> dict[str, torch.Tensor]:
 
 
 @pytest.mark.slow  # three runs
-def test_after_a_kill(train, made: Counter[str], tiny: list[str], tmp_path: Path) -> None:
+def test_after_a_kill(train, one_thread: None, made: Counter[str], tiny: list[str], tmp_path: Path) -> None:
     """``kill -9`` between two checkpoints: from the last one, in another process, to the same weights."""
     (tmp_path / "killer.py").write_text(
         "import os, signal\n"
@@ -217,6 +217,15 @@ def test_another_number_of_worlds_gathers_anew(train, worlds: int, tmp_path: Pat
     before, after = first.replay(), second.replay()
     assert before is not None and after is not None and second.counters["updates"] == 20
     assert len(after) == worlds and second.counters["env_steps"] == before.numel() + after.numel()
+
+
+@pytest.fixture
+def one_thread() -> Iterator[None]:
+    """As many as a fork has (`tests/helpers/forks.py`): on some processors products of matrices differ by it."""
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(threads)
 
 
 @pytest.fixture
