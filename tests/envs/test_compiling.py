@@ -54,7 +54,8 @@ def test_what_is_compiled_ahead_is_what_a_step_launches(task: str, observations:
     ahead = {str(name) for name, _ in known} | {m.name for m, _ in physics_modules(sim.solver)}
     with wp.Tape() as tape:
         if config.resolved_scene:
-            compile_collisions(sim.solver)
+            with wp.ScopedDevice("cpu"):  # on a machine with a GPU that is the default one
+                compile_collisions(sim.solver)
     looked_for = {kernel.module.name for kernel, *_ in tape.launches}
     with wp.Tape() as tape:
         sim._launch_step_and_restart()
@@ -71,7 +72,8 @@ def test_looking_for_what_a_step_launches_moves_no_world() -> None:
     sim.reset()
     before = sim.get_state()
     assert len(physics_modules(sim.solver)) > 20
-    compile_collisions(sim.solver)
+    with wp.ScopedDevice("cpu"):
+        compile_collisions(sim.solver)
     after = sim.get_state()
     assert [name for name, value in before.items() if not after[name].equal(value)] == []
 
@@ -106,6 +108,16 @@ def test_an_error_of_a_compiler_is_raised_where_it_is_waited_for(monkeypatch: py
     monkeypatch.setattr(os, "sched_getaffinity", lambda _: {0, 1}, raising=False)
     with Compiler("cpu") as compiler, pytest.raises(RuntimeError, match=r"no\.such\.module"):
         compiler.finish(compiler.begin([("no.such.module", None)]))
+
+
+@pytest.mark.parametrize("device", ["cpu", "cuda:0"])
+def test_two_cores_load_ahead_on_every_device(device: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(os, "sched_getaffinity", lambda _: {0, 1}, raising=False)
+    called = []
+    with Compiler(device) as compiler:
+        assert compiler.ahead
+        compiler.finish(compiler.begin_calls([lambda: called.append(device)]))
+    assert called == [device]
 
 
 def test_one_core_loads_nothing_ahead(monkeypatch: pytest.MonkeyPatch) -> None:
