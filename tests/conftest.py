@@ -37,6 +37,11 @@ LONG = (
 """Files that take longest. They begin: else one process works at them when the other has nothing left."""
 
 
+def pytest_configure() -> None:
+    """One thread by plain ``pytest``, too, as by ``make test``: tests compare with processes that have one."""
+    torch.set_num_threads(int(os.environ.setdefault("OMP_NUM_THREADS", "1")))
+
+
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Long files first; otherwise as they are found."""
     place = {name: k for k, name in enumerate(LONG)}
