@@ -241,6 +241,10 @@ def values_of(what: str, then: str) -> Iterator[None]:
         TypeError,
         ValueError,
     ) as error:
+        if (
+            type(error).__name__ == "OutOfMemoryError"
+        ):  # torch's, of a GPU: a RuntimeError, but not the file's fault
+            raise
         reason = (str(error).strip() or "no value").splitlines()[0]
         raise UserError(
             f"{what} holds values of another form than was written ({type(error).__name__}: {reason}); {then}"

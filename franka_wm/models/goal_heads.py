@@ -7,6 +7,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from franka_wm.models.layers import mlp, zero_head
+from franka_wm.seeding import normal_like
 
 LOWEST, HIGHEST = -3.0, 0.0
 """Range of the logarithm of the policy's deviation."""
@@ -52,9 +53,9 @@ class GoalHeads(nn.Module):
             self.ruler = zero_head(2 * embed_dim, (hidden, hidden), 1)
 
     def act(self, embedded: Tensor, goal: Tensor, *, deterministic: bool) -> Tensor:
-        """Actions (..., A) from embeddings (..., D) towards goals (..., D): a sample, or the mode."""
+        """Actions (..., A) in [-1, 1] from embeddings (..., D) towards goals (..., D): a sample, or the mode."""
         mean, std = self._gaussian(embedded, goal)
-        return mean if deterministic else mean + std * torch.randn_like(mean)
+        return mean if deterministic else (mean + std * normal_like(mean)).clamp(-1.0, 1.0)
 
     def steps(self, embedded: Tensor, goal: Tensor) -> Tensor:
         """Distance (...) in [0, 1] from embeddings (..., D) to goals (..., D)."""

@@ -16,6 +16,7 @@ from franka_wm.planning.tree import Recurrent
 from franka_wm.policies.capture import GraphCache
 from franka_wm.policies.graph_key import graph_key
 from franka_wm.policies.planner import captures
+from franka_wm.seeding import share_of_worlds
 
 
 class SearchPolicy(TensorDictModuleBase):
@@ -110,7 +111,7 @@ class SearchPolicy(TensorDictModuleBase):
         inputs = tensordict.select(*self.in_keys)
         if not captures(self.capture, inputs[self.in_keys[0]]):
             return tensordict.update(self._decide(inputs, explore))
-        modes = (explore, None if self.model is None else self.model.training)
+        modes = (explore, None if self.model is None else self.model.training, share_of_worlds())
         return tensordict.update(
             self._graphs(
                 lambda entries: self._decide(entries, explore),

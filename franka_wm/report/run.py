@@ -191,13 +191,18 @@ def _history(files: UntrustedFolder) -> tuple[list[dict[str, float]], dict[str, 
     checkpoints = files.below("checkpoints")
     if any(checkpoints.root.glob("*/manifest.json")):
         from franka_wm.training.checkpoint import latest_checkpoint, load_checkpoint
+        from franka_wm.training.history import read_rows
         from franka_wm.training.manifest import read_manifest
 
         checkpoints.check_links()
         try:
             checkpoint = load_checkpoint(latest_checkpoint(files.root))
-            rows = (checkpoint.extra() or {}).get("rows") or []
-            return list(rows), dict(checkpoint.counters), read_manifest(checkpoint.folder).written_by, ""
+            return (
+                read_rows(checkpoint),
+                dict(checkpoint.counters),
+                read_manifest(checkpoint.folder).written_by,
+                "",
+            )
         except UserError as error:
             damage = str(error)
     return csv_rows(files.below("csv/scalars").root), {}, None, damage

@@ -200,8 +200,8 @@ class Learner:
 
         Updates before it read it, too: a compiled loss is compiled again for other strides, which no capture allows.
         """
-        if static and self._graph is None:
-            self._batch = batch
+        if static and batch is not self._batch:  # what was captured reads the memory of before
+            self._batch, self._graph = batch, None
         elif self._batch is None:
             self._batch = batch.clone()
         elif batch is not self._batch:

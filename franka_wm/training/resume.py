@@ -12,8 +12,10 @@ from torch import Tensor
 from franka_wm import processes
 from franka_wm.console import say
 from franka_wm.data.image_storage import CHANNELS
+from franka_wm.errors import UserError
 from franka_wm.seeding import derive_seed
 from franka_wm.training.checkpoint import Checkpoint
+from franka_wm.training.history import read_rows
 from franka_wm.training.moment import go_on_drawing, put_back, restorable, same_worlds
 from franka_wm.training.shards import own_experience, own_moment
 from franka_wm.training.storage_budget import fill
@@ -43,7 +45,7 @@ def restore(trainer: Trainer, checkpoint: Checkpoint) -> None:
         learner.updates = int(checkpoint.counters["updates"])
         trainer.env_steps = int(checkpoint.counters["env_steps"])
         trainer.seconds = checkpoint.counters["seconds"]
-        trainer.rows = list((checkpoint.extra() or {}).get("rows", []))
+        trainer.rows = read_rows(checkpoint)
         there, here = (one["collector"]["num_envs"] for one in (checkpoint.config, settings.values))
         fits = env is None or there == here
         experience = own_experience(checkpoint, env.device) if env is not None and fits else None
@@ -80,6 +82,12 @@ def _fitting(trainer: Trainer, experience: TensorDictBase) -> TensorDictBase:
     """
     assert trainer.env is not None
     gathered = trainer.env.fake_tensordict()
+    lacking = [key for key in trainer.kept if key not in experience.keys(True)]
+    if lacking:
+        raise UserError(
+            f"the checkpoint's experience has no {lacking[0]}, which this run keeps; resume it with the same model and "
+            "export as before"
+        )
     experience = experience.select(*trainer.kept)
     for key in trainer.kept:
         saved, like = (

@@ -26,6 +26,7 @@ from franka_wm.models import WorldModel
 from franka_wm.policies.exploration import ActingPolicy
 from franka_wm.seeding import derive_seed, seeded
 from franka_wm.training.build import arm_of, explore
+from franka_wm.training.history import columns_of
 from franka_wm.training.learner import Learner
 from franka_wm.training.loggers import log_numbers
 from franka_wm.training.moment import draws, worlds_now
@@ -217,7 +218,8 @@ class Trainer:
     @property
     def kept(self) -> list[NestedKey]:
         """Keys of a step that go into the replay."""
-        after = [("next", key) for key in (*self._keys, "reward", "terminated")]
+        exported = ["success"] if self.settings.export.kind != "none" else []
+        after = [("next", key) for key in (*self._keys, "reward", "terminated", *exported)]
         return [*self._keys, "action", "is_init", *self._extra, *after]
 
     def gather(self) -> None:
@@ -359,7 +361,7 @@ class Trainer:
             config=self._config(),
             counters=self.counters,
             replay=replay,
-            extra={"rows": self.rows, "spaces": self.spaces.as_dict()},
+            extra={"rows": columns_of(self.rows), "spaces": self.spaces.as_dict()},
             moment=self.moment(),
         )
         return latest

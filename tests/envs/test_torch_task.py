@@ -204,5 +204,11 @@ def test_a_function_of_another_shape_or_type_is_one_line(make, task: type[Task])
     assert "\n" not in str(caught.value)
 
 
+def test_hindsight_reads_the_objects_where_there_are_any(box) -> None:
+    assert box(FrankaConfig(**SMALL)).relabel_reads == ("state",)
+    scene = {"objects": [{"name": "cube", "size": [0.04, 0.04, 0.04]}]}
+    assert box(FrankaConfig(**SMALL, gripper=True, scene=scene)).relabel_reads == ("state", "objects")
+
+
 def test_hindsight_needs_a_task_that_is_about_a_distance(make) -> None:
     assert not Wrong.relabels()

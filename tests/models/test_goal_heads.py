@@ -14,6 +14,7 @@ from franka_wm.models import make
 from franka_wm.models.goal_heads import GoalHeads
 from franka_wm.planning import CEM, GoalImage
 from franka_wm.policies.planner import ModelPolicy, PlannerPolicy
+from franka_wm.seeding import drawing_for
 
 SMALL: dict[str, dict[str, Any]] = {
     "lewm": dict(
@@ -229,3 +230,16 @@ def test_the_learned_distance_is_part_of_the_score() -> None:
     own = model.goal_steps(reached, goal.expand_as(reached)).sum(-1)
     assert own.std() > 0.01
     assert torch.allclose(goals.bind(seen)(trajectory, trajectory), plain - 2.0 * own, rtol=1e-5)
+
+
+def test_sampled_actions_are_actions() -> None:
+    """In [-1, 1], and those of a world are the same in any share of the worlds."""
+    heads = GoalHeads(4, 2, policy=True, distance=False)
+    embedded, goal = torch.randn(2, 64, 4)
+    with drawing_for(0, 64, 64):
+        torch.manual_seed(1)
+        whole = heads.act(embedded, goal, deterministic=False)
+    assert whole.abs().max() == 1.0 and len(whole.unique()) > 100
+    with drawing_for(32, 32, 64):
+        torch.manual_seed(1)
+        assert torch.equal(heads.act(embedded[32:], goal[32:], deterministic=False), whole[32:])

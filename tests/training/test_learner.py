@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from contextlib import nullcontext
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, cast
 
 import pytest
 import torch
@@ -256,3 +256,13 @@ def test_parts_of_a_loss_are_compiled_one_by_one(monkeypatch) -> None:
     torch.manual_seed(1)
     learner.update(data)
     assert learner.metrics()["loss"] == pytest.approx(plain["loss"].item())
+
+
+def test_a_batch_in_new_memory_is_captured_anew() -> None:
+    """A replay that grew draws into other memory; frames of goals are views there, which nothing can be copied into."""
+    learner = Learner(Line())
+    first, second = (TensorDict({"x": torch.ones(4, 1).expand(4, 2)}, [4, 2]) for _ in range(2))
+    assert learner._kept(first, True) is first
+    learner._graph = graph = cast("torch.cuda.CUDAGraph", object())
+    assert learner._kept(first, True) is first and learner._graph is graph
+    assert learner._kept(second, True) is second and learner._graph is None

@@ -222,7 +222,7 @@ def cut_replay(
     after = data.get("next").clone(recurse=False)
     after["done"] = whole.unsqueeze(-1)
     after["terminated"] = (whole & terminated).unsqueeze(-1)
-    after["truncated"] = (whole & (age == episode_length)).unsqueeze(-1)
+    after["truncated"] = (whole & ~terminated).unsqueeze(-1)
     data["next"] = after
     worlds = first.shape[0]
     cutter = EpisodeCutter(

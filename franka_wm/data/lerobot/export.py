@@ -72,12 +72,13 @@ def export_replay(
 ) -> Exported:
     """Writes the whole episodes of a replay.
 
-    A replay keeps what its model reads, so a dataset may have fewer features than one that was collected. The goal
-    and success are not kept; they follow from ``state``, the goal within the rounding of one subtraction.
+    A replay keeps what its model reads, so a dataset may have fewer features than one that was collected. Where the
+    goal is not kept, it follows from ``state``, within the rounding of one subtraction; success follows where it is
+    the tool's distance to the goal, and is left out of other tasks' datasets.
 
     Args:
         data: (worlds, time), oldest step first: observations, ``action``, ``is_init`` and, under ``next``,
-            observations, ``reward``, ``terminated``.
+            observations, ``reward``, ``terminated``, ``success`` if it is there.
         config: The environment's.
         out, format, workers: As for :class:`~franka_wm.data.lerobot.writer.DatasetWriter`.
         seed: Seed of the run.
@@ -93,26 +94,25 @@ def export_replay(
     """
     from franka_wm import processes
     from franka_wm.envs.discretize import discrete_action_table
+    from franka_wm.envs.tasks import goal_distance, make_task
 
     if config.frame_stack > 1:  # a replay keeps each image once, and so does a dataset
         stacked = [str(key) for key in data.keys() if str(key).startswith(("pixels", "goal_pixels"))]  # noqa: SIM118
         data, config = newest(data, stacked, config.frame_stack), replace(config, frame_stack=1)
     after = data.get("next")
-    known = ("state", "joint_target")
+    known = ("state", "joint_target", "objects", "contacts", "goal")
     keys = [key for key in data.keys() if key in known or str(key).startswith(("pixels", "goal_pixels"))]  # noqa: SIM118
     keys = [str(key) for key in keys if key in after.keys()]  # noqa: SIM118
-    has_state = "state" in keys
-    if has_state:
-        data = data.clone(recurse=False)
-        after = after.clone(recurse=False)
+    data, after = data.clone(recurse=False), after.clone(recurse=False)
+    if "state" in keys and "goal" not in keys:
         for part in (data, after):
             state = part.get("state")
             part.set("goal", state[..., 14:17] - state[..., 17:20])
-        distance = after.get("state")[..., 17:20].norm(dim=-1, keepdim=True)
-        after.set("success", distance < config.success_distance)
-        data.set("next", after)
         keys.append("goal")
-    schema = schema_for(config, format=format, keys=keys, success=has_state)
+    if "state" in keys and "success" not in after.keys() and make_task(config).goal_distance:  # noqa: SIM118
+        after.set("success", goal_distance(after.get("state")).unsqueeze(-1) < config.success_distance)
+    data.set("next", after)
+    schema = schema_for(config, format=format, keys=keys, success="success" in after.keys())  # noqa: SIM118
     discrete = None
     if not data.get("action").is_floating_point():
         discrete = discrete_action_table(config.action_dim)

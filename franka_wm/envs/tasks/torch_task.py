@@ -60,6 +60,11 @@ class TorchTask(Task):
         out.set(("next", "terminated"), ended)
         return out
 
+    @property
+    def relabel_reads(self) -> tuple[str, ...]:
+        """The objects, too, where there are any: reward and success may be about them."""
+        return ("state", "objects") if self.config.object_dim else ("state",)
+
     @classmethod
     def relabels(cls) -> bool:
         """Where success is a distance to the goal: else a place that the tool reached is no goal of the task."""

@@ -24,6 +24,7 @@ from franka_wm.data.lerobot.schema import (
     EPISODE_KEY,
     GOAL,
     IMAGE_PREFIX,
+    OBJECTS,
     REWARD,
     SEED,
     STATE,
@@ -32,6 +33,7 @@ from franka_wm.data.lerobot.schema import (
     schema_for,
 )
 from franka_wm.data.lerobot.terminal import read_terminals
+from franka_wm.envs import FrankaConfig, FrankaEnv
 from franka_wm.errors import UserError
 from franka_wm.policies.scripted import SmoothRandomPolicy
 from franka_wm.seeding import derive_seed
@@ -249,6 +251,31 @@ def test_a_replay_comes_back_bit_for_bit(tmp_path, load, small_env, frame_stack:
         assert np.array_equal(terminal.values[FRONT][i], part["next", "pixels"][-1][..., -3:].numpy())
     np.testing.assert_allclose(column(dataset, GOAL), np.tile(env.config.goal, (42, 1)), atol=1e-6)
     assert column(dataset, SUCCESS).dtype == bool
+
+
+def test_success_is_that_of_the_task(tmp_path, load) -> None:
+    """Not the tool's distance to the goal, where the task is about something else; nor anything that was not kept."""
+    config = FrankaConfig(task="push", substeps=2, episode_length=5, observations=("state", "objects"))
+    env = FrankaEnv(config, num_envs=2, device="cpu")
+    policy = SmoothRandomPolicy(8, generator=torch.Generator().manual_seed(0))
+    options = {"frames_per_batch": 10, "total_frames": -1, "track_traj_ids": False}
+    data = next(iter(Collector(env, policy, **options)))
+    data["next", "success"][:] = torch.tensor([[0, 0, 0, 0, 1], [0, 1, 0, 0, 0]], dtype=torch.bool).unsqueeze(
+        -1
+    )
+    far = data["next", "state"][..., 17:20]
+    far[:] = 0.0  # the tool is at the goal
+    keys = ("state", "objects", "goal", "reward", "terminated")
+    for name, kept in (("with", (*keys, "success")), ("without", keys)):
+        part = data.select("state", "objects", "goal", "action", "is_init", *(("next", key) for key in kept))
+        done = export_replay(
+            part, config=config, out=tmp_path / name, seed=0, policy="p", settings={}, workers=0
+        )
+        dataset = load(done.out)
+        assert np.array_equal(column(dataset, OBJECTS), data["objects"].flatten(0, 1).numpy())
+        assert (SUCCESS in dataset.features) == (name == "with")
+    success = column(load(tmp_path / "with"), SUCCESS)
+    assert np.array_equal(success.ravel(), data["next", "success"].numpy().ravel())
 
 
 def test_a_replay_without_whole_episodes_is_refused(tmp_path, small_env) -> None:

@@ -127,6 +127,7 @@ def test_a_replay_gives_whole_episodes_only(make_schema) -> None:
     data = stream(ends)
     data["next", "terminated"] = torch.zeros_like(data["next", "terminated"])
     data["next", "terminated"][1, 14] = True
+    data["next", "terminated"][1, 54] = True  # at its last step: it is over, and was not cut off
     data["is_init"][0, 0] = False  # the oldest has lost its start
     kept = data.clone()
     for key in ("done", "truncated"):
@@ -140,6 +141,8 @@ def test_a_replay_gives_whole_episodes_only(make_schema) -> None:
     assert not ended.rows[TRUNCATED][-1, 0]
     assert np.array_equal(ended.rows[STATE], kept["state"][1, 11:15].numpy())
     assert np.array_equal(ended.terminal[STATE], kept["next", "state"][1, 14].numpy())
+    last = next(e for e in reversed(episodes) if e.rows[SEED][0, 1] == 1)
+    assert last.length == 8 and last.rows[TERMINATED][-1, 0] and not last.rows[TRUNCATED].any()
     by_time = next(e for e in episodes if e.length == 8)
     assert by_time.rows[TRUNCATED][-1, 0]
     assert not by_time.rows[TRUNCATED][:-1].any()
