@@ -26,7 +26,10 @@ def compose(overrides: Sequence[str], options: Sequence[str] = ()) -> Any:
         raise
     # The last three for a group that is no name, or too long for one.
     except (HydraException, OmegaConfBaseException, ValueError, TypeError, OSError) as error:
-        raise UserError(explain(str(error), allowed=_allowed(str(error), overrides, options))) from error
+        said = str(error)
+        if _UNKNOWN.search(said):  # of a mapping, the cause names the key inside it
+            said = f"{said}\n{error.__cause__}"
+        raise UserError(explain(said, allowed=_allowed(said, overrides, options))) from error
 
 
 def given(overrides: Sequence[str], key: str) -> str | None:
@@ -61,7 +64,7 @@ def explain(message: str, *, allowed: Sequence[str] = ()) -> str:
         allowed: Keys that there are in the place of an unknown one.
     """
     lines = [line.strip() for line in message.splitlines() if line.strip()]
-    missing, unknown = _MISSING.search(message), _UNKNOWN.search(message)
+    missing, unknown = _MISSING.search(message), _unknown_key(message)
     if missing is not None:
         choices = [line for line in message.splitlines() if line.startswith("\t") and "provider=" not in line]
         names = [line.strip() for line in choices]
@@ -69,22 +72,30 @@ def explain(message: str, *, allowed: Sequence[str] = ()) -> str:
         hint = f"; pip install 'franka-wm[{extra}]'" if extra else did_you_mean(missing[2], names)
         return f"{missing[1]}={missing[2]}: must be one of {', '.join(names)}{hint}"
     if unknown is not None:
-        return no_such_option(unknown[1], allowed)
+        return no_such_option(unknown, allowed)
     noise = ("full_key:", "object_type", "Config search path", "provider=", "See https://", "Set the env")
     return "; ".join(line for line in lines if not line.startswith(noise))
+
+
+def _unknown_key(message: str) -> str | None:
+    """The key that an override names in vain; of one that sets a mapping, the key inside it."""
+    unknown, full = _UNKNOWN.search(message), re.search(r"full_key: (\S+)", message)
+    if unknown is None:
+        return None
+    return full[1] if full is not None and full[1].startswith(f"{unknown[1]}.") else unknown[1]
 
 
 def _allowed(message: str, overrides: Sequence[str], options: Sequence[str]) -> list[str]:
     """The keys besides the one that an override names in vain; at the top, the verb's own, too."""
     from omegaconf import DictConfig, OmegaConf
 
-    unknown = _UNKNOWN.search(message)
+    unknown = _unknown_key(message)
     if unknown is None:
         return []
     # With the same choices of groups: other environments have other options.
-    chosen = [o for o in overrides if "." not in o.partition("=")[0] and o.partition("=")[0] != unknown[1]]
+    chosen = [o for o in overrides if "." not in o.partition("=")[0] and o.partition("=")[0] != unknown]
     node: Any = conf.compose(*chosen)
-    place = unknown[1].rpartition(".")[0] if "/" not in unknown[1] and "@" not in unknown[1] else ""
+    place = unknown.rpartition(".")[0] if "/" not in unknown and "@" not in unknown else ""
     found = OmegaConf.select(node, place) if place else node
     if isinstance(found, DictConfig):
         return [

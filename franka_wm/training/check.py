@@ -2,10 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
 import torch
 
 from franka_wm import models
+from franka_wm.console import say
 from franka_wm.device import resolve_device
+from franka_wm.envs import FrankaConfig
 from franka_wm.envs.external import check_external
 from franka_wm.envs.external_config import ExternalConfig
 from franka_wm.envs.external_ray import import_ray
@@ -23,6 +28,10 @@ from franka_wm.training.loggers import check_loggers
 from franka_wm.training.settings import RunSettings
 from franka_wm.training.spaces import Spaces
 from franka_wm.training.storage_budget import check_memory
+
+if TYPE_CHECKING:
+    from franka_wm.data.lerobot.mapping import FeatureMap
+    from franka_wm.data.lerobot.source import Source
 
 
 def check(run: RunSettings) -> None:
@@ -305,7 +314,7 @@ def _check_dataset(run: RunSettings) -> None:
         from franka_wm.data.lerobot.opening import read_datasets
 
         arm = run.env.arm if run.is_arm else None
-        read_datasets(
+        sources, mappings = read_datasets(
             root,
             features=run.dataset.features,
             keys=run.model.observations,
@@ -313,3 +322,47 @@ def _check_dataset(run: RunSettings) -> None:
             fps=arm and arm.fps,
             action_dim=arm and arm.action_dim,
         )
+        if arm is not None:
+            _check_seen_alike(run, mappings[0])
+            _check_meant_alike(arm, sources)
+
+
+def _check_seen_alike(run: RunSettings, recorded: FeatureMap) -> None:
+    """What the model will read of the data, the arm that it is to act in must show."""
+    family, wanted = run.model.family, run.model.observations
+    if not (family.has_next or family.has_policy):
+        return
+    arm = Spaces.of_config(run.env.arm)
+    there = {key: (size,) for key, (_, size) in recorded.vectors.items()}
+    here = {key: (size,) for key, size in arm.observation_sizes.items()}
+    if wanted is not None:  # else a model reads vectors alone
+        there |= {key: size[:2] for key, (_, size) in recorded.images.items()}
+        here |= {key: size[:2] for key, size in arm.image_sizes.items()}
+    for key in there if wanted is None else [key for key in wanted if key in there]:
+        if here.get(key) != there[key]:
+            size = f"of size {' × '.join(map(str, there[key]))}"
+            shown = "does not show it" if key not in here else f"has {' × '.join(map(str, here[key]))}"
+            raise UserError(
+                f"dataset: {key} is {size} there, env.task={run.env.arm.task} {shown}, so what is learned cannot act "
+                "here; choose model.observations, dataset.features or dataset.image_size, or env=none to train alone"
+            )
+
+
+def _check_meant_alike(arm: FrankaConfig, sources: Sequence[Source]) -> None:
+    """Actions must mean the same; rewards of another task are said."""
+    from franka_wm.data.lerobot.provenance import ACTIONS, other_option, read_provenance
+
+    for source in sources:
+        sessions = (read_provenance(source.root) or {}).get("sessions", ())
+        if (changed := other_option(sessions, vars(arm), ACTIONS)) is not None:
+            name, there = changed
+            raise UserError(
+                f"dataset.root={source.root}: recorded with env.{name}={there}, this run has {getattr(arm, name)}, so "
+                f"actions mean something else; use env.{name}={there}"
+            )
+        if (changed := other_option(sessions, vars(arm))) is not None:
+            name, there = changed
+            say(
+                f"dataset {source.root}: recorded with env.{name}={there}, this run has {getattr(arm, name)}; "
+                "its rewards and ends are those of then"
+            )

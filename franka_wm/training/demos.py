@@ -17,12 +17,6 @@ from franka_wm.training import build
 from franka_wm.training.settings import RunSettings
 from franka_wm.training.spaces import Spaces
 
-SAME = (
-    *("task", "reward", "action_mode", "action_scale", "action_penalty", "success_distance"),
-    "terminate_on_success",
-)
-"""Options of the arm that must be those of its demonstrations."""
-
 UNSEEN = ("object_size", "table_height", "observation_noise", "object_noise", "action_latency")
 """Randomization that is not in what is observed, or hides it: states cannot be restored from that."""
 
@@ -106,7 +100,7 @@ def check_demonstrations(run: RunSettings) -> None:
             "replay.demos: demonstrations are of one task, env=multitask has several; leave it at null"
         )
     from franka_wm.data.lerobot.opening import read_datasets
-    from franka_wm.data.lerobot.provenance import read_provenance
+    from franka_wm.data.lerobot.provenance import other_option, read_provenance
 
     arm = run.env.arm if run.is_arm else None
     try:
@@ -116,7 +110,8 @@ def check_demonstrations(run: RunSettings) -> None:
     if arm is None:
         return
     for source in sources:
-        for session in (read_provenance(source.root) or {}).get("sessions", ()):
+        sessions = (read_provenance(source.root) or {}).get("sessions", ())
+        for session in sessions:
             recorded = session.get("config", {}).get("env", {})
             drawn = {"run": vars(arm.randomization), "dataset": recorded.get("randomization", {})}
             for where, ranges in drawn.items():
@@ -126,9 +121,9 @@ def check_demonstrations(run: RunSettings) -> None:
                         f"replay.demo_resets={share}: this {where} has env.randomization.{unseen}={ranges[unseen]}, "
                         "which no observation shows; leave one of them at 0"
                     )
-            for name in SAME:
-                here = getattr(arm, name)
-                if recorded.get(name, here) != here:
-                    raise UserError(
-                        f"replay.demos={source.root}: recorded with env.{name}={recorded[name]}, this run has {here}"
-                    )
+        changed = other_option(sessions, vars(arm))
+        if changed is not None:
+            name, there = changed
+            raise UserError(
+                f"replay.demos={source.root}: recorded with env.{name}={there}, this run has {getattr(arm, name)}"
+            )

@@ -335,7 +335,9 @@ def start(cfg: DictConfig) -> Run:
     write_versions(folder, device)
     say(f"device {device}   seed {settings.seed}   results in {folder}")
     if checkpoint is not None:
-        say(f"going on from update {int(checkpoint.counters.get('updates', 0))} of {checkpoint.folder}")
+        done, wanted = int(checkpoint.counters.get("updates", 0)), settings.trainer.updates
+        nothing = f"; nothing is left to train until trainer.updates={wanted}" if done >= wanted else ""
+        say(f"going on from update {done} of {checkpoint.folder}{nothing}")
     run = Run(settings, folder, checkpoint, open_loggers(settings, folder))
     if _begun is not None:
         _begun = (folder, _files(folder), run.loggers)
@@ -426,9 +428,10 @@ def resumed(cfg: DictConfig, overrides: list[str]) -> tuple[Checkpoint, DictConf
     changes = []
     for override in overrides:
         name = override.split("=", 1)[0].lstrip("+~")
-        if name in ("resume", "scale", "plugins"):
+        if name in ("resume", "plugins"):
             continue
-        if "." not in name and name not in ("seed", "device", "gpus"):
+        same = name in ("scale", "size", "seed") and str(cfg[name]) == str(saved.get(name))
+        if "." not in name and not same and name not in ("device", "gpus"):
             raise FrankaError(
                 f"{override}: a run that resumes keeps its {name}; leave it out, or change single values ({name}.key=…)"
             )

@@ -395,6 +395,10 @@ TYPOS = [
     ("env.image_sise=3", "env.image_sise: no such option; did you mean env.image_size?"),
     ("model=tdmcp2", "did you mean tdmpc2?"),
     ("--cfg job env.image_sise=3", "did you mean env.image_size?"),
+    (
+        "env.randomization={colour:0.2}",
+        "env.randomization.colour: no such option; did you mean env.randomization.color?",
+    ),
     ("seed=1 --cfg job --resolve env.fps=${nope}", "Interpolation key 'nope' not found"),
     ("--help model=tdmcp2", "did you mean tdmpc2?"),
     ("--info defaults modle=tdmpc2", "did you mean model?"),

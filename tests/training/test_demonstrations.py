@@ -202,6 +202,36 @@ def test_what_cannot_be_is_refused_before_anything_is_built(demos: Path, settled
     assert "\n" not in str(refused.value)
 
 
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        (
+            ("env.action_scale=0.05",),
+            r"recorded with env.action_scale=0.085, this run has 0.05, so actions mean",
+        ),
+        (
+            ("env.observations=[joint_target]",),
+            r"dataset: state is of size 20 there, env.task=reach does not show it",
+        ),
+    ],
+)
+def test_data_that_mean_something_else_are_refused(demos: Path, settled, changes, message) -> None:
+    words = ("scale=smoke", *ARM, "dataset=lerobot", "trainer=offline", f"dataset.root={demos}")
+    check(settled(*words))
+    with pytest.raises(UserError, match=message) as refused:
+        check(settled(*words, *changes))
+    assert "\n" not in str(refused.value)
+    check(settled("scale=smoke", "env=none", "device=cpu", *words[-3:]))
+
+
+def test_rewards_of_another_task_are_said(demos: Path, settled, capsys) -> None:
+    words = ("scale=smoke", *ARM, "dataset=lerobot", "trainer=offline", f"dataset.root={demos}")
+    check(settled(*words))
+    assert "recorded with" not in capsys.readouterr().out
+    check(settled(*words, "env.reward=sparse"))
+    assert "recorded with env.reward=dense, this run has sparse; its rewards" in capsys.readouterr().out
+
+
 def test_states_that_no_observation_shows_are_refused(pushes: Path, settled) -> None:
     words = (f"replay.demos={pushes}", "replay.demo_resets=0.5", "env.randomization.object_size=0.1")
     run = settled("scale=smoke", *GRIPPER, *words)

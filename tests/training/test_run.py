@@ -8,12 +8,14 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
+import torch
+from omegaconf import OmegaConf
 
 from franka_wm.conf import compose
-from franka_wm.errors import UserError
+from franka_wm.errors import FrankaError, UserError
 from franka_wm.training import build
-from franka_wm.training.checkpoint import load_checkpoint
-from franka_wm.training.run import Run, import_plugins
+from franka_wm.training.checkpoint import load_checkpoint, save_checkpoint
+from franka_wm.training.run import Run, import_plugins, resumed
 from franka_wm.training.settings import RunSettings
 from franka_wm.training.spaces import Spaces
 from small_checkpoint import save
@@ -96,3 +98,17 @@ def test_plugins_that_cannot_be_imported_are_one_line(names, said: str, tmp_path
     with pytest.raises(UserError, match=said) as caught:
         import_plugins(names)
     assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("word", ["scale=gpu", "size=gpu", "seed=7", "planner=icem"])
+def test_a_resumed_run_keeps_what_it_was(word: str, tmp_path: Path) -> None:
+    """The weights are of the first seed and scale, whatever the folder of the second would say."""
+    words = ("scale=smoke", "device=cpu", "env=reach_fixed", "seed=0")
+    began = OmegaConf.create(OmegaConf.to_container(compose(*words), resolve=True))
+    save_checkpoint(tmp_path, model=torch.nn.Linear(1, 1), config=began, counters={})
+    cfg = compose(f"resume={tmp_path}", word)
+    with pytest.raises(FrankaError, match=f"{word}: a run that resumes keeps its {word.partition('=')[0]}"):
+        resumed(cfg, [f"resume={tmp_path}", word])
+    same = [f"resume={tmp_path}", "scale=smoke", "seed=0", "trainer.updates=50"]
+    _, merged = resumed(compose(*same), same)
+    assert merged.trainer.updates == 50 and merged.seed == 0

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import platform
 import sys
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from datetime import UTC, datetime
 from importlib import metadata
 from pathlib import Path
@@ -37,6 +37,27 @@ def describe(
         "config": dict(config),
         **more,
     }
+
+
+ACTIONS = ("action_mode", "action_scale")
+"""Options of the arm that give recorded actions their meaning."""
+MEANING = (
+    *("task", "reward", *ACTIONS, "action_penalty", "success_distance"),
+    "terminate_on_success",
+)
+"""Those that give actions, rewards and ends their meaning."""
+
+
+def other_option(
+    sessions: Iterable[Mapping[str, Any]], env: Mapping[str, Any], names: Iterable[str] = MEANING
+) -> tuple[str, Any] | None:
+    """The first of these options that sessions were recorded with another value of than ``env`` has, and that value."""
+    for session in sessions:
+        recorded = session.get("config", {}).get("env", {})
+        for name in names:
+            if name in recorded and name in env and recorded[name] != env[name]:
+                return name, recorded[name]
+    return None
 
 
 def _version(package: str) -> str | None:

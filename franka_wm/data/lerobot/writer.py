@@ -26,7 +26,7 @@ from typing import Any
 import numpy as np
 
 from franka_wm.data.lerobot.episodes import Episode
-from franka_wm.data.lerobot.provenance import read_provenance
+from franka_wm.data.lerobot.provenance import other_option, read_provenance
 from franka_wm.data.lerobot.schema import Schema
 from franka_wm.data.lerobot.shard import check_episode
 from franka_wm.data.lerobot.shard_workers import (
@@ -201,6 +201,14 @@ class DatasetWriter:
                 what = next(key for key in mine if other["schema"].get(key) != mine[key])
                 raise UserError(
                     f"out={self.out}: what is there has other {what}; give the same env and format, or another out"
+                )
+            env = self._session.get("config", {}).get("env", {})
+            changed = other and other_option(other["sessions"], json.loads(json.dumps(env)))
+            if changed:
+                name, there = changed
+                raise UserError(
+                    f"out={self.out}: what is there was recorded with env.{name}={there}, this has {env[name]}; give "
+                    "the same, or another out"
                 )
 
     def _save_state(self, **more: Any) -> None:

@@ -37,6 +37,27 @@ def test_a_folder_that_exists_is_not_touched(tmp_path, make_schema, make_episode
     assert sorted(p.name for p in tmp_path.iterdir()) == ["other", "set"]
 
 
+def test_actions_that_mean_something_else_are_not_mixed(tmp_path, make_schema, make_episode) -> None:
+    schema = make_schema()
+
+    def options(env: dict, policy: str = "p") -> dict:
+        provenance = describe(policy=policy, seed=1, config={"env": env})
+        return {"provenance": provenance, "workers": 0, "shard_frames": 1}
+
+    for keep in (True, False):  # an unfinished one, and a finished one
+        out = tmp_path / str(keep)
+        with DatasetWriter(out, schema, **options({"action_scale": 0.085, "fps": 30})) as writer:
+            writer.add([make_episode(schema, 0)])
+            if not keep:
+                writer.finish()
+        with pytest.raises(
+            UserError, match=r"recorded with env\.action_scale=0\.085, this has 0\.02; give the same"
+        ):
+            DatasetWriter(out, schema, **options({"action_scale": 0.02}), resume=True)
+        with DatasetWriter(out, schema, **options({"action_scale": 0.085}, "another"), resume=True) as writer:
+            assert writer.resumed == 1
+
+
 def test_goes_on_with_what_is_finished(tmp_path, make_schema, make_episode, load) -> None:
     schema = make_schema()
     episodes = [make_episode(schema, i) for i in range(6)]
