@@ -232,6 +232,8 @@ def check_overrides(arguments: list[str]) -> None:
     try:
         cfg = compose([a for a in arguments if a != "scale=auto"])
         OmegaConf.to_container(cfg, resolve=True)
+        if "trainer=offline" in arguments and cfg.resume is None and cfg.dataset.kind == "none":
+            fail("trainer=offline: trains on recorded data; name them, dataset=lerobot dataset.root=FOLDER")
     except FrankaError as error:
         fail(str(error))
     except OmegaConfBaseException as error:

@@ -239,8 +239,8 @@ def _check_parts(run: RunSettings) -> None:
         for option, count in counts.items():
             if count is not None and count < len(run.env.config.tasks):
                 raise UserError(
-                    f"{option}={count}: env=multitask has {len(run.env.config.tasks)} tasks, each needs a world; "
-                    "raise it, or leave tasks out: '~env.tasks.NAME'"
+                    f"{option}={count}: env=multitask has {(tasks := len(run.env.config.tasks))} tasks, each needs a "
+                    f"world; use at least {tasks}, or leave tasks out: '~env.tasks.NAME'"
                 )
     if not run.is_arm:
         return

@@ -413,6 +413,10 @@ TYPOS = [
     ("env=gym model.name=nope", "model.name='nope': must be one of tdmpc2"),
     ("env=gym env.frame_skip=0", "env.frame_skip=0: must be a whole number"),
     ("env.substeps=0", "substeps=0: must be a whole number"),
+    (
+        "trainer=offline",
+        "trainer=offline: trains on recorded data; name them, dataset=lerobot dataset.root=FOLDER",
+    ),
     ("-m seed=0,1 planner.precision=half", "planner.precision='half': must be one of float32, bfloat16"),
 ]
 SCRIPT, VERB = (str(TRAIN),), ("-m", "franka_wm", "train")
