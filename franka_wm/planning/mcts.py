@@ -33,9 +33,8 @@ class MCTS:
     σ(Q). σ(Q) = (`c_visit` + max n) · `c_scale` · Q, with Q completed (an action without visits counts as the
     mixed value of its node) and scaled to [0, 1] within its node. Other nodes take, without noise, the action
     whose share of visits lags furthest behind softmax(logits + σ(Q)). The action is the best of the most
-    visited. The policy target is π' = softmax(logits + σ(Q)) at the root, and the value target Σ π' · Q, which is
-    what the improved policy expects. The noise is there with `explore` alone. It improves the policy with any
-    number of simulations, 2 as well, where PUCT may worsen it.
+    visited; the policy target is softmax(logits + σ(Q)) at the root. The noise is there with `explore` alone.
+    It improves the policy with any number of simulations, 2 as well, where PUCT may worsen it.
 
     What differs from the papers' own code: a node counts itself as a visit (N = 1 + Σ n), also the root, so
     the root's priors matter in the first simulation; the smallest and largest Q̂ are those of the tree as it
@@ -112,9 +111,8 @@ class MCTS:
 
         Returns:
             TensorDict of batch size [E]: `action` (E,) int64; `policy` (E, M), the improved policy to learn
-            from; `value` (E, 1): with PUCT the root's mean return over all simulations and the model's own
-            value, with Gumbel the completed Q that the improved policy expects; `visits` (E, M), which sum to
-            `num_simulations`.
+            from; `value` (E, 1), the root's mean return over all simulations and the model's own value;
+            `visits` (E, M), which sum to `num_simulations`.
 
         Raises:
             ValueError: a tensor of another shape.
@@ -138,7 +136,8 @@ class MCTS:
                     f"recurrent must return logits of shape ({envs}, {actions}), got {tuple(logits.shape)}"
                 )
             rule.add(node, logits, last, used)
-        action, policy, visits, value = rule.result()
+        action, policy, visits = rule.result()
+        value = (tree.returns[:, 0] / tree.visits[:, 0]).unsqueeze(-1)
         return TensorDict(
             {"action": action, "policy": policy, "value": value, "visits": visits}, batch_size=[envs]
         )
@@ -224,15 +223,13 @@ class _Puct:
         self.tried[env, last] = tried + 1 if used is None else tried + used
         self._sort(node, logits.softmax(-1))
 
-    def result(self) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        tree = self.tree
-        visits = tree.root_visits(self.actions)
+    def result(self) -> tuple[Tensor, Tensor, Tensor]:
+        visits = self.tree.root_visits(self.actions)
         score = visits
         if self.explore and self.settings.temperature > 0.0:
             # The largest of log p + Gumbel noise is a draw from p; a action without visits has p = 0.
             score = visits.log() / self.settings.temperature + _gumbel_noise(visits, self.generator)
-        value = (tree.returns[:, 0] / tree.visits[:, 0]).unsqueeze(-1)
-        return score.argmax(-1), visits / visits.sum(-1, keepdim=True), visits, value
+        return score.argmax(-1), visits / visits.sum(-1, keepdim=True), visits
 
 
 class _Gumbel:
@@ -250,8 +247,8 @@ class _Gumbel:
             min(settings.max_num_considered_actions, self.actions), settings.num_simulations
         )
 
-    def _sigma(self, nodes: int, slots: int) -> tuple[Tensor, Tensor, Tensor]:
-        """Visits, completed Q, and σ of it, of the actions of the first `nodes` (E, nodes, M).
+    def _sigma(self, nodes: int, slots: int) -> tuple[Tensor, Tensor]:
+        """Visits, and σ of the completed Q, of the actions of the first `nodes` (E, nodes, M).
 
         Args:
             slots: how many are filled.
@@ -274,7 +271,7 @@ class _Gumbel:
         q = torch.where(visited, q, mixed)
         low, high = torch.aminmax(q, dim=-1, keepdim=True)
         scale = (self.settings.c_visit + visits.amax(-1, keepdim=True)) * self.settings.c_scale
-        return visits, q, scale * ((q - low) / (high - low).clamp_min(_tiny(q)))
+        return visits, scale * ((q - low) / (high - low).clamp_min(_tiny(q)))
 
     def _root_score(self, visits: Tensor, sigma: Tensor, considered: Tensor | int) -> Tensor:
         """noise + logits + σ(Q) of the root's actions (E, M); -inf unless they have `considered` visits."""
@@ -284,7 +281,7 @@ class _Gumbel:
 
     def choose(self, nodes: int) -> tuple[Tensor, Callable[[Tensor], Tensor]]:
         tree = self.tree
-        visits, _, sigma = self._sigma(nodes, nodes)
+        visits, sigma = self._sigma(nodes, nodes)
         improved = (self.logits[:, :nodes] + sigma).softmax(-1)
         choice = (improved - visits / tree.visits[:, :nodes, None]).argmax(-1)
         choice[:, 0] = self._root_score(visits, sigma, self.schedule[nodes - 1]).argmax(-1)
@@ -295,13 +292,11 @@ class _Gumbel:
     def add(self, node: int, logits: Tensor, last: Tensor, used: Tensor | None) -> None:
         self.logits[:, node] = logits.log_softmax(-1)
 
-    def result(self) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        visits, q, sigma = self._sigma(1, self.tree.slot.shape[0])
+    def result(self) -> tuple[Tensor, Tensor, Tensor]:
+        visits, sigma = self._sigma(1, self.tree.slot.shape[0])
         score = self._root_score(visits, sigma, visits[:, 0].amax(-1, keepdim=True))
         policy = (self.logits[:, 0] + sigma[:, 0]).softmax(-1)
-        # The mean over the visits would be that of actions which the improved policy no longer takes.
-        value = (policy * q[:, 0]).sum(-1, keepdim=True)
-        return score.argmax(-1), policy, visits[:, 0].clone(), value
+        return score.argmax(-1), policy, visits[:, 0].clone()
 
 
 def sequential_halving(considered: int, simulations: int) -> list[int]:

@@ -110,8 +110,7 @@ def puct(init=1.25, base=19652.0):
     return choose
 
 
-def completed(node):
-    """Q of each action, that of the unvisited ones being the mixed value of their node."""
+def sigma(node, c_visit=50.0, c_scale=0.1):
     moves = range(len(node.prior))
     visited = [m for m in moves if node.visits(m)]
     total = sum(node.visits(m) for m in moves)
@@ -120,13 +119,9 @@ def completed(node):
         mass = sum(node.prior[m] for m in visited)
         average = sum(node.prior[m] * node.q(m) for m in visited) / mass
         mixed = (node.value + total * average) / (1 + total)
-    return [float(node.q(m) if m in visited else mixed) for m in moves]
-
-
-def sigma(node, c_visit=50.0, c_scale=0.1):
-    q = completed(node)
+    q = [node.q(m) if m in visited else mixed for m in moves]
     low, high = min(q), max(q)
-    scale = (c_visit + max(node.visits(m) for m in range(len(q)))) * c_scale
+    scale = (c_visit + max(node.visits(m) for m in moves)) * c_scale
     return torch.tensor([scale * (x - low) / max(high - low, 1e-8) for x in q], dtype=torch.float64)
 
 
