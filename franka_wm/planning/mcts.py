@@ -55,6 +55,8 @@ class MCTS:
         temperature: of the drawn action (PUCT); 0 takes the most visited.
         max_num_considered_actions: at the root (Gumbel).
         c_visit, c_scale: σ, see above (Gumbel).
+        c_scale_acting: in place of `c_scale` without `explore`: what acts may trust Q more than what teaches, whose
+            policy must keep what it has not tried enough; None: the same.
 
     Raises:
         ValueError: a setting that cannot work.
@@ -72,12 +74,13 @@ class MCTS:
     max_num_considered_actions: int = 16
     c_visit: float = 50.0
     c_scale: float = 0.1
+    c_scale_acting: float | None = None
 
     ranges: ClassVar[Mapping[str, Bounds]] = {
         **dict.fromkeys(("num_actions", "num_simulations", "max_depth"), POSITIVE),
         "max_num_considered_actions": POSITIVE,
         **dict.fromkeys(("pb_c_base", "dirichlet_alpha"), Bounds(above=0)),
-        **dict.fromkeys(("pb_c_init", "temperature", "c_visit", "c_scale"), COEFFICIENT),
+        **dict.fromkeys(("pb_c_init", "temperature", "c_visit", "c_scale", "c_scale_acting"), COEFFICIENT),
         "dirichlet_fraction": FRACTION,
     }
 
@@ -239,6 +242,8 @@ class _Gumbel:
         self, settings: MCTS, tree: Tree, logits: Tensor, explore: bool, generator: torch.Generator | None
     ) -> None:
         self.settings, self.tree = settings, tree
+        acting = None if explore else settings.c_scale_acting
+        self.c_scale = settings.c_scale if acting is None else acting
         self.actions, slots = logits.shape[1], tree.slot.shape[0]
         self.logits = logits.new_zeros(logits.shape[0], slots, self.actions)
         self.logits[:, 0] = logits.log_softmax(-1)
@@ -270,7 +275,7 @@ class _Gumbel:
         mixed = weighted + (tree.value[:, :nodes, None] - weighted) / total
         q = torch.where(visited, q, mixed)
         low, high = torch.aminmax(q, dim=-1, keepdim=True)
-        scale = (self.settings.c_visit + visits.amax(-1, keepdim=True)) * self.settings.c_scale
+        scale = (self.settings.c_visit + visits.amax(-1, keepdim=True)) * self.c_scale
         return visits, scale * ((q - low) / (high - low).clamp_min(_tiny(q)))
 
     def _root_score(self, visits: Tensor, sigma: Tensor, considered: Tensor | int) -> Tensor:

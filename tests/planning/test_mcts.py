@@ -177,6 +177,22 @@ def test_the_unit_of_the_reward_does_not_matter(variant, scale):
 # ------------------------------------------------------------------ Gumbel
 
 
+def test_what_acts_may_trust_q_more_than_what_teaches():
+    model = RandomModel(0, moves=6)
+    low, high, both = (
+        MCTS(num_actions=6, num_simulations=8, variant="gumbel", **scales)
+        for scales in ({"c_scale": 0.02}, {"c_scale": 2.0}, {"c_scale": 0.02, "c_scale_acting": 2.0})
+    )
+
+    def policy(search: MCTS, *, explore: bool):
+        noise = torch.Generator().manual_seed(3)
+        return search.search(*model.root(), model.recurrent, explore=explore, generator=noise)["policy"]
+
+    assert torch.equal(policy(both, explore=True), policy(low, explore=True))
+    assert torch.equal(policy(both, explore=False), policy(high, explore=False))
+    assert not torch.equal(policy(low, explore=False), policy(high, explore=False))
+
+
 def bandits(seed: int, envs: int = 200, moves: int = 8):
     """One decision, then the end. Returns the search's arguments and the true Q (E, M)."""
     draw = torch.Generator().manual_seed(seed)
