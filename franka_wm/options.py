@@ -67,8 +67,15 @@ class Bounds(NamedTuple):
 
     def __str__(self) -> str:
         words = ("of at least", "above", "of at most", "below")
-        said = [f"{word} {bound:g}" for word, bound in zip(words, self, strict=True) if math.isfinite(bound)]
+        said = [
+            f"{word} {_plain(bound)}" for word, bound in zip(words, self, strict=True) if math.isfinite(bound)
+        ]
         return " " + " and ".join(said) if said else ""
+
+
+def _plain(bound: float) -> str:
+    """A whole number up to a billion with all its digits, as a count is written."""
+    return str(int(bound)) if bound == int(bound) and abs(bound) <= 1e9 else f"{bound:g}"
 
 
 POSITIVE = Bounds(least=1, most=10**6)
@@ -198,6 +205,12 @@ def unknown(option: str, known: Sequence[str]) -> str:
     if near:
         return f"{option}: there is no such option; did you mean {' or '.join(near)}?"
     return f"{option}: there is no such option; there are {', '.join(known)}"
+
+
+def did_you_mean(word: str, known: Sequence[str]) -> str:
+    """``; did you mean NAME?`` for the nearest of the known words; empty if none is near."""
+    near = get_close_matches(word, known, n=1, cutoff=0.75)
+    return f"; did you mean {near[0]}?" if near else ""
 
 
 def check_arguments(

@@ -14,13 +14,13 @@ from __future__ import annotations
 import functools
 import math
 from collections.abc import Callable, Iterator, Sequence
-from difflib import get_close_matches
 from pathlib import Path
 from typing import Any
 
 import click
 
 from franka_wm.errors import UserError
+from franka_wm.options import did_you_mean
 
 FLAG = click.BOOL
 
@@ -236,12 +236,6 @@ def verb(name: str, **settings: Any) -> Callable[[Any], Verb]:
     """Make a function a verb; the first paragraphs of its docstring, up to a form feed, are its help."""
     context = {"max_content_width": 110, "help_option_names": ["--help", "-h"]}
     return click.command(name, cls=Verb, context_settings=context, **settings)
-
-
-def did_you_mean(word: str, known: Sequence[str]) -> str:
-    """``; did you mean NAME?`` for the nearest of the known words; empty if none is near."""
-    near = get_close_matches(word, known, n=1, cutoff=0.75)
-    return f"; did you mean {near[0]}?" if near else ""
 
 
 def no_such_option(name: str, known: Sequence[str]) -> str:

@@ -25,7 +25,7 @@ from franka_wm.envs.config import FrankaConfig
 from franka_wm.envs.frames import FrameStack
 from franka_wm.envs.kinematics import check_robot
 from franka_wm.envs.simulation import Simulation
-from franka_wm.envs.specs import observation_spec
+from franka_wm.envs.specs import goals_given, observation_spec
 from franka_wm.envs.tasks import Task, goal_distance
 from franka_wm.errors import UserError
 from franka_wm.options import check_whole
@@ -120,8 +120,12 @@ class FrankaEnv(EnvBase):
         super().__init__(device=device, batch_size=torch.Size([num_envs]))
         if task is None:
             check_robot(config, urdf_path)
-        else:
+        elif isinstance(task, Task):
             config = task.config = replace(config, **task.brings())
+        else:
+            raise UserError(
+                f"task={task!r}: must be an instance of Task; by name it is FrankaConfig(task=NAME)"
+            )
         self.config = config
         self.num_envs = num_envs
         started = time.perf_counter()
@@ -166,12 +170,11 @@ class FrankaEnv(EnvBase):
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
         sim = self.simulation
-        action = tensordict.get("action")
+        action = tensordict.get("action", None)
         expected = tuple(sim.tensors.action.shape)
-        if action.shape != expected:
-            raise UserError(
-                f"action has shape {tuple(action.shape)}; it must be {expected}: (worlds, joints)"
-            )
+        if action is None or action.shape != expected:
+            given = "there is no action" if action is None else f"action has shape {tuple(action.shape)}"
+            raise UserError(f"{given}; it must be {expected}: (worlds, joints)")
         sim.tensors.action.copy_(action)
         sim.step(restart=self._restart)
         for key in self._stacked:
@@ -276,7 +279,8 @@ class FrankaEnv(EnvBase):
 
         Each world keeps its goal until its next episode draws another. With ``task="track"`` the circle is
         moved so that the goal passes there now. Nothing else changes; with ``reward="normalized"`` the episode's
-        initial distance stays what it was. A goal out of reach is allowed: the arm gets as near as it can.
+        initial distance stays what it was. It is for use by hand: a goal out of reach is allowed, however far, and the
+        arm gets as near as it can.
 
         Args:
             goal: (N, 3), or (3,) for all worlds [m], in the world's frame.
@@ -284,13 +288,7 @@ class FrankaEnv(EnvBase):
         Raises:
             UserError: Another shape, or a number that is not finite; nothing is changed then.
         """
-        goal = torch.as_tensor(goal, dtype=torch.float32, device=self.device)
-        if goal.shape not in ((3,), (self.num_envs, 3)) or not bool(goal.isfinite().all()):
-            raise UserError(
-                f"set_goal: got shape {tuple(goal.shape)}; it must be ({self.num_envs}, 3) or (3,), "
-                "finite, in metres"
-            )
-        self.simulation.set_goal(goal.expand(self.num_envs, 3))
+        self.simulation.set_goal(goals_given(goal, self.num_envs, self.device))
         return self._observed_anew()
 
     def _observed_anew(self) -> TensorDict:

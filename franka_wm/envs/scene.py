@@ -95,6 +95,11 @@ class Scene:
     @classmethod
     def of(cls, values: Any) -> Scene:
         """From a mapping, or one that is there already."""
+        if isinstance(values, str):  # env.scene=kitchen.yaml
+            raise UserError(
+                f"scene={short(values)}: must be a mapping, not the name of a file; write 'env.scene={{objects: "
+                "[{name: cube}]}', or make the file one of --config-dir: docs/tasks.md, A scene of your own"
+            )
         return values if isinstance(values, cls) else cls(**known_fields(cls, values))
 
     def body(self, name: str) -> int:

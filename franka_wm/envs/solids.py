@@ -11,7 +11,7 @@ import numpy as np
 
 from franka_wm.envs.mesh_solids import Surface, read_parts, read_surface
 from franka_wm.errors import UserError
-from franka_wm.options import is_real
+from franka_wm.options import did_you_mean, is_real
 
 SIZES = {
     "box": ("length", "width", "height"),
@@ -151,7 +151,9 @@ class Solid:
         value = getattr(self, field)
         ok = isinstance(value, Sequence) and not isinstance(value, str) and len(value) == count
         if not ok or not all(is_real(v) for v in value):
-            raise UserError(f"{self._where}.{field}={value!r}: give {count} numbers ({what})")
+            raise UserError(
+                f"{self._where}.{field}={value!r}: give {count} number{'s' * (count > 1)} ({what})"
+            )
         object.__setattr__(self, field, tuple(float(v) for v in value))
         return getattr(self, field)
 
@@ -246,8 +248,9 @@ class Body(Solid):
         far = math.hypot(x + self.spread[0], y + self.spread[1])
         near = math.hypot(max(x - self.spread[0], 0.0), max(y - self.spread[1], 0.0))
         if near < REACH[0] or far > REACH[1]:
+            place = f"{near:.2f} m" if f"{near:.2f}" == f"{far:.2f}" else f"{near:.2f} to {far:.2f} m"
             raise UserError(
-                f"{self._where}: starts {near:.2f} to {far:.2f} m from the base; the arm reaches {REACH[0]} to "
+                f"{self._where}: starts {place} from the base; the arm reaches {REACH[0]} to "
                 f"{REACH[1]} m on the table: change at or spread"
             )
 
@@ -308,8 +311,9 @@ def known_fields(cls: type, values: Any) -> dict[str, Any]:
     known = {f.name for f in fields(cls)}
     for name in values:
         if name not in known:
-            what = f"scene.{values.get('name', cls.__name__.lower())}"
-            raise UserError(f"{what}: unknown {name!r}; known: {', '.join(sorted(known))}")
+            what = "scene" if cls.__name__ == "Scene" else f"scene.{values.get('name', cls.__name__.lower())}"
+            hint = did_you_mean(str(name), sorted(known))
+            raise UserError(f"{what}: unknown {name!r}; known: {', '.join(sorted(known))}{hint}")
     for one in fields(cls):
         if one.default is MISSING and one.default_factory is MISSING and one.name not in values:
             raise UserError(f"scene: {short(values)} has no {one.name}; give one")

@@ -5,6 +5,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import torch
 from torchrl.data import Binary, Bounded, Composite, Unbounded
@@ -12,6 +13,7 @@ from torchrl.data import Binary, Bounded, Composite, Unbounded
 from franka_wm.envs.config import FrankaConfig
 from franka_wm.envs.constants import MOST_OPEN
 from franka_wm.envs.kinematics import Kinematics
+from franka_wm.errors import UserError
 
 
 def observation_spec(
@@ -52,3 +54,21 @@ def observation_spec(
     entries["success"] = Binary(shape=(n, 1), dtype=torch.bool, device=device)
     entries["is_init"] = Binary(shape=(n, 1), dtype=torch.bool, device=device)
     return Composite(**entries, shape=(n,), device=device)
+
+
+def goals_given(goal: Any, n: int, device: torch.device) -> torch.Tensor:
+    """Goals (n, 3) [m] from as many, or from one (3,) for all worlds.
+
+    Raises:
+        UserError: No numbers, another shape, or a number that is not finite.
+    """
+    try:
+        goals = torch.as_tensor(goal, dtype=torch.float32, device=device)
+    except (TypeError, ValueError, RuntimeError) as error:
+        raise UserError(f"set_goal: {goal!r} must be numbers, ({n}, 3) or (3,), in metres") from error
+    if goals.shape not in ((3,), (n, 3)):
+        raise UserError(f"set_goal: got shape {tuple(goals.shape)}; it must be ({n}, 3) or (3,), in metres")
+    wrong = goals[~goals.isfinite()]
+    if len(wrong):
+        raise UserError(f"set_goal: has {float(wrong[0])}; all numbers must be finite, in metres")
+    return goals.expand(n, 3)

@@ -12,6 +12,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 from franka_wm.errors import UserError
+from franka_wm.options import did_you_mean
 
 if TYPE_CHECKING:
     from franka_wm.models.base import WorldModel
@@ -92,7 +93,8 @@ def family(name: str) -> type[WorldModel]:
     if name in _REGISTERED:
         return _REGISTERED[name][0]
     if name not in _FAMILIES:
-        raise ValueError(f"unknown model {name!r}; available: {', '.join(sorted(available()))}")
+        known = sorted(available())
+        raise ValueError(f"unknown model {name!r}; available: {', '.join(known)}{did_you_mean(name, known)}")
     module, cls, _ = _FAMILIES[name]
     return getattr(import_module(module), cls)
 

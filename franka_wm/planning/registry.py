@@ -8,7 +8,7 @@ from collections.abc import Mapping
 from importlib import import_module
 from typing import Any
 
-from franka_wm.options import check_arguments, check_names
+from franka_wm.options import check_arguments, check_names, did_you_mean
 
 # name -> (module, class, whether it chooses among discrete actions, what it is in one line)
 _PLANNERS: dict[str, tuple[str, str, bool, str]] = {
@@ -94,4 +94,5 @@ def make(name: str, **arguments: Any) -> Any:
 
 def _require(name: str) -> None:
     if name not in _PLANNERS and name not in _REGISTERED:
-        raise ValueError(f"must be one of {', '.join(available())}, got {name!r}")
+        known = list(available())
+        raise ValueError(f"must be one of {', '.join(known)}, got {name!r}{did_you_mean(name, known)}")

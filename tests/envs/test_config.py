@@ -12,6 +12,7 @@ from omegaconf import OmegaConf
 
 from franka_wm.device import resolve_device
 from franka_wm.envs import FrankaConfig, FrankaEnv
+from franka_wm.envs.tasks import Reach
 from franka_wm.errors import UserError
 
 STATE = {"observations": ("state",)}
@@ -143,6 +144,12 @@ def test_impossible_number_of_worlds(num_envs: Any) -> None:
     with pytest.raises(UserError) as caught:
         FrankaEnv(FrankaConfig(**STATE), num_envs=num_envs, device="cpu")
     assert "num_envs" in one_line(caught.value)
+
+
+@pytest.mark.parametrize("task", ["lift", Reach])
+def test_what_is_no_task_is_refused(task: Any) -> None:
+    with pytest.raises(UserError, match=r"task=.*must be an instance of Task.*FrankaConfig\(task=NAME\)"):
+        FrankaEnv(FrankaConfig(), num_envs=2, device="cpu", task=task)
 
 
 def test_goal_out_of_reach() -> None:

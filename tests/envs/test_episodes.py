@@ -262,3 +262,8 @@ def test_wrong_action_shape(env: FrankaEnv, shape: tuple[int, ...]) -> None:
         env._step(TensorDict({"action": torch.zeros(shape)}))
     assert "\n" not in str(caught.value)
     assert torch.equal(env.state_observation(), before["state"])
+
+
+def test_no_action(env: FrankaEnv) -> None:
+    with pytest.raises(UserError, match=r"there is no action; it must be \(\d+, 7\)"):
+        env.step(env.reset(seed=0))

@@ -89,7 +89,12 @@ def test_one_goal_may_serve_all_worlds_and_bad_ones_change_nothing(small_env) ->
     env = small_env(N)
     env.reset(seed=0)
     assert torch.equal(env.set_goal(GOALS[0])["goal"], GOALS[:1].expand(N, 3))
-    for bad in (torch.zeros(2, 3), torch.zeros(N, 2), torch.tensor([0.0, float("nan"), 0.0])):
-        with pytest.raises(UserError, match=r"set_goal.*\(3, 3\) or \(3,\)"):
+    for bad, said in (
+        (torch.zeros(2, 3), r"set_goal: got shape \(2, 3\).*\(3, 3\) or \(3,\)"),
+        (torch.zeros(N, 2), r"set_goal: got shape \(3, 2\)"),
+        ("x", r"set_goal: 'x' must be numbers"),
+        ([0.0, float("nan"), 0.0], r"set_goal: has nan; all numbers must be finite"),
+    ):
+        with pytest.raises(UserError, match=said):
             env.set_goal(bad)
     assert torch.equal(env.goal, GOALS[:1].expand(N, 3))

@@ -106,6 +106,11 @@ def test_what_is_no_world_model_is_refused():
         models.register("plain", nn.Linear)  # pyright: ignore[reportArgumentType]
 
 
+def test_a_misspelt_family_names_the_nearest():
+    with pytest.raises(ValueError, match=r"unknown model 'tdmpc'; .*; did you mean tdmpc2\?"):
+        models.make("tdmpc")
+
+
 # -- options ------------------------------------------------------------------------------------------------
 
 

@@ -205,6 +205,13 @@ def test_options_of_models_and_planners_refuse_other_types(group: str, file: str
 def test_a_planner_option_that_does_not_exist() -> None:
     with pytest.raises(UserError, match=r"planner\.num_sample: .*planner\.num_samples"):
         registry.validate("mppi", {"num_sample": 3})
+    with pytest.raises(ValueError, match=r"did you mean mppi\?"):
+        registry.planner("mpi")
+
+
+def test_a_bound_of_a_count_has_all_its_digits() -> None:
+    with pytest.raises(UserError, match=r"planner\.num_samples=2000000: .* and of at most 1000000$"):
+        registry.validate("mppi", {"num_samples": 2_000_000})
 
 
 def test_settings_are_what_several_options_make_of_them() -> None:
