@@ -23,6 +23,9 @@ from franka_wm.seeding import derive_seed, restore_generator
 
 SPLITS = ("train", "validation", "all")
 
+STILL = 1e-5
+"""A component of the actions whose range is at most this part of the largest one's never changes: it is noise."""
+
 
 class NoWindows(UserError):
     """A split has no window of the length asked for."""
@@ -54,6 +57,13 @@ class Recording:
     action_high: np.ndarray | None
     notes: list[str] = field(default_factory=list)
 
+    def __post_init__(self) -> None:
+        if self.action_low is None or self.action_high is None:
+            return
+        for k in np.flatnonzero(still(self.action_low, self.action_high)):
+            low, high = self.action_low[k], self.action_high[k]
+            self.notes.append(f"actions: component {k} never changes and becomes 0 ({low:.4g} … {high:.4g})")
+
 
 class Moments(NamedTuple):
     """Moments of a vector's components, (size,) float32 each."""
@@ -76,8 +86,8 @@ class RecordedWindows:
     of this package), the last action is in some window; elsewhere it is left out.
 
     **Actions** of a dataset of this package are in [−1, 1] already. Others are scaled linearly, each component
-    from its smallest and largest value in the dataset to [−1, 1] (a component that never changes becomes 0);
-    ``action_low`` and ``action_high`` record it, :meth:`recorded_action` undoes it.
+    from its smallest and largest value in the dataset to [−1, 1] (a component that never changes, see
+    :data:`STILL`, becomes 0); ``action_low`` and ``action_high`` record it, :meth:`recorded_action` undoes it.
 
     Made by :func:`~franka_wm.data.lerobot.opening.open_dataset`.
 
@@ -378,9 +388,16 @@ def _split(dataset: np.ndarray, split: str, fraction: float, seed: int) -> np.nd
     return np.flatnonzero(validation if split == "validation" else ~validation)
 
 
+def still(low: np.ndarray, high: np.ndarray) -> np.ndarray:
+    """Which components never change, (A,) bool: see :data:`STILL`."""
+    span = high.astype(np.float64) - low
+    return span <= STILL * span.max(initial=0.0)
+
+
 def _centre_and_half(low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     low64, high64 = low.astype(np.float64), high.astype(np.float64)
-    return ((high64 + low64) / 2).astype(np.float32), ((high64 - low64) / 2).astype(np.float32)
+    half = np.where(still(low, high), 0.0, (high64 - low64) / 2)
+    return ((high64 + low64) / 2).astype(np.float32), half.astype(np.float32)
 
 
 def _moments(values: np.ndarray, device: torch.device) -> Moments:

@@ -160,6 +160,22 @@ def test_actions_of_others_are_scaled(pictures: Path, foreign, opened: Callable)
         opened(pictures, normalize_actions=False)
 
 
+def test_an_action_that_only_trembles_never_changes(
+    foreign, tmp_path: Path, opened: Callable, monkeypatch
+) -> None:
+    """Noise of 7e-7 would fill [−1, 1]; a component of another unit, a thousandth of the largest, is learned."""
+    monkeypatch.setattr(
+        foreign, "action", lambda episode, t: np.array([t, 0.001 * t, 7e-7 * (t % 2)], np.float32)
+    )
+    windows = opened(foreign.make_foreign(tmp_path / "trembling", pictures=False))
+    for batch in windows.batches(3):
+        assert (batch["action"][..., 2] == 0).all()
+        assert torch.allclose(batch["action"][..., 0], batch["action"][..., 1], atol=1e-5)
+    statistics = windows.statistics()["action"]
+    assert statistics.std[2] == 0 and statistics.std[1] > 0.1
+    assert any("component 2 never changes and becomes 0" in note for note in windows.notes)
+
+
 def test_discrete_actions(foreign, tmp_path: Path, opened: Callable) -> None:
     moves = {"action": {"dtype": "int64", "shape": (1,), "names": None}}
     windows = opened(foreign.make_foreign(tmp_path / "moves", pictures=False, **moves))
