@@ -83,9 +83,7 @@ def test_add(arguments: tuple[str, ...], root: Path, tmp_path: Path) -> None:
         # Not in a fork: other tests of this process may have imported the module.
         program = [sys.executable, "-m", "franka_wm", *evaluate]
         done = subprocess.run(program, cwd=root, capture_output=True, text=True, check=False)
-        assert done.returncode == 1 and "import its module first (plugins=[MODULE])" in done.stderr, (
-            done.stderr
-        )
+        assert done.returncode == 1 and "plugins=[MODULE] imports its module" in done.stderr, done.stderr
         assert "height [m]" in run(root, "franka_wm/__main__.py", *evaluate, arguments[0])
 
 

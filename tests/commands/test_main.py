@@ -34,6 +34,9 @@ def test_list_names_everything_with_one_line(capsys: pytest.CaptureFixture[str])
     assert names >= {file.stem for group in ("env", "planner") for file in (conf / group).glob("*.yaml")}
     assert names >= {"embedded", "reach", "tdmpc2"}
     assert all(len(entry) == 2 for entry in entries), "an entry has no description"
+    groups = ("env", "model", "planner", "pretrain", "dataset", "scale", "experiment")
+    cut = [line for group in groups for line in listing.options(group).values() if line[-1] not in ".?"]
+    assert not cut, "only the first line of a file's comment is shown: it must end a sentence"
 
 
 def test_list_shows_what_is_one_s_own(tmp_path: Path) -> None:

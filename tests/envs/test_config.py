@@ -146,6 +146,12 @@ def test_impossible_number_of_worlds(num_envs: Any) -> None:
     assert "num_envs" in one_line(caught.value)
 
 
+def test_a_task_that_no_plugin_registers_says_what_a_plugin_must_do() -> None:
+    """Imported or not: a module that never calls register was imported in vain."""
+    with pytest.raises(UserError, match=r"task='box': .*plugins=\[MODULE\].* must call register\(NAME, …\)"):
+        FrankaConfig(task="box")
+
+
 @pytest.mark.parametrize("task", ["lift", Reach])
 def test_what_is_no_task_is_refused(task: Any) -> None:
     with pytest.raises(UserError, match=r"task=.*must be an instance of Task.*FrankaConfig\(task=NAME\)"):

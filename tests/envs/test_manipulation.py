@@ -359,7 +359,10 @@ def test_objects_start_apart_everywhere_anew() -> None:
         ({"scene": {"objcts": []}}, "scene: unknown 'objcts'; known: articulated, objects"),
         ({"scene": "kitchen.yaml"}, "must be a mapping, not the name of a file; write 'env.scene={"),
         ({"scene": {"objects": [{"name": "ball", "shape": "sphere", "size": 1}]}}, "give 1 number ("),
-        ({"scene": {"objects": [{"name": "cube", "at": [3, 0]}]}}, "starts 3.00 m from the base; the arm reaches"),
+        (
+            {"scene": {"objects": [{"name": "cube", "at": [3, 0]}]}},
+            "starts 3.00 m from the base; the arm reaches",
+        ),
         (
             {"scene": {"objects": [{"name": "cube", "at": [1.5, 0], "spread": [0.1, 0]}]}},
             "1.40 to 1.60 m from",
