@@ -65,6 +65,17 @@ def test_the_printed_collisions(root: Path) -> None:
     assert "link5_8" in env.simulation.model.shape_label
 
 
+def test_the_printed_scene_of_a_run(root: Path, tmp_path: Path, composed) -> None:
+    page = (root / "docs" / "tasks.md").read_text()
+    text = next(b for b in re.findall(r"```yaml\n(.*?)```", page, re.DOTALL) if b.startswith("defaults:"))
+    (tmp_path / "env").mkdir()
+    (tmp_path / "env" / "kitchen.yaml").write_text(text)
+    arm = RunSettings.of(composed(f"hydra.searchpath=[file://{tmp_path}]", "env=kitchen")).env.arm
+    assert arm.task == "lift" and arm.resolved_scene is not None
+    assert [(body.name, body.spread) for body in arm.resolved_scene.objects] == [("cube", (0.1, 0.15))]
+    assert (arm.randomization.object_size, arm.randomization.color, arm.collisions) == (0.2, 0.2, "arm")
+
+
 def test_the_printed_task_and_its_expert(printed_class, composed) -> None:
     topple = printed_class("Topple(TorchTask)", lines=40)
     config = RunSettings.of(composed("env=lift", "env.task=topple")).env.arm  # it has registered itself
