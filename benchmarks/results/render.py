@@ -16,6 +16,12 @@ from benchmarks.results.state import Record, numbers, state, unmeasured
 from franka_wm.errors import UserError
 
 BEGIN, END = "<!-- results: written by `make results` -->", "<!-- end of results -->"
+LEGEND = (
+    "*7 of 10 seeds*: the row declares ten and seven were measured; the others have not been, none was left out for "
+    "its result. *6 at a time*: so many runs shared the machine, so each took longer than by itself; *alone (3 of 5 "
+    "runs)*: times of the three that had it to themselves. ¹ and ², an earlier commit: see below the tables."
+)
+"""What README says of its tables' words."""
 HEAD = """# Results
 
 Written by `make results` from the files in [results/](results), which the runs wrote themselves; no number in a table
@@ -407,7 +413,7 @@ def readme_tables(rows: Mapping[str, Row], place: Path = PLACE) -> str:
         nothing = _mean([DISTANCE.of(record, "noop") for record in records])
         found = [*took, f"{distance:.1f} cm", f"{worst:.0f} %", f"{nothing:.0f} cm"]
         arm.append([who, row.model, f"{where}, {runs}", *found])
-    parts = []
+    parts = [LEGEND, ""] if arm or manipulation or others else []
     if arm:
         titles = ["task", "model, planner", "machine", "training", "whole command", "final distance"]
         parts += [table([*titles, "within 5 cm, worst seed", "doing nothing"], arm), ""]

@@ -376,6 +376,7 @@ def test_what_cannot_be_is_said_in_one_line(changes: dict, said: str) -> None:
     with pytest.raises(UserError) as caught:
         FrankaConfig(**(PRESET | changes))
     assert said in str(caught.value) and "\n" not in str(caught.value)
+    assert "scene.scene" not in str(caught.value)
 
 
 def test_a_goal_that_would_be_drawn_over_is_refused() -> None:
