@@ -89,8 +89,8 @@ def open_dataset(
     scale = scale and not mappings[0].discrete
     if scale:
         notes.append(
-            f"actions are scaled to [−1, 1] from {np.array2string(low, precision=3)} … "
-            f"{np.array2string(high, precision=3)}, what the data spans"
+            f"actions are scaled to [−1, 1] from {np.array2string(low, precision=3, suppress_small=True)} … "
+            f"{np.array2string(high, precision=3, suppress_small=True)}, what the data spans"
         )
     elif not mappings[0].discrete and (np.abs([low, high]) > 1 + 1e-6).any():
         raise UserError(
