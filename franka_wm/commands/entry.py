@@ -268,7 +268,7 @@ def fail(message: str) -> NoReturn:
 
 
 def with_scale(arguments: list[str], stream: TextIO | None = None, *, quiet: bool = False) -> list[str]:
-    """Adds ``scale=gpu`` or ``scale=laptop`` where none, or ``scale=auto``, is given.
+    """Adds ``scale=gpu`` or ``scale=laptop`` where none, or ``scale=auto``, is given; a run that resumes keeps its own.
 
     Args:
         stream: Where that is said.
@@ -277,12 +277,14 @@ def with_scale(arguments: list[str], stream: TextIO | None = None, *, quiet: boo
     given = next((a for a in arguments if a.startswith("scale=")), None)
     if given not in (None, "scale=auto"):
         return arguments
+    if any(a.startswith("resume=") for a in arguments):
+        return [a for a in arguments if a != given]
     import torch
 
     device = next((a.split("=", 1)[1] for a in arguments if a.startswith("device=")), "auto")
     on_gpu = device.startswith(("cuda", "spread")) or (device == "auto" and torch.cuda.is_available())
     scale = "gpu" if on_gpu else "laptop"
-    if not quiet and not any(a.startswith("resume=") for a in arguments):
+    if not quiet:
         say(f"scale={scale}, by the device; choose with scale=laptop, gpu or smoke", stream)
     return [a for a in arguments if a != given] + [f"scale={scale}"]
 

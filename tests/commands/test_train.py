@@ -23,6 +23,7 @@ from franka_wm.conf import run_name
 from franka_wm.errors import FrankaError
 from franka_wm.report.run import read_run
 from franka_wm.training.checkpoint import latest_checkpoint, load_checkpoint
+from franka_wm.training.history import read_rows
 from franka_wm.training.run import occupied
 from light import Answer, answers
 
@@ -152,8 +153,8 @@ def test_going_on(run, tmp_path: Path) -> None:
     assert after.counters["updates"] == 50
     assert after.counters["env_steps"] == before.counters["env_steps"] + 8 * 10  # no second seed phase
     assert after.counters["seconds"] > before.counters["seconds"]
-    history = after.extra()["rows"]
-    assert history[: len(before.extra()["rows"])] == before.extra()["rows"]
+    history = read_rows(after)
+    assert history[: len(read_rows(before))] == read_rows(before)
     assert before.replay().numel() == 8 * 25 and after.replay().numel() == 8 * 35
     assert (tmp_path / "more" / "evaluation.json").exists()
     assert (

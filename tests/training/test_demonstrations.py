@@ -17,6 +17,7 @@ from franka_wm.errors import UserError
 from franka_wm.training import build
 from franka_wm.training.check import check
 from franka_wm.training.demos import open_demonstrations
+from franka_wm.training.history import read_rows
 from franka_wm.training.learner import Learner
 from franka_wm.training.run import Run
 from franka_wm.training.spaces import Spaces
@@ -58,7 +59,7 @@ def test_a_run_without_an_environment_evaluates_nothing(demos: Path, train) -> N
         "env=none", "trainer=offline", "dataset=lerobot", f"dataset.root={demos}", "dataset.workers=1"
     )
     assert run.counters["updates"] == 30 and not (run.folder.parents[1] / "evaluation.json").exists()
-    assert not any("eval/" in name for row in (run.extra() or {})["rows"] for name in row)
+    assert not any("eval/" in name for row in read_rows(run) for name in row)
 
 
 def test_statistics_of_observations_see_them_too(demos: Path, train) -> None:

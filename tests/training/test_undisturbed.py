@@ -13,6 +13,7 @@ from safetensors.torch import load_file
 from franka_wm.commands.main import main
 from franka_wm.seeding import seeded
 from franka_wm.training.checkpoint import Checkpoint
+from franka_wm.training.history import read_rows
 
 
 def weights(checkpoint: Checkpoint) -> dict[str, torch.Tensor]:
@@ -49,10 +50,10 @@ def test_what_is_looked_at_does_not_change_the_weights(actor: str, name: str, ke
         kept[actor] = weights(train(actor, "evaluation.during=[]", folder=tmp_path / "alone"))
     run = train(actor, *OTHERWISE[name])
     if "during=[]" not in OTHERWISE[name][0]:
-        rows = (run.extra() or {})["rows"]
+        rows = read_rows(run)
         assert any(key.startswith("eval/") for row in rows for key in row)
     if "log_every" in OTHERWISE[name][1]:
-        assert len((run.extra() or {})["rows"]) == 3
+        assert len(read_rows(run)) == 3
     got = weights(run)
     assert [key for key in got if not torch.equal(got[key], kept[actor][key])] == []
 
@@ -90,7 +91,7 @@ def test_validation_losses_do_not_change_the_weights(train, tmp_path: Path) -> N
         train(*data, f"trainer.log_every={seconds}", folder=tmp_path / str(seconds))
         for seconds in (1e9, 1e-6)
     ]
-    counts = [sum("validation/loss" in row for row in (run.extra() or {})["rows"]) for run in runs]
+    counts = [sum("validation/loss" in row for row in read_rows(run)) for run in runs]
     assert counts == [1, 6]
     assert_same_weights(*runs)
 
