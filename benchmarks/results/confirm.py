@@ -13,7 +13,7 @@ import shlex
 import subprocess
 import sys
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from datetime import date
 from pathlib import Path
 from typing import Any
@@ -62,7 +62,8 @@ def confirm(row: Row, place: Path = PLACE) -> Path:
         UserError: The row was not measured, its code is not in this repository, a run fails, or they differ.
     """
     records = read(row, place)
-    commits = sorted({str(record["commit"]) for record in records})
+    # With "+" something was not committed, such as results of the row's first seeds: its code is compared below.
+    commits = sorted({str(record["commit"]).removesuffix("+") for record in records})
     if row.script is not None or len(commits) != 1:
         raise UserError(
             f"{row.name}: only a row of train.py that one commit measured can be confirmed; measure it again"
@@ -78,6 +79,7 @@ def confirm(row: Row, place: Path = PLACE) -> Path:
         try:
             _prepare(row, tree)
             _run(tree, short(row), before)
+            _require_measured(row, records, commits[0], (read_json(before / "finished.json") or {})["source"])
         finally:
             _git("worktree", "remove", "--force", str(tree))
         _prepare(row, ROOT)
@@ -102,6 +104,17 @@ def confirm(row: Row, place: Path = PLACE) -> Path:
             )
         )
     return path
+
+
+def _require_measured(row: Row, records: Sequence[Record], commit: str, files: Mapping[str, str]) -> None:
+    """Refuses records of other code than the commit's, as far as a short run reads it."""
+    for record in records:
+        measured = record["code"]["files"]
+        other = next((name for name, code in files.items() if measured.get(name, code) != code), None)
+        if other is not None:
+            raise UserError(
+                f"{row.name}: measured with another {other} than that of {commit}; measure it again"
+            )
 
 
 def outcome(run: Path) -> dict[str, Any]:
@@ -129,7 +142,7 @@ def confirmed(row: Row, records: Sequence[Record], place: Path = PLACE) -> Recor
     from franka_wm.source import differing
 
     found = read_json(place / "confirmed" / f"{row.name}.json")
-    if not found or {record["commit"] for record in records} != {found["measured"]}:
+    if not found or {str(record["commit"]).removesuffix("+") for record in records} != {found["measured"]}:
         return None
     now = composed(tuple(shlex.split(records[0]["command"])[2:]))
     return found if not differing(found["files"]) and found["config"] == now else None

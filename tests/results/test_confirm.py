@@ -109,3 +109,16 @@ def test_a_row_of_two_commits_is_not_confirmed(measured: Path) -> None:
     records.write(record, measured)
     with pytest.raises(UserError, match=r"only a row of train\.py that one commit measured"):
         confirm.confirm(ROW, measured)
+
+
+def test_what_else_was_not_committed_counts_as_far_as_it_is_code(measured: Path, monkeypatch) -> None:
+    """The results of a row's first seeds make the tree of the others one with changes."""
+    play(monkeypatch, torch.ones(2), torch.ones(2))
+    path = measured / "reach" / "seed-100.json"
+    record = json.loads(path.read_text()) | {"commit": "abc1234+"}
+    path.write_text(json.dumps(record))
+    assert json.loads(confirm.confirm(ROW, measured).read_text())["measured"] == "abc1234"
+    code = {"files": {"train.py": "another"}, "config": {}}
+    records.write(record | {"code": code}, measured)
+    with pytest.raises(UserError, match=r"measured with another train\.py than that of abc1234"):
+        confirm.confirm(ROW, measured)
