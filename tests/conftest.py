@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import copy
+import importlib.util
 import itertools
 import logging
 import os
+import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -40,6 +42,12 @@ LONG = (
 def pytest_configure() -> None:
     """One thread by plain ``pytest``, too, as by ``make test``: tests compare with processes that have one."""
     torch.set_num_threads(int(os.environ.setdefault("OMP_NUM_THREADS", "1")))
+    # dm_control brings absl, which takes the stderr that it finds, here pytest's file, and closes it as Hydra sets up
+    # logging: in whichever tests a process has come to by then.
+    if importlib.util.find_spec("absl"):
+        from absl import logging as absl_logging
+
+        absl_logging.get_absl_handler().python_handler.stream = sys.__stderr__
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
