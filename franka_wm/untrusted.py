@@ -241,9 +241,7 @@ def values_of(what: str, then: str) -> Iterator[None]:
         TypeError,
         ValueError,
     ) as error:
-        if (
-            type(error).__name__ == "OutOfMemoryError"
-        ):  # torch's, of a GPU: a RuntimeError, but not the file's fault
+        if type(error).__name__ == "OutOfMemoryError":  # torch's RuntimeError: no fault of the file
             raise
         reason = (str(error).strip() or "no value").splitlines()[0]
         raise UserError(

@@ -10,11 +10,12 @@ import zlib
 from pathlib import Path
 
 import pytest
+import torch
 
 from franka_wm.commands import main as cli
 from franka_wm.data.lerobot.source import read_source
 from franka_wm.errors import UserError
-from franka_wm.untrusted import MOST_JSON, MOST_YAML, UntrustedFolder, check_image, check_video
+from franka_wm.untrusted import MOST_JSON, MOST_YAML, UntrustedFolder, check_image, check_video, values_of
 
 SECRET = "hunter2-of-this-machine"
 
@@ -208,3 +209,13 @@ def test_values_of_another_form_are_one_line(evaluation, run: Path, capsys) -> N
 def test_what_is_not_finite_is_missing(run: Path) -> None:
     (run / "a.json").write_text('{"x": NaN, "y": -Infinity, "z": 1e999, "w": 1.5}')
     assert UntrustedFolder(run).json("a.json") == {"x": None, "y": None, "z": None, "w": 1.5}
+
+
+def test_a_full_gpu_is_no_fault_of_the_file() -> None:
+    with pytest.raises(torch.OutOfMemoryError), values_of("checkpoint a", "use another."):
+        raise torch.OutOfMemoryError("CUDA out of memory")
+    with (
+        pytest.raises(UserError, match="checkpoint a holds values"),
+        values_of("checkpoint a", "use another."),
+    ):
+        raise RuntimeError("shapes")

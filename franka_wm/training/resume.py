@@ -82,12 +82,12 @@ def _fitting(trainer: Trainer, experience: TensorDictBase) -> TensorDictBase:
     """
     assert trainer.env is not None
     gathered = trainer.env.fake_tensordict()
-    lacking = [key for key in trainer.kept if key not in experience.keys(True)]
-    if lacking:
-        raise UserError(
-            f"the checkpoint's experience has no {lacking[0]}, which this run keeps; resume it with the same model and "
-            "export as before"
-        )
+    for key in trainer.kept:
+        if key not in experience.keys(True):
+            name = key if isinstance(key, str) else ".".join(key)
+            raise UserError(
+                f"the checkpoint's experience has no {name}, which this run keeps; leave export as it was then"
+            )
     experience = experience.select(*trainer.kept)
     for key in trainer.kept:
         saved, like = (

@@ -13,6 +13,7 @@ from torchrl.envs.utils import ExplorationType, check_env_specs, set_exploration
 from franka_wm.models import WorldModel
 from franka_wm.planning import MCTS
 from franka_wm.policies import SearchPolicy
+from franka_wm.seeding import drawing_for
 
 LEFT, RIGHT, STAY = 0, 1, 2
 
@@ -127,6 +128,18 @@ def test_a_copy_of_the_policy_uses_its_own_model():
     start = TensorDict({"state": torch.full((2, 1), 6.0)}, [2])
     assert (original(start.clone())["action"] == LEFT).all()
     assert (duplicate(start.clone())["action"] == RIGHT).all()  # it believes to be at 0
+
+
+def test_a_captured_search_is_of_one_share_of_the_worlds(monkeypatch):
+    """It draws for some of the worlds; another share of them must not replay it."""
+    monkeypatch.setattr("franka_wm.policies.search.captures", lambda *_: True)
+    policy, keys = acting(explore=True), []
+    policy._graphs = lambda decide, inputs, *, key, **_: (keys.append(key), decide(inputs))[1]
+    start = TensorDict({"state": torch.full((2, 1), 3.0)}, [2])
+    for first in (0, 0, 2):
+        with drawing_for(first, 2, 4):
+            policy(start.clone())
+    assert keys[0] == keys[1] != keys[2]
 
 
 def test_its_own_generator_makes_actions_repeat():

@@ -257,7 +257,7 @@ def test_experience_that_fits() -> None:
 @pytest.mark.parametrize(
     ("key", "value", "said"),
     [
-        (("next", "reward"), None, "reward"),
+        (("next", "reward"), None, "the checkpoint's experience has no next.reward, which this run keeps"),
         ("state", torch.zeros(2, 4, 4, dtype=torch.float64), "experience of state is torch.float64"),
         ("state", torch.zeros(2, 4, 5), "experience of state is of shape"),
         (

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import signal
 import time
@@ -14,6 +15,7 @@ import torch
 from tensordict import TensorDict
 
 from franka_wm import processes
+from franka_wm.data.lerobot.schema import GOAL, OBJECTS, SUCCESS
 from franka_wm.envs import FrankaEnv
 from franka_wm.errors import UserError
 from franka_wm.training import build, storage_budget
@@ -366,3 +368,17 @@ def test_statistics_of_several_processes_are_means_over_their_episodes() -> None
         ]
     )
     assert found == {"episodes": 12, "success": 0.75, "success/lift": 0.25, "episodes/lift": 4, "overflow": 3}
+
+
+def test_a_run_that_exports_keeps_what_the_task_says(train, tmp_path: Path) -> None:
+    """The dataset is for other models, too: objects that this one does not read, and the task's own success."""
+    words = ("env=push", "env.substeps=1", "env.episode_length=8", "model.observations=[state,goal]")
+    train(
+        *words,
+        "evaluation.during=[]",
+        "export=lerobot",
+        f"export.out={tmp_path}/set",
+        folder=tmp_path / "run",
+    )
+    features = json.loads((tmp_path / "set" / "meta" / "info.json").read_text())["features"]
+    assert {SUCCESS, OBJECTS, GOAL} <= features.keys()
