@@ -323,11 +323,11 @@ def _check_dataset(run: RunSettings) -> None:
             action_dim=arm and arm.action_dim,
         )
         if arm is not None:
-            _check_seen_alike(run, mappings[0])
-            _check_meant_alike(arm, sources)
+            _check_same_observations(run, mappings[0])
+            _check_same_actions(arm, sources)
 
 
-def _check_seen_alike(run: RunSettings, recorded: FeatureMap) -> None:
+def _check_same_observations(run: RunSettings, recorded: FeatureMap) -> None:
     """What the model will read of the data, the arm that it is to act in must show."""
     family, wanted = run.model.family, run.model.observations
     if not (family.has_next or family.has_policy):
@@ -348,7 +348,7 @@ def _check_seen_alike(run: RunSettings, recorded: FeatureMap) -> None:
             )
 
 
-def _check_meant_alike(arm: FrankaConfig, sources: Sequence[Source]) -> None:
+def _check_same_actions(arm: FrankaConfig, sources: Sequence[Source]) -> None:
     """Actions must mean the same; rewards of another task are said."""
     from franka_wm.data.lerobot.provenance import ACTIONS, other_option, read_provenance
 

@@ -40,6 +40,7 @@ def read_rows(checkpoint: Checkpoint) -> list[dict[str, float]]:
         saved = (checkpoint.extra() or {}).get("rows") or []
         if isinstance(saved, list):  # written before there were columns
             return list(saved)
+        # Some quantities stand in every row: env_steps, updates.
         rows: list[dict[str, float]] = [{} for _ in range(max(len(one["row"]) for one in saved.values()))]
         for name, column in saved.items():
             for number, value in zip(column["row"].tolist(), column["value"].tolist(), strict=True):
