@@ -84,7 +84,7 @@ def _fitting(trainer: Trainer, experience: TensorDictBase) -> TensorDictBase:
     gathered = trainer.env.fake_tensordict()
     for key in trainer.kept:
         if key not in experience.keys(True):
-            name = key if isinstance(key, str) else ".".join(key)
+            name = key if isinstance(key, str) else ".".join(map(str, key))
             raise UserError(
                 f"the checkpoint's experience has no {name}, which this run keeps; leave export as it was then"
             )
