@@ -81,6 +81,10 @@ def test_without_training_nothing_changes_and_goals_are_compared_on_patches(dots
     torch.testing.assert_close(model.embed(z), model.encode_goal(window[:, 0]))
     torch.testing.assert_close(model.history.last(z)[:, -2:], window["position"][:, 0])
     assert model.loss(window)["relative_error"] == 1.0
+    still = window.clone()
+    for frames in (still, still["next"]):
+        frames["pixels"] = torch.full_like(frames["pixels"], 7)
+    assert model.loss(still)["relative_error"] == 0.0
     with torch.no_grad():
         model.leave.bias[-2:] = 0.5  # of the state
     both, actions = torch.stack((z, z)), torch.stack((window["action"][:, 0],) * 2)

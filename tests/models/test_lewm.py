@@ -207,6 +207,9 @@ def test_the_loss_is_what_it_says(dots):
     changed = batch.clone()
     changed["next", "pixels"][:, -1] = 0
     assert model.loss(changed)["loss_prediction"] != model.loss(batch)["loss_prediction"]
+    still = batch.clone()
+    still["pixels"] = still["next", "pixels"] = torch.full_like(batch["pixels"], 7)
+    assert model.eval().loss(still)["relative_error"].isfinite()  # nothing moves: no division by zero
     extra = small(rollout=2, infonce_coef=0.1, inverse_coef=0.2, history=2, reward_head=True).loss(batch)
     parts = {"loss_rollout", "loss_infonce", "loss_inverse", "loss_reward"}
     assert parts <= set(extra.keys())
