@@ -40,10 +40,11 @@ class MCTS:
     the root's priors matter in the first simulation; the smallest and largest Q̂ are those of the tree as it
     stands, without the history; equal scores are not broken at random.
 
-    Plain tensor code: static shapes, no data-dependent control flow, no host synchronisation. All nodes choose
-    at once and the tree (`franka_wm.planning.tree`) needs no loop over depth, so every simulation is the same
-    few operations, however deep it goes. Memory is about E · N · (Z + 2 M + 3 N) numbers with
-    N = `num_simulations` + 1.
+    Static shapes, no host synchronisation. What a search does is defined by plain tensor code without
+    data-dependent control flow: all nodes choose at once and the tree (`franka_wm.planning.tree`) needs no loop over
+    depth, so every simulation is the same few operations, however deep it goes. Memory is about
+    E · N · (Z + 2 M + 3 N) numbers with N = `num_simulations` + 1. Warp kernels
+    (`franka_wm.planning.tree_kernels`, see `kernels`) make the same choices in fewer launches.
 
     Args:
         num_actions: M.
@@ -57,6 +58,8 @@ class MCTS:
         c_visit, c_scale: σ, see above (Gumbel).
         c_scale_acting: in place of `c_scale` without `explore`: what acts may trust Q more than what teaches, whose
             policy must keep what it has not tried enough; None: the same.
+        kernels: walk and add up in Warp kernels, with sums in float64; False: in the plain tensor code; None: kernels
+            on a CPU, where they are tried.
 
     Raises:
         ValueError: a setting that cannot work.
@@ -75,6 +78,7 @@ class MCTS:
     c_visit: float = 50.0
     c_scale: float = 0.1
     c_scale_acting: float | None = None
+    kernels: bool | None = None
 
     ranges: ClassVar[Mapping[str, Bounds]] = {
         **dict.fromkeys(("num_actions", "num_simulations", "max_depth"), POSITIVE),
@@ -127,6 +131,8 @@ class MCTS:
             raise ValueError(f"root_value must be ({envs}, 1), got {tuple(root_value.shape)}")
         if root_embedding.dim() != 2 or root_embedding.shape[0] != envs:
             raise ValueError(f"root_embedding must be ({envs}, Z), got {tuple(root_embedding.shape)}")
+        if root_value.device.type == "cpu" if self.kernels is None else self.kernels:
+            return self._walked(root_logits, root_value, root_embedding, recurrent, explore, generator)
         tree = Tree(self.num_simulations + 1, root_value, root_embedding, self.max_depth)
         rule = (_Puct if self.variant == "puct" else _Gumbel)(self, tree, root_logits, explore, generator)
         for node in range(1, self.num_simulations + 1):
@@ -144,6 +150,67 @@ class MCTS:
         return TensorDict(
             {"action": action, "policy": policy, "value": value, "visits": visits}, batch_size=[envs]
         )
+
+    def _walked(
+        self,
+        logits: Tensor,
+        value: Tensor,
+        embedding: Tensor,
+        recurrent: Recurrent,
+        explore: bool,
+        generator: torch.Generator | None,
+    ) -> TensorDict:
+        """The same search in kernels."""
+        from franka_wm.planning.tree_kernels import KernelTree
+
+        if self.variant == "puct":
+            prior, noise, considered = _root_prior(self, logits, explore, generator), None, None
+            options = self.pb_c_init, self.pb_c_base
+        else:
+            prior, noise = logits.log_softmax(-1), _root_noise(logits, explore, generator)
+            considered, options = self._halving(), (self.c_visit, self._c_scale(explore))
+        tree = KernelTree(
+            self.num_simulations,
+            value,
+            embedding,
+            prior,
+            noise,
+            max_depth=self.max_depth,
+            tiny=_tiny(value),
+            options=options,
+            considered=considered,
+        )
+        for node in range(1, self.num_simulations + 1):
+            tree.simulate(node, recurrent)
+        visits, total = tree.tries[:, 0], tree.visits[:, :1]
+        if noise is None:
+            action, policy = _act_by_visits(self, visits, explore, generator)
+        else:
+            sigma = completed_sigma(
+                visits,
+                tree.q[:, 0],
+                tree.prior[:, 0],
+                total,
+                tree.value[:, :1],
+                self.c_visit,
+                options[1],
+                _tiny(value),
+            )
+            score = _root_score(noise, tree.prior[:, 0], sigma, visits, visits.amax(-1, keepdim=True))
+            action, policy = score.argmax(-1), (tree.prior[:, 0] + sigma).softmax(-1)
+        found = {"policy": policy, "value": tree.returns[:, :1] / total, "visits": visits}
+        return TensorDict(
+            {"action": action} | {key: x.to(value.dtype) for key, x in found.items()},
+            batch_size=[len(logits)],
+        )
+
+    def _halving(self) -> list[int]:
+        return sequential_halving(
+            min(self.max_num_considered_actions, self.num_actions), self.num_simulations
+        )
+
+    def _c_scale(self, explore: bool) -> float:
+        return self.c_scale if explore or self.c_scale_acting is None else self.c_scale_acting
 
 
 class _Puct:
@@ -169,21 +236,7 @@ class _Puct:
         self.weight = count.sqrt() * (
             ((count + settings.pb_c_base + 1.0) / settings.pb_c_base).log() + settings.pb_c_init
         )
-        prior = logits.softmax(-1)
-        if explore:
-            prior = prior.lerp(self._dirichlet(prior), settings.dirichlet_fraction)
-        self._sort(0, prior)
-
-    def _dirichlet(self, like: Tensor) -> Tensor:
-        """Dirichlet noise of the shape of `like` (E, M)."""
-        # torch.distributions takes no generator. A draw may underflow, hence the smallest number.
-        draw = of_worlds(
-            lambda shape: torch._standard_gamma(  # pyright: ignore[reportPrivateImportUsage]
-                like.new_full(shape, self.settings.dirichlet_alpha), generator=self.generator
-            ),
-            like.shape,
-        ).clamp_min(torch.finfo(like.dtype).tiny)
-        return draw / draw.sum(-1, keepdim=True)
+        self._sort(0, _root_prior(settings, logits, explore, generator))
 
     def _sort(self, node: int, prior: Tensor) -> None:
         self.priors[:, node, : self.actions], self.order[:, node, : self.actions] = prior.sort(
@@ -228,11 +281,7 @@ class _Puct:
 
     def result(self) -> tuple[Tensor, Tensor, Tensor]:
         visits = self.tree.root_visits(self.actions)
-        score = visits
-        if self.explore and self.settings.temperature > 0.0:
-            # The largest of log p + Gumbel noise is a draw from p; a action without visits has p = 0.
-            score = visits.log() / self.settings.temperature + _gumbel_noise(visits, self.generator)
-        return score.argmax(-1), visits / visits.sum(-1, keepdim=True), visits
+        return *_act_by_visits(self.settings, visits, self.explore, self.generator), visits
 
 
 class _Gumbel:
@@ -242,15 +291,12 @@ class _Gumbel:
         self, settings: MCTS, tree: Tree, logits: Tensor, explore: bool, generator: torch.Generator | None
     ) -> None:
         self.settings, self.tree = settings, tree
-        acting = None if explore else settings.c_scale_acting
-        self.c_scale = settings.c_scale if acting is None else acting
+        self.c_scale = settings._c_scale(explore)
         self.actions, slots = logits.shape[1], tree.slot.shape[0]
         self.logits = logits.new_zeros(logits.shape[0], slots, self.actions)
         self.logits[:, 0] = logits.log_softmax(-1)
-        self.noise = _gumbel_noise(logits, generator) if explore else torch.zeros_like(logits)
-        self.schedule = sequential_halving(
-            min(settings.max_num_considered_actions, self.actions), settings.num_simulations
-        )
+        self.noise = _root_noise(logits, explore, generator)
+        self.schedule = settings._halving()
 
     def _sigma(self, nodes: int, slots: int) -> tuple[Tensor, Tensor]:
         """Visits, and σ of the completed Q, of the actions of the first `nodes` (E, nodes, M).
@@ -266,30 +312,20 @@ class _Gumbel:
             visits.scatter_(1, index, tree.visits[:, 1:slots])
             q.scatter_(1, index, tree.q(slots))
         visits, q = (x[:, : nodes * self.actions].view(shape) for x in (visits, q))
-        visited = visits > 0
-        # The mixed value: the model's own, and the mean Q of what was visited, by prior.
-        tiny = torch.finfo(q.dtype).tiny
-        prior = self.logits[:, :nodes].exp().clamp_min(tiny).masked_fill(~visited, 0.0)
-        weighted = (prior * q).sum(-1, keepdim=True) / prior.sum(-1, keepdim=True).clamp_min(tiny)
-        total = tree.visits[:, :nodes, None]  # counts the node itself
-        mixed = weighted + (tree.value[:, :nodes, None] - weighted) / total
-        q = torch.where(visited, q, mixed)
-        low, high = torch.aminmax(q, dim=-1, keepdim=True)
-        scale = (self.settings.c_visit + visits.amax(-1, keepdim=True)) * self.c_scale
-        return visits, scale * ((q - low) / (high - low).clamp_min(_tiny(q)))
-
-    def _root_score(self, visits: Tensor, sigma: Tensor, considered: Tensor | int) -> Tensor:
-        """noise + logits + σ(Q) of the root's actions (E, M); -inf unless they have `considered` visits."""
-        score = self.noise + self.logits[:, 0] + sigma[:, 0]
-        # A floor, or a action with a prior of nearly 0 would be no better than one out of turn.
-        return score.clamp_min(-1e9).masked_fill(visits[:, 0] != considered, -math.inf)
+        total, value = tree.visits[:, :nodes, None], tree.value[:, :nodes, None]
+        sigma = completed_sigma(
+            visits, q, self.logits[:, :nodes], total, value, self.settings.c_visit, self.c_scale, _tiny(q)
+        )
+        return visits, sigma
 
     def choose(self, nodes: int) -> tuple[Tensor, Callable[[Tensor], Tensor]]:
         tree = self.tree
         visits, sigma = self._sigma(nodes, nodes)
         improved = (self.logits[:, :nodes] + sigma).softmax(-1)
         choice = (improved - visits / tree.visits[:, :nodes, None]).argmax(-1)
-        choice[:, 0] = self._root_score(visits, sigma, self.schedule[nodes - 1]).argmax(-1)
+        choice[:, 0] = _root_score(
+            self.noise, self.logits[:, 0], sigma[:, 0], visits[:, 0], self.schedule[nodes - 1]
+        ).argmax(-1)
         off_path = choice.gather(1, tree.parent[:, :nodes]) != tree.action[:, :nodes]
         off_path[:, 0] = False
         return off_path, lambda last: choice[tree.env, last]
@@ -299,9 +335,9 @@ class _Gumbel:
 
     def result(self) -> tuple[Tensor, Tensor, Tensor]:
         visits, sigma = self._sigma(1, self.tree.slot.shape[0])
-        score = self._root_score(visits, sigma, visits[:, 0].amax(-1, keepdim=True))
-        policy = (self.logits[:, 0] + sigma[:, 0]).softmax(-1)
-        return score.argmax(-1), policy, visits[:, 0].clone()
+        visits, sigma, logits = visits[:, 0].clone(), sigma[:, 0], self.logits[:, 0]
+        score = _root_score(self.noise, logits, sigma, visits, visits.amax(-1, keepdim=True))
+        return score.argmax(-1), (logits + sigma).softmax(-1), visits
 
 
 def sequential_halving(considered: int, simulations: int) -> list[int]:
@@ -324,6 +360,72 @@ def sequential_halving(considered: int, simulations: int) -> list[int]:
             visits[:left] = [count + 1 for count in visits[:left]]
         left = max(2, left // 2)
     return sequence[:simulations]
+
+
+def _root_prior(settings: MCTS, logits: Tensor, explore: bool, generator: torch.Generator | None) -> Tensor:
+    """Of the root's actions (E, M), in PUCT; with `explore` mixed with Dirichlet noise."""
+    prior = logits.softmax(-1)
+    if not explore:
+        return prior
+    # torch.distributions takes no generator. A draw may underflow, hence the smallest number.
+    draw = of_worlds(
+        lambda shape: torch._standard_gamma(  # pyright: ignore[reportPrivateImportUsage]
+            prior.new_full(shape, settings.dirichlet_alpha), generator=generator
+        ),
+        prior.shape,
+    ).clamp_min(torch.finfo(prior.dtype).tiny)
+    return prior.lerp(draw / draw.sum(-1, keepdim=True), settings.dirichlet_fraction)
+
+
+def _act_by_visits(
+    settings: MCTS, visits: Tensor, explore: bool, generator: torch.Generator | None
+) -> tuple[Tensor, Tensor]:
+    """Actions (E,) and the policy (E, M) to learn from, in PUCT."""
+    score = visits
+    if explore and settings.temperature > 0.0:
+        # The largest of log p + Gumbel noise is a draw from p; an action without visits has p = 0.
+        score = visits.log() / settings.temperature + _gumbel_noise(visits, generator)
+    return score.argmax(-1), visits / visits.sum(-1, keepdim=True)
+
+
+def completed_sigma(
+    visits: Tensor,
+    q: Tensor,
+    logits: Tensor,
+    total: Tensor,
+    value: Tensor,
+    c_visit: float,
+    c_scale: float,
+    tiny: float,
+) -> Tensor:
+    """σ of the completed Q of all actions (..., M) of nodes, in Gumbel MuZero.
+
+    Args:
+        visits, q, logits: (..., M); q counts where there are visits.
+        total, value: (..., 1) visits of the node, itself counted, and the model's value of it.
+        tiny: the least range of Q that counts as a difference.
+    """
+    visited = visits > 0
+    # The mixed value: the model's own, and the mean Q of what was visited, by prior.
+    smallest = torch.finfo(q.dtype).tiny
+    prior = logits.exp().clamp_min(smallest).masked_fill(~visited, 0.0)
+    weighted = (prior * q).sum(-1, keepdim=True) / prior.sum(-1, keepdim=True).clamp_min(smallest)
+    q = torch.where(visited, q, weighted + (value - weighted) / total)
+    low, high = torch.aminmax(q, dim=-1, keepdim=True)
+    scale = (c_visit + visits.amax(-1, keepdim=True)) * c_scale
+    return scale * ((q - low) / (high - low).clamp_min(tiny))
+
+
+def _root_score(
+    noise: Tensor, logits: Tensor, sigma: Tensor, visits: Tensor, considered: Tensor | int
+) -> Tensor:
+    """noise + logits + σ(Q) of the root's actions (E, M); -inf unless they have `considered` visits."""
+    # A floor, or an action with a prior of nearly 0 would be no better than one out of turn.
+    return (noise + logits + sigma).clamp_min(-1e9).masked_fill(visits != considered, -math.inf)
+
+
+def _root_noise(logits: Tensor, explore: bool, generator: torch.Generator | None) -> Tensor:
+    return _gumbel_noise(logits, generator) if explore else torch.zeros_like(logits)
 
 
 def _gumbel_noise(like: Tensor, generator: torch.Generator | None) -> Tensor:

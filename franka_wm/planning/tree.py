@@ -108,7 +108,7 @@ class Tree:
 
         embedding, reward, discount, logits, value = recurrent(self.embedding[self.env, parent], action)
         if node == 1:
-            _check(self.visits.shape[0], reward=reward, discount=discount, value=value)
+            check_columns(self.visits.shape[0], reward=reward, discount=discount, value=value)
         self.embedding[:, node] = embedding
         self.reward[:, node], self.discount[:, node] = reward.squeeze(-1), discount.squeeze(-1)
         self.value[:, node] = self.returns[:, node] = value.squeeze(-1)
@@ -134,7 +134,8 @@ class Tree:
         )
 
 
-def _check(envs: int, **columns: Tensor) -> None:
+def check_columns(envs: int, **columns: Tensor) -> None:
+    """Refuses what a model returns of another shape than (E, 1)."""
     for name, column in columns.items():
         if column.shape != (envs, 1):
             raise ValueError(f"recurrent must return {name} of shape ({envs}, 1), got {tuple(column.shape)}")

@@ -37,6 +37,7 @@ class SearchPolicy(TensorDictModuleBase):
             the policy is to be copied, pass bound methods, not closures.
         generator: source of the noise.
         capture: replay decisions as CUDA graphs, see `PlannerPolicy`; None: where the observations are on CUDA.
+        compile: `torch.compile` what a search calls once for each simulation, `recurrent`; see `PlannerPolicy`.
 
     Raises:
         ValueError, CaptureError: see `PlannerPolicy`.
@@ -54,8 +55,11 @@ class SearchPolicy(TensorDictModuleBase):
         model: nn.Module | None = None,
         generator: torch.Generator | None = None,
         capture: bool | None = None,
+        compile: bool = False,
     ) -> None:
         super().__init__()
+        if compile:
+            recurrent = torch.compile(recurrent, dynamic=False)
         self.in_keys = list(observation_keys)
         self.out_keys = ["action", "search_policy", "search_value"]
         self.search, self.explore, self.model, self.generator = search, explore, model, generator
@@ -71,8 +75,9 @@ class SearchPolicy(TensorDictModuleBase):
         explore: bool | None = None,
         generator: torch.Generator | None = None,
         capture: bool | None = None,
+        compile: bool = False,
     ) -> SearchPolicy:
-        """Search with a model that has `prediction` and `recurrent`.
+        """Search with a model that has `prediction` and `recurrent`; other arguments: see the class.
 
         Raises:
             ValueError: the model lacks one of them, or has another number of actions than the search.
@@ -96,6 +101,7 @@ class SearchPolicy(TensorDictModuleBase):
             model=model,
             generator=generator,
             capture=capture,
+            compile=compile,
         )
 
     @torch.no_grad()

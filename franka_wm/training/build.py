@@ -236,13 +236,13 @@ def make_policies(
 
     ``planner`` and ``policy`` where the model has what they need; ``noop`` and ``random`` (smooth random:
     first-order autoregressive); for the arm ``ik``, inverse kinematics with true geometry, or a search over pairs
-    of discrete actions. ``capture``, ``precision`` and ``compile`` are the planner's, see
-    :class:`~franka_wm.policies.PlannerPolicy`.
+    of discrete actions. ``capture``, ``precision``, ``compile``: see :class:`~franka_wm.policies.PlannerPolicy`.
     """
     policies: dict[str, TensorDictModuleBase] = {}
     discrete = not env.action_spec.dtype.is_floating_point
     if discrete:
-        policies["planner"] = SearchPolicy.for_model(model, cast(MCTS, planner), capture=capture)
+        search = cast(MCTS, planner)
+        policies["planner"] = SearchPolicy.for_model(model, search, capture=capture, compile=compile)
     elif model.has_next:
         policies["planner"] = PlannerPolicy.for_model(
             model,

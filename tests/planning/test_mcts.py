@@ -1,10 +1,13 @@
 # pyright: reportCallIssue=false, reportArgumentType=false
 """The batched search against plain searches, node by node, and against problems with known answers."""
 
+from functools import partial
+
 import pytest
 import torch
 from torch._subclasses.fake_tensor import FakeTensorMode
 
+from franka_wm.planning import tree_kernels
 from franka_wm.planning.mcts import MCTS, sequential_halving
 from plain_search import MOVES, RandomModel, gumbel, plain_search, puct, sigma
 
@@ -14,16 +17,22 @@ def _seed():
     torch.manual_seed(0)
 
 
+@pytest.fixture(params=[False, True], ids=["plain", "kernels"])
+def mcts(request):
+    """The search in plain tensor code, and in kernels."""
+    return partial(MCTS, kernels=request.param)
+
+
 # ------------------------------------------------------------------ the plain searches
 
 
 @pytest.mark.parametrize(
     ("simulations", "max_depth"), [(1, None), (2, None), (30, None), (70, None), (30, 1), (30, 3)]
 )
-def test_puct_makes_the_visits_of_a_plain_search(simulations, max_depth):
+def test_puct_makes_the_visits_of_a_plain_search(mcts, simulations, max_depth):
     for seed in range(2 if simulations < 70 else 1):
         model = RandomModel(seed)
-        found = MCTS(num_actions=MOVES, num_simulations=simulations, max_depth=max_depth).search(
+        found = mcts(num_actions=MOVES, num_simulations=simulations, max_depth=max_depth).search(
             *model.root(), model.recurrent
         )
         for world in range(3):
@@ -39,10 +48,10 @@ def test_puct_makes_the_visits_of_a_plain_search(simulations, max_depth):
     ("simulations", "considered", "max_depth"),
     [(1, 16, None), (2, 16, None), (16, 16, None), (70, 16, None), (30, 3, None), (10, 1, None), (30, 16, 2)],
 )
-def test_gumbel_makes_the_visits_of_a_plain_search(simulations, considered, max_depth):
+def test_gumbel_makes_the_visits_of_a_plain_search(mcts, simulations, considered, max_depth):
     for seed in range(2 if simulations < 70 else 1):
         model = RandomModel(seed, moves=6)
-        found = MCTS(
+        found = mcts(
             num_actions=6,
             num_simulations=simulations,
             variant="gumbel",
@@ -109,26 +118,26 @@ VARIANTS = ("puct", "gumbel")
 
 
 @pytest.mark.parametrize("variant", VARIANTS)
-def test_finds_a_payoff_one_move_away(variant):
+def test_finds_a_payoff_one_move_away(mcts, variant):
     world = table_world([[0, 0, 0]], [[0.0, 0.0, 1.0]])
-    found = MCTS(num_actions=3, num_simulations=16, variant=variant).search(*world([0, 0]))
+    found = mcts(num_actions=3, num_simulations=16, variant=variant).search(*world([0, 0]))
     assert found["action"].tolist() == [2, 2] and found["policy"].argmax(-1).tolist() == [2, 2]
 
 
 @pytest.mark.parametrize("variant", VARIANTS)
-def test_finds_a_delayed_payoff_that_a_greedy_choice_misses(variant):
+def test_finds_a_delayed_payoff_that_a_greedy_choice_misses(mcts, variant):
     # From state 0, move 0 pays 0.5 at once; move 1 pays nothing but leads to where move 1 pays 2.
     world = table_world([[2, 1], [2, 2], [2, 2]], [[0.5, 0.0], [0.0, 2.0], [0.0, 0.0]])
-    one = MCTS(num_actions=2, num_simulations=100, variant=variant, max_depth=1).search(*world([0]))
-    two = MCTS(num_actions=2, num_simulations=100, variant=variant).search(*world([0]))
+    one = mcts(num_actions=2, num_simulations=100, variant=variant, max_depth=1).search(*world([0]))
+    two = mcts(num_actions=2, num_simulations=100, variant=variant).search(*world([0]))
     assert one["action"].item() == 0 and two["action"].item() == 1
 
 
 @pytest.mark.parametrize("variant", VARIANTS)
-def test_nothing_is_earned_after_the_end(variant):
+def test_nothing_is_earned_after_the_end(mcts, variant):
     # Move 0 ends the episode; were it ignored, state 1 behind it would pay 5 with every move.
     args = ([[1, 2], [1, 1], [2, 2]], [[0.0, 0.0], [5.0, 5.0], [0.3, 0.3]])
-    search = MCTS(num_actions=2, num_simulations=32, variant=variant)
+    search = mcts(num_actions=2, num_simulations=32, variant=variant)
     assert search.search(*table_world(*args)([0]))["action"].item() == 0
     ends = [[True, False], [False, False], [False, False]]
     found = search.search(*table_world(*args, ends)([0]))
@@ -137,10 +146,10 @@ def test_nothing_is_earned_after_the_end(variant):
 
 
 @pytest.mark.parametrize("variant", VARIANTS)
-def test_environments_do_not_touch_each_other(variant):
+def test_environments_do_not_touch_each_other(mcts, variant):
     model = RandomModel(0)
     logits, value, z = model.root()
-    search = MCTS(num_actions=MOVES, num_simulations=30, variant=variant)
+    search = mcts(num_actions=MOVES, num_simulations=30, variant=variant)
     together = search.search(logits, value, z, model.recurrent)
     for world in range(3):
         alone = search.search(*(x[world : world + 1] for x in (logits, value, z)), model.recurrent)
@@ -157,14 +166,14 @@ def test_environments_do_not_touch_each_other(variant):
 
 @pytest.mark.parametrize("variant", VARIANTS)
 @pytest.mark.parametrize("scale", [1e-3, 1.0, 1e5])
-def test_the_unit_of_the_reward_does_not_matter(variant, scale):
+def test_the_unit_of_the_reward_does_not_matter(mcts, variant, scale):
     model = RandomModel(1)
 
     def recurrent(z, action):
         z, reward, discount, logits, value = model.recurrent(z, action)
         return z, scale * reward, discount, logits, scale * value
 
-    search = MCTS(num_actions=MOVES, num_simulations=30, variant=variant)
+    search = mcts(num_actions=MOVES, num_simulations=30, variant=variant)
     logits, value, z = model.root()
     plain, scaled = (
         search.search(logits, factor * value, z, law)
@@ -177,10 +186,10 @@ def test_the_unit_of_the_reward_does_not_matter(variant, scale):
 # ------------------------------------------------------------------ Gumbel
 
 
-def test_what_acts_may_trust_q_more_than_what_teaches():
+def test_what_acts_may_trust_q_more_than_what_teaches(mcts):
     model = RandomModel(0, moves=6)
     low, high, both = (
-        MCTS(num_actions=6, num_simulations=8, variant="gumbel", **scales)
+        mcts(num_actions=6, num_simulations=8, variant="gumbel", **scales)
         for scales in ({"c_scale": 0.02}, {"c_scale": 2.0}, {"c_scale": 0.02, "c_scale_acting": 2.0})
     )
 
@@ -215,9 +224,9 @@ def bandits(seed: int, envs: int = 200, moves: int = 8):
 
 @pytest.mark.parametrize("simulations", [2, 4, 8, 16])
 @pytest.mark.parametrize("explore", [False, True])
-def test_gumbel_improves_the_policy_with_any_number_of_simulations(simulations, explore):
+def test_gumbel_improves_the_policy_with_any_number_of_simulations(mcts, simulations, explore):
     args, q = bandits(0)
-    found = MCTS(num_actions=8, num_simulations=simulations, variant="gumbel").search(*args, explore=explore)
+    found = mcts(num_actions=8, num_simulations=simulations, variant="gumbel").search(*args, explore=explore)
     prior = args[0].softmax(-1)
     before, after = (prior * q).sum(-1), (found["policy"] * q).sum(-1)
     assert (after >= before - 1e-4).all() and (after - before).mean() > 0.2
@@ -226,18 +235,18 @@ def test_gumbel_improves_the_policy_with_any_number_of_simulations(simulations, 
     assert gain.mean() > 0.2
 
 
-def test_more_simulations_improve_the_policy_more():
+def test_more_simulations_improve_the_policy_more(mcts):
     args, q = bandits(1, envs=500)
-    searches = [MCTS(num_actions=8, num_simulations=n, variant="gumbel") for n in (2, 4, 8, 16, 32)]
+    searches = [mcts(num_actions=8, num_simulations=n, variant="gumbel") for n in (2, 4, 8, 16, 32)]
     values = [(s.search(*args, explore=True)["policy"] * q).sum(-1).mean().item() for s in searches]
     assert values == sorted(values) and values[-1] > values[0] + 0.2
 
 
-def test_the_gumbel_noise_draws_root_moves_by_their_prior():
+def test_the_gumbel_noise_draws_root_moves_by_their_prior(mcts):
     logits = torch.tensor([[2.0, 1.0, 0.0, -1.0]]).expand(4000, 4)
     model = table_world([[0] * 4], [[0.0] * 4])
     recurrent = model([0] * 4000)[-1]
-    search = MCTS(num_actions=4, num_simulations=1, variant="gumbel")
+    search = mcts(num_actions=4, num_simulations=1, variant="gumbel")
     found = search.search(logits, torch.zeros(4000, 1), torch.ones(4000, 1), recurrent, explore=True)
     shares = torch.nn.functional.one_hot(found["action"], 4).float().mean(0)
     torch.testing.assert_close(shares, logits[0].softmax(-1), atol=0.03, rtol=0)
@@ -262,38 +271,38 @@ def test_sequential_halving_spends_every_simulation():
 # ------------------------------------------------------------------ noise and drawn actions
 
 
-def test_dirichlet_noise_lets_puct_look_at_what_the_prior_forbids():
+def test_dirichlet_noise_lets_puct_look_at_what_the_prior_forbids(mcts):
     logits = torch.tensor([[0.0, -20.0, -20.0]]).expand(64, 3)
     recurrent = table_world([[0] * 3], [[0.0] * 3])([0] * 64)[-1]
     args = (logits, torch.zeros(64, 1), torch.ones(64, 1), recurrent)
-    search = MCTS(num_actions=3, num_simulations=25)
+    search = mcts(num_actions=3, num_simulations=25)
     assert (search.search(*args)["visits"][:, 1:] == 0).all()
     explored = search.search(*args, explore=True)["visits"]
     assert (explored[:, 1:] > 0).any(1).float().mean() > 0.5
     assert len(explored.unique(dim=0)) > 3  # each environment has its own noise
-    quiet = MCTS(num_actions=3, num_simulations=25, dirichlet_fraction=0.0)
+    quiet = mcts(num_actions=3, num_simulations=25, dirichlet_fraction=0.0)
     assert (quiet.search(*args, explore=True)["visits"][:, 1:] == 0).all()
 
 
 @pytest.mark.parametrize(("temperature", "power"), [(1.0, 1.0), (0.5, 2.0)])
-def test_puct_draws_actions_by_visits(temperature, power):
+def test_puct_draws_actions_by_visits(mcts, temperature, power):
     model = RandomModel(2)
     logits, value, z = (x[:1].expand(2000, -1) for x in model.root())
-    search = MCTS(num_actions=MOVES, num_simulations=12, temperature=temperature, dirichlet_fraction=0.0)
+    search = mcts(num_actions=MOVES, num_simulations=12, temperature=temperature, dirichlet_fraction=0.0)
     found = search.search(logits, value, z, model.recurrent, explore=True)
     weights = found["visits"][0] ** power
     shares = torch.nn.functional.one_hot(found["action"], MOVES).double().mean(0)
     torch.testing.assert_close(shares, weights / weights.sum(), atol=0.04, rtol=0)
-    cold = MCTS(num_actions=MOVES, num_simulations=20, temperature=0.0)
+    cold = mcts(num_actions=MOVES, num_simulations=20, temperature=0.0)
     found = cold.search(logits[:50], value[:50], z[:50], model.recurrent, explore=True)
     chosen = found["visits"].gather(1, found["action"].unsqueeze(-1)).squeeze(-1)
     assert torch.equal(chosen, found["visits"].amax(-1))
 
 
 @pytest.mark.parametrize("variant", VARIANTS)
-def test_a_generator_makes_the_noise_repeat(variant):
+def test_a_generator_makes_the_noise_repeat(variant, mcts):
     model = RandomModel(0)
-    search = MCTS(num_actions=MOVES, num_simulations=8, variant=variant)
+    search = mcts(num_actions=MOVES, num_simulations=8, variant=variant)
 
     def visits(seed):
         noise = torch.Generator().manual_seed(seed)
@@ -311,7 +320,7 @@ def test_a_generator_makes_the_noise_repeat(variant):
 def test_nothing_waits_for_the_host_or_depends_on_the_data(variant, max_depth):
     """Fake tensors hold no data: reading one, or branching on it, raises. Shapes must come out all the same."""
     with FakeTensorMode():
-        search = MCTS(num_actions=5, num_simulations=9, variant=variant, max_depth=max_depth)
+        search = MCTS(num_actions=5, num_simulations=9, variant=variant, max_depth=max_depth, kernels=False)
 
         def recurrent(z, action):
             return z + action.unsqueeze(-1), z[:, :1], z[:, 1:2], z[:, :5], z[:, 2:3]
@@ -323,12 +332,23 @@ def test_nothing_waits_for_the_host_or_depends_on_the_data(variant, max_depth):
     assert found["policy"].shape == found["visits"].shape == (3, 5) and found["value"].shape == (3, 1)
 
 
+def test_kernels_are_the_default_on_a_cpu(monkeypatch):
+    used, kernel_tree = [], tree_kernels.KernelTree
+    monkeypatch.setattr(
+        tree_kernels, "KernelTree", lambda *args, **options: used.append(1) or kernel_tree(*args, **options)
+    )
+    model = RandomModel(0)
+    for kernels, count in ((False, 0), (True, 1), (None, 2)):
+        MCTS(num_actions=MOVES, num_simulations=2, kernels=kernels).search(*model.root(), model.recurrent)
+        assert len(used) == count
+
+
 @pytest.mark.parametrize("variant", VARIANTS)
-def test_no_gradient_is_recorded_and_inputs_are_left_alone(variant):
+def test_no_gradient_is_recorded_and_inputs_are_left_alone(mcts, variant):
     model = RandomModel(0)
     inputs = [x.clone().requires_grad_() for x in model.root()]
     kept = [x.detach().clone() for x in inputs]
-    found = MCTS(num_actions=MOVES, num_simulations=8, variant=variant).search(
+    found = mcts(num_actions=MOVES, num_simulations=8, variant=variant).search(
         *inputs, model.recurrent, explore=True
     )
     assert not any(value.requires_grad for value in found.values())
@@ -356,10 +376,10 @@ def test_settings_that_cannot_work_are_refused(setting):
         MCTS(**{"num_actions": 3, **setting})
 
 
-def test_wrong_shapes_are_named():
+def test_wrong_shapes_are_named(mcts):
     model = RandomModel(0)
     logits, value, z = model.root()
-    search = MCTS(num_actions=MOVES, num_simulations=2)
+    search = mcts(num_actions=MOVES, num_simulations=2)
     with pytest.raises(ValueError, match="root_logits"):
         search.search(logits[:, :2], value, z, model.recurrent)
     with pytest.raises(ValueError, match="root_value"):

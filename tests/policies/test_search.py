@@ -142,6 +142,21 @@ def test_a_captured_search_is_of_one_share_of_the_worlds(monkeypatch):
     assert keys[0] == keys[1] != keys[2]
 
 
+def test_a_compiled_search_decides_the_same(monkeypatch):
+    calls, compiled = [], torch.compile
+
+    def compile(function, **options):
+        calls.append(function.__name__)
+        return compiled(function, backend="eager", **options)
+
+    monkeypatch.setattr(torch, "compile", compile)
+    start = TensorDict({"state": torch.randn(8, 1)}, [8])
+    plain, fast = (acting(explore=False, compile=wanted)(start.clone()) for wanted in (False, True))
+    assert calls == ["recurrent"]
+    for key in ("action", "search_policy", "search_value"):
+        torch.testing.assert_close(plain[key], fast[key])
+
+
 def test_its_own_generator_makes_actions_repeat():
     start = TensorDict({"state": torch.full((200, 1), 3.0)}, [200])
     first, second = (

@@ -19,11 +19,11 @@ import warp as wp
 
 from franka_wm.envs.config import FrankaConfig
 from franka_wm.envs.constants import NUM_FINGERS, NUM_JOINTS
-from franka_wm.envs.quiet import start_warp
 from franka_wm.envs.robots import gripper, meshes
 from franka_wm.envs.robots.description import read_description
 from franka_wm.envs.robots.sources import SOURCES, Source, detail, urdf_source
 from franka_wm.errors import UserError
+from franka_wm.quiet import start_warp
 
 __all__ = [
     "SOURCES",
