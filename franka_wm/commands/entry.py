@@ -17,7 +17,7 @@ from hydra.core.hydra_config import HydraConfig
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.errors import OverrideParseException
 from hydra.types import RunMode
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig, ListConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from franka_wm import conf
@@ -100,6 +100,8 @@ def _run(main: Callable[[], Any], arguments: list[str]) -> None:
         for one in composed:
             check_overrides(one)
         for one in [] if only_shows or asked.cfg or joins else composed:
+            if not any(a.startswith("hydra/launcher=") for a in overrides):  # may take jobs to other machines
+                check_folders(one)
             check_settings(one)
     if joins:
         if elsewhere or asked.multirun:
@@ -254,6 +256,17 @@ def check_settings(arguments: list[str]) -> None:
             RunSettings.whole(cfg)
     except FrankaError as error:
         fail(str(error))
+
+
+def check_folders(arguments: list[str]) -> None:
+    """Whether the folders that a run reads are there, which needs no simulator."""
+    cfg = compose([a for a in arguments if a != "scale=auto"])
+    for option in ("resume", "dataset.root", "replay.demos"):
+        named = OmegaConf.select(cfg, option)
+        for folder in named if isinstance(named, ListConfig) else [named]:
+            if folder is not None and not Path(str(folder)).expanduser().is_dir():
+                hint = "; give that of a run, as train.py prints it last" if option == "resume" else ""
+                fail(f"{option}={folder}: no such folder{hint}")
 
 
 def fail(message: str) -> NoReturn:

@@ -412,6 +412,9 @@ TYPOS = [
     ("env=gym env.frame_skip=0", "env.frame_skip=0: must be a whole number"),
     ("env.substeps=0", "substeps=0: must be a whole number"),
     ("trainer=offline", "trainer=offline: trains on recorded data; name them, dataset=lerobot"),
+    ("resume=nowhere", "resume=nowhere: no such folder; give that of a run"),
+    ("trainer=offline dataset=lerobot dataset.root=[nowhere]", "dataset.root=nowhere: no such folder"),
+    ("-m seed=0,1 replay.demos=nowhere", "replay.demos=nowhere: no such folder"),
     ("-m seed=0,1 planner.precision=half", "planner.precision='half': must be one of float32, bfloat16"),
 ]
 SCRIPT, VERB = (str(TRAIN),), ("-m", "franka_wm", "train")
