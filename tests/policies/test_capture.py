@@ -285,15 +285,19 @@ def test_a_captured_decision_sees_new_weights():
 @on_gpu
 @pytest.mark.parametrize("variant", ["puct", "gumbel"])
 @pytest.mark.parametrize("own_generator", [False, True])
-def test_captured_searches_are_the_eager_ones(variant, own_generator):
+@pytest.mark.parametrize("kernels", [False, True], ids=["plain", "kernels"])
+def test_captured_searches_are_the_eager_ones(variant, own_generator, kernels):
     torch.manual_seed(0)
     model = models.make("muzero", observation_sizes={"state": 6}, num_actions=5, latent_dim=16, hidden_dim=16)
     model = model.cuda().eval()
-    search = MCTS(num_actions=5, num_simulations=12, variant=variant)
+    # What is captured is compared with the plain search.
+    plain, search = (
+        MCTS(num_actions=5, num_simulations=12, variant=variant, kernels=fast) for fast in (False, kernels)
+    )
     generators = [torch.Generator("cuda") if own_generator else None for _ in range(2)]
     eager, captured = (
-        SearchPolicy.for_model(model, search, explore=True, capture=wanted, generator=generator)
-        for wanted, generator in zip((False, True), generators, strict=True)
+        SearchPolicy.for_model(model, one, explore=True, capture=wanted, generator=generator)
+        for one, wanted, generator in zip((plain, search), (False, True), generators, strict=True)
     )
     agreeing = []
     for seed in range(6):
