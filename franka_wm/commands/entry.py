@@ -24,7 +24,7 @@ from franka_wm import conf
 from franka_wm.commands import several
 from franka_wm.commands.overrides import compose, explain, given
 from franka_wm.commands.sweep import Sweep, jobs, names
-from franka_wm.console import say, terminal_log
+from franka_wm.console import quoted, say, terminal_log
 from franka_wm.errors import REFUSALS, FrankaError, machine_refused
 from franka_wm.interrupt import INTERRUPTED
 
@@ -91,8 +91,8 @@ def _run(main: Callable[[], Any], arguments: list[str]) -> None:
     if asked.experimental_rerun:
         fail("--experimental-rerun unpickles a file, which may run anything; resume=RUN goes on with a run")
     flags = [a for a in arguments if a not in asked.overrides]
-    overrides = list(asked.overrides)
-    elsewhere = asked.config_dir or asked.config_name or asked.config_path
+    overrides = with_folder(asked)
+    elsewhere = asked.config_name or asked.config_path
     only_shows = asked.help or asked.hydra_help or asked.shell_completion or asked.info
     joins = several.started_by_torchrun() and not only_shows
     if not (elsewhere or asked.hydra_help or asked.shell_completion):
@@ -153,6 +153,23 @@ def hydra_flags(arguments: list[str]) -> Any:
     parser = get_args_parser()
     parser.error = lambda message: fail(f"{message}; python train.py --hydra-help lists the flags")  # type: ignore
     return parser.parse_intermixed_args(arguments)
+
+
+def with_folder(asked: Any) -> list[str]:
+    """The overrides, and the folder of ``--config-dir`` as one more: what checks and starts a run knows no flags.
+
+    To Hydra both mean the same.
+    """
+    overrides = list(asked.overrides)
+    if asked.config_dir is None:
+        return overrides
+    folder = Path(asked.config_dir).resolve()
+    if not folder.is_dir():
+        fail(f"--config-dir={asked.config_dir}: no such folder")
+    own = f"hydra.searchpath=[{quoted(f'file://{folder}')}]"
+    if any(one.startswith("hydra.searchpath=") and one != own for one in overrides):
+        fail("--config-dir beside hydra.searchpath=: name all folders in hydra.searchpath=[file://FOLDER,…]")
+    return overrides if own in overrides else [*overrides, own]
 
 
 def swept(overrides: list[str]) -> Iterator[list[str]]:

@@ -92,8 +92,9 @@ def _allowed(message: str, overrides: Sequence[str], options: Sequence[str]) -> 
     unknown = _unknown_key(message)
     if unknown is None:
         return []
-    # With the same choices of groups: other environments have other options.
-    chosen = [o for o in overrides if "." not in o.partition("=")[0] and o.partition("=")[0] != unknown]
+    # With the same choices of groups, and where they are looked for: other environments have other options.
+    keys = [(o.partition("=")[0], o) for o in overrides]
+    chosen = [o for key, o in keys if key == "hydra.searchpath" or ("." not in key and key != unknown)]
     node: Any = conf.compose(*chosen)
     place = unknown.rpartition(".")[0] if "/" not in unknown and "@" not in unknown else ""
     found = OmegaConf.select(node, place) if place else node

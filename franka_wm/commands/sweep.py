@@ -115,7 +115,8 @@ class Sweep:
                 cfg.resume = str(folder)
             if cfg.gpus == 1:
                 return main(cfg)
-            several.launch_job(list(told.overrides.task), cfg, folder)
+            paths = [one for one in told.overrides.hydra if one.startswith("hydra.searchpath=")]
+            several.launch_job([*told.overrides.task, *paths], cfg, folder)
             return _score(folder)
         except (KeyboardInterrupt, SystemExit):  # the latter is how a run ends that has saved after Ctrl-C
             say(f"the sweep is stopped; {self.advice}")
