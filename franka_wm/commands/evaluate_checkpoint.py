@@ -105,7 +105,9 @@ def _look_ahead(
         say(f"warning: open loop not measured: {error}")
     results["open_loop"] = ahead
     say("value calibration …")
-    results["calibration"] = diagnose.calibration(agent)
+    value = results["calibration"] = diagnose.calibration(agent)
+    if "not_measured" in value:
+        say(f"warning: value calibration not measured: {value['not_measured']}")
     results["health"] = diagnose.health(agent, evaluation)
     imagined = diagnose.imagine(agent, held, say=say)
     if imagined is not None:

@@ -36,6 +36,7 @@ from franka_wm.evaluation.rollouts import (
     embedding,
     encode_episodes,
     encoded_validly,
+    followed,
     gather_episodes,
     mixture,
 )
@@ -84,7 +85,7 @@ def hold_out(agent: Agent, *, images: bool = True, seed: int = ROLLOUT_SEED) -> 
     shown = min(SHOWN, env.num_envs) if images and arm_of(env) is not None else 0
     episodes, seen = gather_episodes(
         env,
-        mixture(agent.policies),
+        mixture(agent.policies, env),
         seed=seed,
         keys=keys,
         image_size=image_size(model),
@@ -163,7 +164,9 @@ def calibration(agent: Agent, *, episodes: int = 32) -> dict[str, Any]:
     """The value against true discounted returns of the policy that it is the value of.
 
     Played in episodes that are long enough for what is cut off to weigh less than 2 %, since a value looks
-    beyond the end of an episode that time cut off. Empty for families without ``value``, ``policy`` and ``discount``.
+    beyond the end of an episode that time cut off. Steps that something else truncates earlier are left out: a
+    library's own time limit, an object that has left the table. Empty for families without ``value``, ``policy`` and
+    ``discount``; ``not_measured`` says why no step is left.
     """
     from franka_wm.training import build
 
@@ -177,13 +180,16 @@ def calibration(agent: Agent, *, episodes: int = 32) -> dict[str, Any]:
     )
     keys = model.observation_keys
     played, _ = gather_episodes(env, agent.policies["policy"], keys=keys)
-    returns = discounted_returns(
-        played.get(("next", "reward")), played.get(("next", "terminated")), model.discount
-    )[:, :length]
+    done, terminated = (played.get(("next", key)) for key in ("done", "terminated"))
+    use = (played.get("valid") & followed(done, terminated, tail))[:, :length]
+    if not use.any():
+        return {
+            "not_measured": f"no episode goes on for {tail} steps, until what follows weighs less than 2 %"
+        }
+    returns = discounted_returns(played.get(("next", "reward")), done, model.discount)[:, :length]
     with torch.no_grad(), seeded(ROLLOUT_SEED):
         latents = encode_episodes(model, played)[:, :length]
         values = model.value(latents)
-    use = played.get("valid")[:, :length]
     result = value_calibration(values[use].squeeze(-1), returns[use].squeeze(-1))
     if success_distance(env) is not None:
         distance = played.get("physical")[:, :length, 17:20].norm(dim=-1)[use].cpu()
@@ -254,7 +260,7 @@ def _starts(agent: Agent, *, decoder_size: int, rounds: int = 6, steps: int = 8)
     for k in range(rounds):
         episodes, seen = gather_episodes(
             agent.env,
-            mixture(agent.policies),
+            mixture(agent.policies, agent.env),
             seed=derive_seed("diagnostics", 0, "starts", k),
             steps=steps,
             keys=keys,

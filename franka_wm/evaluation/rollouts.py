@@ -11,7 +11,7 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
-from franka_wm.envs import Environment
+from franka_wm.envs import Environment, MultiTaskEnv
 from franka_wm.evaluation.closed_loop import begin, evaluating
 from franka_wm.seeding import derive_seed, seeded
 from franka_wm.training.build import arm_of
@@ -24,22 +24,27 @@ ROLLOUT_SEED = derive_seed("diagnostics", 0)
 
 
 class Alternating(TensorDictModuleBase):
-    """World k follows policy k mod P: one rollout with the behaviour of several policies.
+    """World k follows policy k // ``together`` mod P: one rollout with the behaviour of several policies.
 
     Args:
         policies: P of them; each acts for all worlds and keeps what it carries along to itself.
+        together: So many worlds in a row follow the same one: one of each task, where worlds have several.
     """
 
-    def __init__(self, policies: Sequence[TensorDictModuleBase]):
+    def __init__(self, policies: Sequence[TensorDictModuleBase], *, together: int = 1):
         super().__init__()
+        self.together = together
         self.policies = nn.ModuleList(policies)
         self.in_keys = sorted({key for policy in policies for key in policy.in_keys})  # pyright: ignore
         self.out_keys = ["action"]
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        number = torch.arange(tensordict.batch_size[0], device=tensordict.device) % len(self.policies)
-        chosen = None
+        worlds = torch.arange(tensordict.batch_size[0], device=tensordict.device)
+        number = worlds // self.together % len(self.policies)
+        chosen, executed = None, tensordict.get("action", None)
         for k, policy in enumerate(self.policies):
+            if executed is not None:  # what the policy before has written there was not done
+                tensordict.set("action", executed)
             action = policy(tensordict).get("action")
             if chosen is None:
                 chosen = action.clone()
@@ -51,10 +56,14 @@ class Alternating(TensorDictModuleBase):
         return tensordict.set("action", chosen)
 
 
-def mixture(policies: dict[str, TensorDictModuleBase]) -> TensorDictModuleBase:
-    """Half of the worlds move at random, half as the model wants: its policy, or its planner where it has none."""
+def mixture(policies: dict[str, TensorDictModuleBase], env: Environment) -> TensorDictModuleBase:
+    """Half of the worlds move at random, half as the model wants: its policy, or its planner where it has none.
+
+    Of several tasks half of each task's worlds.
+    """
     names = ["random", *[name for name in ("policy", "planner") if name in policies][:1]]
-    return Alternating([policies[name] for name in names])
+    tasks = len(env.envs) if isinstance(env, MultiTaskEnv) else 1
+    return Alternating([policies[name] for name in names], together=tasks)
 
 
 @torch.no_grad()
@@ -151,12 +160,12 @@ def embedding(model: WorldModel) -> Callable[[Tensor], Tensor]:
     return model.embed
 
 
-def discounted_returns(reward: Tensor, terminated: Tensor, discount: float) -> Tensor:
-    """Σ γ^k r_{t+k} to the end of what was recorded, or to a termination.
+def discounted_returns(reward: Tensor, ended: Tensor, discount: float) -> Tensor:
+    """Σ γ^k r_{t+k} to the end of what was recorded, or of the episode.
 
     Args:
         reward: (E, T, 1).
-        terminated: (E, T, 1) bool, after that step.
+        ended: (E, T, 1) bool, after that step.
         discount: γ.
 
     Returns:
@@ -165,6 +174,24 @@ def discounted_returns(reward: Tensor, terminated: Tensor, discount: float) -> T
     out = torch.zeros_like(reward)
     following = torch.zeros_like(reward[:, 0])
     for t in reversed(range(reward.shape[1])):
-        following = reward[:, t] + discount * torch.where(terminated[:, t], 0.0, following)
+        following = reward[:, t] + discount * torch.where(ended[:, t], 0.0, following)
         out[:, t] = following
+    return out
+
+
+def followed(done: Tensor, terminated: Tensor, steps: int) -> Tensor:
+    """Where an episode goes on for so many steps, or to its own end: what was truncated says nothing of what follows.
+
+    Args:
+        done, terminated: (E, T, 1) bool, after that step.
+        steps: From that step on, itself included.
+
+    Returns:
+        (E, T) bool.
+    """
+    out = torch.zeros_like(done[..., 0])
+    known = torch.zeros_like(out[:, 0], dtype=torch.int64)
+    for t in reversed(range(done.shape[1])):
+        known = torch.where(done[:, t, 0], terminated[:, t, 0] * steps, known) + 1
+        out[:, t] = known >= steps
     return out

@@ -130,7 +130,9 @@ def findings(results: Mapping[str, Any]) -> dict[str, str]:
         errors = ahead["decoder"]
         share = errors["error"] / max(errors["mean_image"], 1e-12)
         out["decoder's error / that of the mean image"] = number(share)
-    if value:
+    if "not_measured" in value:
+        out["value calibration, not measured"] = value["not_measured"]
+    elif value:
         line = f"return = {number(value['slope'])} · value + {number(value['intercept'])}".replace(
             "+ -", "− "
         )

@@ -16,6 +16,8 @@ from franka_wm.envs.multitask_config import MultiTaskConfig, multi_task_config
 from franka_wm.errors import UserError
 from franka_wm.evaluation.closed_loop import play_episodes, summarize
 from franka_wm.evaluation.results import point
+from franka_wm.evaluation.rollouts import gather_episodes, mixture
+from franka_wm.policies.scripted import NoopPolicy
 from franka_wm.report.seeds import seeds_table
 from franka_wm.report.table import evaluation_tables
 from franka_wm.seeding import derive_seed
@@ -196,3 +198,20 @@ def test_what_does_not_fit_is_one_line(values, said) -> None:
 def test_fewer_worlds_than_tasks(config) -> None:
     with pytest.raises(UserError, match="2 tasks need at least as many worlds"):
         MultiTaskEnv(config, num_envs=1, device="cpu")
+
+
+def test_diagnostics_see_each_task_at_random_and_by_the_model(env) -> None:
+    """By turns of all tasks: with an even number of them a turn of single worlds gives each task one policy alone."""
+
+    class Always(NoopPolicy):
+        def __init__(self, action: float) -> None:
+            super().__init__(env.action_dim)
+            self.action = action
+
+        def forward(self, tensordict: Any) -> Any:
+            super().forward(tensordict)["action"].fill_(self.action)
+            return tensordict
+
+    policies: Any = {"random": Always(0.5), "policy": Always(-0.5)}
+    played, _ = gather_episodes(env, mixture(policies, env), steps=1)
+    assert played["action"][:, 0, 0].tolist() == [0.5, 0.5, -0.5, -0.5, 0.5]

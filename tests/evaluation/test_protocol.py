@@ -125,11 +125,11 @@ def test_every_generator_inside_a_policy_is_seeded() -> None:
 
 def test_half_at_random_half_by_the_model(agent) -> None:
     episodes, pictures = gather_episodes(
-        agent.env, mixture(agent.policies), keys=["state", "joint_target"], image_size=32, images=3
+        agent.env, mixture(agent.policies, agent.env), keys=["state", "joint_target"], image_size=32, images=3
     )
     assert episodes.batch_size == (6, 12) and pictures is not None
     assert pictures.shape == (3, 12, 32, 32, 3) and pictures.float().std() > 10
-    again, _ = gather_episodes(agent.env, mixture(agent.policies), keys=["state"])
+    again, _ = gather_episodes(agent.env, mixture(agent.policies, agent.env), keys=["state"])
     assert torch.equal(episodes["action"], again["action"])
     # Odd worlds do what the model's policy does, even ones do not.
     with torch.no_grad():
