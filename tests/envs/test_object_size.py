@@ -188,6 +188,20 @@ def test_a_stack_of_other_sizes_is_one() -> None:
     assert still(env, root, 8)["success"].all()
 
 
+def test_a_stack_of_an_own_scene_is_one() -> None:
+    """A brick upright on a plate, and one that stands too far from the plate's middle."""
+    brick = Body(name="brick", size=(0.05, 0.03, 0.06), at=(0.45, 0.1))
+    plate = Body(name="plate", size=(0.14, 0.06, 0.03), at=(0.5, -0.1))
+    env = make(2, size=0.0, task="stack", scene=Scene(objects=(brick, plate)))
+    root, t = env.reset(), env.simulation.tensors
+    assert torch.allclose(t.task_goal, torch.tensor([0.5, -0.1, 0.06]), atol=1e-4)
+    t.rest_q[:, 2:5] = t.task_goal
+    t.rest_q[1, 2] += 0.5 * 0.06 + 0.005 + 0.003
+    after = still(env, root, 8)
+    assert after["success"].flatten().tolist() == [True, False]
+    assert (after["objects"][:, 2] - 0.06).abs().max() < 1e-3  # both stand on it
+
+
 @pytest.mark.parametrize(
     ("changes", "said"),
     [

@@ -20,6 +20,7 @@ from franka_wm.errors import UserError
 if TYPE_CHECKING:
     from franka_wm.envs.config import FrankaConfig
     from franka_wm.envs.kinematics import Kinematics
+    from franka_wm.envs.scene import Body
     from franka_wm.envs.simulation import Simulation
 
 READY = (0.0, 0.1, 0.0, -2.3, 0.0, 2.4, 0.785)
@@ -102,7 +103,7 @@ def goal_from_start(
     rest_q: wp.array2d[float],
     body: int,
     away: wp.vec3f,
-    rise: float,
+    rises: wp.vec2f,
     sizes: wp.array2d[float],
     goal: wp.array2d[float],
 ):
@@ -111,8 +112,8 @@ def goal_from_start(
     if mask[world]:
         for i in range(3):
             goal[world, i] = rest_q[world, FIRST + 7 * body + i] + away[i]
-        if rise > 0.0:
-            goal[world, 2] += rise * (sizes[world, 0] + sizes[world, 1])
+        if rises[0] > 0.0:
+            goal[world, 2] += rises[0] * sizes[world, 0] + rises[1] * sizes[world, body]
 
 
 @wp.kernel(enable_backward=False)
@@ -186,6 +187,12 @@ class GripperTask(Task):
     def reward_bounds(self) -> tuple[float, float]:
         return -self.config.action_penalty, 1.0
 
+    @property
+    def objects(self) -> "tuple[Body, ...]":
+        """The scene's."""
+        assert self.config.resolved_scene is not None
+        return self.config.resolved_scene.objects
+
     def launch_goal(
         self,
         sim: "Simulation",
@@ -193,7 +200,7 @@ class GripperTask(Task):
         *,
         body: int = 0,
         away: tuple[float, float, float] = (0.0, 0.0, 0.0),
-        rise: float = 0.0,
+        onto: bool = False,
     ) -> None:
         """For ``reset``: the goal is where an object stands as the episode begins, moved.
 
@@ -201,11 +208,10 @@ class GripperTask(Task):
             sim, mask: As given.
             body: Number of the object.
             away: From its centre [m].
-            rise: Half of the edge of the first two objects, if the first is to lie on the second: up by both, as large
-                as they are drawn [m].
+            onto: Whether the first object is to lie on that one: up by half of both heights, as they are drawn.
         """
-        w = sim.warp
-        inputs = [mask, w.rest_q, body, wp.vec3f(*away), rise, w.sizes, w.task_goal]
+        w, halves = sim.warp, [self.objects[k].half_height if onto else 0.0 for k in (0, body)]
+        inputs = [mask, w.rest_q, body, wp.vec3f(*away), wp.vec2f(*halves), w.sizes, w.task_goal]
         wp.launch(goal_from_start, sim.num_envs, inputs, device=sim.device)
 
     def launch_reward(self, sim: "Simulation", kernel: wp.Kernel, *further: object) -> None:

@@ -28,10 +28,8 @@ from franka_wm.envs.tasks.manipulation import (
 if TYPE_CHECKING:
     from franka_wm.envs.simulation import Simulation
 
-EDGE = 0.04
-"""Edge of both cubes [m]."""
-ASIDE, OFF = 0.5 * EDGE + 0.005, 0.005
-"""How far the upper cube may be off, sideways and in height [m]."""
+ASIDE, OFF = 0.005, 0.005
+"""How far the upper one may be off: sideways, beyond half the width of the lower one, and in height [m]."""
 AWAY = 0.10
 """How far over it the hand is when all is done [m]."""
 STILL = 0.01
@@ -47,7 +45,7 @@ def stack_reward_and_success(
     action: wp.array2d[float],
     sparse: bool,
     penalty: float,
-    edge: float,
+    edges: wp.vec3f,
     aside: float,
     off: float,
     still: float,
@@ -57,13 +55,14 @@ def stack_reward_and_success(
 ):
     world = wp.tid()
     cube = place_of(objects, world, 0)
-    upper = edge * sizes[world, 0]
-    rise = 0.5 * (upper + edge * sizes[world, 1])
+    size = sizes[world, 0]
+    rise = 0.5 * (edges[0] * size + edges[1] * sizes[world, 1])
     missing = place_of(objects, world, 1) + wp.vec3f(0.0, 0.0, rise) - cube
     shift = wp.length(wp.vec2f(missing[0], missing[1]))
     placed = shift <= aside * sizes[world, 1] and wp.abs(missing[2]) <= off
     away = wp.length(tool_of(state, world) - cube)
-    released = away > upper or state[world, 20] + state[world, 21] > upper + 0.004
+    opened = state[world, 20] + state[world, 21] > edges[2] * size + 0.004
+    released = away > wp.max(edges[0], edges[2]) * size or opened
     solved = placed and released and speed_of(objects, world, 0) < still
     value = 0.2 * nearness(away)
     if holds(state, joint_target, cube, world):
@@ -99,14 +98,17 @@ class Stack(GripperTask):
     words = "Put the red cube on the green one."
 
     def reset(self, sim: "Simulation", mask: wp.array) -> None:
-        self.launch_goal(sim, mask, body=1, rise=0.5 * EDGE)
+        self.launch_goal(sim, mask, body=1, onto=True)
 
     def pose_at_goal(self, sim: "Simulation", mask: wp.array) -> None:
         """The first cube on the second, the open hand over it."""
         self.launch_goal_pose(sim, mask, tool=(0.0, 0.0, AWAY), opening=MOST_OPEN)
 
     def reward_and_success(self, sim: "Simulation") -> None:
-        self.launch_reward(sim, stack_reward_and_success, EDGE, ASIDE, OFF, STILL, sim.warp.sizes)
+        upper, lower = self.objects[:2]
+        edges = wp.vec3f(2.0 * upper.half_height, 2.0 * lower.half_height, max(upper.widths))
+        aside = 0.5 * min(lower.widths) + ASIDE
+        self.launch_reward(sim, stack_reward_and_success, edges, aside, OFF, STILL, sim.warp.sizes)
 
     def measures(self, sim: "Simulation") -> dict[str, torch.Tensor]:
         return {"cube's height [m]": sim.tensors.next_true_objects[:, 2]}
@@ -118,16 +120,16 @@ class Stack(GripperTask):
         lies where it can is taken to lie on the other.
         """
         ranges, scene = self.config.randomization, self.config.resolved_scene
-        width = ranges.object_size
+        width, (top, bottom) = ranges.object_size, [one.half_height for one in self.objects[:2]]
         if not width or scene is None:
-            return EDGE
+            return top + bottom
         if ranges.table_height:  # the height of the lower one says nothing then, the goal over it does
             return sight.goal[:, 2] - sight.body(1)[0][:, 2]
         (upper, _), (lower, _) = sight.body(0), sight.body(1)
         below = lower[:, 2] - scene.top
         lies = upper[:, 2] - lower[:, 2] - below
         half = torch.where(sight.squeezes, sight.opening + 0.001, lies)
-        return below + half.clamp(0.5 * EDGE * (1 - width), 0.5 * EDGE * (1 + width))
+        return below + half.clamp(top * (1 - width), top * (1 + width))
 
     def expert(self, sight: Sight) -> Aim:
         """Grasp the first cube from above, bring it over the second, down, let go, and up."""
