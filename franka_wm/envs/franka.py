@@ -409,6 +409,7 @@ class FrankaEnv(EnvBase):
             self._renderers[key] = camera
         sim = self.simulation
         with sim.recorder.on_stream_of_torch():
+            sim.renderer.launch_marker()
             self.model.bvh_refit_shapes(sim.newton_state)
             camera.render(sim.newton_state, sim.warp, sim.chain)
         return as_torch("pixels", camera.images["pixels"]).clone(memory_format=torch.contiguous_format)

@@ -169,3 +169,36 @@ def test_framing(env: FrankaEnv) -> None:
         look_at((1, 1, 1), (1, 1, 1))
     straight_down = np.array(look_at((0, 0, 2), (0, 0, 0)))
     assert np.isfinite(straight_down).all()
+
+
+def test_the_marker_is_at_the_goal_where_nothing_is_observed_in_images(small_env) -> None:
+    """As videos of a model that reads vectors show it: after a reset, a step and a goal set by hand."""
+    options = {"goal_sampling": "reachable", "show_goal": True, "image_size": 48}
+    seen = small_env(3, **options, observations=("pixels", "state", "joint_target"))
+    blind = small_env(3, **options)
+    action = TensorDict({"action": torch.zeros(3, 7)}, batch_size=[3])
+    for change in (
+        lambda env: env.reset(seed=2),
+        lambda env: env.step(action.clone()),
+        lambda env: env.set_goal(torch.tensor([0.3, -0.3, 0.3])),
+    ):
+        change(seen), change(blind)
+        assert torch.equal(blind.render(48), seen.render(48))
+    plain = small_env(3, goal_sampling="reachable", image_size=48)
+    plain.reset(seed=2), blind.reset(seed=2)
+    changed = difference(plain.render(96), blind.render(96)) > 25
+    for k, mark in enumerate(project(blind.goal, blind.config, 96)):
+        rows, columns = changed[k].nonzero(as_tuple=True)
+        assert rows.numel() and torch.hypot(columns - mark[0], rows - mark[1]).max() < 6, k
+
+
+def test_a_camera_that_looks_straight_down_is_not_turned_by_a_small_offset(small_env) -> None:
+    straight = {"camera_distance": 0.4, "camera_target_distance": 0.4, "camera_height": 1.2}
+    env = small_env(16, **straight, randomization={"camera_position": 0.02})
+    env.reset(seed=0)
+    x, y, z, w = env.simulation.tensors.poses[:, 3:].unbind(-1)
+    right = torch.stack([1 - 2 * (y * y + z * z), 2 * (x * y + z * w), 2 * (x * z - y * w)], -1)
+    expected = np.array(look_at((0.4, 0.0, 1.2), (0.4, 0.0, 0.45)))[3:]
+    torch.testing.assert_close(right, torch.tensor([[0.0, 1.0, 0.0]]).expand(16, 3), atol=0.05, rtol=0)
+    ours = env.simulation.tensors.poses[:, 3:]
+    assert ((ours @ torch.tensor(expected, dtype=torch.float32)).abs() > 0.999).all()

@@ -11,8 +11,9 @@ import torch
 import warp as wp
 from tensordict import TensorDictBase
 
-from franka_wm.envs import FrankaEnv
-from franka_wm.envs.camera import BACKGROUND, project
+from franka_wm.envs import FrankaConfig, FrankaEnv
+from franka_wm.envs.camera import BACKGROUND, GOAL_MARKER, project
+from franka_wm.envs.tasks import Reach
 
 N, SIZE, LENGTH = 3, 48, 4
 GROUND, BASE, HAND, MARKER = 1, 2, 9, 255
@@ -207,6 +208,20 @@ def test_images_of_a_step_agree_with_each_other(env: FrankaEnv, random_actions) 
                     t,
                     suffix,
                 )
+
+
+def test_a_task_given_as_an_object_has_its_own_marker() -> None:
+    class Flat(Reach):
+        marker = 0.08
+
+    config = FrankaConfig(show_goal=True, goal_sampling="reachable", observations=("state",), substeps=2)
+    env = FrankaEnv(config, num_envs=2, device="cpu", task=Flat(config))
+    env.reset()
+    env.render(16)
+    model = env.model
+    marks = [k for k, label in enumerate(model.shape_label) if label.endswith(GOAL_MARKER)]
+    assert (model.shape_type.numpy()[marks] == newton.GeoType.CYLINDER).all()
+    assert (model.shape_transform.numpy()[marks, 2] == 0.0).all() and (env.goal[:, 2] > 0.1).all()
 
 
 # -- side camera -----------------------------------------------------------------------------------------

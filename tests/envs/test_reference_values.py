@@ -93,3 +93,9 @@ def test_featherstone_moves_the_arm_alike(small_env) -> None:
     ]
     assert (played[0][-1] - played[0][0]).norm() > 0.05
     torch.testing.assert_close(played[0], played[1], atol=0.005, rtol=0)
+
+
+def test_featherstone_compensates_gravity_as_well(small_env) -> None:
+    env = small_env(1, solver="featherstone", substeps=32, pose_noise=0.0)
+    joints = env.rollout_actions(torch.zeros(1, 12, 7))["joint_q"]
+    assert (joints[:, -1] - joints[:, 0]).abs().max() < 0.007

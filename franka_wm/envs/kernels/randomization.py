@@ -48,7 +48,12 @@ def draw_looks(
     )
     t = at + wp.vec3f(wp.randf(rng, -1.0, 1.0), wp.randf(rng, -1.0, 1.0), wp.randf(rng, -1.0, 1.0)) * at_noise
     back = wp.normalize(e - t)
-    right = wp.normalize(wp.cross(wp.vec3f(0.0, 0.0, 1.0), back))
+    vertical = wp.vec3f(0.0, 0.0, 1.0)
+    right = wp.cross(vertical, back)
+    if wp.length(wp.cross(vertical, wp.normalize(eye - at))) < 1.0e-6:
+        # Straight up or down: y is to the right, as in look_at. Else a small offset could turn the image by any angle.
+        right = wp.vec3f(0.0, 1.0, 0.0) - back * back[1]
+    right = wp.normalize(right)
     up = wp.cross(back, right)
     poses[world] = wp.transformf(e, wp.quat_from_matrix(wp.matrix_from_cols(right, up, back)))
     delay[world] = wp.min(int(wp.randf(rng) * float(latency + 1)), latency)

@@ -21,14 +21,17 @@ from franka_wm.envs.robots.sources import detail
 from franka_wm.envs.scene import FLOOR
 from franka_wm.envs.simulation.bodies import contact_options
 from franka_wm.envs.simulation.scene import add_scene, harden
+from franka_wm.envs.tasks import Task
 
 
 def build_model(
-    config: FrankaConfig, num_envs: int, device: str, urdf_path: str | Path | None = None
+    config: FrankaConfig, task: type[Task], num_envs: int, device: str, urdf_path: str | Path | None = None
 ) -> tuple[newton.Model, Robot]:
-    """N copies of the robot, and the ground that all of them share."""
+    """N copies of the robot and of what the task has around it, and the ground that all of them share."""
     arm = arm_builder()
     robot = add_robot(arm, config, urdf_path)
+    if config.solver == "featherstone" and config.gravity_compensation:
+        arm.gravity = (0.0, 0.0, 0.0)  # it knows no compensation; nothing is there but the arm
     if config.resolved_scene:
         add_scene(arm, config.resolved_scene, robot.tool_body, detail(SOURCES[config.robot], config))
         if config.collisions != "hand":
@@ -44,7 +47,7 @@ def build_model(
         )
         color = (0.16, 0.58, 0.62) if config.resolved_scene else (0.90, 0.22, 0.12)  # unlike the cube's
         look: dict[str, object] = {"cfg": ghost, "color": color, "label": GOAL_MARKER}
-        disc = config.task_class.marker
+        disc = task.marker
         if disc is None:
             arm.add_shape_sphere(body=-1, radius=0.025, **look)
         else:

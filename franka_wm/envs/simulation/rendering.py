@@ -81,7 +81,7 @@ class Renderer:
         if self.cameras:
             # A broken world is shown in its last finite pose; its NaN must not reach the ray tracer's tree.
             sim.launch_forward_kinematics(sim.warp.broken)
-            self._launch_marker()
+            self.launch_marker()
             sim.model.bvh_refit_shapes(sim.newton_state)
             for camera, _, now, after in self.cameras:
                 camera.render(sim.newton_state, sim.warp, sim.chain, images=after)
@@ -94,7 +94,7 @@ class Renderer:
         """Renders the present of the worlds that were reset."""
         if not (self.cameras or self._goal_cameras):
             return
-        self._launch_marker()
+        self.launch_marker()
         self._list_worlds(self.sim.warp.mask)
         self._pose_at_goal()
         wp.capture_while(self._counts[2:], self._render_some)
@@ -103,7 +103,7 @@ class Renderer:
         """Renders the present of all worlds anew, at once, on torch's stream."""
         sim = self.sim
         with sim.recorder.on_stream_of_torch():
-            self._launch_marker()
+            self.launch_marker()
             self._pose_at_goal()
             self._list_worlds(wp.ones(sim.num_envs, dtype=wp.bool, device=sim.device))
             for _ in range(-(-sim.num_envs // self._views.shape[0])):
@@ -114,11 +114,12 @@ class Renderer:
         if self._goal_cameras or (self.cameras and self.sim.config.show_goal):
             self.show_all()
 
-    def _launch_marker(self) -> None:
+    def launch_marker(self) -> None:
+        """Puts the markers of ``show_goal`` on the present goals: before whatever renders them."""
         sim = self.sim
         if sim.config.show_goal:
             scene = sim.config.resolved_scene
-            ground, flat = (scene.top if scene else 0.0), sim.config.task_class.marker is not None
+            ground, flat = (scene.top if scene else 0.0), type(sim.task).marker is not None
             w = sim.warp
             inputs = [w.task_goal, flat, ground, w.raised, self._markers, sim.model.shape_transform]
             wp.launch(kernels.move_goal_marker, sim.num_envs, inputs, device=sim.device)

@@ -82,12 +82,13 @@ class Simulation:
         self._step_graphs: dict[bool, Recording] = {}
         self._reset_graph: Recording | None = None
         self._overflowed = False
+        kind = config.task_class if task is None else type(task)
         # Warp's default device is one for all threads.
         with wp.ScopedDevice(device), Compiler(device) as compiler:
             loading = compiler.begin(solver_modules(config))
-            self.model, self.robot = build_model(config, num_envs, device, urdf_path)
+            self.model, self.robot = build_model(config, kind, num_envs, device, urdf_path)
             compiler.finish(loading)
-            around = compiler.begin(step_modules(config, config.task_class if task is None else type(task)))
+            around = compiler.begin(step_modules(config, kind))
             self.solver = make_solver(self.model, config)
             self._in_place = isinstance(self.solver, newton.solvers.SolverMuJoCo)
             compiler.finish(around)
