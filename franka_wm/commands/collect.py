@@ -274,26 +274,26 @@ def _agent(part: str, checkpoint: str, overrides: Sequence[str], worlds: int) ->
     from omegaconf.errors import OmegaConfBaseException
     from yaml import YAMLError
 
-    changes: dict[str, Any] = {}
+    changed: Any = OmegaConf.create()
     seed, device = None, "auto"
     for override in overrides:
         key, _, text = override.partition("=")
         try:
             value: Any = OmegaConf.from_dotlist([f"value={text}"]).value
+            if key.startswith("env."):
+                changed = OmegaConf.merge(changed, OmegaConf.from_dotlist([override]))
         except (YAMLError, OmegaConfBaseException) as error:
             raise UserError(f"collect: {override}: {text!r} is not a value as in YAML") from error
         if key == "seed":
             seed = number(OmegaConf.create({"seed": value}), "seed")
         elif key == "device":
             device = text
-        elif key.startswith("env."):
-            changes[key.removeprefix("env.")] = (
-                OmegaConf.to_container(value) if OmegaConf.is_config(value) else value
-            )
-        else:
+        elif not key.startswith("env."):
             raise UserError(
                 f"collect: {override}: an agent keeps its configuration; only seed=, device= and env.KEY= can change"
             )
+    plain: Any = OmegaConf.to_container(changed)
+    changes = plain.get("env", {})
     if isinstance(changes.get("observations"), list):  # else it is refused where it is read
         changes["observations"] = [
             *changes["observations"],
@@ -311,6 +311,5 @@ def _agent(part: str, checkpoint: str, overrides: Sequence[str], worlds: int) ->
     if part not in agent.policies:
         raise UserError(f"collect: policy={part}: {checkpoint} has only {', '.join(agent.policies)}")
     settings = agent.settings
-    return Source(
-        agent.env, agent.policies[part], dict(settings.values), f"{part} of {checkpoint}", settings.seed
-    )
+    played = {**settings.values, "env": dict(settings.env.changed(**changes).values)}
+    return Source(agent.env, agent.policies[part], played, f"{part} of {checkpoint}", settings.seed)

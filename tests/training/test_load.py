@@ -205,6 +205,16 @@ def test_an_environment_that_the_model_cannot_act_in_is_refused_before_it_is_bui
     assert said in str(refused.value) and "\n" not in str(refused.value)
 
 
+@pytest.mark.parametrize("env", ["env=lift", "env=multitask"])
+def test_what_is_not_named_of_a_group_stays_when_an_environment_is_changed(env: str, settled) -> None:
+    """As ``env.randomization.color=0.2`` changes a run: its delay is no less."""
+    of = "env.tasks.push" if "multitask" in env else "env"
+    run = settled(env, f"{of}.randomization.action_latency=2", "collector.num_envs=8")
+    changed = run.env.changed(randomization={"color": 0.2}, fps=20.0).config
+    arm = changed.tasks["push"] if "multitask" in env else changed
+    assert (arm.randomization.action_latency, arm.randomization.color, arm.fps) == (2, 0.2, 20.0)
+
+
 @pytest.mark.parametrize(
     ("overrides", "named"),
     [

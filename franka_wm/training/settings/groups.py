@@ -241,6 +241,14 @@ class PlannerSettings:
         return cls(**vars(read_first), options=options)
 
 
+def _merged(values: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
+    """``values`` with ``changes``, mappings in them likewise."""
+    groups = {
+        k for k, new in changes.items() if isinstance(new, Mapping) and isinstance(values.get(k), Mapping)
+    }
+    return {**values, **{k: _merged(values[k], new) if k in groups else new for k, new in changes.items()}}
+
+
 @dataclass(frozen=True)
 class EnvSettings:
     """The environment: ``franka`` or ``multitask`` with its config, another library's with its own, or ``none``."""
@@ -269,10 +277,13 @@ class EnvSettings:
         return cls(str(kind), external_config(values), values=values)
 
     def changed(self, **changes: Any) -> EnvSettings:
-        """The same with other values of its fields, where there are several tasks in each of them."""
+        """The same with other values of its fields, where there are several tasks in each of them.
+
+        Of a mapping, such as ``randomization``, what is not named stays: as an override of Hydra's changes it.
+        """
         if changes and isinstance(self.config, MultiTaskConfig):
-            changes = {"tasks": {name: {**one, **changes} for name, one in self.values["tasks"].items()}}
-        return EnvSettings.of({**self.values, **changes}) if changes else self
+            changes = {"tasks": {name: _merged(one, changes) for name, one in self.values["tasks"].items()}}
+        return EnvSettings.of(_merged(self.values, changes)) if changes else self
 
     @property
     def arm(self) -> FrankaConfig:

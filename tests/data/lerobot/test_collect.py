@@ -14,6 +14,7 @@ import torch
 from torchrl.collectors import Collector
 
 from franka_wm.commands.collect import open_source
+from franka_wm.commands.demo import AGENT
 from franka_wm.commands.main import main
 from franka_wm.data.lerobot.collect import gather
 from franka_wm.data.lerobot.export import export_replay
@@ -117,6 +118,16 @@ def test_provenance_says_how(collected) -> None:
     ]
     assert provenance["sessions"][0]["config"]["env"]["image_size"] == 16
     assert provenance["sessions"][0]["versions"]["newton"]
+
+
+def test_what_is_changed_for_an_agent_is_played_and_told() -> None:
+    """An option of a group, too; training from the dataset asks what it was recorded with."""
+    overrides = ["device=cpu", "env.action_penalty=0.5", "env.randomization.action_noise=0.1"]
+    source = open_source(str(AGENT), overrides=overrides, episodes=1)
+    for options in (vars(source.env.config), source.config["env"]):
+        assert options["action_penalty"] == 0.5
+    assert source.env.config.randomization.action_noise == 0.1
+    assert source.config["env"]["randomization"]["action_noise"] == 0.1
 
 
 def test_the_same_seed_gives_the_same_dataset(collected, tmp_path, load) -> None:
