@@ -16,6 +16,7 @@ from franka_wm.envs import FrankaConfig, FrankaEnv
 from franka_wm.errors import UserError
 from franka_wm.interrupt import INTERRUPTED
 from franka_wm.live.commanded import kinematic_planner
+from franka_wm.options import check_whole
 from franka_wm.policies.expert import ExpertPolicy
 from franka_wm.policies.scripted import IKPolicy, NoopPolicy, SmoothRandomPolicy
 from franka_wm.training.load import find_checkpoint, load_agent
@@ -124,7 +125,9 @@ def untrained(options: Options, changes: Mapping[str, Any]) -> Stage:
     policies: dict[str, Any] = {}
     task = env.simulation.task
     if config.has_gripper:
-        if task.expert is not None and "joint_target" in config.observations:
+        fits = config.gravity_compensation and config.action_mode != "ee_delta"
+        able = task.expert is not None and "joint_target" in config.observations
+        if able and (fits or options.policy == "expert"):  # who asks for it is told why it cannot act
             policies = {"expert": ExpertPolicy(task, env.kinematics, config)}
     elif "joint_target" in config.observations:
         policies = {"planner": kinematic_planner(env), "ik": IKPolicy(env.kinematics, config)}
@@ -141,6 +144,8 @@ def record(options: Options) -> None:
     length = options.env.pop(
         "episode_length", None
     )  # of the recording; the world itself must not restart in it
+    if length is not None:
+        check_whole("env.episode_length", length, most=ENDLESS["episode_length"], unit="control steps")
     stage = build(options)
     steps = stage.steps if length is None else length
     if options.seconds is not None:

@@ -328,3 +328,25 @@ def test_a_task_with_a_gripper_is_shown_by_its_expert() -> None:
     assert observation["success"].all()
     with pytest.raises(UserError, match="the checkpoint has its own environment"):
         options_of([], None, env="stack", checkpoint="somewhere")
+
+
+@pytest.mark.parametrize("length", ["0", "-3", "1e1", "ten"])
+def test_a_recording_of_no_such_length_is_refused_before_anything_is_built(
+    length: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    pytest.importorskip("rerun", reason="needs the extra rerun")
+    monkeypatch.setattr("franka_wm.live.stage.build", lambda options: pytest.fail("built"))
+    arguments = [f"rerun={tmp_path}/arm.rrd", f"env.episode_length={length}"]
+    assert cli.main(["view", *CHEAP, *arguments]) == 1
+    captured = capsys.readouterr()
+    assert "env.episode_length=" in captured.err and "must be a whole number of control steps" in captured.err
+    assert captured.err.count("\n") == 1 and not list(tmp_path.iterdir())
+
+
+def test_a_task_whose_expert_cannot_act_is_shown_without_it() -> None:
+    """Its hand can still be moved at random; who asks for the expert is told what it needs."""
+    changes = {"env": "lift", "device": "cpu"}
+    stage = build(options_of(["env.action_mode=ee_delta"], None, **changes))  # type: ignore[arg-type]
+    assert list(stage.policies) == ["random", "noop"] and stage.env.action_dim == 4
+    with pytest.raises(UserError, match="policy=expert: drives joints"):
+        build(options_of(["env.action_mode=ee_delta"], None, policy="expert", **changes))  # type: ignore[arg-type]
