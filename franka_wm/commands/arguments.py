@@ -129,7 +129,12 @@ class Verb(click.Command):
     def _as_options(self, args: Sequence[str]) -> Iterator[str]:
         """Words as click's options; what is neither a word nor an option stays as it is."""
         seen: set[str] = set()
+        awaited = False  # the value of the option before, `--name value`
         for argument in args:
+            if awaited:
+                awaited = False
+                yield argument
+                continue
             if self.first and self.first not in seen and not argument.startswith("-") and "=" not in argument:
                 argument = f"{self.first}={argument}"
             dashed = argument.startswith("--")
@@ -144,6 +149,7 @@ class Verb(click.Command):
                     raise UserError(f"{self.name}: {argument}: a value is missing")
                 seen.add(name)
                 value = "true" if not equals and self.words[name].type is FLAG else value
+                awaited = not value
                 yield f"--{name}={value}" if value else f"--{name}"
             elif dashed or (equals and not self._is_other(argument) and not Path(argument).exists()):
                 raise UserError(f"{self.name}: {no_such_option(name, list(self.words))}")

@@ -173,6 +173,17 @@ def test_options() -> None:
     assert found["episodes"] == 7 and found["robustness"] and not found["probes"] and found["open_loop"]
 
 
+def test_the_bare_folder_may_follow_an_option_and_its_value() -> None:
+    for words in (
+        ["--episodes", "7", "a"],
+        ["a", "--episodes", "7"],
+        ["--robustness", "a", "--episodes", "7"],
+    ):
+        found = verb.make_context("evaluate", words).params
+        assert (found["checkpoint"], found["episodes"]) == ("a", 7), words
+    assert verb.make_context("evaluate", ["--out", "b=1", "a"]).params["out"] == "b=1"
+
+
 def test_default_folder(tmp_path: Path) -> None:
     checkpoint = tmp_path / "run" / "checkpoints" / "latest"
     checkpoint.mkdir(parents=True)
