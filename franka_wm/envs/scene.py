@@ -224,7 +224,9 @@ class Scene:
 
 def _articulated(values: Any) -> Articulated | ArticulatedFile:
     """A drawer or a door, or what a file holds."""
-    if isinstance(values, ArticulatedFile) or (isinstance(values, Mapping) and "file" in values):
+    if isinstance(values, ArticulatedFile) or (
+        isinstance(values, Mapping) and values.get("file") is not None
+    ):
         return ArticulatedFile.of(values)
     return Articulated.of(values)
 

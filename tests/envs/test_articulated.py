@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Callable
+from dataclasses import asdict
 from pathlib import Path
 
 import pytest
@@ -371,3 +372,9 @@ def test_the_printed_drawers_stand_in_a_scene(root: Path) -> None:
     text = next(b for b in re.findall(r"```yaml\n(.*?)```", page, re.DOTALL) if "kind: drawer" in b)
     scene = Scene.of(yaml.safe_load(text))
     assert [(one.name, one.slides) for one in scene.articulated] == [("chest", True), ("fridge", False)]
+
+
+def test_a_config_with_drawers_reads_back_from_its_plain_values() -> None:
+    """As the live page writes it beside what it records."""
+    config = FrankaConfig(gripper=True, observations=("state",), scene=ROOM)
+    assert FrankaConfig.from_mapping(asdict(config)) == config
