@@ -363,7 +363,7 @@ def sequential_halving(considered: int, simulations: int) -> list[int]:
 
 
 def _root_prior(settings: MCTS, logits: Tensor, explore: bool, generator: torch.Generator | None) -> Tensor:
-    """Of the root's actions (E, M), in PUCT; with `explore` mixed with Dirichlet noise."""
+    """Prior (E, M) of the root's actions in PUCT; with `explore` mixed with Dirichlet noise."""
     prior = logits.softmax(-1)
     if not explore:
         return prior

@@ -24,7 +24,7 @@ SMALLEST = wp.constant(wp.float64(2.2250738585072014e-308))
 
 @wp.struct
 class Statistics:
-    """Of E environments with N slots (slot 0 is the root) and M actions.
+    """The tree of E environments with N slots (slot 0 is the root) and M actions.
 
     parent, action, depth: (E, N), of the slot; -1 where it stands for nothing and at the root.
     value, reward, discount, visits, returns: (E, N), as in `franka_wm.planning.tree.Tree`.
