@@ -3,13 +3,15 @@
 python benchmarks/search.py                  50 simulations of PUCT and of Gumbel over 15 discrete actions
 python benchmarks/search.py --envs 1 --variants puct
 
-On CUDA every search is timed twice: launched operation by operation, and as one captured graph, which is what runs do.
+Each with the tree in plain tensor code and in Warp kernels. On CUDA every search is timed twice: launched operation by
+operation, and as one captured graph, which is what runs do.
 """
 
 from __future__ import annotations
 
 import argparse
 from functools import partial
+from itertools import product
 
 import torch
 from common import publish, rate
@@ -42,8 +44,10 @@ def main() -> None:
     )
     model.eval()
     rows = []
-    for variant in arguments.variants:
-        search = MCTS(num_actions=MOVES, num_simulations=arguments.simulations, variant=variant)
+    for variant, kernels in product(arguments.variants, (False, True)):
+        search = MCTS(
+            num_actions=MOVES, num_simulations=arguments.simulations, variant=variant, kernels=kernels
+        )
         for envs in arguments.envs:
             observation = TensorDict(
                 {
@@ -58,6 +62,7 @@ def main() -> None:
                 rows.append(
                     {
                         "variant": variant,
+                        "tree": "kernels" if kernels else "plain",
                         "launched": way,
                         "environments": envs,
                         "ms/decision": 1e3 / decisions,

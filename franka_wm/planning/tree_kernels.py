@@ -296,7 +296,6 @@ class KernelTree:
         def integers(*shape: int, fill: int = 0) -> Tensor:
             return torch.full((envs, *shape), fill, device=device, dtype=torch.int32)
 
-        self.simulations = simulations
         self.value, self.visits, self.returns = numbers(slots), numbers(slots), numbers(slots)
         self.tries, self.q, self.prior = (numbers(slots, actions) for _ in range(3))
         self.embedding = embedding.new_empty(envs, slots, embedding.shape[1])
