@@ -304,7 +304,9 @@ def test_the_planner_computes_as_configured(settled) -> None:
     policy = build.make_agent_policies(cfg, model, env, spaces)["planner"]
     assert policy.next != model.next  # compiled
     assert policy.capture is None  # a checkpoint of a GPU acts on a CPU, too
-    cfg = settled("model=muzero", "planner=gumbel", "env=gym", "planner.compile=true", "planner.kernels=false")
+    cfg = settled(
+        "model=muzero", "planner=gumbel", "env=gym", "planner.compile=true", "planner.kernels=false"
+    )
     env = build.make_evaluation_env(cfg, num_envs=2)
     model = build.make_model(cfg, spaces := Spaces.of_env(env), "cpu")
     policy = build.make_agent_policies(cfg, model, env, spaces)["planner"]
