@@ -304,13 +304,11 @@ def test_the_planner_computes_as_configured(settled) -> None:
     policy = build.make_agent_policies(cfg, model, env, spaces)["planner"]
     assert policy.next != model.next  # compiled
     assert policy.capture is None  # a checkpoint of a GPU acts on a CPU, too
-    cfg = settled(
-        "model=muzero", "planner=gumbel", "env=gym", "planner.compile=true", "planner.kernels=false"
-    )
+    cfg = settled("model=muzero", "planner=gumbel", "env=gym", "planner.compile=true")
     env = build.make_evaluation_env(cfg, num_envs=2)
     model = build.make_model(cfg, spaces := Spaces.of_env(env), "cpu")
     policy = build.make_agent_policies(cfg, model, env, spaces)["planner"]
-    assert policy.recurrent != model.recurrent and policy.search.kernels is False
+    assert policy.recurrent != model.recurrent and policy.search.kernels is None
 
 
 def test_goal_pictures_of_every_camera_that_the_model_reads(settled) -> None:
