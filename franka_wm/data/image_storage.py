@@ -112,9 +112,11 @@ class ImageStorage(LazyTensorStorage):
             time, world: Indices of steps, of equal shape; none of the oldest ``frame_stack - 1`` times that are kept.
         """
         data: Any = self._storage
-        batch = data[time, world]
+        batch = data.exclude(*self.images)[time, world]
         if not self.images:
             return batch
+        for key in self.images:
+            batch.set(key, _read(data.get(key), time, world))
         led_to = self._led_to(time, world)
         if self.stacked:
             begins = data.get(BOUNDARY).squeeze(-1)
@@ -124,7 +126,7 @@ class ImageStorage(LazyTensorStorage):
                 times.insert(0, earlier)
             for key in self.stacked:
                 images = data.get(key)
-                stack = torch.cat([*(images[one, world] for one in times), batch.get(key)], -1)
+                stack = torch.cat([*(_read(images, one, world) for one in times), batch.get(key)], -1)
                 batch.set(key, stack)
                 # The step's own images come before what it led to, also at the end of an episode.
                 led_to[key] = torch.cat([stack[..., CHANNELS:], led_to[key]], -1)
@@ -162,10 +164,12 @@ class ImageStorage(LazyTensorStorage):
         slot, following = self._ends.slots[time, world].long(), (time + 1) % data.shape[0]
         last = slot >= 0
         slot = slot.clamp_min(0)
-        return {
-            key: torch.where(_beside(last, ends), ends[slot, world], data.get(key)[following, world])
-            for key, ends in self._ends.images.items()
-        }
+        found = {}
+        for key, ends in self._ends.images.items():
+            ended, goes_on = _words(ends)[slot, world], _words(data.get(key))[following, world]
+            images = torch.where(last.unsqueeze(-1), ended, goes_on)
+            found[key] = images.view(ends.dtype).view(*time.shape, *ends.shape[2:])
+        return found
 
     def _empty(self) -> None:
         super()._empty()
@@ -284,9 +288,18 @@ class _Ends:
         self._surely_free += more
 
 
-def _beside(mask: torch.Tensor, images: torch.Tensor) -> torch.Tensor:
-    """A mask (…) with the trailing dimensions of images (slots, worlds, …)."""
-    return mask.view(*mask.shape, *[1] * (images.dim() - 2))
+def _words(images: torch.Tensor) -> torch.Tensor:
+    """Kept images (a, b, …) as (a, b, words), in the same memory.
+
+    What is read by indices goes number by number, and there are eight times fewer words than bytes.
+    """
+    flat = images.view(*images.shape[:2], -1)
+    return flat.view(torch.int64) if flat.shape[2] % 8 == 0 else flat
+
+
+def _read(images: torch.Tensor, time: torch.Tensor, world: torch.Tensor) -> torch.Tensor:
+    """``images[time, world]`` of kept images (times, worlds, …)."""
+    return _words(images)[time, world].view(images.dtype).view(*time.shape, *images.shape[2:])
 
 
 def image_keys(data: TensorDictBase) -> tuple[str, ...]:

@@ -7,6 +7,7 @@ import pytest
 import torch
 from torch._subclasses.fake_tensor import FakeTensorMode
 
+from franka_wm.planning import mcts as mcts_module
 from franka_wm.planning import tree_kernels
 from franka_wm.planning.mcts import MCTS, sequential_halving
 from plain_search import MOVES, RandomModel, gumbel, plain_search, puct, sigma
@@ -332,15 +333,35 @@ def test_nothing_waits_for_the_host_or_depends_on_the_data(variant, max_depth):
     assert found["policy"].shape == found["visits"].shape == (3, 5) and found["value"].shape == (3, 1)
 
 
-def test_kernels_are_the_default_on_a_cpu(monkeypatch):
+def test_kernels_are_the_default(monkeypatch):
     used, kernel_tree = [], tree_kernels.KernelTree
     monkeypatch.setattr(
         tree_kernels, "KernelTree", lambda *args, **options: used.append(1) or kernel_tree(*args, **options)
     )
     model = RandomModel(0)
-    for kernels, count in ((False, 0), (True, 1), (None, 2)):
-        MCTS(num_actions=MOVES, num_simulations=2, kernels=kernels).search(*model.root(), model.recurrent)
+    for options, count in (({"kernels": False}, 0), ({}, 1)):
+        MCTS(num_actions=MOVES, num_simulations=2, **options).search(*model.root(), model.recurrent)
         assert len(used) == count
+
+
+@pytest.mark.parametrize("variant", VARIANTS)
+def test_kernels_draw_the_same_actions(variant, monkeypatch):
+    """What is explored does not depend on how a tree is walked: a GPU draws other numbers in another precision."""
+    model, found, drawn, noise_of = RandomModel(0), [], [], mcts_module._gumbel_noise
+    monkeypatch.setattr(
+        mcts_module, "_gumbel_noise", lambda like, *args: drawn.append(like.dtype) or noise_of(like, *args)
+    )
+    z = model.start[:1].float() + torch.randn(
+        256, model.start.shape[1], generator=torch.Generator().manual_seed(1)
+    )
+    model.move, model.head = model.move.float(), model.head.float()
+    for kernels in (False, True):
+        search = MCTS(num_actions=MOVES, num_simulations=9, variant=variant, kernels=kernels)
+        noise = torch.Generator().manual_seed(0)
+        answer = search.search(*model.predict(z), z, model.recurrent, explore=True, generator=noise)
+        found.append(answer["action"])
+    assert (found[0] == found[1]).float().mean() > 0.95  # rounding may turn a tie
+    assert drawn == [torch.float32] * 2
 
 
 @pytest.mark.parametrize("variant", VARIANTS)
