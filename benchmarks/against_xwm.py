@@ -154,7 +154,7 @@ def main() -> None:
         }
         for name in mine
     ]
-    publish("against xwm", rows, args.out)
+    publish("against xwm", rows, args.out, device="cpu", ran=("benchmarks/_xwm_side.py",))
 
 
 if __name__ == "__main__":

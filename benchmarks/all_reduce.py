@@ -68,7 +68,7 @@ def main() -> None:
         sent = 2 * (processes.count() - 1) / processes.count() * size * 1e6
         rows.append({"processes": processes.count(), "MB": size, "ms": 1e3 * took, "GB/s": sent / took / 1e9})
     if processes.is_first():
-        publish("all-reduce", rows, args.out)
+        publish("all-reduce", rows, args.out, device=device)
         if len(rows) > 1:
             latency, bandwidth = fit([(1e6 * row["MB"], row["ms"] / 1e3) for row in rows])
             print(f"\ntime = {1e3 * latency:.3g} ms + size / ({bandwidth / 1e9:.3g} GB/s)")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import sys
 import time
 from collections.abc import Callable
 from datetime import UTC, datetime
@@ -11,10 +12,14 @@ from typing import Any
 import torch
 
 from franka_wm import source
+from franka_wm.device import resolve_device
 from franka_wm.files import atomic_write
 from franka_wm.versions import versions
 
 source.snapshot()
+COMMAND = list(sys.argv)
+BEGUN = versions() | {"started": datetime.now(UTC).isoformat(timespec="seconds")}
+"""Before anything is measured: by its end another commit may be checked out."""
 
 
 def synchronize() -> None:
@@ -73,16 +78,27 @@ def table(rows: list[dict[str, Any]]) -> str:
     return "\n".join(lines)
 
 
-def publish(name: str, rows: list[dict[str, Any]], out: str | None) -> None:
-    """Prints the machine and the table; writes ``out`` as JSON if given, with the machine, versions and code."""
-    made = versions("cuda" if torch.cuda.is_available() else "cpu")
+def publish(
+    name: str,
+    rows: list[dict[str, Any]],
+    out: str | None,
+    *,
+    device: torch.device | str = "auto",
+    ran: tuple[str, ...] = (),
+) -> None:
+    """Prints the machine and the table; writes ``out`` as JSON if given, with the machine, versions, command and code.
+
+    Args:
+        device: What computed.
+        ran: How the paths of code begin that other processes ran. All of it counts: which of it, they did not tell.
+    """
+    made = versions(resolve_device(device)) | BEGUN
     where = made["processor"] if made["device"] == "cpu" else made["device"]
     print(f"\n{name}: {where}, {made['cores']} cores, torch {made['torch']}, newton {made['newton']}\n")
     print(table(rows), flush=True)
     if out:
-        made |= {
-            "started": datetime.now(UTC).isoformat(timespec="seconds"),
-            "source": source.source(),
-        }
+        files = source.snapshot().items()
+        others = {file: source.code_hash(file, content) for file, content in files if file.startswith(ran)}
+        made |= {"command": COMMAND, "source": others | source.source()}
         with atomic_write(out) as path:
             path.write_text(json.dumps({"benchmark": name, "machine": made, "rows": rows}, indent=2) + "\n")

@@ -215,7 +215,7 @@ def main() -> None:
             for contacts in arguments.contacts:
                 rows.append(measure(name, n, device, arguments.seconds, contacts))
                 print(rows[-1], flush=True)
-    publish("environment", rows, arguments.out)
+    publish("environment", rows, arguments.out, device=device)
 
 
 if __name__ == "__main__":

@@ -97,7 +97,7 @@ def main() -> None:
             }
         )
         print(rows[-1], flush=True)
-    publish("learner", rows, arguments.out)
+    publish("learner", rows, arguments.out, device=device)
 
 
 if __name__ == "__main__":

@@ -143,7 +143,7 @@ def main() -> None:
     options = parser.parse_args()
     torch.set_num_threads(len(os.sched_getaffinity(0)) if "OMP_NUM_THREADS" not in os.environ else 1)
     rows = reading(episodes=options.episodes, window=options.window, batch_size=options.batch_size)
-    publish("reading a LeRobot dataset", rows, options.out)
+    publish("reading a LeRobot dataset", rows, options.out, device="cpu")
 
 
 if __name__ == "__main__":

@@ -99,7 +99,8 @@ def main() -> None:
     parser.add_argument("--out", help="JSON file")
     args = parser.parse_args()
     if args.train:
-        return publish("memory", watch(args.train, args.minutes or 25.0, args.device), args.out)
+        rows = watch(args.train, args.minutes or 25.0, args.device)
+        return publish("memory", rows, args.out, device=args.device, ran=("franka_wm/", "train.py"))
     observations = ("pixels", "state") if args.pixels else ("state",)
     config = (
         RunSettings.of(conf.compose(f"env={args.env}")).env.arm
@@ -137,7 +138,7 @@ def main() -> None:
         row["seconds"] = round(time.perf_counter() - started)
         rows.append(row)
         print(row, flush=True)
-    publish("memory", rows, args.out)
+    publish("memory", rows, args.out, device=args.device)
 
 
 if __name__ == "__main__":

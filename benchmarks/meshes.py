@@ -38,7 +38,7 @@ def main() -> None:
         difference = float((pictures - whole).abs().mean())
         rows.append({"mesh_detail [m]": detail, "triangles": triangles, "difference": difference})
         print(rows[-1], flush=True)
-    publish("meshes", rows, arguments.out)
+    publish("meshes", rows, arguments.out, device="cpu")
 
 
 if __name__ == "__main__":

@@ -87,7 +87,7 @@ def main() -> None:
             config = replace(arm, substeps=substeps, collision_pipeline=arguments.contacts)
             rows.append(measure(config, arguments.worlds))
             print(rows[-1], flush=True)
-    publish("penetration", rows, arguments.out)
+    publish("penetration", rows, arguments.out, device="cpu")
 
 
 if __name__ == "__main__":

@@ -131,9 +131,8 @@ def main() -> None:
                     )
                     print(rows[-1], flush=True)
     details = ", compiled" if arguments.compile else ""
-    publish(
-        f"planners, with rewards and a terminal value, {arguments.precision}{details}", rows, arguments.out
-    )
+    title = f"planners, with rewards and a terminal value, {arguments.precision}{details}"
+    publish(title, rows, arguments.out, device=device)
 
 
 if __name__ == "__main__":

@@ -182,7 +182,8 @@ def main() -> None:
             row["times one GPU"] = done / alone
             rows.append(row)
             print(row, flush=True)
-    publish("scale", rows, args.out)
+    processes = "franka_wm/", "train.py", "benchmarks/all_reduce.py"
+    publish("scale", rows, args.out, device=args.device, ran=processes)
 
 
 if __name__ == "__main__":

@@ -71,9 +71,8 @@ def main() -> None:
                     }
                 )
                 print(rows[-1], flush=True)
-    publish(
-        f"tree search: {arguments.simulations} simulations, {MOVES} discrete actions", rows, arguments.out
-    )
+    title = f"tree search: {arguments.simulations} simulations, {MOVES} discrete actions"
+    publish(title, rows, arguments.out, device=device)
 
 
 if __name__ == "__main__":

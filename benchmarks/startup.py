@@ -73,7 +73,8 @@ def main() -> None:
     ]
     for row in rows:
         row["seconds"] = round(float(str(row["seconds"])), 1)
-    publish("startup", rows, args.out)
+    given = [word.removeprefix("device=") for word in args.arguments if word.startswith("device=")]
+    publish("startup", rows, args.out, device=(given or ["auto"])[0], ran=("franka_wm/", "train.py"))
 
 
 if __name__ == "__main__":

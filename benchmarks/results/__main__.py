@@ -10,7 +10,7 @@ from pathlib import Path
 import benchmarks.results
 from benchmarks.results import confirm, records, render, running
 from benchmarks.results.rows import Row, choose, load_rows
-from benchmarks.results.state import state, unmeasured
+from benchmarks.results.state import state
 from franka_wm.errors import FrankaError
 from franka_wm.files import atomic_write
 from franka_wm.source import ROOT
@@ -40,10 +40,16 @@ def overview(rows: Mapping[str, Row], place: Path) -> str:
 
 
 def to_measure(row: Row, seeds: Sequence[int], place: Path) -> list[int]:
-    """Those of a row's seeds that today's code has not measured."""
+    """Those of a row's seeds that today's code has not measured; all where that leaves a row of mixed packages."""
     found = records.read(row, place)
-    kind, _ = state(row, found)
-    return [seed for seed in seeds if kind not in ("fresh", "part") or seed in unmeasured(row, found)]
+    fresh = {record["seed"] for record in found if state(row, [record])[0] in ("fresh", "part")}
+    missing = [seed for seed in seeds if seed not in fresh]
+    return missing or [seed for seed in seeds if state(row, found)[0] == "mixed"]
+
+
+def is_fresh(row: Row, place: Path) -> bool:
+    """Whether today's code has measured all of the row."""
+    return state(row, records.read(row, place))[0] == "fresh"
 
 
 def write_pages(rows: Mapping[str, Row], place: Path) -> None:
@@ -120,7 +126,12 @@ def main(arguments: list[str] | None = None) -> int:
             )
             work = [(row, chosen.seeds or row.seeds) for row in (choose(rows, name) for name in chosen.rows)]
             if chosen.missing:
-                work = [(row, to_measure(row, seeds, chosen.results)) for row, seeds in work]
+                work = [
+                    (row, left)
+                    for row, seeds in work
+                    if (left := to_measure(row, seeds, chosen.results))
+                    or (row.script is not None and not is_fresh(row, chosen.results))
+                ]
             failed = running.run(
                 work, machine, out=chosen.out.absolute(), place=chosen.results, minutes=chosen.minutes
             )

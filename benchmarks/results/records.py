@@ -6,6 +6,7 @@ docs/results/code/HASH.json, which the files name.
 
 from __future__ import annotations
 
+import argparse
 import hashlib
 import json
 import shlex
@@ -73,12 +74,13 @@ def record_benchmark(row: Row, file: Path, *, commit: str | None = None) -> dict
     """What a benchmark wrote with ``--out``.
 
     Raises:
-        UserError: The file is not one of a benchmark.
+        UserError: The file is not one of a benchmark, was made with other arguments, or on another kind of machine.
     """
     found = read_json(file)
     if not found or not {"machine", "rows"} <= set(found) or "source" not in found["machine"]:
         raise UserError(f"{file}: not what a benchmark wrote with --out")
     check_machine(row, found["machine"], file)
+    check_script(row, found["machine"].get("command"), file)
     return {
         "row": row.name,
         "command": shlex.join(row.command),
@@ -102,6 +104,21 @@ def check_arguments(row: Row, typed: Sequence[str], where: Any) -> None:
             f"with {a}" for a in sorted(given - wanted)
         ]
         raise UserError(f"{where}: not a run of {row.name}, started {', '.join(apart)}")
+
+
+def check_script(row: Row, typed: Sequence[str] | None, where: Any) -> None:
+    """Refuses a benchmark whose command, as far as its file says it, is not the row's.
+
+    Raises:
+        UserError: It says what it was made by.
+    """
+    if typed is None:  # of an earlier version
+        return
+    parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
+    parser.add_argument("--out")
+    given = [f"benchmarks/{Path(typed[0]).name}", *parser.parse_known_args(typed[1:])[1]]
+    if given != [row.script, *row.words]:
+        raise UserError(f"{where}: not a measurement of {row.name}, made by {shlex.join(given)}")
 
 
 def check_machine(row: Row, versions: Mapping[str, Any], where: Any) -> None:

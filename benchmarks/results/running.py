@@ -103,6 +103,8 @@ def run(
         UserError: Before anything runs.
     """
     begun, failed = time.monotonic(), []
+    if not work:
+        return []
     if machine.extra and (scripts := [row.name for row, _ in work if row.script is not None]):
         raise UserError(
             f"--extra: {', '.join(scripts)}: benchmarks have no arguments of train.py; run them apart"

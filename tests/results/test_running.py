@@ -162,6 +162,32 @@ def test_only_what_is_missing_is_run(tmp_path, monkeypatch) -> None:
     assert command_line.to_measure(ROW, ROW.seeds, tmp_path) == []
 
 
+def test_a_row_that_was_measured_anew_in_part_is_finished(tmp_path, monkeypatch) -> None:
+    """Seeds of the code before and of today's are mixed: those of today's stay."""
+    old, new = ({"seed": seed, "commit": str(seed)} for seed in (100, 101))
+
+    def judge(row, found) -> tuple[str, list[str]]:
+        return ("mixed" if len(found) > 1 else "stale" if found == [old] else "part"), []
+
+    monkeypatch.setattr(command_line, "state", judge)
+    monkeypatch.setattr(records, "read", lambda row, place: [old, new])
+    assert command_line.to_measure(ROW, ROW.seeds, tmp_path) == [100]
+    # Each by itself is today's, but they are of other packages.
+    monkeypatch.setattr(records, "read", lambda row, place: [new, {"seed": 100}])
+    assert command_line.to_measure(ROW, ROW.seeds, tmp_path) == [100, 101]
+
+
+def test_a_benchmark_that_is_fresh_is_not_missing(tmp_path, monkeypatch) -> None:
+    ran = []
+    monkeypatch.setattr(running, "_benchmark", lambda row, *_: ran.append(row.name) or [])
+    for kind in ("fresh", "stale", "missing"):
+        monkeypatch.setattr(command_line, "state", lambda row, found, kind=kind: (kind, []))
+        places = ["--results", str(tmp_path), "--out", str(tmp_path / "out")]
+        assert main(["run", "search-gpu", "--missing", *places]) == 0
+        assert ran == ([] if kind == "fresh" else ["search-gpu"])
+        ran.clear()
+
+
 @pytest.mark.slow
 def test_a_row_is_run_and_collected(tmp_path, capsys) -> None:
     words = "env=reach_fixed evaluation.episodes=2 evaluation.video_episodes=0 logger=none"
