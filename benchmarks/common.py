@@ -5,7 +5,9 @@ from __future__ import annotations
 import json
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
 from datetime import UTC, datetime
 from typing import Any
 
@@ -45,6 +47,36 @@ def rate(work: Callable[[], Any], *, seconds: float = 2.0, warmup: int = 3, repe
         synchronize()
         rates.append(count / (time.perf_counter() - started))
     return sorted(rates)[repeats // 2]
+
+
+@dataclass
+class Power:
+    """Mean power of a GPU [W]; nan before it is known, and where it cannot be."""
+
+    watts: float = float("nan")
+
+
+@contextmanager
+def power(device: torch.device) -> Iterator[Power]:
+    """Measures the power of the whole GPU meanwhile, by NVML's energy counter; on a CPU nothing."""
+    drawn = Power()
+    if device.type != "cuda":
+        yield drawn
+        return
+    try:
+        import pynvml  # pyright: ignore[reportMissingImports]
+    except ModuleNotFoundError:
+        print("power is not measured; pip install nvidia-ml-py")
+        yield drawn
+        return
+    pynvml.nvmlInit()
+    # NVML counts GPUs as they are built in, CUDA as they are visible.
+    gpu = pynvml.nvmlDeviceGetHandleByUUID(f"GPU-{torch.cuda.get_device_properties(device).uuid}")
+    started, before = time.perf_counter(), pynvml.nvmlDeviceGetTotalEnergyConsumption(gpu)  # mJ
+    yield drawn
+    joule = (pynvml.nvmlDeviceGetTotalEnergyConsumption(gpu) - before) / 1e3
+    drawn.watts = joule / (time.perf_counter() - started)
+    pynvml.nvmlShutdown()
 
 
 def tdmpc2(latent: int, encoder: int, hidden: int) -> Any:

@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import benchmarks.results
-from benchmarks.results import confirm, records, render, running
+from benchmarks.results import confirm, plots, records, render, running
 from benchmarks.results.rows import Row, choose, load_rows
 from benchmarks.results.state import state
 from franka_wm.errors import FrankaError
@@ -53,7 +53,10 @@ def is_fresh(row: Row, place: Path) -> bool:
 
 
 def write_pages(rows: Mapping[str, Row], place: Path) -> None:
-    """docs/results.md and README's tables."""
+    """docs/results.md, its pictures and README's tables."""
+    for row in rows.values():
+        if row.plot and (found := records.read(row, place)):
+            plots.write(row, found[0], place)
     readme = ROOT / "README.md"
     for path, text in (
         (ROOT / "docs" / "results.md", render.page(rows, place)),

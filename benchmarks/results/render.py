@@ -205,10 +205,8 @@ def part(row: Row, records: Sequence[Record], judged: tuple[str, list[str]], pla
             ]
         else:
             many = f"{len(reasons)} files" if len(reasons) > 1 else "one file"
-            lines += [
-                f"**Measured before changes of {many}.** <details><summary>Files</summary>{files}</details>",
-                "",
-            ]
+            opened = f"<details><summary>Files</summary>{files}</details>"
+            lines += [f"**Measured before changes of {many}.** {opened}", ""]
     if missing := unmeasured(row, records):
         one = "seed" if len(missing) == 1 else "seeds"
         lines += [
@@ -216,7 +214,8 @@ def part(row: Row, records: Sequence[Record], judged: tuple[str, list[str]], pla
             "",
         ]
     if row.script is not None:
-        return "\n".join([*lines, table(list(records[0]["rows"][0]), _cells(records[0]["rows"])), ""])
+        shown = [f"![{row.title}](results/{row.picture})", ""] if row.plot else []
+        return "\n".join([*lines, *shown, table(list(records[0]["rows"][0]), _cells(records[0]["rows"])), ""])
     if judgement := verdicts(row, records):
         cells = [[wanted, reached, "yes" if enough else "**no**"] for wanted, reached, enough in judgement]
         lines += [table(["wanted", "measured", "reached"], cells), ""]

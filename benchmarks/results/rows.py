@@ -57,6 +57,7 @@ class Row:
     script: str | None = None
     text: str = ""
     readme: bool | list[str] = False
+    plot: Mapping[str, str] | None = None
 
     @property
     def words(self) -> list[str]:
@@ -67,6 +68,11 @@ class Row:
     def command(self) -> list[str]:
         """What is typed, without the seed."""
         return ["python", self.script or "train.py", *self.words]
+
+    @property
+    def picture(self) -> str:
+        """Where a benchmark's picture lies in the folder of the results."""
+        return f"{self.name}/plot.svg"
 
     @property
     def prepares(self) -> tuple[list[str], str] | None:
