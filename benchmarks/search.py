@@ -23,6 +23,8 @@ from franka_wm.planning import MCTS
 from franka_wm.policies import SearchPolicy
 
 MOVES = 15
+TREES = {"plain": False, "kernels": True}
+"""Whether it walks in kernels."""
 
 
 def main() -> None:
@@ -32,6 +34,10 @@ def main() -> None:
     parser.add_argument("--device", default="auto")
     parser.add_argument("--envs", type=int, nargs="+", default=[1, 64, 1024])
     parser.add_argument("--variants", nargs="+", default=["puct", "gumbel"], choices=["puct", "gumbel"])
+    parser.add_argument("--trees", nargs="+", default=list(TREES), choices=TREES)
+    parser.add_argument(
+        "--compile", action="store_true", help="torch.compile the model's part, as planner.compile does"
+    )
     parser.add_argument("--simulations", type=int, default=50)
     parser.add_argument("--seconds", type=float, default=3.0)
     parser.add_argument("--out")
@@ -44,9 +50,9 @@ def main() -> None:
     )
     model.eval()
     rows = []
-    for variant, kernels in product(arguments.variants, (False, True)):
+    for variant, tree in product(arguments.variants, arguments.trees):
         search = MCTS(
-            num_actions=MOVES, num_simulations=arguments.simulations, variant=variant, kernels=kernels
+            num_actions=MOVES, num_simulations=arguments.simulations, variant=variant, kernels=TREES[tree]
         )
         for envs in arguments.envs:
             observation = TensorDict(
@@ -57,12 +63,14 @@ def main() -> None:
                 batch_size=[envs],
             )
             for way in ("eager", "captured") if device.type == "cuda" else ("eager",):
-                policy = SearchPolicy.for_model(model, search, explore=True, capture=way == "captured")
+                policy = SearchPolicy.for_model(
+                    model, search, explore=True, capture=way == "captured", compile=arguments.compile
+                )
                 decisions = rate(partial(policy, observation), seconds=arguments.seconds)
                 rows.append(
                     {
                         "variant": variant,
-                        "tree": "kernels" if kernels else "plain",
+                        "tree": tree,
                         "launched": way,
                         "environments": envs,
                         "ms/decision": 1e3 / decisions,
@@ -71,7 +79,8 @@ def main() -> None:
                     }
                 )
                 print(rows[-1], flush=True)
-    title = f"tree search: {arguments.simulations} simulations, {MOVES} discrete actions"
+    details = ", compiled" if arguments.compile else ""
+    title = f"tree search: {arguments.simulations} simulations, {MOVES} discrete actions{details}"
     publish(title, rows, arguments.out, device=device)
 
 
