@@ -62,6 +62,7 @@ def test_no_interpolation_is_resolved_into_a_page(run: Path, monkeypatch) -> Non
 IN_RUN = ("config.yaml", "versions.json", "evaluation.json", "last_frame.png")
 BELOW = (
     ".hydra/overrides.yaml",
+    ".hydra/hydra.yaml",
     "evaluation/evaluation.json",
     "evaluation/timing.json",
     "evaluation/imagined.mp4",

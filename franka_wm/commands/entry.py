@@ -90,6 +90,9 @@ def _run(main: Callable[[], Any], arguments: list[str]) -> None:
     _sweep, _there, asked = None, None, hydra_flags(arguments)
     if asked.experimental_rerun:
         fail("--experimental-rerun unpickles a file, which may run anything; resume=RUN goes on with a run")
+    modes = [flag for flag in ("run", "multirun", "cfg", "info", "shell_completion") if getattr(asked, flag)]
+    if len(modes) > 1 and not (asked.help or asked.hydra_help):
+        fail(f"--{' beside --'.join(modes)}: give one of them")
     flags = [a for a in arguments if a not in asked.overrides]
     overrides = with_folder(asked)
     elsewhere = asked.config_name or asked.config_path

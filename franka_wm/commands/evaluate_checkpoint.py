@@ -143,8 +143,11 @@ def _shift(agent: Agent, options: Options, results: dict[str, Any], say: Say) ->
 def _write(
     folder: Path, results: dict[str, Any], text: str, evaluation: Evaluation, imagined: Imagined | None
 ) -> None:
-    """Every file whole; the one that others read, last."""
-    if imagined is not None:
+    """Every file whole; the one that others read, last. Nothing stays of an earlier evaluation."""
+    if imagined is None:
+        for name in ("imagined.png", "imagined.mp4"):
+            (folder / name).unlink(missing_ok=True)
+    else:
         from franka_wm.video import write_png, write_video
 
         write_png(imagined.strip, folder / "imagined.png")

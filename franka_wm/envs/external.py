@@ -137,15 +137,25 @@ class ExternalEnv(TransformedEnv):
         return {"return": total / count_or_one, "length": length / count_or_one, "episodes": count}
 
 
-def check_external(config: ExternalConfig) -> None:
+def check_external(config: ExternalConfig) -> tuple[dict[str, int], int, int]:
     """Makes one copy and closes it again.
+
+    Returns:
+        Sizes of the observations that models read; the size of a continuous action, or 0; how many discrete actions
+        there are, or 0.
 
     Raises:
         UserError: The extra is not installed, or there is no such environment or observation.
     """
     env = _make_one(config)
     try:
-        _groups(config, env)
+        spec = env.observation_spec
+        sizes = {
+            name: sum(spec[key].shape.numel() for key in keys) for name, keys in _groups(config, env).items()
+        }
+        action: Any = env.action_spec
+        continuous = action.dtype.is_floating_point
+        return sizes, action.shape[-1] if continuous else 0, 0 if continuous else int(action.n)
     finally:
         env.close()
 

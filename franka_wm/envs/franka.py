@@ -286,9 +286,11 @@ class FrankaEnv(EnvBase):
             goal: (N, 3), or (3,) for all worlds [m], in the world's frame.
 
         Raises:
-            UserError: Another shape, or a number that is not finite; nothing is changed then.
+            UserError: Another shape, a number that is not finite, or, with ``task="track"``, less than 5 cm above the
+                ground; nothing is changed then.
         """
-        self.simulation.set_goal(goals_given(goal, self.num_envs, self.device))
+        lowest = self.simulation.task.lowest_goal
+        self.simulation.set_goal(goals_given(goal, self.num_envs, self.device, lowest))
         return self._observed_anew()
 
     def _observed_anew(self) -> TensorDict:

@@ -35,6 +35,8 @@ except ImportError as error:
     raise UserError(f"franka_wm.envs.gym needs pip install 'franka-wm[gym]' ({error})") from error
 
 CAMERA = "front"
+RENAMED = ("pixels", "state", "goal", "success", "is_init")
+"""What has another name, or no place, among Gymnasium's observations."""
 
 REACH_V0: dict[str, Any] = {
     "observations": ("pixels", "state"),
@@ -60,6 +62,9 @@ class FrankaVectorEnv(gymnasium.vector.VectorEnv):
     ``agent_pos``            (N, 7) float32                joint angles [rad]
     ``environment_state``    (N, 3) float32                the goal [m]
     =======================  ============================  ======================================
+
+    All else that ``observations`` and ``cameras`` ask for has its own name: ``objects``, ``joint_target``, ``depth``,
+    ``pixels_wrist``, …, (N, …) as :class:`~franka_wm.envs.FrankaEnv` has it.
 
     Actions are (N, A) float32 in [−1, 1], where A is 7, or 3 with ``action_mode="ee_delta"``. Rewards are (N,)
     float32, terminations and truncations (N,) bool.
@@ -126,6 +131,12 @@ class FrankaVectorEnv(gymnasium.vector.VectorEnv):
         # Joints may overshoot their limits a little, so the box is open.
         entries["agent_pos"] = spaces.Box(-np.inf, np.inf, (NUM_JOINTS,), np.float32)
         entries["environment_state"] = spaces.Box(-np.inf, np.inf, (3,), np.float32)
+        self._others = [key for key in env.observation_spec if key not in RENAMED]
+        for key in self._others:
+            spec = env.observation_spec[key]
+            image = spec.dtype == torch.uint8
+            low, high, dtype = (0, 255, np.uint8) if image else (-np.inf, np.inf, np.float32)
+            entries[key] = spaces.Box(low, high, tuple(spec.shape[1:]), dtype)
         self.single_observation_space = spaces.Dict(entries)
         self.single_action_space = spaces.Box(-1.0, 1.0, (env.action_dim,), np.float32)
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
@@ -244,6 +255,7 @@ class FrankaVectorEnv(gymnasium.vector.VectorEnv):
             out["pixels"] = {CAMERA: tensordict.get("pixels").contiguous().cpu().numpy()}
         out["agent_pos"] = tensordict.get("state")[:, :NUM_JOINTS].contiguous().cpu().numpy()
         out["environment_state"] = tensordict.get("goal").contiguous().cpu().numpy()
+        out |= {key: tensordict.get(key).contiguous().cpu().numpy() for key in self._others}
         return out, _host(tensordict.get("success"))
 
 
@@ -264,9 +276,9 @@ class FrankaGymEnv(gymnasium.Env):
     """One arm behind Gymnasium's interface: a :class:`FrankaVectorEnv` of one world, without its leading dimension.
 
     Observations are those of the vector environment: ``pixels``/``front`` (H, W, 3) uint8, ``agent_pos`` (7,)
-    [rad], ``environment_state`` (3,) [m]. Actions are (A,) float32 in [−1, 1]; A is 7, or 3 with
-    ``action_mode="ee_delta"``. ``info["is_success"]`` belongs to the observation returned. A finished episode
-    goes on until :meth:`reset`, still finished.
+    [rad], ``environment_state`` (3,) [m], and what else was asked for. Actions are (A,) float32 in [−1, 1]; A is
+    7, or 3 with ``action_mode="ee_delta"``. ``info["is_success"]`` belongs to the observation returned. A finished
+    episode goes on until :meth:`reset`, still finished.
 
     Args:
         device: Where it simulates; the GPU where there is one.

@@ -56,11 +56,11 @@ def observation_spec(
     return Composite(**entries, shape=(n,), device=device)
 
 
-def goals_given(goal: Any, n: int, device: torch.device) -> torch.Tensor:
+def goals_given(goal: Any, n: int, device: torch.device, lowest: float) -> torch.Tensor:
     """Goals (n, 3) [m] from as many, or from one (3,) for all worlds.
 
     Raises:
-        UserError: No numbers, another shape, or a number that is not finite.
+        UserError: No numbers, another shape, a number that is not finite, or a goal below ``lowest`` [m].
     """
     try:
         goals = torch.as_tensor(goal, dtype=torch.float32, device=device)
@@ -71,4 +71,9 @@ def goals_given(goal: Any, n: int, device: torch.device) -> torch.Tensor:
     wrong = goals[~goals.isfinite()]
     if len(wrong):
         raise UserError(f"set_goal: has {float(wrong[0])}; all numbers must be finite, in metres")
+    low = goals[..., 2].min()
+    if low < lowest:
+        raise UserError(
+            f"set_goal: has a goal {low:.3g} m high; this task keeps them at {lowest:g} m or above"
+        )
     return goals.expand(n, 3)

@@ -385,6 +385,7 @@ class Session:
         point = torch.tensor([float(x) for x in goal], dtype=torch.float32)
         if point.shape != (3,) or not bool((point.abs() <= FARTHEST).all()):  # NaN is not, either
             raise UserError(f"goal {tuple(goal)}: must be three numbers, none beyond ±{FARTHEST:g} m")
+        point[2].clamp_(min=self.arm.simulation.task.lowest_goal)  # one that is dragged lower stays there
         return point.to(self.arm.device)
 
     def _check_policy(self, name: str) -> None:

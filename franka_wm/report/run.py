@@ -2,6 +2,7 @@
 
     config.yaml             what was run
     .hydra/overrides.yaml   what was typed after ``train.py``
+    .hydra/hydra.yaml       and where configurations of the user's own are
     versions.json           packages and machine, as `franka_wm.versions` writes them
     evaluation.json         results, as :mod:`franka_wm.evaluation.results` describes them
     checkpoints/…           counters and the logged rows; without a checkpoint, rows come from ``csv/``
@@ -39,7 +40,7 @@ class RunFiles:
     Attributes:
         folder: of the run.
         config: as the run saved it; interpolations are never resolved here.
-        overrides: typed after ``train.py``.
+        overrides: typed after ``train.py``, of Hydra's own only where configurations of the user's are.
         versions: of packages and machine.
         results: of the run's end and of ``franka-wm evaluate``; the one with most episodes, which is shown, first.
         rows: logged while training, and what its end found.
@@ -130,7 +131,7 @@ def _read_run(run: Path) -> RunFiles:
     return RunFiles(
         folder=run.resolve(),
         config=config or {},
-        overrides=[str(one) for one in files.yaml(".hydra/overrides.yaml") or []],
+        overrides=_overrides(files),
         versions=versions,
         results=found,
         rows=rows,
@@ -172,6 +173,13 @@ def _config(files: UntrustedFolder) -> dict[str, Any] | None:
             f"{files.root / 'config.yaml'} holds no configuration; remove it or give another run."
         )
     return found
+
+
+def _overrides(files: UntrustedFolder) -> list[str]:
+    told = files.yaml(".hydra/hydra.yaml")
+    hydras = told["hydra"]["overrides"]["hydra"] if told else []  # such as the folder, which is this run's
+    paths = [one for one in map(str, hydras) if one.startswith("hydra.searchpath=")]
+    return [*map(str, files.yaml(".hydra/overrides.yaml") or []), *paths]
 
 
 def _image(files: UntrustedFolder, name: str) -> Path | None:

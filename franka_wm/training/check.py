@@ -223,13 +223,13 @@ def _check_planner(run: RunSettings) -> None:
         raise UserError(
             f"planner.name={run.planner.name!r}: must be one of {', '.join(registry.available())}{OF_ONES_OWN}"
         )
+    if run.model.family.has_next:
+        run.check_planner_fits()
     registry.validate(run.planner.name, run.planner.options)
 
 
 def _check_parts(run: RunSettings) -> None:
     """Builds what costs little, where the environment's sizes are known before it is."""
-    if isinstance(run.env.config, ExternalConfig):
-        check_external(run.env.config)
     if isinstance(run.env.config, MultiTaskConfig):
         counts = {
             "collector.num_envs": run.collector.num_envs,
@@ -242,12 +242,11 @@ def _check_parts(run: RunSettings) -> None:
                     f"{option}={count}: env=multitask has {(tasks := len(run.env.config.tasks))} tasks, each needs a "
                     f"world; use at least {tasks}, or leave tasks out: '~env.tasks.NAME'"
                 )
-    if not run.is_arm:
+    if run.is_arm:
+        check_robot(run.env.arm, run.env.urdf_path)
+    spaces = known_spaces(run)
+    if run.is_offline or spaces is None:
         return
-    check_robot(run.env.arm, run.env.urdf_path)
-    if run.is_offline:
-        return
-    spaces = Spaces.of_config(run.env.arm, discrete=run.is_discrete)
     run = _with_encoder(run, spaces)
     model = sketch(run, spaces)
     if model is None:
@@ -255,15 +254,27 @@ def _check_parts(run: RunSettings) -> None:
     if run.objective_name == "goal_image":
         goals = goal_images(model.image_sizes).values()
         if not goals or any(goal not in spaces.image_sizes for goal in goals):
+            there = [*spaces.observation_sizes, *spaces.image_sizes]
             raise UserError(
-                "planning to a goal image needs goal_pixels among env.observations="
-                f"{list(run.env.arm.observations)}, and a model that reads pixels, not {model.observation_keys}; "
+                f"planning to a goal image needs goal_pixels (here are {', '.join(there)}), and a model that reads "
+                f"pixels, not {model.observation_keys}; "
                 "use env=reach_goal_image, lift_goal_image or another …_goal_image"
             )
     build.make_objective(run, model)
     if model.has_next:
         build.make_planner(run, spaces.num_actions or spaces.action_dim)
     check_memory(run, model, spaces)
+
+
+def known_spaces(run: RunSettings) -> Spaces | None:
+    """Those of the environment before its worlds are built; ``None`` without one."""
+    config = run.env.config
+    if isinstance(config, ExternalConfig):
+        sizes, action_dim, num_actions = check_external(config)
+        return Spaces(sizes, {}, action_dim, num_actions, config.episode_length, None, config.kind == "gym")
+    if isinstance(config, MultiTaskConfig):
+        return Spaces.of_tasks(config)
+    return Spaces.of_config(run.env.arm, discrete=run.is_discrete) if run.is_arm else None
 
 
 def _with_encoder(run: RunSettings, spaces: Spaces) -> RunSettings:

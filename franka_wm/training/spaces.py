@@ -11,6 +11,7 @@ import torch
 from franka_wm.envs import Environment
 from franka_wm.envs.config import IMAGES, FrankaConfig
 from franka_wm.envs.discretize import discrete_action_table
+from franka_wm.envs.multitask_config import MultiTaskConfig
 from franka_wm.envs.tasks import make_task
 from franka_wm.errors import UserError
 
@@ -123,6 +124,25 @@ class Spaces:
             episode_length=config.episode_length,
             reward_bounds=make_task(config).reward_bounds,
             terminates=config.terminate_on_success,
+        )
+
+    @classmethod
+    def of_tasks(cls, config: MultiTaskConfig) -> Spaces:
+        """Spaces of several tasks in one environment, before it is built."""
+        parts = [cls.of_config(one) for one in config.tasks.values()]
+        sizes = {"task": len(parts)}
+        for key, size in (item for part in parts for item in part.observation_sizes.items()):
+            sizes[key] = max(size, sizes.get(key, 0))
+        most, bounds = max(part.action_dim for part in parts), [part.reward_bounds for part in parts]
+        known = [one for one in bounds if one is not None]
+        masks = [[float(k < part.action_dim) for k in range(most)] for part in parts]
+        return cls(
+            observation_sizes=sizes,
+            action_dim=most,
+            episode_length=config.episode_length,
+            reward_bounds=(min(a for a, _ in known), max(b for _, b in known)) if known == bounds else None,
+            terminates=config.terminate_on_success,
+            action_masks=masks if any(0.0 in mask for mask in masks) else None,
         )
 
     @classmethod

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import pytest
 import torch
@@ -105,6 +106,15 @@ def test_a_result_of_more_episodes_is_not_replaced(tmp_path: Path, capsys) -> No
     assert "holds a result of 100 episodes, which one of 99 would replace" in capsys.readouterr().err
     assert cli.main(["evaluate", str(tmp_path), "episodes=100", "device=cpu"]) == 1
     assert "no checkpoint in" in capsys.readouterr().err  # nothing against it: it goes on to load
+
+
+def test_images_of_an_earlier_evaluation_do_not_stay_beside_new_numbers(tmp_path: Path) -> None:
+    for name in ("imagined.png", "imagined.mp4", "mine.png"):
+        (tmp_path / name).write_text("earlier")
+    nothing: Any = SimpleNamespace(seconds={}, worlds=2)
+    evaluate_checkpoint._write(tmp_path, {}, "", nothing, None)
+    names = {"mine.png", "timing.json", "evaluation.md", "evaluation.json"}
+    assert {one.name for one in tmp_path.iterdir()} == names
 
 
 @pytest.mark.parametrize("out", ["taken", "taken/below"])

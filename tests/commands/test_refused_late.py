@@ -97,18 +97,19 @@ def test_a_file_of_the_users_stays(refused: Refused, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("word", "said"),
+    ("words", "said"),
     [
         ("hydra.run.dir=", "hydra.run.dir=: names no folder"),
         ("--experimental-rerun=job.pickle", "unpickles a file"),
+        ("-m --cfg job seed=0,1", "--multirun beside --cfg: give one of them"),
     ],
 )
 def test_what_hydra_would_take_is_refused_early(
-    word: str, said: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+    words: str, said: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.chdir(tmp_path)
     with pytest.raises(SystemExit) as ended:
-        run_command(lambda: pytest.fail("begun"), ["scale=smoke", "device=cpu", word])
+        run_command(lambda: pytest.fail("begun"), ["scale=smoke", "device=cpu", *words.split()])
     line = capfd.readouterr().err
     assert ended.value.code == 1 and said in line and line.count("\n") == 1
     assert list(tmp_path.iterdir()) == []

@@ -114,6 +114,22 @@ def test_a_search_needs_its_plugin_and_its_direction(tmp_path: Path, capsys) -> 
     assert entry.check_sweep(["hydra/sweeper=optuna", "hydra.sweeper.direction=maximize"]).names == []
 
 
+def test_folders_are_not_looked_for_where_a_launcher_may_take_jobs_to_other_machines(
+    monkeypatch: pytest.MonkeyPatch, capsys
+) -> None:
+    """Of a search, whose jobs are not known beforehand: of those of a sweep each is checked whole."""
+    for plugin in ("optuna_sweeper", "joblib_launcher"):
+        pytest.importorskip(f"hydra_plugins.hydra_{plugin}")
+    monkeypatch.setattr(sys, "argv", ["train.py"])
+    search = ["-m", "hydra/sweeper=optuna", "hydra.sweeper.direction=maximize", "scale=smoke", "device=cpu"]
+    begun = []
+    entry._run(lambda: begun.append(1), [*search, "replay.demos=elsewhere", "hydra/launcher=joblib"])
+    assert begun and capsys.readouterr().err == ""
+    with pytest.raises(SystemExit):
+        entry._run(lambda: pytest.fail("begun"), [*search, "replay.demos=elsewhere"])
+    assert capsys.readouterr().err == "error: replay.demos=elsewhere: no such folder\n"
+
+
 def test_what_a_run_returns_is_better_the_higher() -> None:
     rate, distance, gain = ({"mean": x, "low": 0.0, "high": 1.0} for x in (0.25, 0.3, 7.0))
     assert score({"planner": {"success": rate, "return": gain}, "policy": {"return": gain}}) == 0.25

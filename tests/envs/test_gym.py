@@ -65,6 +65,25 @@ def test_actions_are_as_many_as_the_mode_has() -> None:
         view.step(np.zeros((2, 7), np.float32))
 
 
+def test_what_else_was_asked_for_is_observed() -> None:
+    """Under its own name, as the arm itself has it; nothing that was asked for is dropped."""
+    options = {"image_size": 16, "substeps": 2, "device": "cpu", "cameras": ("front", "wrist")}
+    asked = ("pixels", "segmentation", "depth", "state", "joint_target", "objects", "contacts")
+    one = gymnasium.make("franka_wm/Lift-v0", observations=asked, **options).unwrapped
+    assert isinstance(one, FrankaGymEnv) and isinstance(one.observation_space, gymnasium.spaces.Dict)
+    others = {*asked, "pixels_wrist", "segmentation_wrist", "depth_wrist"} - {"pixels", "state"}
+    assert set(one.observation_space) == others | {"pixels", "agent_pos", "environment_state"}
+    observation = one.reset(seed=0)[0]
+    present = FrankaEnv(one.env.config, num_envs=1, device="cpu").reset(seed=0)
+    kept = {key: observation[key].copy() for key in others}
+    moved = one.step(np.ones(8, np.float32))[0]
+    for each in (observation, moved):
+        assert one.observation_space.contains(each)
+    for key in others:
+        assert np.array_equal(observation[key], kept[key]) and np.array_equal(kept[key], present[key][0])
+    assert not np.array_equal(moved["joint_target"], kept["joint_target"])
+
+
 def test_registering_again_changes_nothing() -> None:
     spec = gymnasium.spec("FrankaWM/Reach-v0")
     register()

@@ -66,6 +66,28 @@ def test_a_moving_goal_goes_on_from_there(small_env) -> None:
         torch.testing.assert_close(root["goal"], untouched["goal"] + shift, rtol=0, atol=1e-6)
 
 
+def test_a_circle_that_touches_the_ground_passes_where_the_goal_was_set(small_env) -> None:
+    """Also where it is set while it is kept above the ground: after one turn it is there again."""
+    env = small_env(N, task="track", track_radius=0.6, track_period=0.4, goal_sampling="reachable")
+    turn = round(0.4 * env.config.fps)
+    root = env.reset(seed=0)
+    for _ in range(turn):
+        if (kept := root["goal"][:, 2] == 0.05).any():
+            break
+        root = env.step_and_maybe_reset(root.set("action", zeros(env)))[1]
+    assert kept.any()
+    root = env.set_goal(GOALS)
+    for _ in range(turn):
+        before, root = root["goal"], env.step_and_maybe_reset(root.set("action", zeros(env)))[1]
+        assert ((root["goal"] - before).norm(dim=-1) <= 0.6 * 2 * torch.pi / turn + 1e-5).all(), "it jumps"
+    torch.testing.assert_close(root["goal"], GOALS, rtol=0, atol=1e-5)
+    for low, said in ((0.04, "has a goal 0.04 m high; this task keeps them at 0.05 m"), (-5.0, "-5 m")):
+        with pytest.raises(UserError, match=said):
+            env.set_goal([0.4, 0.0, low])
+    assert torch.equal(env.goal, root["goal"])
+    assert (env.set_goal([0.4, 0.0, 0.05])["goal"][:, 2] == 0.05).all()
+
+
 def test_goal_pictures_show_the_new_goal(small_env) -> None:
     env = small_env(
         2, observations=("pixels", "goal_pixels", "state"), image_size=32, goal_sampling="reachable"

@@ -128,6 +128,11 @@ def test_a_goal_set_by_hand_outlives_the_episode_only_if_asked(make_session) -> 
     np.testing.assert_allclose(play(session, 50).tool, LEFT, atol=0.02)
 
 
+def test_a_moving_goal_that_is_dragged_into_the_ground_stays_above(make_session) -> None:
+    session = make_session(policy="noop", task="track")
+    np.testing.assert_allclose(session.set_goal((0.4, 0.0, -0.1)).goal, (0.4, 0.0, 0.05))
+
+
 def test_episodes_that_end_by_themselves_go_on_with_the_kept_goal(make_session) -> None:
     session = make_session(policy="ik", keep_goal=True, episode_length=3)
     session.set_goal(LEFT)

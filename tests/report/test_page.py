@@ -131,8 +131,10 @@ def test_sections_appear_only_with_their_data(make_run) -> None:
 
 def test_the_page_says_how_to_do_it_again(make_run) -> None:
     run = make_run()
+    hydras = "hydra: {overrides: {hydra: [hydra.mode=RUN, 'hydra.searchpath=[file://my]']}}"
+    (run / ".hydra" / "hydra.yaml").write_text(hydras)
     text = read(run).text
-    assert "franka-wm train env=reach_fixed seed=0 'note=a b'" in text
+    assert "franka-wm train env=reach_fixed seed=0 'note=a b' 'hydra.searchpath=[file://my]'\n" in text
     assert f"franka-wm report {run}" in text
 
 

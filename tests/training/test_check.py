@@ -9,7 +9,7 @@ from torch import nn
 from franka_wm import models
 from franka_wm.errors import UserError
 from franka_wm.training import build
-from franka_wm.training.check import check
+from franka_wm.training.check import check, known_spaces
 from franka_wm.training.spaces import Spaces
 
 MODELS = (
@@ -48,6 +48,54 @@ def test_a_check_looks_at_the_shapes_of_the_very_model(words, settled, monkeypat
 def test_what_a_constructor_refuses_is_refused_by_the_check(settled) -> None:
     with pytest.raises(UserError, match=r"model=vjepa|model=jepa.*patch_size must divide"):
         check(settled("device=cpu", "scale=smoke", *MODELS[-1], "model.patch_size=7"))
+
+
+GYM = ("env=gym", "env.name=Pendulum-v1")
+TASKS = (
+    "env=multitask",
+    *(f"~env.tasks.{name}" for name in ("track", "lift", "pick", "stack", "drawer", "peg")),
+)
+ENVIRONMENTS = (
+    ("env=gym", "model=muzero", "planner=gumbel"),  # CartPole: discrete actions
+    GYM,
+    ("env=dm_control", "+env.observations={state: [to_target, velocity], pose: position}"),
+    TASKS,
+)
+
+
+@pytest.mark.parametrize("words", ENVIRONMENTS)
+def test_sizes_are_known_before_worlds_are_built(words, settled) -> None:
+    if "env=dm_control" in words:
+        pytest.importorskip("dm_control")
+    settings = settled("device=cpu", "scale=smoke", *words)
+    check(settings)
+    env = build.make_env(settings, num_envs=2)
+    assert known_spaces(settings) == Spaces.of_env(env)
+    env.close()
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (("env=gym", "model=tdmpc2"), "model=tdmpc2 needs continuous actions, here are 2 discrete ones"),
+        ((*GYM, "model=tdmpc2_pixels"), "reads 'pixels', here are state"),
+        ((*GYM, "model=muzero", "planner=gumbel"), "has discrete actions; this environment's actions are"),
+        ((*GYM, "planner=mcts"), "planner=mcts: model=tdmpc2 has continuous actions; use planner=mppi"),
+        (("env=gym", "model=muzero"), "planner=mppi: model=muzero has discrete actions; use planner=mcts"),
+        (
+            (*GYM, "objective=goal_image"),
+            r"needs goal_pixels \(here are state\), and a model that reads pixels",
+        ),
+        (
+            (*TASKS, "model=tdmpc2_pixels"),
+            "reads 'pixels', here are goal, joint_target, objects, state, ",
+        ),
+        ((*TASKS, "model=muzero", "planner=gumbel"), "model=muzero has discrete actions"),
+    ],
+)
+def test_a_model_that_does_not_fit_is_refused_before_worlds_are_built(words, said, settled) -> None:
+    with pytest.raises(UserError, match=said):
+        check(settled("device=cpu", "scale=smoke", *words))
 
 
 def test_a_family_of_ones_own_is_built_whole(settled, monkeypatch) -> None:

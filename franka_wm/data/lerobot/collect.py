@@ -130,8 +130,8 @@ def gather(
                     batch = next(batches)
                     steps += batch.numel()
                     writer.add(episode for episode in cutter.push(batch) if chosen.takes(episode))
-                told = processes.objects((chosen.taken, chosen.seen, steps, stop()))
-                done, seen, all_steps, stopped = (sum(one) for one in zip(*told, strict=True))
+                told = processes.objects((chosen.taken, chosen.seen, chosen.steps, steps, stop()))
+                done, seen, kept, played, stopped = (sum(one) for one in zip(*told, strict=True))
                 if success_only and seen >= HOPELESS and not done:
                     raise UserError(
                         f"collect: none of {seen} episodes succeeded; success_only=true would never end: "
@@ -142,8 +142,8 @@ def gather(
                     rate = done / (now - started)
                     rest = f"   left {duration((left - done) / rate)}" if rate else ""
                     say(
-                        f"episodes {writer.resumed + done}/{episodes}   steps {count(all_steps)} "
-                        f"({count(all_steps / (now - started))}/s){rest}"
+                        f"episodes {writer.resumed + done}/{episodes}   steps {count(kept)} kept, "
+                        f"{count(played)} played ({count(played / (now - started))}/s){rest}"
                     )
                     said = now
         collector.shutdown()
@@ -159,11 +159,12 @@ class _Choice:
 
     Attributes:
         seen, taken: How many episodes it was asked for, and how many it took.
+        steps: Of those that it took.
     """
 
     def __init__(self, quota: np.ndarray, success_only: bool):
         self._left, self._success_only = quota.copy(), success_only
-        self.seen = self.taken = 0
+        self.seen = self.taken = self.steps = 0
 
     def takes(self, episode: Episode) -> bool:
         """Whether this one is kept; called for all in the order of their ends."""
@@ -175,6 +176,7 @@ class _Choice:
             return False
         self._left[world] -= 1
         self.taken += 1
+        self.steps += episode.length
         return True
 
 

@@ -193,13 +193,10 @@ class Simulation:
             self.renderer.show_all()
 
     def set_goal(self, goal: torch.Tensor) -> None:
-        """Moves every world's goal to ``goal`` (N, 3) [m], until its next reset; no host sync.
-
-        A goal that moves goes on from there: its circle is moved along.
-        """
+        """Moves every world's goal to ``goal`` (N, 3) [m], until its next reset; no host sync."""
         t = self.tensors
-        t.goal_center.add_(goal - t.task_goal)
         t.task_goal.copy_(goal)
+        self.task.goal_was_set(self)
         t.goal_q.copy_(self.kinematics.solve(goal, t.goal_q, iterations=24))
         if self.bodies:
             self.bodies.move_goal()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
@@ -34,6 +35,7 @@ class Task:
         scene: What stands around the arm, where the config does not say.
         home: Joint angles at the start [rad], where the config does not say; ``None``: the arm's.
         marker: What ``show_goal`` draws: a disc of this radius on the table [m]; ``None``: a ball at the goal.
+        lowest_goal: Where the task keeps its goals at or above this height [m]: so do those set by hand.
         rewards: What ``reward`` may be.
         words: The task in words, for datasets.
     """
@@ -44,6 +46,7 @@ class Task:
     scene: Scene | None = None
     home: tuple[float, ...] | None = None
     marker: float | None = None
+    lowest_goal = -math.inf
     rewards: tuple[str, ...] = ("dense", "sparse", "normalized")
     words = "Do what the reward asks for."
 
@@ -108,6 +111,9 @@ class Task:
 
     def advance(self, sim: Simulation) -> None:
         """Called in every step after the physics and before the observation: moves a goal that moves."""
+
+    def goal_was_set(self, sim: Simulation) -> None:
+        """Called when ``sim.tensors.task_goal`` was set by hand: a goal that moves goes on from there. Only torch."""
 
     def reward_and_success(self, sim: Simulation) -> None:
         """Writes ``sim.warp.reward`` and ``sim.warp.success`` (N, 1) from ``next_true_state`` (N, 20) and ``action``.

@@ -3,8 +3,10 @@
 """Track: keep the tool on a goal that moves."""
 
 # Warp reads annotations as types: no `from __future__ import annotations` here.
+import math
 from typing import TYPE_CHECKING
 
+import torch
 import warp as wp
 
 from franka_wm.envs.kernels import episode_rng
@@ -27,6 +29,7 @@ def circle_goal(
     dt: float,
     radius: float,
     period: float,
+    lowest: float,
     center: wp.array2d[float],
     goal: wp.array2d[float],
 ):
@@ -39,17 +42,19 @@ def circle_goal(
         angle = phase[world] + 2.0 * wp.pi * float(step_count[world, 0] + ahead) * dt / period
         goal[world, 0] = center[world, 0]
         goal[world, 1] = center[world, 1] + radius * wp.cos(angle)
-        goal[world, 2] = wp.max(center[world, 2] + radius * wp.sin(angle), 0.05)
+        goal[world, 2] = wp.max(center[world, 2] + radius * wp.sin(angle), lowest)
 
 
 class Track(Reach):
     """Follow a goal that moves on an upright circle.
 
     **Goal**: a circle of ``track_radius`` in the plane x = const around a centre that is chosen as
-    :class:`Reach` chooses its goal; one turn in ``track_period`` seconds, from a random phase. What is observed
-    is the goal's position at that moment. **Reward** and **success**: as in :class:`Reach`, at that moment.
+    :class:`Reach` chooses its goal, but 5 cm above the ground where it would be lower; one turn in
+    ``track_period`` seconds, from a random phase. What is observed is the goal's position at that moment.
+    **Reward** and **success**: as in :class:`Reach`, at that moment.
     """
 
+    lowest_goal = 0.05
     words = "Follow the moving goal with the tool."
 
     def __init__(self, config: "FrankaConfig"):
@@ -63,6 +68,12 @@ class Track(Reach):
     def advance(self, sim: "Simulation") -> None:
         self._move(sim, sim.warp.mask, everywhere=True, ahead=1)  # the step is counted after the observation
 
+    def goal_was_set(self, sim: "Simulation") -> None:
+        t, c = sim.tensors, self.config
+        angle = t.phase + 2.0 * math.pi * t.step_count.squeeze(-1) / (c.fps * c.track_period)
+        circle = torch.stack([torch.zeros_like(angle), angle.cos(), angle.sin()], -1)
+        t.goal_center.copy_(t.task_goal - c.track_radius * circle)
+
     def _move(self, sim: "Simulation", mask: wp.array, *, everywhere: bool, ahead: int) -> None:
         w, c = sim.warp, self.config
         wp.launch(
@@ -70,7 +81,7 @@ class Track(Reach):
             sim.num_envs,
             [
                 mask, everywhere, w.seed, w.episode, w.step_count, w.phase, ahead, 1.0 / c.fps, c.track_radius,
-                c.track_period, w.goal_center, w.task_goal,
+                c.track_period, self.lowest_goal, w.goal_center, w.task_goal,
             ],
             device=sim.device,
         )  # fmt: skip

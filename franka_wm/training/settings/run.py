@@ -307,6 +307,26 @@ class RunSettings:
             )
         return policy
 
+    def check_planner_fits(self) -> None:
+        """Whether the planner is one for the actions of the model.
+
+        Raises:
+            UserError: It is for the other kind.
+            ValueError: No planner has this name.
+        """
+        from franka_wm.planning import registry  # here: it imports torch
+
+        name, discrete = self.planner.name, self.is_discrete
+        if registry.is_search(name) == discrete:
+            return
+        fitting = [one for one in registry.available() if registry.is_search(one) == discrete]
+        fitting += ["gumbel"] if discrete else []  # mcts with other settings: a name in conf/planner alone
+        typed = "gumbel" if self.planner.options.get("variant") == "gumbel" else name
+        raise UserError(
+            f"planner={typed}: model={self.model.name} has {'discrete' if discrete else 'continuous'} actions; "
+            f"use planner={' or '.join(fitting)}"
+        )
+
     def planned_steps(self, updates: int = 0) -> int:
         """Steps that each world will make until the end of the run, after so many ``updates``."""
         c, t = self.collector, self.trainer

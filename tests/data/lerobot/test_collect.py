@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import signal
 import threading
 import time
@@ -135,6 +136,13 @@ def test_the_same_seed_gives_the_same_dataset(collected, tmp_path, load) -> None
     assert main(["collect", f"out={out}", "num_envs=8", "workers=0", "seed=5", "episodes=12", *SMALL]) == 0
     again, before = load(out), load(collected)
     assert np.array_equal(column(again, EPISODE_KEY), column(before, EPISODE_KEY)[: 12 * 6])
+
+
+def test_steps_of_discarded_episodes_are_counted_apart(tmp_path, load, capsys) -> None:
+    words = [*SMALL, "num_envs=8", "workers=0", "seed=5", "env.success_distance=0.45", "success_only=true"]
+    assert main(["collect", f"out={tmp_path}/set", "episodes=8", *words]) == 0
+    told = re.search(r"episodes 8/8   steps (\d+) kept, (\d+) played", capsys.readouterr().out)
+    assert told is not None and int(told[1]) == load(tmp_path / "set").num_frames == 48 < int(told[2])
 
 
 def test_ctrl_c_leaves_a_dataset(tmp_path, load) -> None:
