@@ -176,9 +176,10 @@ def _config(files: UntrustedFolder) -> dict[str, Any] | None:
 
 
 def _overrides(files: UntrustedFolder) -> list[str]:
-    told = files.yaml(".hydra/hydra.yaml")
-    hydras = told["hydra"]["overrides"]["hydra"] if told else []  # such as the folder, which is this run's
-    paths = [one for one in map(str, hydras) if one.startswith("hydra.searchpath=")]
+    hydras = files.yaml(".hydra/hydra.yaml")
+    for key in ("hydra", "overrides", "hydra"):  # most of these, such as the folder, are this run's alone
+        hydras = hydras.get(key) if isinstance(hydras, dict) else None
+    paths = [one for one in map(str, hydras or []) if one.startswith("hydra.searchpath=")]
     return [*map(str, files.yaml(".hydra/overrides.yaml") or []), *paths]
 
 
