@@ -2,6 +2,11 @@
 
 from __future__ import annotations
 
+import os
+import shutil
+import sysconfig
+from pathlib import Path
+
 import torch
 
 from franka_wm.errors import UserError
@@ -31,3 +36,17 @@ def resolve_device(device: torch.device | str | None) -> torch.device:
     if device.type != "cpu" or device.index:
         raise UserError(f"device={device}: Newton runs on cpu, which has no number, and cuda")
     return torch.device("cpu")
+
+
+def missing_to_compile(device: torch.device) -> str | None:
+    """What ``torch.compile`` needs for a device and this machine has not, in words; ``None``: nothing is missing.
+
+    On CUDA Triton builds its launchers with a C compiler, on a CPU the code itself is C++; both read Python's headers.
+    """
+    own, usual = ("CC", ["gcc", "clang"]) if device.type == "cuda" else ("CXX", ["g++"])
+    compilers = [os.environ[own]] if os.environ.get(own) else usual
+    if not any(map(shutil.which, compilers)):
+        return f"a compiler ({' or '.join(compilers)})"
+    if not Path(sysconfig.get_path("include", "posix_prefix"), "Python.h").is_file():
+        return "Python's headers (Python.h; the package python3-dev)"
+    return None

@@ -18,7 +18,7 @@ from franka_wm.data.future import FutureFrames
 from franka_wm.data.hindsight import Hindsight
 from franka_wm.data.lerobot.windows import RecordedWindows
 from franka_wm.data.replay import WindowReplay, make_replay
-from franka_wm.device import resolve_device
+from franka_wm.device import missing_to_compile, resolve_device
 from franka_wm.envs import Environment, FrankaEnv, MultiTaskEnv, TransformedFrankaEnv
 from franka_wm.envs.discretize import DiscreteActions
 from franka_wm.envs.external import ExternalEnv
@@ -313,6 +313,10 @@ def make_agent_policies(
     if env is None:
         return {}
     planner = make_planner(run, spaces.num_actions or spaces.action_dim) if model.has_next else None
+    compile = run.planner.compile
+    if compile and (missing := missing_to_compile(env.device)) is not None:  # a checkpoint of another machine
+        say(f"planner.compile: {missing} is not here; it plans without, more slowly")
+        compile = False
     return make_policies(
         model,
         planner,
@@ -324,7 +328,7 @@ def make_agent_policies(
         objective=make_objective(run, model),
         capture=None if run.trainer.capture else run.trainer.capture,  # true asks for what CUDA does anyway
         precision=run.planner.precision,
-        compile=run.planner.compile,
+        compile=compile,
     )
 
 

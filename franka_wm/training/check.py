@@ -9,7 +9,7 @@ import torch
 
 from franka_wm import models
 from franka_wm.console import say
-from franka_wm.device import resolve_device
+from franka_wm.device import missing_to_compile, resolve_device
 from franka_wm.envs import FrankaConfig
 from franka_wm.envs.external import check_external
 from franka_wm.envs.external_config import ExternalConfig
@@ -40,7 +40,12 @@ def check(run: RunSettings) -> None:
     Raises:
         UserError: One line.
     """
-    resolve_device(run.device)
+    device = resolve_device(run.device)
+    for option, asked in (("trainer.compile", run.trainer.compile), ("planner.compile", run.planner.compile)):
+        if asked and (missing := missing_to_compile(device)) is not None:
+            raise UserError(
+                f"{option}=true: torch.compile needs {missing}, which is not here; install it, or {option}=false"
+            )
     check_loggers(run.logger.names, **run.logger.options)
     _check_windows(run)
     _check_evaluation(run)
