@@ -161,14 +161,14 @@ def make_planner(run: RunSettings, actions: int) -> Planner | MCTS:
     try:
         if registry.is_search(name) != discrete:
             fitting = [one for one in registry.available() if registry.is_search(one) == discrete]
-            fitting += (
-                ["gumbel"] if discrete else []
-            )  # mcts with other settings: a name in conf/planner alone
+            fitting += ["gumbel"] if discrete else []  # mcts with other settings, in conf/planner alone
             what = "has discrete actions" if discrete else "has continuous actions"
             typed = "gumbel" if values.get("variant") == "gumbel" else name
             raise UserError(
                 f"planner={typed}: model={run.model.name} {what}; use planner={' or '.join(fitting)}"
             )
+        if discrete and run.planner.precision != "float32":
+            raise UserError("planner.precision: tree search computes in float32; leave it out")
         registry.validate(name, values)
         return registry.make(name, **values, **{"num_actions" if discrete else "action_dim": actions})
     except (TypeError, ValueError) as error:
