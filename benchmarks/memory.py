@@ -27,6 +27,7 @@ from common import publish
 from franka_wm import conf
 from franka_wm.envs import FrankaConfig, FrankaEnv
 from franka_wm.training.checkpoint import latest_checkpoint, load_checkpoint
+from franka_wm.training.history import read_rows
 from franka_wm.training.settings import RunSettings
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -69,11 +70,13 @@ def watch(arguments: list[str], minutes: float, device: str) -> list[dict[str, A
             print(seen[-1], flush=True)
         run.send_signal(signal.SIGINT)
         run.wait(timeout=120)
-        logged = (load_checkpoint(latest_checkpoint(f"{folder}/run")).extra() or {})["rows"]
+        logged = read_rows(load_checkpoint(latest_checkpoint(f"{folder}/run")))
     logged = [row for row in logged if "loss" in row]
-    for k, row in enumerate(seen):
-        there = logged[: max(1, (k + 1) * len(logged) // 10)]
-        last = there[-1]
+    for row in seen:
+        # The last one was logged as the run ended; what it took to begin is not in its time.
+        ago = 60 * (minutes - row["minutes"])
+        there = [one for one in logged if one["time_s"] <= logged[-1]["time_s"] - ago]
+        last = there[-1] if there else {"updates": 0, "env_steps": 0}
         row |= {"updates": int(last["updates"]), "env steps": int(last["env_steps"])}
         row |= {"device [MB]": round(last["device_memory_mb"], 1)} if "device_memory_mb" in last else {}
         row["broken worlds"] = round(sum(one.get("train/nonfinite", 0.0) for one in there))

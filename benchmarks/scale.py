@@ -26,6 +26,7 @@ from common import publish
 
 from franka_wm import conf
 from franka_wm.training.checkpoint import latest_checkpoint, load_checkpoint
+from franka_wm.training.history import read_rows
 from franka_wm.training.tree import read_tensors
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -131,11 +132,13 @@ def training(arguments: list[str], gpus: int, updates: int) -> tuple[float, int,
         if done.returncode:
             raise SystemExit(f"{' '.join(command)}\n{done.stdout[-2000:]}\n{done.stderr[-4000:]}")
         place = latest_checkpoint(f"{folder}/run")
-        rows = (load_checkpoint(place).extra() or {})["rows"]
+        rows = read_rows(load_checkpoint(place))
         # Adam keeps a mean of each gradient.
         kept = read_tensors(place, "optimizer").items()
         gradients = sum(x.numel() for name, x in kept if name.endswith("exp_avg")) * 4 / 1e6
     later = [row for row in rows if "updates_per_s" in row and row["updates"] >= updates / 3]
+    if len(later) < 2:
+        raise SystemExit(f"--updates {updates}: over before two rows were logged; make more")
     first, last = later[0], later[-1]
     rate = (last["updates"] - first["updates"]) / (last["time_s"] - first["time_s"])
     return rate, grown["replay.batch_size"] * gpus, gradients

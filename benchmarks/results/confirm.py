@@ -1,8 +1,9 @@
 """Whether code that has changed since a row was measured still does the same, to the last bit.
 
-A row's command at its smallest runs on the CPU twice, with the code that the row was measured with and with today's.
-Equal weights and equal episodes are written to docs/results/confirmed/ROW.json. They say that nothing was changed on
-purpose or by mistake that a run of a minute shows; what only a GPU or a long run shows, they do not.
+A row's command at its smallest runs on the CPU twice, with the code that the row was measured with and with today's;
+each gathers anew what the row reads. Equal weights and equal episodes are written to docs/results/confirmed/ROW.json.
+They say that nothing was changed on purpose or by mistake that a run of a minute shows; what only a GPU or a long run
+shows, they do not.
 """
 
 from __future__ import annotations
@@ -38,6 +39,7 @@ SIZES = (
 )
 SHORT_DEMOS = "replay.demo_updates=10"
 """Of a row that begins with demonstrations alone; a smoke run makes 30 updates in all."""
+ONE_CORE = {"OMP_NUM_THREADS": "1", "CUDA_VISIBLE_DEVICES": ""}
 SHORT = ("scale=smoke", "device=cpu", "seed=3", "logger=none", "evaluation.video_episodes=0")
 
 
@@ -73,16 +75,16 @@ def confirm(row: Row, place: Path = PLACE) -> Path:
     if other := [change for change in found if "– → " not in change and not change.endswith("→ –")]:
         raise UserError(f"{row.name}: its command now has {'; '.join(other)}; measure it again")
     with tempfile.TemporaryDirectory() as folder:
-        before, now = Path(folder) / "before", Path(folder) / "now"
+        before, now = Path(folder) / "before" / "run", Path(folder) / "now" / "run"
         tree = Path(folder) / "tree"
         _git("worktree", "add", "--detach", str(tree), commits[0])
         try:
-            _prepare(row, tree)
+            _prepare(row, tree, before.parent)
             _run(tree, short(row), before)
             _require_measured(row, records, commits[0], (read_json(before / "finished.json") or {})["source"])
         finally:
             _git("worktree", "remove", "--force", str(tree))
-        _prepare(row, ROOT)
+        _prepare(row, ROOT, now.parent)
         _run(ROOT, short(row), now)
         if apart := [name for name in ("weights", "episodes") if outcome(before)[name] != outcome(now)[name]]:
             raise UserError(
@@ -154,15 +156,18 @@ def _git(*words: str) -> None:
         raise UserError(f"git {' '.join(words)}: {done.stderr.strip().splitlines()[-1]}")
 
 
-def _prepare(row: Row, top: Path) -> None:
-    if failure := prepare(row, top):
+def _prepare(row: Row, top: Path, place: Path) -> None:
+    place.mkdir()
+    if failure := prepare(row, top, place, **ONE_CORE):
         raise UserError(failure)
 
 
 def _run(top: Path, words: Sequence[str], folder: Path) -> None:
-    environment = os.environ | {"PYTHONPATH": str(top), "OMP_NUM_THREADS": "1", "CUDA_VISIBLE_DEVICES": ""}
+    environment = os.environ | {"PYTHONPATH": str(top)} | ONE_CORE
     command = [sys.executable, str(top / "train.py"), *words, f"hydra.run.dir={folder}"]
-    done = subprocess.run(command, cwd=top, env=environment, capture_output=True, text=True, check=False)
+    done = subprocess.run(
+        command, cwd=folder.parent, env=environment, capture_output=True, text=True, check=False
+    )
     if done.returncode:
         last = (done.stderr.strip() or done.stdout.strip() or "nothing printed").splitlines()[-1]
         raise UserError(f"the short run of {top} failed: {last}; {shlex.join(command)}")

@@ -89,7 +89,7 @@ def verdicts(row: Row, records: Sequence[Record]) -> list[tuple[str, str, bool]]
     """For each thing wanted: what, what was reached, and whether that is enough."""
     found = []
     for name, wanted in row.wanted.items():
-        policy = acting(records[0]["policies"])
+        policy = row.acting(records[0]["policies"])
         if name == "minutes":
             slowest = max(map(seconds, timed(records)))
             reached = duration(slowest) + company(records)
@@ -142,11 +142,6 @@ def company(records: Sequence[Record]) -> str:
         alone = len(timed(records))
         return "" if alone == len(records) else f" alone ({alone} of {len(records)} runs)"
     return f", {' – '.join(map(str, dict.fromkeys((jobs[0], jobs[-1]))))} at a time"
-
-
-def acting(policies: Mapping[str, Any]) -> str:
-    """The policy that a run is about."""
-    return next((name for name in ("planner", "policy") if name in policies), next(iter(policies)))
 
 
 def duration(*values: float) -> str:
@@ -221,7 +216,8 @@ def part(row: Row, records: Sequence[Record], judged: tuple[str, list[str]], pla
         lines += [table(["wanted", "measured", "reached"], cells), ""]
     lines += [_over_seeds(records), ""]
     if len(records) > 1:
-        lines += ["<details><summary>Every seed</summary>", "", _each_seed(records), "", "</details>", ""]
+        seeds = _each_seed(row, records)
+        lines += ["<details><summary>Every seed</summary>", "", seeds, "", "</details>", ""]
     return "\n".join(lines)
 
 
@@ -259,9 +255,9 @@ def _commit(record: Record) -> str:
     return str(record["commit"])[:12]
 
 
-def _each_seed(records: Sequence[Record]) -> str:
+def _each_seed(row: Row, records: Sequence[Record]) -> str:
     """A line for each seed: what acts, with its intervals."""
-    policy = acting(records[0]["policies"])
+    policy = row.acting(records[0]["policies"])
     cells = []
     for record in records:
         line = [_one_seed(record, policy, metric) for metric in columns(records)]
@@ -388,7 +384,7 @@ def readme_tables(rows: Mapping[str, Row], place: Path = PLACE) -> str:
             cells = [[machine(records[0]) + mark, *line] for line in _cells(records[0]["rows"], row.readme)]
             speed += [table(titles, cells), ""]
             continue
-        policy = acting(records[0]["policies"])
+        policy = row.acting(records[0]["policies"])
         of = f" of {len(row.seeds)}" if unmeasured(row, records) else ""
         where, runs = cores(row, records), f"{len(records)}{of} seeds"
         who = f"{row.title}{mark}"

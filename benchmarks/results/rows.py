@@ -52,6 +52,7 @@ class Row:
     arguments: str = ""
     before: str = ""
     model: str = ""
+    policy: str = ""
     seeds: tuple[int, ...] = ()
     wanted: Mapping[str, Any] = field(default_factory=dict)
     script: str | None = None
@@ -68,6 +69,11 @@ class Row:
     def command(self) -> list[str]:
         """What is typed, without the seed."""
         return ["python", self.script or "train.py", *self.words]
+
+    def acting(self, policies: Mapping[str, Any]) -> str:
+        """The policy that a run is about, of those that were evaluated."""
+        names = (self.policy, "planner", "policy", next(iter(policies)))
+        return next(name for name in names if name in policies)
 
     @property
     def picture(self) -> str:

@@ -115,7 +115,7 @@ def run(
     stamp = datetime.now().strftime("%Y-%m-%d_%H-%M-%S")
     line: list[tuple[Row, int]] = []
     for row, seeds in work:
-        if made := prepare(row, ROOT):
+        if made := prepare(row, ROOT, ROOT):
             failed.append(made)
         elif row.script is None:
             line += [(row, seed) for seed in seeds]
@@ -170,13 +170,15 @@ def _benchmark(row: Row, slot: Slot, folder: Path, place: Path) -> list[str]:
     return [failure] if failure else []
 
 
-def prepare(row: Row, top: Path) -> str | None:
-    """Makes what the row's runs read, in the repository at ``top``, where it is not there; what failed, if it did."""
-    if row.prepares is None or (top / row.prepares[1]).exists():
+def prepare(row: Row, top: Path, place: Path, **environment: str) -> str | None:
+    """Makes what the row's runs read, at ``place`` by the code at ``top``, unless it is there; what failed."""
+    if row.prepares is None or (place / row.prepares[1]).exists():
         return None
     command = [sys.executable, "-m", "franka_wm", *row.prepares[0]]
-    environment = os.environ | {"PYTHONPATH": os.pathsep.join([str(top), os.environ.get("PYTHONPATH", "")])}
-    done = subprocess.run(command, cwd=top, env=environment, capture_output=True, text=True, check=False)
+    environment = {"PYTHONPATH": os.pathsep.join([str(top), os.environ.get("PYTHONPATH", "")])} | environment
+    done = subprocess.run(
+        command, cwd=place, env=os.environ | environment, capture_output=True, text=True, check=False
+    )
     if done.returncode == 0:
         return None
     return f"{shlex.join(command)}: {((done.stderr or done.stdout).strip().splitlines() or ['nothing printed'])[-1]}"

@@ -11,7 +11,7 @@ from torch import Tensor
 from franka_wm.errors import UserError
 from franka_wm.options import POSITIVE, Bounds, check_arguments
 from franka_wm.planning.objectives import Score
-from franka_wm.planning.sampling import explored, require_is_init, rollout
+from franka_wm.planning.sampling import explored, repeated, require_is_init, rollout
 
 Next = Callable[[Tensor, Tensor], Tensor]
 """(z (..., D), action (..., A)) -> next latents (..., D)."""
@@ -171,7 +171,7 @@ class ContinuousPlanner:
         z, samples = query.z, self.num_policy_samples
         if query.prior is None or not samples:
             return []
-        latent = z.unsqueeze(1).expand(z.shape[0], samples, *z.shape[1:])
+        latent = repeated(z, samples)
         actions = []
         for _ in range(self.horizon):
             # A weight of zero does not remove a nan from a weighted mean, so it must not get in.

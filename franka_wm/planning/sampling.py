@@ -21,9 +21,14 @@ def require_is_init(is_init: Tensor, envs: int) -> None:
 # ---------------------------------------------------------------------- candidates
 
 
+def repeated(z: Tensor, samples: int) -> Tensor:
+    """Latents (E, ...) -> (E, samples, ...), in memory like those that a model returns: one kind less to compile."""
+    return z.unsqueeze(1).expand(z.shape[0], samples, *z.shape[1:]).contiguous()
+
+
 def rollout(z: Tensor, actions: Tensor, next: Callable[[Tensor, Tensor], Tensor]) -> Tensor:
     """Latents (E, ...) and candidates (E, S, H, A) -> trajectories (E, S, H+1, ...) that start at `z`."""
-    latents = [z.unsqueeze(1).expand(z.shape[0], actions.shape[1], *z.shape[1:])]
+    latents = [repeated(z, actions.shape[1])]
     for t in range(actions.shape[2]):
         latents.append(next(latents[-1], actions[:, :, t]))
     return torch.stack(latents, dim=2)

@@ -29,8 +29,8 @@ from franka_wm.policies.capture import GraphCache
 from franka_wm.policies.graph_key import graph_key
 from franka_wm.seeding import share_of_worlds
 
-"""How a model may compute while planning."""
-
+RECOMPILES = 64
+"""For so many shapes a function is compiled: its rounds' numbers of candidates times the numbers of environments."""
 
 CONTEXT = ("context", "context_action")
 """Entries in which a model's memory travels: the last latent, and the action taken in it."""
@@ -183,6 +183,10 @@ class PlannerPolicy(TensorDictModuleBase):
         if precision not in PRECISIONS:
             raise ValueError(f"precision={precision!r}: must be one of {', '.join(PRECISIONS)}")
         if compile:
+            import torch._dynamo.config as dynamo
+
+            # After 8 shapes torch runs a function as it is: iCEM has as many for one number of environments.
+            dynamo.recompile_limit = max(dynamo.recompile_limit, RECOMPILES)
             next = torch.compile(next, dynamic=False)
             if prior is not None and not isinstance(prior, GoalGuide):
                 prior = torch.compile(prior, dynamic=False)

@@ -160,6 +160,8 @@ def make_planner(run: RunSettings, actions: int) -> Planner | MCTS:
     name, values, discrete = run.planner.name, run.planner.options, run.is_discrete
     try:
         run.check_planner_fits()
+        if discrete and run.planner.precision != "float32":
+            raise UserError("planner.precision: tree search computes in float32; leave it out")
         registry.validate(name, values)
         return registry.make(name, **values, **{"num_actions" if discrete else "action_dim": actions})
     except (TypeError, ValueError) as error:

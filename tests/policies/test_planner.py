@@ -1,5 +1,6 @@
 # pyright: reportArgumentType=false, reportCallIssue=false, reportAttributeAccessIssue=false
 import copy
+from functools import partial
 
 import pytest
 import torch
@@ -260,6 +261,39 @@ def test_a_compiled_policy_decides_the_same():
     assert all(part in calls for part in (model.next, model.reward, model.value))
     assert any(getattr(part, "__func__", None) is Guide.act for part in calls)
     torch.testing.assert_close(*actions)
+
+
+def test_a_compiled_policy_stays_compiled_for_many_numbers_of_worlds(monkeypatch):
+    """Those that gather, are evaluated and are filmed differ, and each of iCEM's rounds has its own candidates."""
+    from torch._dynamo import config, reset
+
+    reset()
+    monkeypatch.setattr(torch, "compile", partial(torch.compile, backend="eager"))
+    planner = ICEM(action_dim=2, horizon=2, num_samples=16, num_elites=4, iterations=3, num_policy_samples=4)
+    with config.patch(recompile_limit=8, fail_on_recompile_limit_hit=True):  # the limit is torch's own
+        policy = PlannerPolicy.for_model(opinionated(latent_dim=16, hidden_dim=16), planner, compile=True)
+        for worlds in (1, 2, 5, 7):
+            assert policy(observation(worlds))["action"].shape == (worlds, 2)
+
+
+def test_every_step_of_a_rollout_is_of_one_kind(monkeypatch):
+    """Other strides would be compiled again."""
+    kinds = set()
+
+    def push(z, action):
+        kinds.add((tuple(z.shape), z.stride()))
+        return z + action
+
+    planner = MPPI(action_dim=2, horizon=3, num_samples=16, num_elites=4, num_policy_samples=4)
+    PlannerPolicy(
+        planner,
+        encode=lambda entries: entries["state"],
+        next=push,
+        objective=GoalDistance(torch.zeros(2)),
+        observation_keys=["state"],
+        prior=torch.tanh,
+    )(observation())
+    assert {shape for shape, _ in kinds} == {(3, 4, 2), (3, 16, 2)} and len(kinds) == 2
 
 
 def test_capture_is_refused_where_there_is_no_gpu():

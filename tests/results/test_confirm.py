@@ -44,7 +44,7 @@ def play(monkeypatch: pytest.MonkeyPatch, before: torch.Tensor, now: torch.Tenso
     """Short runs end with these weights; the later one under another name."""
 
     def run(top: Path, words: Sequence[str], folder: Path) -> None:
-        old = folder.name == "before"
+        old = folder.parent.name == "before"
         make_run(folder, {"old.weight" if old else "new.weight": before if old else now})
 
     monkeypatch.setattr(confirm, "_run", run)
@@ -122,3 +122,13 @@ def test_what_else_was_not_committed_counts_as_far_as_it_is_code(measured: Path,
     records.write(record | {"code": code}, measured)
     with pytest.raises(UserError, match=r"measured with another train\.py than that of abc1234"):
         confirm.confirm(ROW, measured)
+
+
+def test_each_code_gathers_what_the_row_reads(measured: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """What lies in datasets/ may be of the code that the row was measured with, which says nothing of today's."""
+    play(monkeypatch, torch.ones(2), torch.ones(2))
+    gathered = []
+    monkeypatch.setattr(confirm, "prepare", lambda row, top, place, **_: gathered.append((top, place)))
+    confirm.confirm(ROW, measured)
+    (_, before), (top, now) = gathered
+    assert top == source.ROOT and len({before, now, source.ROOT}) == 3

@@ -89,13 +89,13 @@ def test_what_a_row_needs_first_is_made_once(tmp_path, monkeypatch) -> None:
 
     monkeypatch.setattr(running.subprocess, "run", made)
     row = replace(ROW, before="franka-wm collect out=push episodes=2")
-    assert "the disk is full" in (running.prepare(row, tmp_path) or "")
+    assert "the disk is full" in (running.prepare(row, tmp_path, tmp_path) or "")
     (failed,) = running.run([(row, [100])], running.Machine(threads=1), out=tmp_path / "out")
     assert "the disk is full" in failed and not (tmp_path / "out").exists()
     assert called == [["-m", "franka_wm", "collect", "out=push", "episodes=2"]] * 2
     (tmp_path / "push").mkdir()
-    assert running.prepare(row, tmp_path) is None and len(called) == 2
-    assert running.prepare(ROW, tmp_path) is None
+    assert running.prepare(row, tmp_path, tmp_path) is None and len(called) == 2
+    assert running.prepare(ROW, tmp_path, tmp_path) is None
 
 
 def test_what_runs_beside_is_recorded_with_the_times(tmp_path, monkeypatch) -> None:

@@ -14,6 +14,7 @@ from omegaconf import OmegaConf
 from franka_wm.conf import FOLDER, compose
 from franka_wm.errors import UserError
 from franka_wm.planning import registry
+from franka_wm.training.build import make_planner
 from franka_wm.training.settings import RunSettings
 from franka_wm.training.settings.run import GROUPS
 
@@ -207,6 +208,12 @@ def test_a_planner_option_that_does_not_exist() -> None:
         registry.validate("mppi", {"num_sample": 3})
     with pytest.raises(ValueError, match=r"did you mean mppi\?"):
         registry.planner("mpi")
+
+
+def test_a_tree_search_has_one_precision() -> None:
+    run = RunSettings.of(compose("model=muzero", "planner=gumbel", "env=gym", "+planner.precision=bfloat16"))
+    with pytest.raises(UserError, match=r"planner\.precision: tree search computes in float32"):
+        make_planner(run, 2)
 
 
 def test_a_bound_of_a_count_has_all_its_digits() -> None:
