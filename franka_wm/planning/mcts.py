@@ -58,7 +58,7 @@ class MCTS:
         c_visit, c_scale: σ, see above (Gumbel).
         c_scale_acting: in place of `c_scale` without `explore`: what acts may trust Q more than what teaches, whose
             policy must keep what it has not tried enough; None: the same.
-        kernels: walk and add up in Warp kernels, with sums in float64; False: in the plain tensor code.
+        kernels: False: walk and add up in the plain tensor code; True or None: in Warp kernels, with sums in float64.
 
     Raises:
         ValueError: a setting that cannot work.
@@ -77,7 +77,7 @@ class MCTS:
     c_visit: float = 50.0
     c_scale: float = 0.1
     c_scale_acting: float | None = None
-    kernels: bool = True
+    kernels: bool | None = None
 
     ranges: ClassVar[Mapping[str, Bounds]] = {
         **dict.fromkeys(("num_actions", "num_simulations", "max_depth"), POSITIVE),
@@ -130,7 +130,7 @@ class MCTS:
             raise ValueError(f"root_value must be ({envs}, 1), got {tuple(root_value.shape)}")
         if root_embedding.dim() != 2 or root_embedding.shape[0] != envs:
             raise ValueError(f"root_embedding must be ({envs}, Z), got {tuple(root_embedding.shape)}")
-        if self.kernels:
+        if self.kernels is not False:
             return self._walked(root_logits, root_value, root_embedding, recurrent, explore, generator)
         tree = Tree(self.num_simulations + 1, root_value, root_embedding, self.max_depth)
         rule = (_Puct if self.variant == "puct" else _Gumbel)(self, tree, root_logits, explore, generator)

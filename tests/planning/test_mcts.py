@@ -339,7 +339,7 @@ def test_kernels_are_the_default(monkeypatch):
         tree_kernels, "KernelTree", lambda *args, **options: used.append(1) or kernel_tree(*args, **options)
     )
     model = RandomModel(0)
-    for options, count in (({"kernels": False}, 0), ({}, 1)):
+    for options, count in (({"kernels": False}, 0), ({}, 1), ({"kernels": True}, 2)):
         MCTS(num_actions=MOVES, num_simulations=2, **options).search(*model.root(), model.recurrent)
         assert len(used) == count
 

@@ -308,7 +308,7 @@ def test_the_planner_computes_as_configured(settled) -> None:
     env = build.make_evaluation_env(cfg, num_envs=2)
     model = build.make_model(cfg, spaces := Spaces.of_env(env), "cpu")
     policy = build.make_agent_policies(cfg, model, env, spaces)["planner"]
-    assert policy.recurrent != model.recurrent and policy.search.kernels is True
+    assert policy.recurrent != model.recurrent and policy.search.kernels is None
 
 
 def test_goal_pictures_of_every_camera_that_the_model_reads(settled) -> None:
