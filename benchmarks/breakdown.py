@@ -19,11 +19,10 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from common import publish, rate, synchronize
+from common import compose, publish, rate, synchronize
 from torch.autograd import DeviceType  # pyright: ignore[reportPrivateImportUsage]
 from torch.profiler import ProfilerActivity, profile
 
-from franka_wm.conf import compose
 from franka_wm.data.lerobot.windows import RecordedWindows
 from franka_wm.device import resolve_device
 from franka_wm.training import build

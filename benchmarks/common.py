@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shlex
 import sys
 import time
 from collections.abc import Callable, Iterator
@@ -12,8 +13,9 @@ from datetime import UTC, datetime
 from typing import Any
 
 import torch
+from omegaconf import DictConfig, OmegaConf
 
-from franka_wm import source
+from franka_wm import conf, source
 from franka_wm.device import resolve_device
 from franka_wm.files import atomic_write
 from franka_wm.versions import versions
@@ -22,6 +24,17 @@ source.snapshot()
 COMMAND = list(sys.argv)
 BEGUN = versions() | {"started": datetime.now(UTC).isoformat(timespec="seconds")}
 """Before anything is measured: by its end another commit may be checked out."""
+
+
+COMPOSED: dict[str, Any] = {}
+"""Arguments of train.py whose configuration this benchmark takes numbers from -> that configuration."""
+
+
+def compose(*arguments: str) -> DictConfig:
+    """The configuration of ``train.py ARGUMENT …``; the file of ``--out`` holds it, too."""
+    config = conf.compose(*arguments)
+    COMPOSED[shlex.join(arguments)] = OmegaConf.to_container(config, resolve=True)
+    return config
 
 
 def synchronize() -> None:
@@ -133,4 +146,5 @@ def publish(
         others = {file: source.code_hash(file, content) for file, content in files if file.startswith(ran)}
         made |= {"command": COMMAND, "source": others | source.source()}
         with atomic_write(out) as path:
-            path.write_text(json.dumps({"benchmark": name, "machine": made, "rows": rows}, indent=2) + "\n")
+            written = {"benchmark": name, "machine": made, "rows": rows, "composed": COMPOSED}
+            path.write_text(json.dumps(written, indent=2) + "\n")

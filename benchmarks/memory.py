@@ -22,9 +22,8 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from common import publish
+from common import compose, publish
 
-from franka_wm import conf
 from franka_wm.envs import FrankaConfig, FrankaEnv
 from franka_wm.training.checkpoint import latest_checkpoint, load_checkpoint
 from franka_wm.training.history import read_rows
@@ -102,11 +101,12 @@ def main() -> None:
     parser.add_argument("--out", help="JSON file")
     args = parser.parse_args()
     if args.train:
+        compose(*args.train)
         rows = watch(args.train, args.minutes or 25.0, args.device)
         return publish("memory", rows, args.out, device=args.device, ran=("franka_wm/", "train.py"))
     observations = ("pixels", "state") if args.pixels else ("state",)
     config = (
-        RunSettings.of(conf.compose(f"env={args.env}")).env.arm
+        RunSettings.of(compose(f"env={args.env}")).env.arm
         if args.env
         else FrankaConfig(
             observations=observations, substeps=4, gravity_compensation=True, goal_sampling="reachable"

@@ -17,9 +17,8 @@ from dataclasses import replace
 
 import torch
 import warp as wp
-from common import publish
+from common import compose, publish
 
-from franka_wm.commands.overrides import compose
 from franka_wm.envs import FrankaConfig, FrankaEnv
 from franka_wm.envs.simulation.bodies import Bodies
 from franka_wm.policies.expert import ExpertPolicy
@@ -82,7 +81,7 @@ def main() -> None:
     arguments = parser.parse_args()
     rows = []
     for task in arguments.tasks:
-        arm = RunSettings.of(compose([f"env={task}"])).env.arm
+        arm = RunSettings.of(compose(f"env={task}")).env.arm
         for substeps in arguments.substeps:
             config = replace(arm, substeps=substeps, collision_pipeline=arguments.contacts)
             rows.append(measure(config, arguments.worlds))

@@ -15,12 +15,11 @@ from functools import partial
 from typing import Any
 
 import torch
-from common import publish, rate, tdmpc2
+from common import compose, publish, rate, tdmpc2
 from omegaconf import OmegaConf
 from tensordict import TensorDict
 
 from franka_wm import models
-from franka_wm.conf import compose
 from franka_wm.device import resolve_device
 from franka_wm.planning import CEM, ICEM, MPPI, GoalImage, GradientPlanner
 from franka_wm.policies import PlannerPolicy

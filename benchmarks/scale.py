@@ -22,9 +22,8 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from common import publish
+from common import compose, publish
 
-from franka_wm import conf
 from franka_wm.training.checkpoint import latest_checkpoint, load_checkpoint
 from franka_wm.training.history import read_rows
 from franka_wm.training.tree import read_tensors
@@ -117,7 +116,7 @@ def training(arguments: list[str], gpus: int, updates: int) -> tuple[float, int,
     Returns:
         Updates per second, its batch, and the gradients of an update [MB].
     """
-    alone = conf.compose(*arguments)
+    alone = compose(*arguments)
     grown = {
         "collector.num_envs": alone.collector.num_envs,
         "collector.planner_worlds": alone.collector.planner_worlds,

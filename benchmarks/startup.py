@@ -18,7 +18,7 @@ import tempfile
 import time
 from pathlib import Path
 
-from common import publish
+from common import compose, publish
 
 ROOT = Path(__file__).resolve().parents[1]
 BUILT, UPDATED = "  done in ", "updates "
@@ -57,6 +57,7 @@ def main() -> None:
     args = parser.parse_args()
     command = [f"scale={args.scale}", *args.arguments]
     one_update = [*command, "trainer.updates=1", "evaluation.during=[]"]
+    compose(*command)
     with tempfile.TemporaryDirectory() as folder:
         kernels, runs = Path(folder, "kernels"), Path(folder, "runs")
         first = start(one_update, kernels, runs / "first")

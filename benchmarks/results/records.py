@@ -86,7 +86,7 @@ def record_benchmark(row: Row, file: Path, *, commit: str | None = None) -> dict
         "command": shlex.join(row.command),
         **_made_with(found["machine"], 1, commit),
         "rows": found["rows"],
-        "code": {"files": found["machine"]["source"], "config": {}},
+        "code": {"files": found["machine"]["source"], "config": {}, "composed": found.get("composed", {})},
     }
 
 

@@ -65,12 +65,16 @@ def stale(records: Sequence[Record]) -> list[str]:
     files: dict[str, str] = {}
     for record in records:
         files |= record["code"]["files"]
-    now = None
-    if records[0]["code"]["config"]:
-        now = composed(tuple(shlex.split(records[0]["command"])[2:]))
-    if isinstance(now, str):
-        return [*differing(files), f"its command, which is refused now: {now}"]
-    return differing(files) + ([] if now is None else changes(records[0]["code"]["config"], now))
+    code = records[0]["code"]
+    measured = {shlex.join(shlex.split(records[0]["command"])[2:]): code["config"]} if code["config"] else {}
+    reasons = differing(files)
+    for words, config in {**measured, **code.get("composed", {})}.items():
+        now = composed(tuple(shlex.split(words)))
+        if isinstance(now, str):
+            reasons.append(f"its command, which is refused now: {now}")
+        else:
+            reasons += changes({name: value for name, value in config.items() if name not in SAME_BUT}, now)
+    return reasons
 
 
 @cache

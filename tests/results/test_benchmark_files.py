@@ -11,7 +11,7 @@ from types import ModuleType
 import pytest
 import torch
 
-from benchmarks.results import records
+from benchmarks.results import records, state
 from benchmarks.results.rows import Row, Section
 from franka_wm.errors import UserError
 
@@ -50,6 +50,26 @@ def test_code_that_other_processes_ran_counts(common: ModuleType, tmp_path: Path
     other = "benchmarks/_xwm_side.py"
     assert other not in files()
     assert files(ran=("benchmarks/_xwm",)) == files() | {other}
+
+
+def test_a_configuration_that_gives_other_numbers_makes_a_row_stale(
+    common: ModuleType, tmp_path: Path
+) -> None:
+    file = tmp_path / "out.json"
+    common.compose("planner=mppi", "scale=gpu")
+    common.publish("search", [{"ms": 1.0}], str(file), device="cpu")
+    record = records.record_benchmark(ROW, file)
+    assert state.stale([record]) == []
+    record["code"]["composed"]["planner=mppi scale=gpu"]["planner"]["num_samples"] = 256
+    assert state.stale([record]) == ["planner.num_samples 256 → 512"]
+    record["code"]["composed"] = {"planner=of_former_times": {}}
+    assert "refused now" in state.stale([record])[0]
+
+
+@pytest.mark.parametrize("script", sorted(BENCHMARKS.glob("*.py")), ids=lambda script: script.stem)
+def test_a_benchmark_notes_the_configurations_that_it_composes(script: Path) -> None:
+    text = script.read_text()
+    assert script.stem == "common" or ("conf.compose" not in text and "import compose\n" not in text)
 
 
 @pytest.mark.parametrize("script", sorted(BENCHMARKS.glob("*.py")), ids=lambda script: script.stem)
