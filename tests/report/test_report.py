@@ -14,6 +14,7 @@ from franka_wm.errors import UserError
 from franka_wm.files import atomic_write
 from franka_wm.report import style
 from franka_wm.report.curves import plot_learning_curves
+from franka_wm.report.run import read_run
 from franka_wm.report.table import evaluation_tables, markdown
 from franka_wm.video import tile_frames, write_gif, write_png, write_video
 
@@ -233,3 +234,10 @@ def test_markdown_has_units_order_and_intervals() -> None:
 def test_policies_that_are_compared_have_different_colours() -> None:
     assert len(set(style.POLICY_COLOURS.values())) == len(style.POLICY_COLOURS)
     assert style.POLICY_COLOURS.keys() == {*style.POLICY_LEGEND, "train"}
+
+
+@pytest.mark.parametrize("told", ["[1]", "hydra: {overrides: [1]}", "hydra: {overrides: {hydra: null}}"])
+def test_a_foreign_runs_search_path_may_have_any_form(told: str, make_run) -> None:
+    run = make_run()
+    (run / ".hydra" / "hydra.yaml").write_text(told)
+    assert not any("searchpath" in one for one in read_run(run).overrides)

@@ -159,7 +159,7 @@ class _Choice:
 
     Attributes:
         seen, taken: How many episodes it was asked for, and how many it took.
-        steps: Of those that it took.
+        steps: How many the episodes have that it took.
     """
 
     def __init__(self, quota: np.ndarray, success_only: bool):
