@@ -18,6 +18,7 @@ import subprocess
 import sys
 import tempfile
 import time
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -70,9 +71,15 @@ def watch(arguments: list[str], minutes: float, device: str) -> list[dict[str, A
         run.send_signal(signal.SIGINT)
         run.wait(timeout=120)
         logged = read_rows(load_checkpoint(latest_checkpoint(f"{folder}/run")))
+    beside(seen, logged, minutes)
+    return seen
+
+
+def beside(seen: list[dict[str, Any]], logged: Sequence[Mapping[str, float]], minutes: float) -> None:
+    """Adds to each row what the run had logged by then; the last was logged as the run ended, after so many minutes."""
     logged = [row for row in logged if "loss" in row]
     for row in seen:
-        # The last one was logged as the run ended; what it took to begin is not in its time.
+        # What it took to begin is not in the run's time.
         ago = 60 * (minutes - row["minutes"])
         there = [one for one in logged if one["time_s"] <= logged[-1]["time_s"] - ago]
         last = there[-1] if there else {"updates": 0, "env_steps": 0}
@@ -82,7 +89,6 @@ def watch(arguments: list[str], minutes: float, device: str) -> list[dict[str, A
         row["finite"] = all(
             value == value and abs(value) < float("inf") for one in there for value in one.values()
         )
-    return seen
 
 
 def main() -> None:

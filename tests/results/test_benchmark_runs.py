@@ -6,6 +6,7 @@ import json
 import os
 import subprocess
 import sys
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -29,8 +30,15 @@ def test_speed_is_that_of_the_later_updates(tmp_path: Path) -> None:
     assert row["updates/s"] > 0 and row["times one GPU"] == 1.0 and row["gradients [MB]"] > 0.01
 
 
-@pytest.mark.slow
-def test_updates_stand_beside_the_minute_at_which_they_were_made(tmp_path: Path) -> None:
-    words = ("--minutes", "1.2", "--train", "env=reach_fixed", "scale=smoke")
-    made = [row["updates"] for row in rows(tmp_path / "out", "memory", *words)]
-    assert made[0] == 0 < made[-1] and made == sorted(made)  # it takes seconds until the first update
+def test_updates_stand_beside_the_minute_at_which_they_were_made(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Two of four minutes went into the start; evaluations are logged as well, and have no loss."""
+    monkeypatch.syspath_prepend(str(TOP / "benchmarks"))
+    memory = import_module("memory")
+    seen = [{"minutes": minute} for minute in (1.0, 2.0, 3.0, 4.0)]
+    logged = [
+        {"loss": 1.0, "time_s": 30.0 * k, "updates": 10 * k, "env_steps": 100 * k} for k in (1, 2, 3, 4)
+    ]
+    memory.beside(seen, [*logged, {"return": 1.0, "time_s": 120.0, "updates": 40, "env_steps": 400}], 4.0)
+    assert [row["updates"] for row in seen] == [0, 0, 20, 40]
+    assert [row["env steps"] for row in seen] == [0, 0, 200, 400]
+    assert all(row["finite"] and row["broken worlds"] == 0 for row in seen)
