@@ -3,8 +3,8 @@
     python benchmarks/growth.py                     the published size on a GPU, the laptop's on a CPU
     python benchmarks/growth.py --what worlds batch --seconds 0.5
 
-*worlds*: control steps of all of them; *batch*: updates of TD-MPC2; *replay*: batches drawn; *horizon* and
-*candidates*: decisions of MPPI. On CUDA each is one captured graph, as in runs. *energy* is that of the whole GPU
+*worlds*: control steps of all of them, without images; *batch*: updates of TD-MPC2; *replay*: batches drawn; *horizon*
+and *candidates*: decisions of MPPI. On CUDA each is one captured graph, as in runs. *energy* is that of the whole GPU
 meanwhile, by NVML's counter; reading it needs `pip install nvidia-ml-py`.
 """
 
@@ -18,14 +18,14 @@ from typing import Any
 
 import torch
 from common import power, publish, rate, tdmpc2
-from env import diverge, uniform
+from env import CASES, diverge, uniform
 from learner import experience
 from planners import make_observation, make_planner
 
 from franka_wm.data.captured import CapturedSampling
 from franka_wm.data.replay import make_replay
 from franka_wm.device import resolve_device
-from franka_wm.envs import FrankaConfig, FrankaEnv
+from franka_wm.envs import FrankaEnv
 from franka_wm.policies import PlannerPolicy
 from franka_wm.training.learner import Learner
 
@@ -49,7 +49,7 @@ def make_model(device: torch.device) -> Any:
 
 def worlds(size: int, device: torch.device) -> Callable[[], object]:
     """A control step of so many worlds."""
-    env = FrankaEnv(FrankaConfig(), num_envs=size, device=device)
+    env = FrankaEnv(CASES["state"], num_envs=size, device=device)
     env.reset()
     diverge(env.simulation, uniform)
 

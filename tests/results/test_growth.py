@@ -61,6 +61,7 @@ def test_worlds_batch_and_replay_have_the_size(growth: ModuleType, monkeypatch) 
     )
     growth.worlds(3, cpu)()
     assert made[0].num_envs == 3 and made[0].simulation.tensors.step_count.max() > 0
+    assert "pixels" not in [*made[0].observation_spec.keys()]
     update = growth.batch(5, cpu)
     update()
     windows = next(
