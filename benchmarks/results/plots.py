@@ -42,7 +42,7 @@ def draw(row: Row, record: Mapping[str, Any]) -> Figure:
         axes.set_ylim(min(values) / 2, max(values) * 2)
         for axis, subs in ((axes.xaxis, (1.0,)), (axes.yaxis, (1.0, 2.0, 5.0))):
             axis.set_major_locator(LogLocator(subs=subs))
-            axis.set_major_formatter(lambda value, _: f"{value:,.6g}")
+            axis.set_major_formatter(lambda value, _: f"{value:,.10g}")
             axis.set_minor_formatter(NullFormatter())
         finish_axes(axes, x=name, y=y, legend=False)
     return figure
