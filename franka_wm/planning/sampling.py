@@ -22,8 +22,8 @@ def require_is_init(is_init: Tensor, envs: int) -> None:
 
 
 def repeated(z: Tensor, samples: int) -> Tensor:
-    """Latents (E, ...) -> (E, samples, ...), in memory like those that a model returns: one kind less to compile."""
-    return z.unsqueeze(1).expand(z.shape[0], samples, *z.shape[1:]).contiguous()
+    """Latents (E, ...) -> (E, samples, ...), without a copy."""
+    return z.unsqueeze(1).expand(z.shape[0], samples, *z.shape[1:])
 
 
 def rollout(z: Tensor, actions: Tensor, next: Callable[[Tensor, Tensor], Tensor]) -> Tensor:

@@ -98,6 +98,16 @@ class GoalGuide:
         return torch.cat((first, self.policy(z[:, 1:], goals[:, 1:])), dim=1)
 
 
+def _compiled(function: Callable[..., Tensor]) -> Callable[..., Tensor]:
+    """`function` of latents compiled, for latents that lie in memory as a model returns them: one kind less."""
+    compiled = torch.compile(function, dynamic=False)
+
+    def call(z: Tensor, *given: Tensor, **options: bool) -> Tensor:
+        return compiled(z.contiguous(), *given, **options)
+
+    return call
+
+
 def captures(wanted: bool | None, observation: Tensor) -> bool:
     """Whether decisions are captured: where the observations are on CUDA, unless it is not wanted.
 
@@ -187,9 +197,9 @@ class PlannerPolicy(TensorDictModuleBase):
 
             # After 8 shapes torch runs a function as it is: iCEM has as many for one number of environments.
             dynamo.recompile_limit = max(dynamo.recompile_limit, RECOMPILES)
-            next = torch.compile(next, dynamic=False)
+            next = _compiled(next)
             if prior is not None and not isinstance(prior, GoalGuide):
-                prior = torch.compile(prior, dynamic=False)
+                prior = _compiled(prior)
             objective = as_objective(objective).compiled()
         self.precision = precision
         self.objective = as_objective(objective)
