@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from types import MappingProxyType
 from typing import Any, ClassVar
 
@@ -66,6 +66,8 @@ class WorldModel(nn.Module):
     """Vector key -> size of its last dimension."""
     image_sizes: Mapping[str, tuple[int, int, int]] = MappingProxyType({})
     """Image key -> (height, width, channels), uint8."""
+    standardized_images: Sequence[str] = ()
+    """Image keys whose mean and deviation `set_image_statistics` is told before the first update."""
     num_actions: int = 0
     """Number of discrete actions, of a family with `discrete`."""
     discount: float = math.nan

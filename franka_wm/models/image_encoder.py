@@ -26,6 +26,7 @@ class ImageEncoder(nn.Module):
         channels: of the convolutions.
         encoder_from, architecture, grid: see `Backbone`.
         freeze: do not train the pretrained transformer.
+        standardize: images of the convolutions, see `ConvEncoder`.
     """
 
     def __init__(
@@ -41,6 +42,7 @@ class ImageEncoder(nn.Module):
         architecture: Sequence[int] | None = None,
         grid: int | None = 4,
         freeze: bool = False,
+        standardize: bool = False,
     ) -> None:
         super().__init__()
         self.keys, self.frozen = list(image_sizes), freeze
@@ -58,7 +60,8 @@ class ImageEncoder(nn.Module):
             if freeze:
                 self.backbone.requires_grad_(False).eval()
         else:
-            convolutions = [ConvEncoder(size, channels=channels) for size in image_sizes.values()]
+            options: dict[str, Any] = {"channels": channels, "standardize": standardize}
+            convolutions = [ConvEncoder(size, **options) for size in image_sizes.values()]
             self.convolutions = nn.ModuleList(convolutions)
             features = sum(conv.features for conv in convolutions)
         layers = []

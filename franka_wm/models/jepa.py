@@ -263,7 +263,9 @@ class JEPA(WorldModel):
                 "feature_rank": participation_ratio(pooled),
                 "ema": self.ema(),
             }
-        return TensorDict({"loss": prediction + guard, **metrics}, batch_size=[])
+        # Adding a constant 0 is what inductor leaves out: the loss would be the detached metric itself.
+        total = prediction + guard if guard.requires_grad else prediction
+        return TensorDict({"loss": total, **metrics}, batch_size=[])
 
     def ema(self) -> Tensor:
         """Share () that the teacher keeps of itself at the next update, on the device."""

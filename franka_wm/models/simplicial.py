@@ -22,6 +22,7 @@ from franka_wm.models.normalizer import (
     register_statistics,
     standardize,
 )
+from franka_wm.models.vision import ConvEncoder
 from franka_wm.options import with_defaults
 
 
@@ -40,6 +41,7 @@ class SimplicialWorldModel(WorldModel):
         random_shift: pixels by which images are shifted at most while training, in each direction.
         encoder_from, encoder_architecture, encoder_grid, freeze_encoder: of a pretrained vision transformer, see
             `ImageEncoder`.
+        standardize_images: of the convolutions, see `set_image_statistics`.
         action_masks: of K tasks (K, A), 1 where a task has the entry of an action. Then `task` (..., K), one-hot, is
             among the observations, and z carries its mask behind the `latent_dim` features. None: one task.
 
@@ -67,6 +69,7 @@ class SimplicialWorldModel(WorldModel):
         encoder_architecture: Sequence[int] | None = None,
         encoder_grid: int | None = None,
         freeze_encoder: bool = False,
+        standardize_images: bool = False,
         action_masks: Sequence[Sequence[float]] | None = None,
     ) -> None:
         super().__init__()
@@ -89,7 +92,10 @@ class SimplicialWorldModel(WorldModel):
                 architecture=encoder_architecture,
                 grid=encoder_grid,
                 freeze=freeze_encoder,
+                standardize=standardize_images,
             )
+            if standardize_images and self.encoder.convolutions is not None:
+                self.standardized_images = list(self.image_sizes)
         else:
             hidden = (encoder_dim,) * (encoder_layers - 1)
             self.encoder = mlp(observation_dim, hidden, latent_dim, output=SimNorm(simnorm_dim))
@@ -123,6 +129,19 @@ class SimplicialWorldModel(WorldModel):
             ValueError: a wrong shape, a value that is not finite, or a negative standard deviation.
         """
         copy_statistics(self.observation_mean, self.observation_std, mean, std)
+
+    def set_image_statistics(self, moments: Mapping[str, tuple[Tensor, Tensor]]) -> None:
+        """Standardise images of the convolutions from now on, as `ConvEncoder.set_statistics` does.
+
+        An addition to the papers, of models with `standardize_images`; saved with the weights, never trained.
+
+        Args:
+            moments: mean and deviation (height, width, c) of each of `standardized_images`, of images in [0, 1].
+        """
+        assert isinstance(self.encoder, ImageEncoder) and self.encoder.convolutions is not None
+        for key, encoder in zip(self.image_sizes, self.encoder.convolutions, strict=True):
+            assert isinstance(encoder, ConvEncoder)
+            encoder.set_statistics(*moments[key])
 
     def encode(self, observation: TensorDictBase) -> Tensor:
         """Latents (..., latent_dim) of vectors, each (..., size), and images, each (..., height, width, C) uint8."""

@@ -90,6 +90,7 @@ class TDMPC2(SimplicialWorldModel):
         encoder_architecture: the transformer's numbers; only to rebuild from a checkpoint.
         encoder_grid: average its tokens to so many rows and columns.
         freeze_encoder: keep it as it is; what joins its features into z is still trained.
+        standardize_images: of the convolutions, by a mean image and one deviation, see `set_image_statistics`.
         action_masks: of several tasks whose actions differ, see `SimplicialWorldModel`.
 
     Raises:
@@ -149,6 +150,7 @@ class TDMPC2(SimplicialWorldModel):
         encoder_architecture: Sequence[int] | None = None,
         encoder_grid: int | None = 4,
         freeze_encoder: bool = False,
+        standardize_images: bool = False,
         action_masks: Sequence[Sequence[float]] | None = None,
     ) -> None:
         self.validate(locals())
@@ -168,6 +170,7 @@ class TDMPC2(SimplicialWorldModel):
             encoder_architecture=encoder_architecture,
             encoder_grid=encoder_grid,
             freeze_encoder=freeze_encoder,
+            standardize_images=standardize_images,
             action_masks=action_masks,
         )
         self.discount = discount_per_step(discount, episode_length)

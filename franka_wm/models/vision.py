@@ -31,6 +31,7 @@ class ConvEncoder(nn.Module):
     Args:
         image_size: (height, width, channels).
         channels: channels of every convolution.
+        standardize: subtract a mean image and divide by one deviation, see `set_statistics`, instead of the scale above.
 
     Raises:
         ValueError: images too small for the four convolutions (less than 38 pixels a side).
@@ -38,11 +39,17 @@ class ConvEncoder(nn.Module):
 
     KERNELS = ((7, 2), (5, 2), (3, 2), (3, 1))
 
-    def __init__(self, image_size: tuple[int, int, int], *, channels: int = 32) -> None:
+    def __init__(
+        self, image_size: tuple[int, int, int], *, channels: int = 32, standardize: bool = False
+    ) -> None:
         super().__init__()
         height, width, inputs = image_size
         if channels < 1:
             raise ValueError(f"channels must be at least 1, got {channels}")
+        self.standardizes = standardize
+        if standardize:
+            self.register_buffer("mean", torch.full(tuple(image_size), 0.5))
+            self.register_buffer("std", torch.ones(()))
         for kernel, stride in self.KERNELS:
             height, width = (height - kernel) // stride + 1, (width - kernel) // stride + 1
         if min(height, width) < 1:
@@ -59,10 +66,24 @@ class ConvEncoder(nn.Module):
             inputs = channels
         self.network = nn.Sequential(*layers[:-1])  # what follows normalises; a last ReLU would lose half
 
+    mean: Tensor
+    std: Tensor
+
+    @torch.no_grad()
+    def set_statistics(self, mean: Tensor, std: Tensor) -> None:
+        """Standardise with the moments (height, width, c) of images in [0, 1]; of stacks, c may be that of one frame.
+
+        What does not move is the same number in every feature and hides what does. Deviations of all pixels make
+        one: a pixel that hardly ever changes must not become loud.
+        """
+        self.mean.copy_(mean.repeat(1, 1, self.mean.shape[-1] // mean.shape[-1]))
+        self.std.copy_(std.square().mean().sqrt().clamp_min(1e-3))
+
     def maps(self, images: Tensor) -> Tensor:
         """(N, height, width, C) uint8 -> feature maps (N, channels, rows, columns)."""
         dtype = next(self.network.parameters()).dtype
-        x = check_images(images).permute(0, 3, 1, 2).to(dtype).div(255.0).sub(0.5)
+        x = check_images(images).permute(0, 3, 1, 2).to(dtype).div(255.0)
+        x = (x - self.mean.permute(2, 0, 1)) / self.std if self.standardizes else x.sub(0.5)
         return self.network(x)
 
     def forward(self, images: Tensor) -> Tensor:

@@ -18,6 +18,7 @@ from franka_wm import processes
 from franka_wm.console import Progress, say
 from franka_wm.data.captured import CapturedSampling
 from franka_wm.data.lerobot.windows import RecordedWindows
+from franka_wm.data.moments import moments
 from franka_wm.data.replay import WindowReplay
 from franka_wm.envs import Environment
 from franka_wm.errors import UserError
@@ -138,7 +139,7 @@ class Trainer:
         anew = self.env is not None and not len(self.replay) and (updates < total or not updates)
         with interruptible() as stop:
             if self.env is None:
-                self.standardize(self.replay.statistics())
+                self.standardize(self.replay.statistics(self.model.standardized_images))
             else:
                 assert self.acting is not None
                 if anew:
@@ -203,17 +204,21 @@ class Trainer:
         data = [self.replay[:]]  # (worlds, time): TorchRL gives back what it was extended with
         if self.demonstrations is not None and processes.is_first():  # all have the same ones
             data.append(self.demonstrations.transitions)
-        seen = {key: torch.cat([one.get(key).flatten(0, 1) for one in data]) for key in self._vectors}
-        own = {key: (x.mean(0), x.std(0), len(x)) for key, x in seen.items()}
+        keys = [*self._vectors, *self.model.standardized_images]
+        seen = {key: torch.cat([one.get(key).flatten(0, 1) for one in data]) for key in keys}
+        own = {key: (*moments(x), len(x)) for key, x in seen.items()}
         self.standardize({key: processes.pooled(*moments) for key, moments in own.items()})
 
     def standardize(self, statistics: Mapping[str, Sequence[torch.Tensor]]) -> None:
-        """Lets the model see mean and deviation of its vector observations."""
-        if not self.settings.trainer.standardize or self.learner.updates or not self._vectors:
+        """Lets the model see mean and deviation of its vector observations, and of images if it standardises them."""
+        if not self.settings.trainer.standardize or self.learner.updates:
             return  # trained weights know their scale
-        mean, std = (torch.cat([statistics[key][i] for key in self._vectors]) for i in (0, 1))
-        device = self.learner.device
-        self.model.set_observation_statistics(mean.to(device), std.to(device).clamp_min(1e-3))
+        device, images = self.learner.device, self.model.standardized_images
+        if self._vectors:
+            mean, std = (torch.cat([statistics[key][i] for key in self._vectors]) for i in (0, 1))
+            self.model.set_observation_statistics(mean.to(device), std.to(device).clamp_min(1e-3))
+        if images:
+            self.model.set_image_statistics({key: statistics[key][:2] for key in images})
 
     @property
     def kept(self) -> list[NestedKey]:

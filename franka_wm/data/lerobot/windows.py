@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
@@ -17,6 +17,7 @@ from franka_wm.data.future import FUTURE, future_frames
 from franka_wm.data.image_storage import CHANNELS
 from franka_wm.data.lerobot.cache import Cache
 from franka_wm.data.lerobot.mapping import FeatureMap
+from franka_wm.data.moments import moments
 from franka_wm.errors import UserError
 from franka_wm.options import is_real, whole_rule
 from franka_wm.seeding import derive_seed, restore_generator
@@ -307,8 +308,11 @@ class RecordedWindows:
         """Whether any episode of the data terminated."""
         return any(bool(ends.any()) for ends in self.recording.arrays.get("next.terminated", ()))
 
-    def statistics(self) -> dict[str, Moments]:
+    def statistics(self, images: Sequence[str] = ()) -> dict[str, Moments]:
         """Mean, deviation, least and largest of each vector observation and of ``action``, over this split.
+
+        Args:
+            images: Keys of images whose moments are wanted, too: as numbers in [0, 1], of at most 2,000 frames.
 
         Computed from the data, in float64, and put on :attr:`device`. Actions are as they are given out.
         """
@@ -327,6 +331,11 @@ class RecordedWindows:
                 centre, half = _centre_and_half(self.action_low, self.action_high)
                 action = np.where(half > 0, (action - centre) / np.maximum(half, 1e-30), 0.0)
             out["action"] = _moments(action, self.device)
+        rows = np.flatnonzero(mask)
+        rows = torch.from_numpy(rows[np.linspace(0, len(rows) - 1, min(len(rows), 2000)).astype(int)])
+        for key in images:
+            frames = self._gather(f"observation.{key}", rows.unsqueeze(0))[0]
+            out[key] = Moments(*moments(frames), *(end(frames, 0) / 255.0 for end in (torch.amin, torch.amax)))
         return out
 
     def recorded_action(self, action: Tensor) -> Tensor:

@@ -1,0 +1,18 @@
+"""Mean and deviation of observations, of vectors and of images."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+
+def moments(x: Tensor, at_once: int = 256) -> tuple[Tensor, Tensor]:
+    """Mean and deviation over the first dimension; of uint8 images, as numbers in [0, 1], `at_once` of them at a time."""
+    if x.dtype != torch.uint8:
+        return x.mean(0), x.std(0)
+    total, squares = (torch.zeros(x.shape[1:], dtype=torch.float64, device=x.device) for _ in range(2))
+    for part in x.split(at_once):
+        values = part.double() / 255.0
+        total, squares = total + values.sum(0), squares + values.square().sum(0)
+    mean = total / len(x)
+    return mean.float(), (squares / len(x) - mean.square()).clamp_min(0.0).sqrt().float()
