@@ -7,7 +7,7 @@ from torch import Tensor
 
 
 def moments(x: Tensor, at_once: int = 256) -> tuple[Tensor, Tensor]:
-    """Mean and deviation over the first dimension; of uint8 images, as numbers in [0, 1], `at_once` of them at a time."""
+    """Mean and deviation over the first dimension; of uint8 images as numbers in [0, 1], `at_once` at a time."""
     if x.dtype != torch.uint8:
         return x.mean(0), x.std(0)
     total, squares = (torch.zeros(x.shape[1:], dtype=torch.float64, device=x.device) for _ in range(2))

@@ -31,7 +31,7 @@ class ConvEncoder(nn.Module):
     Args:
         image_size: (height, width, channels).
         channels: channels of every convolution.
-        standardize: subtract a mean image and divide by one deviation, see `set_statistics`, instead of the scale above.
+        standardize: subtract a mean image and divide by one deviation instead, see `set_statistics`.
 
     Raises:
         ValueError: images too small for the four convolutions (less than 38 pixels a side).

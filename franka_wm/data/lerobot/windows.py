@@ -335,7 +335,9 @@ class RecordedWindows:
         rows = torch.from_numpy(rows[np.linspace(0, len(rows) - 1, min(len(rows), 2000)).astype(int)])
         for key in images:
             frames = self._gather(f"observation.{key}", rows.unsqueeze(0))[0]
-            out[key] = Moments(*moments(frames), *(end(frames, 0) / 255.0 for end in (torch.amin, torch.amax)))
+            out[key] = Moments(
+                *moments(frames), *(end(frames, 0) / 255.0 for end in (torch.amin, torch.amax))
+            )
         return out
 
     def recorded_action(self, action: Tensor) -> Tensor:
