@@ -1,4 +1,5 @@
 import copy
+import shutil
 
 import pytest
 import torch
@@ -184,6 +185,17 @@ def test_the_loss_traces_without_graph_breaks_or_host_reads(recipe, dots):
         fullgraph=True,
     )
     assert compiled(dots.windows(4, 2)["pixels"]).isfinite()
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(shutil.which("g++") is None, reason="needs a compiler")
+def test_a_compiled_loss_without_a_guard_has_a_gradient(dots):
+    """A constant 0 that is added is left out: then the loss is the metric, which is detached."""
+    torch._dynamo.reset()
+    model = small(collapse="ema")
+    loss = model.compiled_loss()(dots.windows(4, 2).select("pixels"))["loss"]
+    loss.backward()
+    assert model.encoder.patch_embedding.weight.grad.abs().sum() > 0
 
 
 def test_settings_that_cannot_work_are_refused(dots):

@@ -68,6 +68,23 @@ def test_the_convolutional_encoder_has_the_published_shape():
     assert kernels == [(7, 2), (5, 2), (3, 2), (3, 1)]
 
 
+def test_images_are_standardised_by_a_mean_image_and_one_deviation():
+    plain = ConvEncoder((64, 64, 6))
+    encoder, images = ConvEncoder((64, 64, 6), standardize=True), pictures(5, side=64)
+    encoder.network = plain.network
+    stacks = torch.cat((images, images.flip(0)), -1)
+    torch.testing.assert_close(encoder(stacks), plain(stacks))  # until it is told
+    seen = images / 255.0
+    encoder.set_statistics(seen.mean(0), seen.std(0))
+    given = []
+    encoder.network.register_forward_pre_hook(lambda module, inputs: given.append(inputs[0]))
+    assert not torch.allclose(encoder(stacks), plain(stacks))
+    moved = (seen - seen.mean(0)) / seen.std(0).square().mean().sqrt()
+    torch.testing.assert_close(given[0], torch.cat((moved, moved.flip(0)), -1).permute(0, 3, 1, 2))
+    encoder.set_statistics(seen.mean(0), torch.zeros(64, 64, 3))  # nothing moved
+    assert encoder(stacks).isfinite().all()
+
+
 def test_what_is_no_uint8_picture_is_refused():
     with pytest.raises(ValueError, match="uint8"):
         ConvEncoder((64, 64, 3))(torch.rand(1, 64, 64, 3))

@@ -53,7 +53,7 @@ def env(cfg: RunSettings) -> FrankaEnv:
 
 @pytest.fixture
 def make(cfg: RunSettings, env: FrankaEnv, tmp_path: Path) -> Make:
-    def make(folder: str = "run", evaluate=dict, model=(), **changes) -> Trainer:
+    def make(folder: str = "run", evaluate=dict, model=(), cfg=cfg, env=env, **changes) -> Trainer:
         mine = cfg.changed(trainer=changes, model=dict(model))
         torch.manual_seed(0)
         env.set_seed(0)
@@ -132,6 +132,25 @@ def test_observations_are_standardized_by_the_seed_data(make: Make) -> None:
     seen = torch.cat([data[key] for key in trainer.model.observation_sizes], -1).flatten(0, 1)
     torch.testing.assert_close(given[0][0], seen.mean(0))
     torch.testing.assert_close(given[0][1], seen.std(0).clamp_min(1e-3))
+
+
+def test_images_are_standardized_by_the_seed_data(make: Make, settled) -> None:
+    cfg = settled(
+        *("scale=smoke", "device=cpu", "env=reach_pixels", "env.frame_stack=2", "model=tdmpc2_pixels"),
+        *("env.cameras=[front,side]", "model.observations=[pixels,pixels_side]", "env.substeps=1"),
+        *("collector.num_envs=3", "model.standardize_images=true"),
+    )
+    env = build.make_env(cfg)
+    trainer = make(cfg=cfg, env=env)
+    trainer.seed()
+    encoders = trainer.model.encoder.convolutions
+    for key, encoder in zip(("pixels", "pixels_side"), encoders, strict=True):
+        seen = trainer.replay[:][key].flatten(0, 1) / 255.0  # single images
+        mean, variance = seen.mean(0), seen.var(0, correction=0)
+        torch.testing.assert_close(encoder.mean, torch.cat((mean, mean), -1))
+        torch.testing.assert_close(encoder.std, variance.mean().sqrt())
+        assert float(encoder.std) > 0.01
+    make(cfg=cfg, env=env, standardize=False).seed()  # asks for none
 
 
 def test_demonstrations_count_once_in_statistics_of_all_processes(make: Make, monkeypatch) -> None:

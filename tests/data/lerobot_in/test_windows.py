@@ -247,6 +247,16 @@ def test_statistics(foreign, tmp_path: Path, opened: Callable) -> None:
     assert (statistics["action"].min >= -1).all() and float(statistics["action"].std[2]) == 0
 
 
+def test_statistics_of_images(pictures: Path, opened: Callable) -> None:
+    train = opened(pictures, split="all", validation_fraction=0.0)
+    (images,) = train.recording.arrays["observation.pixels"]
+    found = train.statistics(["pixels"])["pixels"]
+    seen = images.double() / 255.0
+    torch.testing.assert_close(found.mean.double(), seen.mean(0), rtol=0, atol=1e-6)
+    torch.testing.assert_close(found.std.double(), seen.std(0, correction=0), rtol=0, atol=1e-6)
+    assert torch.equal(found.min.double(), seen.amin(0).float().double()) and "pixels" not in train.statistics()
+
+
 def test_what_does_not_fit_the_environment_is_refused(pictures: Path, opened: Callable) -> None:
     opened(pictures, keys=["joints", "pixels"], fps=10, action_dim=3)
     for options, message in (
