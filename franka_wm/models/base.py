@@ -172,6 +172,13 @@ class WorldModel(nn.Module):
             mean, std: (sum of `observation_sizes`), in the units of the observations.
         """
 
+    def set_image_statistics(self, moments: Mapping[str, Sequence[Tensor]]) -> None:
+        """Standardise images from now on, of a model with `standardized_images`; does nothing by default.
+
+        Args:
+            moments: mean and deviation (height, width, c) of each of these, of images in [0, 1].
+        """
+
     def parameter_groups(self, lr: float) -> list[ParameterGroup]:
         """Groups of parameters for AdamW: all that are trained, without weight decay by default."""
         return decay_groups(self.parameters(), lr, weight_decay=0.0)

@@ -130,7 +130,7 @@ class SimplicialWorldModel(WorldModel):
         """
         copy_statistics(self.observation_mean, self.observation_std, mean, std)
 
-    def set_image_statistics(self, moments: Mapping[str, tuple[Tensor, Tensor]]) -> None:
+    def set_image_statistics(self, moments: Mapping[str, Sequence[Tensor]]) -> None:
         """Standardise images of the convolutions from now on, as `ConvEncoder.set_statistics` does.
 
         An addition to the papers, of models with `standardize_images`; saved with the weights, never trained.
@@ -141,7 +141,8 @@ class SimplicialWorldModel(WorldModel):
         assert isinstance(self.encoder, ImageEncoder) and self.encoder.convolutions is not None
         for key, encoder in zip(self.image_sizes, self.encoder.convolutions, strict=True):
             assert isinstance(encoder, ConvEncoder)
-            encoder.set_statistics(*moments[key])
+            mean, std = moments[key]
+            encoder.set_statistics(mean, std)
 
     def encode(self, observation: TensorDictBase) -> Tensor:
         """Latents (..., latent_dim) of vectors, each (..., size), and images, each (..., height, width, C) uint8."""

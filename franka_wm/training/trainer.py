@@ -204,10 +204,10 @@ class Trainer:
         data = [self.replay[:]]  # (worlds, time): TorchRL gives back what it was extended with
         if self.demonstrations is not None and processes.is_first():  # all have the same ones
             data.append(self.demonstrations.transitions)
-        keys = [*self._vectors, *self.model.standardized_images]
-        seen = {key: torch.cat([one.get(key).flatten(0, 1) for one in data]) for key in keys}
+        seen = {key: torch.cat([one.get(key).flatten(0, 1) for one in data]) for key in self._vectors}
+        seen |= {key: data[0].get(key).flatten(0, 1) for key in self.model.standardized_images}
         own = {key: (*moments(x), len(x)) for key, x in seen.items()}
-        self.standardize({key: processes.pooled(*moments) for key, moments in own.items()})
+        self.standardize({key: processes.pooled(*mine) for key, mine in own.items()})
 
     def standardize(self, statistics: Mapping[str, Sequence[torch.Tensor]]) -> None:
         """Lets the model see mean and deviation of its vector observations, and of images if it standardises them."""

@@ -101,7 +101,7 @@ def test_a_model_that_does_not_fit_is_refused_before_worlds_are_built(words, sai
 def test_images_are_standardized_where_statistics_are_taken(settled) -> None:
     words = ("device=cpu", "scale=smoke", "env=reach_pixels", "model=tdmpc2_pixels")
     assert settled(*words).model.options["standardize_images"]
-    with pytest.raises(UserError, match="standardize_images=true: .*trainer.standardize=true"):
+    with pytest.raises(UserError, match=r"standardize_images=true: .*trainer.standardize=true"):
         check(settled(*words, "trainer.standardize=false"))
 
 
