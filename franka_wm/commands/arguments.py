@@ -88,7 +88,7 @@ class Verb(click.Command):
     def __init__(
         self,
         *args: Any,
-        others: str | None = None,
+        others: str | tuple[str, ...] | None = None,
         shown: tuple[str, str] = ("", ""),
         raw: str = "",
         first: str | None = None,

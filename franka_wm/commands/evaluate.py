@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -10,7 +11,15 @@ from franka_wm.errors import UserError
 from franka_wm.files import unwritable
 
 
-@verb("evaluate", first="checkpoint")
+@verb(
+    "evaluate",
+    first="checkpoint",
+    others=("planner.", "objective."),
+    shown=(
+        "planner.KEY=VALUE",
+        "plans otherwise than the run did, also objective.KEY=VALUE; wants out=FOLDER, the run's own results stay",
+    ),
+)
 @word(
     "checkpoint",
     "a run's folder, a checkpoint in it, or hf:user/name; the bare folder will do",
@@ -29,18 +38,23 @@ from franka_wm.files import unwritable
 @word("probes", "joints, tool and goal predicted from the latents by probes; spectrum", FLAG, True)
 @word("robustness", "the same in shifted worlds: looks, camera, dynamics, delay, noise", FLAG, False)
 @plugins
-def evaluate(checkpoint: str, out: str | None, **options: Any) -> None:
+def evaluate(checkpoint: str, out: str | None, overrides: Sequence[str] = (), **options: Any) -> None:
     """Evaluate a checkpoint on held-out episodes. Success, predictions, latents, robustness.
 
     Writes evaluation.json and evaluation.md (the same twice on a CPU), timing.json, imagined.png, imagined.mp4.
     """
+    if overrides and (out is None or Path(out).resolve() == default_folder(checkpoint).resolve()):
+        raise UserError(
+            f"evaluate: {' '.join(overrides)}: results of other settings than the run's do not take the place of its "
+            "own; give another folder, out=FOLDER"
+        )
     place = default_folder(checkpoint) if out is None else Path(out)
     check_folder(place)
     check_run("evaluate", "checkpoint", checkpoint)
     check_larger(place, options["episodes"])
     from franka_wm.commands.evaluate_checkpoint import Options, run
 
-    run(Options(checkpoint=checkpoint, out=place, **options))
+    run(Options(checkpoint=checkpoint, out=place, overrides=tuple(overrides), **options))
 
 
 def default_folder(checkpoint: str) -> Path:

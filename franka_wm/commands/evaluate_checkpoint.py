@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from franka_wm.commands.overrides import changes
 from franka_wm.console import announced, say
 from franka_wm.evaluation import diagnose
 from franka_wm.evaluation.decoder import Imagined
@@ -44,6 +45,7 @@ class Options:
     open_loop: bool
     probes: bool
     robustness: bool
+    overrides: tuple[str, ...] = ()
 
 
 def run(options: Options) -> dict[str, Any]:
@@ -56,7 +58,12 @@ def run(options: Options) -> dict[str, Any]:
 
     console = Console(width=120)
     with announced(f"loading {options.checkpoint} and building {min(options.episodes, WORLDS)} worlds"):
-        agent = load_agent(options.checkpoint, num_envs=min(options.episodes, WORLDS), device=options.device)
+        agent = load_agent(
+            options.checkpoint,
+            num_envs=min(options.episodes, WORLDS),
+            device=options.device,
+            planning=changes("evaluate", options.overrides),
+        )
     if options.robustness:
         check_shiftable(agent)
     say(f"{options.episodes} held-out episodes for each of {', '.join(agent.policies)} …")
@@ -64,8 +71,9 @@ def run(options: Options) -> dict[str, Any]:
         agent, episodes=options.episodes, report=lambda name, r: say(describe(name, r))
     )
     described = protocol(agent.settings, agent.env, evaluation, by=COMMAND, counters=agent.counters)
+    otherwise = {"planned with": ", ".join(options.overrides)} if options.overrides else {}
     results = {
-        "protocol": {"checkpoint": options.checkpoint, **described},
+        "protocol": {"checkpoint": options.checkpoint, **described, **otherwise},
         "policies": evaluation.policies,
     }
     for table in evaluation_tables(evaluation.policies):
@@ -85,8 +93,13 @@ def run(options: Options) -> dict[str, Any]:
     tables = diagnostic_tables(results, agent.env.config)
     for title, table in tables.items():
         console.print(terminal(table, title))
+    lines = [f"Planned with {text}, not as the run did.\n" for text in otherwise.values()]
     text = "\n".join(
-        [evaluation_markdown(evaluation), *(f"### {t}\n\n{markdown(table)}" for t, table in tables.items())]
+        [
+            *lines,
+            evaluation_markdown(evaluation),
+            *(f"### {t}\n\n{markdown(table)}" for t, table in tables.items()),
+        ]
     )
     _write(options.out, results, text, evaluation, None if imagined is None else imagined[0])
     say(f"results: {options.out}")

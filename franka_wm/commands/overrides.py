@@ -44,6 +44,23 @@ def given(overrides: Sequence[str], key: str) -> str | None:
     return value.text if isinstance(value, QuotedString) else str(value)
 
 
+def changes(verb: str, overrides: Sequence[str]) -> dict[str, Any]:
+    """``GROUP.KEY=VALUE`` … of a verb as nested dictionaries, values as in YAML.
+
+    Raises:
+        UserError: A value that is none.
+    """
+    from omegaconf import OmegaConf
+    from omegaconf.errors import OmegaConfBaseException
+    from yaml import YAMLError
+
+    try:
+        found: Any = OmegaConf.to_container(OmegaConf.from_dotlist(list(overrides)))
+    except (YAMLError, OmegaConfBaseException) as error:
+        raise UserError(f"{verb}: {' '.join(overrides)}: not a value as in YAML ({error})") from error
+    return found
+
+
 EXTRAS = {
     "joblib": "joblib",
     "submitit_slurm": "slurm",

@@ -85,19 +85,13 @@ def options_of(
     Raises:
         UserError: A value that cannot be, or a missing extra.
     """
-    from omegaconf import OmegaConf
-    from omegaconf.errors import OmegaConfBaseException
-    from yaml import YAMLError
+    from franka_wm.commands.overrides import changes
 
     if rerun is not None and not rerun.endswith(".rrd"):
         raise UserError(f"view: rerun={rerun}: must end in .rrd")
     if rerun is not None and (why := unwritable(Path(rerun).parent)) is not None:
         raise UserError(f"view: rerun={rerun}: {why}; choose another place")
-    try:
-        changes: Any = OmegaConf.to_container(OmegaConf.from_dotlist(list(overrides)))
-    except (YAMLError, OmegaConfBaseException) as error:
-        raise UserError(f"view: {' '.join(overrides)}: not a value as in YAML ({error})") from error
-    fields = _named(env, checkpoint) | changes.get("env", {})
+    fields = _named(env, checkpoint) | changes("view", overrides).get("env", {})
     if rerun is None:
         import_viser()
     else:

@@ -12,6 +12,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from franka_wm.models.backbone import Backbone
+from franka_wm.models.base import summed
 from franka_wm.models.ema import ema_update, frozen_copy
 from franka_wm.models.groups import ParameterGroup, decay_groups
 from franka_wm.models.history import FrameHistory, HistoryWorldModel
@@ -293,10 +294,8 @@ class ActionWorldModel(HistoryWorldModel):
         rolled, rolled_state = self._rollout_loss(frames, targets, action)
         # On what is predicted: on a projection of it, the guard would not see it collapse.
         guard = self.guard(self._pooled(frames).transpose(0, 1))
-        total = prediction + state + rolled + rolled_state + guard
         goals = self.goal_losses(encoded[..., : self.feature_dim], batch)
-        for value in goals.values():
-            total = total + value
+        total = summed(prediction, state, rolled, rolled_state, guard, *goals.values())
         with torch.no_grad():
             unchanged, _ = self._distance(before, after)
             metrics = {

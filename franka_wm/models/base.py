@@ -30,6 +30,19 @@ ABILITIES: Mapping[str, tuple[str, ...]] = MappingProxyType(
 """Flag -> methods that a family defines to have this ability. The flags are set when the class is defined."""
 
 
+def summed(*losses: Tensor) -> Tensor:
+    """Sum of losses; where gradients are recorded, without those that are constant.
+
+    A constant 0 that is added is what inductor leaves out. Of a sum of one term and zeros the detached metric of that
+    term would then be the loss, without a gradient.
+    """
+    trained = [loss for loss in losses if loss.requires_grad]
+    total, *others = trained or losses
+    for loss in others:
+        total = total + loss
+    return total
+
+
 class WorldModel(nn.Module):
     """A latent model of an environment: `encode` and `loss`, and the optional abilities that a family defines.
 

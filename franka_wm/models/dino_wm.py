@@ -12,6 +12,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from franka_wm.models.backbone import Backbone
+from franka_wm.models.base import summed
 from franka_wm.models.groups import ParameterGroup, decay_groups
 from franka_wm.models.history import FrameHistory, HistoryWorldModel
 from franka_wm.models.images import ImageSize, check_image_sizes, shared_image_size, stack_cameras
@@ -196,7 +197,7 @@ class DINOWM(HistoryWorldModel):
                 "loss_state": state.detach(),
                 "relative_error": prediction.detach() / unchanged.clamp_min(1e-12),
             }
-        return TensorDict({"loss": prediction + state, **metrics}, batch_size=[])
+        return TensorDict({"loss": summed(prediction, state), **metrics}, batch_size=[])
 
     def parameter_groups(self, lr: float) -> list[ParameterGroup]:
         """Groups for AdamW: the predictor and its embeddings; the encoder is in none."""

@@ -60,8 +60,9 @@ class ImageEncoder(nn.Module):
             if freeze:
                 self.backbone.requires_grad_(False).eval()
         else:
-            options: dict[str, Any] = {"channels": channels, "standardize": standardize}
-            convolutions = [ConvEncoder(size, **options) for size in image_sizes.values()]
+            convolutions = [
+                ConvEncoder(size, channels=channels, standardize=standardize) for size in image_sizes.values()
+            ]
             self.convolutions = nn.ModuleList(convolutions)
             features = sum(conv.features for conv in convolutions)
         layers = []

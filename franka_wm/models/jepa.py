@@ -10,7 +10,7 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from franka_wm.models.base import WorldModel
+from franka_wm.models.base import WorldModel, summed
 from franka_wm.models.ema import ema_update, frozen_copy
 from franka_wm.models.groups import ParameterGroup, decay_groups
 from franka_wm.models.images import (
@@ -263,9 +263,7 @@ class JEPA(WorldModel):
                 "feature_rank": participation_ratio(pooled),
                 "ema": self.ema(),
             }
-        # Adding a constant 0 is what inductor leaves out: the loss would be the detached metric itself.
-        total = prediction + guard if guard.requires_grad else prediction
-        return TensorDict({"loss": total, **metrics}, batch_size=[])
+        return TensorDict({"loss": summed(prediction, guard), **metrics}, batch_size=[])
 
     def ema(self) -> Tensor:
         """Share () that the teacher keeps of itself at the next update, on the device."""

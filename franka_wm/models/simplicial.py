@@ -41,7 +41,7 @@ class SimplicialWorldModel(WorldModel):
         random_shift: pixels by which images are shifted at most while training, in each direction.
         encoder_from, encoder_architecture, encoder_grid, freeze_encoder: of a pretrained vision transformer, see
             `ImageEncoder`.
-        standardize_images: of the convolutions, see `set_image_statistics`.
+        standardize_images: of the convolutions, see `set_image_statistics`; without effect on a pretrained transformer.
         action_masks: of K tasks (K, A), 1 where a task has the entry of an action. Then `task` (..., K), one-hot, is
             among the observations, and z carries its mask behind the `latent_dim` features. None: one task.
 

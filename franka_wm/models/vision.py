@@ -77,7 +77,8 @@ class ConvEncoder(nn.Module):
         one: a pixel that hardly ever changes must not become loud.
         """
         self.mean.copy_(mean.repeat(1, 1, self.mean.shape[-1] // mean.shape[-1]))
-        self.std.copy_(std.square().mean().sqrt().clamp_min(1e-3))
+        deviation = std.square().mean().sqrt()
+        self.std.copy_(torch.where(deviation > 1.0 / 255.0, deviation, 1.0))  # nothing moved: centred only
 
     def maps(self, images: Tensor) -> Tensor:
         """(N, height, width, C) uint8 -> feature maps (N, channels, rows, columns)."""

@@ -69,10 +69,6 @@ def check(run: RunSettings) -> None:
     _check_objective(run)
     _check_demonstrations(run)
     _check_export(run)
-    if run.model.options.get("standardize_images") and not run.trainer.standardize:
-        raise UserError(
-            "model.standardize_images=true: takes the statistics of trainer.standardize=true, which is false here"
-        )
     if run.pretrain.kind != "none" and "encoder_from" not in run.model.options:
         raise UserError(
             f"pretrain: model={run.model.name} takes no pretrained encoder; use action_world_model, dino_wm or "

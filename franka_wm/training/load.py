@@ -58,6 +58,7 @@ def load_agent(
     device: torch.device | str = "auto",
     env_changes: Mapping[str, Any] | None = None,
     seed: int | None = None,
+    planning: Mapping[str, Mapping[str, Any]] | None = None,
 ) -> Agent:
     """Rebuilds environment, model, planner and policies from a checkpoint.
 
@@ -67,6 +68,7 @@ def load_agent(
         device: ``auto``, ``cpu``, ``cuda``, ``cuda:K``.
         env_changes: Fields of the environment's configuration to change.
         seed: Seed of the environment and the policies; the run's if not given.
+        planning: Options of ``planner`` and ``objective`` that are other than the run's.
 
     Raises:
         UserError: One line: no checkpoint, a damaged one, or one whose environment cannot be built here.
@@ -75,6 +77,8 @@ def load_agent(
     settings = RunSettings.of(checkpoint.config, saved=True).changed(device=str(device))
     if seed is not None:
         settings = settings.changed(seed=seed)
+    if planning:
+        settings = _planning_otherwise(settings, planning)
     if settings.env.kind == "none":
         raise UserError(
             f"{folder}: was trained on recorded data without an environment; there is nothing to act in"
@@ -88,6 +92,18 @@ def load_agent(
     policies = build.make_agent_policies(settings, model, env, spaces)
     planner = getattr(policies.get("planner"), "planner", None)
     return Agent(checkpoint.folder, settings, env, model, planner, policies, dict(checkpoint.counters))
+
+
+def _planning_otherwise(settings: RunSettings, planning: Mapping[str, Mapping[str, Any]]) -> RunSettings:
+    """Refuses options that the run's planner and objective do not have; these would be left out like outdated ones."""
+    for group, changes in planning.items():
+        there = [key for key in settings.values.get(group, {}) if key != "name"]
+        for key in changes:
+            if key not in there:
+                raise UserError(
+                    f"{group}.{key}: what this run has of {group}= has no such option; there are {', '.join(there)}"
+                )
+    return settings.changed(**planning)
 
 
 def load_model(folder: str | Path, *, device: torch.device | str = "cpu") -> WorldModel:

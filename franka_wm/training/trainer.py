@@ -106,6 +106,7 @@ class Trainer:
             spaces = Spaces.of_env(env)
         self.spaces = spaces
         self._vectors = list(self.model.observation_sizes)
+        self._standardized = self.model.standardized_images if settings.trainer.standardize else ()
         self._keys = self.model.observation_keys
         if settings.export.kind != "none":  # a dataset is for other models, too
             self._keys = [*self.spaces.observation_sizes, *self.spaces.image_sizes]
@@ -139,7 +140,9 @@ class Trainer:
         anew = self.env is not None and not len(self.replay) and (updates < total or not updates)
         with interruptible() as stop:
             if self.env is None:
-                self.standardize(self.replay.statistics(self.model.standardized_images))
+                if not updates:
+                    images = self.replay.image_moments(self._standardized)
+                    self.standardize({**self.replay.statistics(), **images})
             else:
                 assert self.acting is not None
                 if anew:
@@ -205,7 +208,7 @@ class Trainer:
         if self.demonstrations is not None and processes.is_first():  # all have the same ones
             data.append(self.demonstrations.transitions)
         seen = {key: torch.cat([one.get(key).flatten(0, 1) for one in data]) for key in self._vectors}
-        seen |= {key: data[0].get(key).flatten(0, 1) for key in self.model.standardized_images}
+        seen |= {key: data[0].get(key).flatten(0, 1) for key in self._standardized}
         own = {key: (*moments(x), len(x)) for key, x in seen.items()}
         self.standardize({key: processes.pooled(*mine) for key, mine in own.items()})
 
@@ -213,12 +216,12 @@ class Trainer:
         """Lets the model see mean and deviation of its vector observations, and of images if it standardises them."""
         if not self.settings.trainer.standardize or self.learner.updates:
             return  # trained weights know their scale
-        device, images = self.learner.device, self.model.standardized_images
         if self._vectors:
             mean, std = (torch.cat([statistics[key][i] for key in self._vectors]) for i in (0, 1))
+            device = self.learner.device
             self.model.set_observation_statistics(mean.to(device), std.to(device).clamp_min(1e-3))
-        if images:
-            self.model.set_image_statistics({key: statistics[key][:2] for key in images})
+        if self._standardized:
+            self.model.set_image_statistics({key: statistics[key] for key in self._standardized})
 
     @property
     def kept(self) -> list[NestedKey]:

@@ -63,7 +63,7 @@ def test_the_closed_loop_alone(run_folder: Path, tmp_path: Path, capsys) -> None
     arguments = ["episodes=4", "device=cpu", "open_loop=false", "probes=false"]
     assert cli.main(["evaluate", f"checkpoint={run_folder}", f"out={tmp_path}", *arguments]) == 0
     results = json.loads((tmp_path / "evaluation.json").read_text())
-    assert set(results) == {"protocol", "policies"}
+    assert set(results) == {"protocol", "policies"} and "planned with" not in results["protocol"]
     assert str(tmp_path) in capsys.readouterr().out.splitlines()[-1]
 
 
@@ -77,15 +77,53 @@ def test_the_closed_loop_alone(run_folder: Path, tmp_path: Path, capsys) -> None
         (["checkpoint=a", "fast=true"], "fast: no such option; there are checkpoint, out"),
         (["checkpoint=a", "--robustnes"], "robustnes: no such option; did you mean robustness?"),
         (["checkpoint=a", "checkpoint=b"], "given twice"),
-        (["a", "outputs/run"], "unexpected extra argument (outputs/run)"),
+        (["a", "outputs/run"], "'outputs/run': write options as name=value"),
         (["checkpoint="], "checkpoint=: a value is missing"),
-        (["checkpoint=a", "outputs/run"], "unexpected extra argument (outputs/run)"),
+        (["a", "planner.num_samples=8"], "do not take the place of its own; give another folder, out=FOLDER"),
+        (["a", "out=a/evaluation", "objective.policy_penalty=1"], "do not take the place of its own"),
+        (
+            ["a", "out=b", "planner.num_samples=[8"],
+            "evaluate: planner.num_samples=[8: not a value as in YAML",
+        ),
+        (["a", "out=b", "planner=cem"], "planner: no such option"),
+        (["checkpoint=a", "outputs/run"], "'outputs/run': write options as name=value"),
     ],
 )
 def test_bad_arguments(arguments: list[str], says: str, capsys) -> None:
     assert cli.main(["evaluate", *arguments]) == 1
     lines = capsys.readouterr().err.strip().splitlines()
     assert len(lines) == 1 and lines[0].startswith("error: ") and says in lines[0]
+
+
+@pytest.mark.slow
+def test_a_checkpoint_plans_otherwise_than_its_run(run_folder: Path, tmp_path: Path, capsys) -> None:
+    words = ["episodes=4", "device=cpu", "open_loop=false", "probes=false"]
+    changed = ["planner.num_samples=6", "planner.num_elites=3", "planner.num_policy_samples=0"]
+    for out, more in (("as_it_was", []), ("otherwise", changed)):
+        assert cli.main(["evaluate", str(run_folder), f"out={tmp_path / out}", *words, *more]) == 0
+    found = {
+        out: json.loads((tmp_path / out / "evaluation.json").read_text())
+        for out in ("as_it_was", "otherwise")
+    }
+    assert found["otherwise"]["protocol"]["planned with"] == ", ".join(changed)
+    assert (tmp_path / "otherwise" / "evaluation.md").read_text().startswith(f"Planned with {changed[0]}, ")
+    returns = {
+        out: {name: one["return"]["mean"] for name, one in f["policies"].items()} for out, f in found.items()
+    }
+    assert returns["otherwise"]["planner"] != returns["as_it_was"]["planner"]
+    assert returns["otherwise"]["policy"] == returns["as_it_was"]["policy"]
+    capsys.readouterr()
+    for wrong, says in (
+        (
+            "planner.num_smaples=6",
+            "planner.num_smaples: what this run has of planner= has no such option; there are horizon",
+        ),
+        ("objective.policy_penalty=-1", "policy_penalty=-1: must be a finite number of at least 0"),
+        ("planner.num_samples=0", "planner.num_samples=0: must be a whole number of at least 1"),
+    ):
+        assert cli.main(["evaluate", str(run_folder), f"out={tmp_path / 'wrong'}", *words, wrong]) == 1
+        assert says in capsys.readouterr().err
+    assert not (tmp_path / "wrong").exists()
 
 
 def test_a_checkpoint_that_is_not_there(tmp_path: Path, capsys) -> None:

@@ -252,6 +252,14 @@ def test_a_hugging_face_backbone(tmp_path, dots):
         small(huggingface=str(tmp_path / "nothing"), local_files_only=True)
 
 
+def test_no_constant_is_added_to_a_loss_of_one_term(dots):
+    """See `summed`: compiled, it would have no gradient."""
+    losses = small(rollout=1, collapse="none").loss(dots.windows(4, 3))
+    loss = losses["loss"]
+    assert loss.grad_fn is not None and "Add" not in loss.grad_fn.name()
+    assert loss == losses["loss_prediction"]
+
+
 def test_the_loss_traces_without_graph_breaks_or_host_reads(dots):
     model = small()
 

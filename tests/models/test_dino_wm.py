@@ -157,6 +157,12 @@ def test_it_learns_where_the_dot_goes(dots):
     assert (right < wrong).float().mean() > 0.8
 
 
+def test_no_constant_is_added_to_a_loss_of_one_term(dots):
+    """See `summed`: compiled, it would have no gradient."""
+    loss = small().loss(dots.windows(4, 3))["loss"]
+    assert loss.grad_fn is not None and "Add" not in loss.grad_fn.name()
+
+
 def test_the_loss_traces_without_graph_breaks_or_host_reads(dots):
     model, batch = small(), dots.windows(4, 3)
 

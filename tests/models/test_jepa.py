@@ -189,13 +189,23 @@ def test_the_loss_traces_without_graph_breaks_or_host_reads(recipe, dots):
 
 @pytest.mark.slow
 @pytest.mark.skipif(shutil.which("g++") is None, reason="needs a compiler")
-def test_a_compiled_loss_without_a_guard_has_a_gradient(dots):
+def test_a_compiled_loss_of_one_term_has_a_gradient(dots):
     """A constant 0 that is added is left out: then the loss is the metric, which is detached."""
     torch._dynamo.reset()
     model = small(collapse="ema")
     loss = model.compiled_loss()(dots.windows(4, 2).select("pixels"))["loss"]
     loss.backward()
     assert model.encoder.patch_embedding.weight.grad.abs().sum() > 0
+
+
+@pytest.mark.parametrize("recipe", ["ijepa", "lejepa"])
+def test_the_loss_is_the_sum_with_and_without_gradients(recipe, dots):
+    model = small(recipe=recipe, collapse="sigreg")
+    for recorded in (True, False):
+        with torch.set_grad_enabled(recorded):
+            losses = model.loss(dots.windows(4, 2))
+        assert float(losses["loss_guard"]) > 0
+        torch.testing.assert_close(losses["loss"].detach(), losses["loss_prediction"] + losses["loss_guard"])
 
 
 def test_settings_that_cannot_work_are_refused(dots):

@@ -285,6 +285,10 @@ def test_what_is_compiled_sees_latents_of_one_kind(monkeypatch):
         kinds.add((tuple(z.shape), z.stride()))
         return z + action
 
+    def guess(z):
+        kinds.add((tuple(z.shape), z.stride()))
+        return z.tanh()
+
     planner = MPPI(action_dim=2, horizon=3, num_samples=16, num_elites=4, num_policy_samples=4)
     PlannerPolicy(
         planner,
@@ -292,7 +296,7 @@ def test_what_is_compiled_sees_latents_of_one_kind(monkeypatch):
         next=push,
         objective=GoalDistance(torch.zeros(2)),
         observation_keys=["state"],
-        prior=torch.tanh,
+        prior=guess,
         compile=True,
     )(observation())
     assert {shape for shape, _ in kinds} == {(3, 4, 2), (3, 16, 2)} and len(kinds) == 2

@@ -98,13 +98,6 @@ def test_a_model_that_does_not_fit_is_refused_before_worlds_are_built(words, sai
         check(settled("device=cpu", "scale=smoke", *words))
 
 
-def test_images_are_standardized_where_statistics_are_taken(settled) -> None:
-    words = ("device=cpu", "scale=smoke", "env=reach_pixels", "model=tdmpc2_pixels")
-    assert settled(*words).model.options["standardize_images"]
-    with pytest.raises(UserError, match=r"standardize_images=true: .*trainer.standardize=true"):
-        check(settled(*words, "trainer.standardize=false"))
-
-
 def test_a_family_of_ones_own_is_built_whole(settled, monkeypatch) -> None:
     class Mine(models.family("tdmpc2")):
         def __init__(self, **options):

@@ -308,21 +308,13 @@ class RecordedWindows:
         """Whether any episode of the data terminated."""
         return any(bool(ends.any()) for ends in self.recording.arrays.get("next.terminated", ()))
 
-    def statistics(self, images: Sequence[str] = ()) -> dict[str, Moments]:
+    def statistics(self) -> dict[str, Moments]:
         """Mean, deviation, least and largest of each vector observation and of ``action``, over this split.
-
-        Args:
-            images: Keys of images whose moments are wanted, too: as numbers in [0, 1], of at most 2,000 frames.
 
         Computed from the data, in float64, and put on :attr:`device`. Actions are as they are given out.
         """
         out = {}
-        mask = np.zeros(int(self._bounds[-1]), bool)
-        action_mask = mask.copy()
-        _, start, length, known = self._chosen().T
-        for s, n, k in zip(start, length, known, strict=True):
-            mask[s : s + n + k] = True
-            action_mask[s : s + n] = True
+        mask, action_mask = self._in_split()
         for key in self.observation_sizes:
             out[key] = _moments(self._whole(f"observation.{key}")[mask], self.device)
         if not self.num_actions:
@@ -331,14 +323,24 @@ class RecordedWindows:
                 centre, half = _centre_and_half(self.action_low, self.action_high)
                 action = np.where(half > 0, (action - centre) / np.maximum(half, 1e-30), 0.0)
             out["action"] = _moments(action, self.device)
-        rows = np.flatnonzero(mask)
-        rows = torch.from_numpy(rows[np.linspace(0, len(rows) - 1, min(len(rows), 2000)).astype(int)])
-        for key in images:
-            frames = self._gather(f"observation.{key}", rows.unsqueeze(0))[0]
-            out[key] = Moments(
-                *moments(frames), *(end(frames, 0) / 255.0 for end in (torch.amin, torch.amax))
-            )
         return out
+
+    def image_moments(self, keys: Sequence[str], most: int = 2000) -> dict[str, tuple[Tensor, Tensor]]:
+        """Mean and deviation (h, w, 3) of images as numbers in [0, 1], over at most so many frames of this split."""
+        rows = np.flatnonzero(self._in_split()[0])
+        chosen = rows[np.linspace(0, len(rows) - 1, min(len(rows), most)).astype(int)]
+        index = torch.from_numpy(chosen).to(self._home).unsqueeze(0)
+        return {key: moments(self._gather(f"observation.{key}", index)[0]) for key in keys}
+
+    def _in_split(self) -> tuple[np.ndarray, np.ndarray]:
+        """Which rows are observations of this split, and which of them have an action."""
+        mask = np.zeros(int(self._bounds[-1]), bool)
+        action_mask = mask.copy()
+        _, start, length, known = self._chosen().T
+        for s, n, k in zip(start, length, known, strict=True):
+            mask[s : s + n + k] = True
+            action_mask[s : s + n] = True
+        return mask, action_mask
 
     def recorded_action(self, action: Tensor) -> Tensor:
         """Actions (…, A) as given out → in the dataset's own units."""

@@ -247,15 +247,16 @@ def test_statistics(foreign, tmp_path: Path, opened: Callable) -> None:
     assert (statistics["action"].min >= -1).all() and float(statistics["action"].std[2]) == 0
 
 
-def test_statistics_of_images(pictures: Path, opened: Callable) -> None:
-    train = opened(pictures, split="all", validation_fraction=0.0)
-    (images,) = train.recording.arrays["observation.pixels"]
-    found = train.statistics(["pixels"])["pixels"]
-    seen = images.double() / 255.0
-    torch.testing.assert_close(found.mean.double(), seen.mean(0), rtol=0, atol=1e-6)
-    torch.testing.assert_close(found.std.double(), seen.std(0, correction=0), rtol=0, atol=1e-6)
-    torch.testing.assert_close(found.min.double(), seen.amin(0), rtol=0, atol=1e-6)
-    assert "pixels" not in train.statistics()
+def test_moments_of_images(foreign, pictures: Path, opened: Callable) -> None:
+    train = opened(pictures, split="train", validation_fraction=0.4)
+    assert len(train.episodes) == 2
+    frames = [foreign.picture(e, t) for _, e in train.episodes for t in range((5, 4, 7)[e])]
+    seen = torch.from_numpy(np.stack(frames)).double() / 255.0
+    mean, std = train.image_moments(["pixels"])["pixels"]
+    torch.testing.assert_close(mean.double(), seen.mean(0), rtol=0, atol=1e-6)
+    torch.testing.assert_close(std.double(), seen.std(0), rtol=0, atol=1e-6)
+    few = train.image_moments(["pixels"], most=2)["pixels"][0]  # the first and the last one
+    torch.testing.assert_close(few.double(), seen[[0, -1]].mean(0), rtol=0, atol=1e-6)
 
 
 def test_what_does_not_fit_the_environment_is_refused(pictures: Path, opened: Callable) -> None:
