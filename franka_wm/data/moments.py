@@ -15,5 +15,4 @@ def moments(x: Tensor, at_once: int = 256) -> tuple[Tensor, Tensor]:
         values = part.double() / 255.0
         total, squares = total + values.sum(0), squares + values.square().sum(0)
     mean = total / len(x)
-    variance = (squares - len(x) * mean.square()).clamp_min(0.0) / max(1, len(x) - 1)
-    return mean.float(), variance.sqrt().float()
+    return mean.float(), (squares / len(x) - mean.square()).clamp_min(0.0).sqrt().float()
