@@ -16,8 +16,8 @@ from franka_wm.files import unwritable
     first="checkpoint",
     others=("planner.", "objective."),
     shown=(
-        "planner.KEY=VALUE",
-        "plans otherwise than the run did, also objective.KEY=VALUE; wants out=FOLDER, the run's own results stay",
+        "planner.KEY=…",
+        "plans otherwise than the run did, also objective.KEY=…; wants out=FOLDER, the run's own results stay",
     ),
 )
 @word(

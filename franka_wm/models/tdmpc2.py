@@ -62,8 +62,7 @@ class TDMPC2(SimplicialWorldModel):
         episode_length: steps of an episode, from which the discount follows if it is not given:
             clamp((T/5 - 1) / (T/5), 0.95, 0.995).
         discount: per step, in [0, 1).
-        latent_dim: size of z.
-        simnorm_dim: features per simplex; divides `latent_dim`.
+        latent_dim, simnorm_dim: size of z; features per simplex, which divides it.
         encoder_dim, encoder_layers: width of the encoder's hidden layers; its layers, the output layer included.
         hidden_dim: width of the two hidden layers of every other network.
         num_q: members of the Q-ensemble, at least 2.
@@ -74,8 +73,7 @@ class TDMPC2(SimplicialWorldModel):
             derived from `reward_bounds` and the discount, see `value_range`.
         reward_bounds: the least and the largest reward of a step; None: unknown.
         terminates: whether episodes may terminate; otherwise there is no head for it.
-        log_std_min, log_std_max: bounds of the policy's log standard deviation before squashing.
-        rho: weight of unroll step t is rho^t.
+        log_std_min, log_std_max: bounds of the policy's log deviation before squashing. rho: step t weighs rho^t.
         consistency_coef, reward_coef, value_coef, termination_coef: weights of the losses.
         entropy_coef: weight, against scaled values, of `action_dim` times the policy's entropy [nat].
         imitation_coef: of the policy's squared error at `demonstrated` steps; among these alone it is all of its loss.
@@ -85,8 +83,7 @@ class TDMPC2(SimplicialWorldModel):
         encoder_lr_scale: learning rate of the encoder relative to the rest.
         channels: of each convolution over images.
         random_shift: pixels by which images are shifted at most, in each direction; the paper pads by 3 to 4.
-        encoder_from: start from the vision transformer of this checkpoint instead of convolutions, see
-            `franka_wm.models.backbone.read_encoder`.
+        encoder_from: start from this checkpoint's vision transformer, see `franka_wm.models.backbone.read_encoder`.
         encoder_architecture: the transformer's numbers; only to rebuild from a checkpoint.
         encoder_grid: average its tokens to so many rows and columns.
         freeze_encoder: keep it as it is; what joins its features into z is still trained.
