@@ -43,12 +43,13 @@ def evaluate(checkpoint: str, out: str | None, overrides: Sequence[str] = (), **
 
     Writes evaluation.json and evaluation.md (the same twice on a CPU), timing.json, imagined.png, imagined.mp4.
     """
-    if overrides and (out is None or Path(out).resolve() == default_folder(checkpoint).resolve()):
+    own = default_folder(checkpoint)
+    if overrides and (out is None or Path(out).resolve() in (own.resolve(), own.parent.resolve())):
         raise UserError(
             f"evaluate: {' '.join(overrides)}: results of other settings than the run's do not take the place of its "
             "own; give another folder, out=FOLDER"
         )
-    place = default_folder(checkpoint) if out is None else Path(out)
+    place = own if out is None else Path(out)
     check_folder(place)
     check_run("evaluate", "checkpoint", checkpoint)
     check_larger(place, options["episodes"])

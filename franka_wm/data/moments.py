@@ -7,7 +7,10 @@ from torch import Tensor
 
 
 def moments(x: Tensor, at_once: int = 256) -> tuple[Tensor, Tensor]:
-    """Mean and deviation over the first dimension; of uint8 images as numbers in [0, 1], `at_once` at a time."""
+    """Mean and deviation over the first dimension (N, ...).
+
+    Of uint8 images as numbers in [0, 1], `at_once` at a time, in float64; their deviation is that of N, not of N - 1.
+    """
     if x.dtype != torch.uint8:
         return x.mean(0), x.std(0)
     total, squares = (torch.zeros(x.shape[1:], dtype=torch.float64, device=x.device) for _ in range(2))

@@ -9,7 +9,7 @@ from typing import Any
 from markupsafe import Markup
 
 from franka_wm.errors import UserError
-from franka_wm.evaluation.results import SHOWN
+from franka_wm.evaluation.results import SHOWN, Result
 from franka_wm.report import style
 from franka_wm.report.bars import bars_figure
 from franka_wm.report.curves import panels, seeds_figure
@@ -171,12 +171,24 @@ def _results(runs: Mapping[str, RunFiles]) -> str:
     return body + folded("Baselines", rest) + _measured(runs)
 
 
+_OTHERWISE = "planned with"
+"""Of a result's protocol: settings of the planner that are not the run's, which ``franka-wm evaluate`` was given."""
+
+
+def _told(result: Result) -> str:
+    otherwise = result.protocol.get(_OTHERWISE)
+    return f"{result.told}, planned with {otherwise}" if otherwise else result.told
+
+
 def _measured(runs: Mapping[str, RunFiles]) -> str:
-    """By whom, where a run was measured more than once: shown is what rests on most episodes."""
-    if all(len(run.results) < 2 for run in runs.values()):
+    """By whom, where a run was measured more than once, or planned otherwise: shown is what rests on most episodes."""
+    found = [one for run in runs.values() for one in run.results]
+    if all(len(run.results) < 2 for run in runs.values()) and not any(
+        _OTHERWISE in one.protocol for one in found
+    ):
         return ""
     rows = [
-        [name, run.results[0].told, "; ".join(one.told for one in run.results[1:]) or MISSING]
+        [name, _told(run.results[0]), "; ".join(map(_told, run.results[1:])) or MISSING]
         for name, run in runs.items()
         if run.results
     ]

@@ -81,6 +81,7 @@ def test_the_closed_loop_alone(run_folder: Path, tmp_path: Path, capsys) -> None
         (["checkpoint="], "checkpoint=: a value is missing"),
         (["a", "planner.num_samples=8"], "do not take the place of its own; give another folder, out=FOLDER"),
         (["a", "out=a/evaluation", "objective.policy_penalty=1"], "do not take the place of its own"),
+        (["a", "out=a", "objective.policy_penalty=1"], "do not take the place of its own"),
         (["a", "out=b", "planner=cem"], "planner: no such option"),
         (["checkpoint=a", "outputs/run"], "'outputs/run': write options as name=value"),
     ],

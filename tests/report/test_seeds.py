@@ -144,3 +144,18 @@ def test_compare_does_not_blame_the_first_run_for_another_ones_values(tmp_path, 
     words = [str(tmp_path / "good"), str(tmp_path / "bad"), f"out={tmp_path}/page.html"]
     assert main(["compare", *words]) == 1
     assert f"{tmp_path}/good or {tmp_path}/bad holds values of another form" in capsys.readouterr().err
+
+
+def test_compare_tells_which_results_were_planned_otherwise(tmp_path, capsys):
+    for name in ("as_it_was", "otherwise"):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "evaluation.json").write_text(written(0.01, 1.0))
+    words = ["compare", str(tmp_path / "as_it_was"), str(tmp_path / "otherwise"), f"out={tmp_path}/page.html"]
+    assert main(words) == 0
+    assert "measured by" not in (tmp_path / "page.html").read_text()
+    found = json.loads((tmp_path / "otherwise" / "evaluation.json").read_text())
+    found["protocol"]["planned with"] = "planner.num_samples=8"
+    (tmp_path / "otherwise" / "evaluation.json").write_text(json.dumps(found))
+    assert main(words) == 0
+    page = (tmp_path / "page.html").read_text()
+    assert "measured by" in page and page.count(", planned with planner.num_samples=8") == 1
