@@ -172,7 +172,7 @@ def _results(runs: Mapping[str, RunFiles]) -> str:
 
 
 _OTHERWISE = "planned with"
-"""Of a result's protocol: settings of the planner that are not the run's, which ``franka-wm evaluate`` was given."""
+"""Key of a result's protocol: settings of the planner that are not the run's, given to ``franka-wm evaluate``."""
 
 
 def _told(result: Result) -> str:
