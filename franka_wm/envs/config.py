@@ -385,11 +385,13 @@ class FrankaConfig:
             raise UserError("gripper and scene need solver=mujoco")
         if self.contact_dim and not self.resolved_scene:
             raise UserError(
-                f"observations: task={self.task} touches nothing; leave contacts out, or give a scene"
+                f"observations: task={self.task} touches nothing; leave contacts out, give a scene, or name a task "
+                "that has one"
             )
         if "objects" in self.observations and not self.object_dim:
             raise UserError(
-                f"observations: task={self.task} has no objects; leave objects out, or give a scene"
+                f"observations: task={self.task} has no objects; leave objects out, give a scene, or name a task "
+                "that has one"
             )
         for name, there, what in (
             ("contact_friction", self.resolved_scene, "a scene"),

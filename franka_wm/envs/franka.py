@@ -23,9 +23,9 @@ from franka_wm.device import resolve_device
 from franka_wm.envs.camera import Camera, as_torch, camera_framing
 from franka_wm.envs.config import FrankaConfig
 from franka_wm.envs.frames import FrameStack
-from franka_wm.envs.kinematics import check_robot
 from franka_wm.envs.simulation import Simulation
 from franka_wm.envs.specs import goals_given, observation_spec
+from franka_wm.envs.start import check_robot, check_task
 from franka_wm.envs.tasks import Task, goal_distance
 from franka_wm.errors import UserError
 from franka_wm.options import check_whole
@@ -121,7 +121,7 @@ class FrankaEnv(EnvBase):
         if task is None:
             check_robot(config, urdf_path)
         elif isinstance(task, Task):
-            config = task.config = replace(config, **task.brings())
+            config = task.config = check_task(task, replace(config, **task.brings()), urdf_path)
         else:
             raise UserError(
                 f"task={task!r}: must be an instance of Task; by name it is FrankaConfig(task=NAME)"

@@ -10,16 +10,13 @@ dimensions without a host sync, and is differentiable, so that policies and plan
 from __future__ import annotations
 
 from collections.abc import Sequence
-from pathlib import Path
 
 import numpy as np
 import torch
 import warp as wp
 
-from franka_wm.envs.config import FrankaConfig
 from franka_wm.envs.constants import HOME
-from franka_wm.envs.robots import Robot, load_robot
-from franka_wm.errors import UserError
+from franka_wm.envs.robots import Robot
 
 
 def _matrix(frame: np.ndarray) -> tuple[torch.Tensor, torch.Tensor]:
@@ -177,15 +174,6 @@ class Kinematics:
         target = torch.tensor(list(goal), dtype=torch.float32, device=self.lower.device)
         reached = self.forward(self.solve(target.expand(64, 3), starts, iterations=60))
         return bool(((reached - target).norm(dim=-1) < tolerance).any())
-
-
-def check_robot(config: FrankaConfig, urdf_path: str | Path | None = None) -> None:
-    """Raises ``UserError`` if the robot cannot be loaded, or a fixed goal is out of its reach."""
-    robot = load_robot(config, urdf_path)
-    if config.fixed_goal and not Kinematics(robot).reachable(config.goal):
-        raise UserError(
-            f"goal={config.goal} m: out of the arm's reach; it reaches about 0.85 m from (0, 0, 0.333)"
-        )
 
 
 def _inverse3(m: torch.Tensor) -> torch.Tensor:

@@ -14,8 +14,8 @@ from franka_wm.envs import FrankaConfig
 from franka_wm.envs.external import check_external
 from franka_wm.envs.external_config import ExternalConfig
 from franka_wm.envs.external_ray import import_ray
-from franka_wm.envs.franka import check_robot
 from franka_wm.envs.multitask_config import MultiTaskConfig
+from franka_wm.envs.start import check_robot
 from franka_wm.errors import UserError
 from franka_wm.models import WorldModel
 from franka_wm.models.vision import ViT

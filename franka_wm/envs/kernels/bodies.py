@@ -19,7 +19,7 @@ from franka_wm.envs.constants import (
     OBJECT_DIM,
     STATE_DIM,
 )
-from franka_wm.envs.kernels.functions import away_from, episode_rng
+from franka_wm.envs.kernels.functions import away_from, away_from_box, episode_rng
 
 FINGERS = wp.constant(NUM_FINGERS)
 ARM = wp.constant(NUM_JOINTS)
@@ -30,6 +30,7 @@ HAND_END = wp.constant(STATE_DIM + HAND_DIM)
 EACH = wp.constant(OBJECT_DIM)
 JOINT = wp.constant(JOINT_DIM)
 ATTEMPTS = wp.constant(64)
+DRAWS = wp.constant(32)
 
 
 @wp.kernel(enable_backward=False)
@@ -61,6 +62,17 @@ def apply_grip(
         rest_control[world, f] = value
 
 
+@wp.func
+def away_from_obstacles(x: float, y: float, blocked: wp.array2d[float]) -> float:
+    """From a point to the nearest of what :meth:`Scene.blocked` says [m]."""
+    least = float(wp.inf)
+    for o in range(blocked.shape[0]):  # x, y, half sides, cosine and sine of the angle, radius
+        there = wp.vec2f(blocked[o, 0], blocked[o, 1])
+        away = away_from_box(x, y, there, blocked[o, 2], blocked[o, 3], blocked[o, 4], blocked[o, 5])
+        least = wp.min(least, away - blocked[o, 6])
+    return least
+
+
 @wp.kernel(enable_backward=False)
 def place(
     mask: wp.array[wp.bool],
@@ -90,7 +102,8 @@ def place(
 
     ``height`` and ``radius`` are those of an object of its plain size on a table that is not ``raised``, ``rise`` the
     half of its own height [m].
-    A place is drawn anew while something stands there. That one is left is seen to when the scene is made.
+    A place is drawn anew while something stands there, and where none is left all of them are. A scene in which that
+    happens often is refused when it is made.
     """
     world = wp.tid()
     if not mask[world]:
@@ -106,41 +119,38 @@ def place(
     for k in range(history.shape[1]):
         history[world, k, history.shape[2] - 1] = 1.0  # what a late action leaves in force
     rng = episode_rng(seed[0], seed[1] + world, episode[world], 8)
-    for b in range(turn.shape[0]):
-        at = FINGERS + 7 * b
-        wide = radius[b] * sizes[world, b]
-        found = bool(False)
-        x = float(0.0)
-        y = float(0.0)
-        for _attempt in range(ATTEMPTS):
-            if not found:
-                x = middle[b, 0] + spread[b, 0] * wp.randf(rng, -1.0, 1.0)
-                y = middle[b, 1] + spread[b, 1] * wp.randf(rng, -1.0, 1.0)
-                clear = bool(True)
-                for o in range(blocked.shape[0]):  # x, y, half sides, cosine and sine of the angle, radius
-                    dx = x - blocked[o, 0]
-                    dy = y - blocked[o, 1]
-                    u = wp.max(wp.abs(blocked[o, 4] * dx + blocked[o, 5] * dy) - blocked[o, 2], 0.0)
-                    v = wp.max(wp.abs(blocked[o, 4] * dy - blocked[o, 5] * dx) - blocked[o, 3], 0.0)
-                    if wp.length(wp.vec2f(u, v)) < wide + blocked[o, 6] + margin:
-                        clear = False
-                for o in range(footprints.shape[0]):
-                    if away_from(x, y, bases[world, o], footprints, o) < wide + margin:
-                        clear = False
-                for o in range(b):
-                    there = FINGERS + 7 * o
-                    away = wp.length(wp.vec2f(x - rest_q[world, there], y - rest_q[world, there + 1]))
-                    if away < wide + radius[o] * sizes[world, o] + margin:
-                        clear = False
-                found = clear
-        angle = turn[b] * wp.randf(rng, -1.0, 1.0)
-        rest_q[world, at] = x
-        rest_q[world, at + 1] = y
-        rest_q[world, at + 2] = height[b] + (sizes[world, b] - 1.0) * rise[b] + raised[world]
-        rest_q[world, at + 3] = 0.0
-        rest_q[world, at + 4] = 0.0
-        rest_q[world, at + 5] = wp.sin(0.5 * angle)
-        rest_q[world, at + 6] = wp.cos(0.5 * angle)
+    placed = bool(False)
+    for _draw in range(DRAWS):
+        if not placed:
+            placed = bool(True)
+            for b in range(turn.shape[0]):
+                at = FINGERS + 7 * b
+                wide = radius[b] * sizes[world, b] + margin
+                found = bool(False)
+                x = float(0.0)
+                y = float(0.0)
+                for _attempt in range(ATTEMPTS):
+                    if not found:
+                        x = middle[b, 0] + spread[b, 0] * wp.randf(rng, -1.0, 1.0)
+                        y = middle[b, 1] + spread[b, 1] * wp.randf(rng, -1.0, 1.0)
+                        found = away_from_obstacles(x, y, blocked) >= wide
+                        for o in range(footprints.shape[0]):
+                            found = found and away_from(x, y, bases[world, o], footprints, o) >= wide
+                        for o in range(b):
+                            there = wp.vec2f(
+                                rest_q[world, FINGERS + 7 * o], rest_q[world, FINGERS + 7 * o + 1]
+                            )
+                            away = wp.length(wp.vec2f(x, y) - there)
+                            found = found and away >= wide + radius[o] * sizes[world, o]
+                placed = placed and found
+                angle = turn[b] * wp.randf(rng, -1.0, 1.0)
+                rest_q[world, at] = x
+                rest_q[world, at + 1] = y
+                rest_q[world, at + 2] = height[b] + (sizes[world, b] - 1.0) * rise[b] + raised[world]
+                rest_q[world, at + 3] = 0.0
+                rest_q[world, at + 4] = 0.0
+                rest_q[world, at + 5] = wp.sin(0.5 * angle)
+                rest_q[world, at + 6] = wp.cos(0.5 * angle)
 
 
 @wp.kernel(enable_backward=False)

@@ -28,6 +28,10 @@ PAD, PAD_AWAY, PAD_ALONG = (0.010, 0.009, 0.0275), 0.010, 0.027
 PALM, PALM_BELOW = (0.031, 0.1025, 0.035), 0.0284
 """Half sides of the palm's box [m]; how far its centre lies before the fingers' joints."""
 
+PADS = tuple(f"hand/pad{k}" for k in range(NUM_FINGERS))
+LABELS = (*PADS, "hand/palm")
+"""Labels of the boxes that are touched; nothing in a scene can have such a name."""
+
 
 def free_fingers(root: ET.Element) -> None:
     """Prismatic joints of a URDF stay joints; what ties one to the other is the command, not the file."""
@@ -81,13 +85,15 @@ def add_colliders(builder: newton.ModelBuilder, tool_body: int) -> None:
         body = builder.joint_child[joint]
         shapes.append(
             builder.add_shape_box(
-                body, xform=at, hx=hx, hy=hy, hz=hz, cfg=config, label=f"pad{joint - NUM_JOINTS}"
+                body, xform=at, hx=hx, hy=hy, hz=hz, cfg=config, label=PADS[joint - NUM_JOINTS]
             )
         )
     below = wp.transform(wp.vec3(0.0, 0.0, -PALM_BELOW), wp.quat_identity())
     at = wp.transform(*builder.joint_X_p[NUM_JOINTS]) * below
     hx, hy, hz = PALM
-    shapes.append(builder.add_shape_box(tool_body, xform=at, hx=hx, hy=hy, hz=hz, cfg=config, label="palm"))
+    shapes.append(
+        builder.add_shape_box(tool_body, xform=at, hx=hx, hy=hy, hz=hz, cfg=config, label=LABELS[-1])
+    )
     for k, one in enumerate(shapes):
         for other in shapes[k + 1 :]:
             builder.add_shape_collision_filter_pair(one, other)

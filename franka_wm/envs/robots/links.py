@@ -13,7 +13,7 @@ import warp as wp
 
 from franka_wm.envs.config import FrankaConfig
 from franka_wm.envs.constants import NUM_JOINTS
-from franka_wm.envs.robots import Robot, add_robot, arm_builder
+from franka_wm.envs.robots import Robot, add_robot, arm_builder, gripper
 from franka_wm.errors import UserError
 
 FRICTION = 0.4
@@ -49,6 +49,11 @@ def _embedded() -> tuple[Robot, tuple[Part, ...]]:
     return robot, tuple(parts)
 
 
+def embedded_parts() -> tuple[Part, ...]:
+    """What is touched of a Franka arm's links with ``collisions=arm``."""
+    return _embedded()[1]
+
+
 def add_link_colliders(builder: newton.ModelBuilder, robot: Robot, *, itself: bool) -> None:
     """Capsules and boxes around all links, unseen, where hand and fingers have theirs already.
 
@@ -69,11 +74,7 @@ def add_link_colliders(builder: newton.ModelBuilder, robot: Robot, *, itself: bo
         density=0.0, mu=FRICTION, gap=0.0, is_visible=False, has_particle_collision=False
     )
     bodies = [-1, *(builder.joint_child[j] for j in range(NUM_JOINTS))]
-    links = {
-        shape: NUM_JOINTS
-        for shape, label in enumerate(builder.shape_label)
-        if label in ("palm", "pad0", "pad1")
-    }
+    links = {shape: NUM_JOINTS for shape, label in enumerate(builder.shape_label) if label in gripper.LABELS}
     for k, part in enumerate(parts):
         body, label = bodies[part.link], f"link{part.link}_{k}"
         a, b, c = part.scale

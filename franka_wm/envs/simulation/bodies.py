@@ -12,6 +12,7 @@ from franka_wm.envs.articulated_file import ArticulatedFile
 from franka_wm.envs.config import FrankaConfig
 from franka_wm.envs.kernels import articulated, goals
 from franka_wm.envs.kernels import bodies as kernels
+from franka_wm.envs.robots.gripper import PADS
 from franka_wm.envs.simulation.arrays import STATISTICS
 
 if TYPE_CHECKING:
@@ -107,7 +108,7 @@ class Bodies:
         if config.contact_dim:
             geoms = sim.solver.mjc_geom_to_newton_shape.numpy()[0]  # pyright: ignore[reportAttributeAccessIssue]
             names = [sim.model.shape_label[shape] if shape >= 0 else "" for shape in geoms]
-            pads = [int(name[-1]) if name in ("pad0", "pad1") else -1 for name in names]
+            pads = [PADS.index(name) if name in PADS else -1 for name in names]
             self._finger = wp.array(pads, dtype=int, device=device)
 
     @property

@@ -18,6 +18,7 @@ from franka_wm.envs.tasks.reach import Reach, goal_distance, reach_reward
 from franka_wm.envs.tasks.stack import Stack
 from franka_wm.envs.tasks.torch_task import TorchTask
 from franka_wm.envs.tasks.track import Track
+from franka_wm.errors import UserError
 
 if TYPE_CHECKING:
     from franka_wm.envs.config import FrankaConfig
@@ -73,7 +74,12 @@ def register(name: str, task: type[Task]) -> None:
     Args:
         name: What ``FrankaConfig.task`` will say.
         task: Built with the config alone.
+
+    Raises:
+        UserError: It is not a subclass of :class:`Task`.
     """
+    if not (isinstance(task, type) and issubclass(task, Task)):
+        raise UserError(f"register({name!r}, {task!r}): must be a class, a subclass of Task or TorchTask")
     _REGISTERED[name] = task
     if name not in TASKS:
         TASKS.append(name)

@@ -10,6 +10,7 @@ import torch
 import warp as wp
 from tensordict import TensorDict, TensorDictBase
 
+from franka_wm.envs.constants import NUM_JOINTS
 from franka_wm.envs.scene import Scene
 from franka_wm.errors import UserError
 
@@ -57,6 +58,12 @@ class Task:
         super().__init_subclass__(**kwargs)
         if "judge" in vars(cls):
             raise UserError(f"{cls.__name__}.judge: the method is called reward_and_success now; rename it")
+        if cls.scene is not None:
+            cls.scene = Scene.of(cls.scene)
+        if cls.home is not None and len(cls.home) != NUM_JOINTS:
+            raise UserError(
+                f"{cls.__name__}.home={cls.home!r}: give {NUM_JOINTS} joint angles [rad], or None"
+            )
 
     @property
     def reward_bounds(self) -> tuple[float, float] | None:

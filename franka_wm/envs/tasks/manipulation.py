@@ -165,6 +165,8 @@ class GripperTask(Task):
     rewards = ("dense", "sparse")
     least_objects = 1
     """How many objects the scene must have."""
+    grasps = True
+    """Whether the first of them must fit between the fingers."""
 
     @classmethod
     def check(cls, config: "FrankaConfig") -> None:
@@ -182,6 +184,13 @@ class GripperTask(Task):
                 f"scene: task={config.task} is about {cls.least_objects} objects, the scene has "
                 f"{config.num_objects}; add to scene.objects"
             )
+        if cls.grasps and cls.least_objects and config.resolved_scene is not None:
+            first, most = config.resolved_scene.objects[0], 1 + config.randomization.object_size
+            if most * min(first.widths) >= 2 * MOST_OPEN:
+                raise UserError(
+                    f"scene.{first.name}: {most * min(first.widths):g} m wide; task={config.task} grasps it, and the "
+                    f"fingers open {2 * MOST_OPEN:g} m: make it narrower (size)"
+                )
 
     @property
     def reward_bounds(self) -> tuple[float, float]:

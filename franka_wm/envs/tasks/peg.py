@@ -103,17 +103,17 @@ class Peg(GripperTask):
     @classmethod
     def check(cls, config: "FrankaConfig") -> None:
         super().check(config)
-        if config.resolved_scene is None or config.resolved_scene.objects[1].shape != "socket":
-            raise UserError(f"scene: task={config.task} needs a shape=socket as the second in scene.objects")
+        assert config.resolved_scene is not None
+        peg, block = config.resolved_scene.objects[:2]
+        if block.shape != "socket" or max(peg.widths) >= block.size[1] or block.size[2] - PLATE < DEEP:
+            what = "a shape=socket as the second in scene.objects, with room for the first"
+            raise UserError(f"scene: task={config.task} needs {what}, {DEEP:g} m deep")
         if config.randomization.object_size:
-            raise UserError(
-                f"randomization.object_size: of task={config.task} the peg would not fit its hole; set it to 0"
-            )
+            raise UserError("randomization.object_size: the peg would not fit its hole; set it to 0")
 
     def _halves(self) -> tuple[float, float, float]:
         """Half of the peg's and the block's height, and of the hole's width [m]."""
-        assert self.config.resolved_scene is not None
-        peg, block = self.config.resolved_scene.objects[:2]
+        peg, block = self.objects[:2]
         return peg.half_height, block.half_height, 0.5 * block.size[1]
 
     def reset(self, sim: "Simulation", mask: wp.array) -> None:

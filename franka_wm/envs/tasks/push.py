@@ -3,13 +3,14 @@
 """Push: slide a cube onto a disc."""
 
 # Warp reads annotations as types: no `from __future__ import annotations` here.
+import math
 from typing import TYPE_CHECKING
 
 import torch
 import warp as wp
 from tensordict import TensorDictBase
 
-from franka_wm.envs.scene import Body, Scene
+from franka_wm.envs.scene import REACH, Body, Scene
 from franka_wm.envs.tasks.manipulation import (
     Aim,
     GripperTask,
@@ -22,8 +23,10 @@ from franka_wm.envs.tasks.manipulation import (
     relabel_place,
     tool_of,
 )
+from franka_wm.errors import UserError
 
 if TYPE_CHECKING:
+    from franka_wm.envs.config import FrankaConfig
     from franka_wm.envs.simulation import Simulation
 
 AHEAD, RADIUS = 0.20, 0.10
@@ -86,13 +89,33 @@ class Push(GripperTask):
     """
 
     scene = Scene(objects=(Body(name="cube", at=(0.42, 0.0), spread=(0.07, 0.15)),))
+    grasps = False
     marker = RADIUS
     words = "Push the cube onto the disc."
     relabel_reads = ("state", "joint_target", "objects")
     achieved = ("objects", slice(0, 3))
 
+    @classmethod
+    def check(cls, config: "FrankaConfig") -> None:
+        super().check(config)
+        assert config.resolved_scene is not None
+        cube, table = config.resolved_scene.objects[0], config.resolved_scene.table
+        x = cube.at[0] + cube.spread[0] + AHEAD
+        far, edge = math.hypot(x, abs(cube.at[1]) + cube.spread[1]), table.at[0] + 0.5 * table.size[0]
+        if far > REACH[1] or x + cube.radius > edge:
+            raise UserError(
+                f"scene.{cube.name}: task={config.task} asks for a place {AHEAD:g} m ahead of it, {far:.2f} m from "
+                f"the base; the arm reaches {REACH[1]:g} m, the table ends at x = {edge:g} m: change at or spread"
+            )
+
     def reset(self, sim: "Simulation", mask: wp.array) -> None:
         self.launch_goal(sim, mask, away=(AHEAD, 0.0, 0.0))
+
+    def goal_was_set(self, sim: "Simulation") -> None:
+        """The goal is a place of the lying cube: its height is not for anyone to choose."""
+        t, scene = sim.tensors, self.config.resolved_scene
+        assert scene is not None
+        t.task_goal[:, 2] = scene.top + t.raised + t.sizes[:, 0] * self.objects[0].half_height
 
     def pose_at_goal(self, sim: "Simulation", mask: wp.array) -> None:
         """The cube in the middle of the disc, the closed fingers behind it."""

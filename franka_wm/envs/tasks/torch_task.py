@@ -24,10 +24,13 @@ class TorchTask(Task):
     ``.item()``), copy nothing from the host (no ``torch.tensor``), and draw nothing: random numbers are given.
 
     The 20 numbers of a state are joints 7 [rad], velocities 7 [rad/s], tool 3 [m], tool − goal 3 [m]; with a gripper 8
-    of the hand follow, and then the 13 of each object (``docs/tasks.md``). It has no observation noise.
+    of the hand follow, and then the 13 of each object (``docs/tasks.md``). It has no observation noise. The config's
+    ``action_penalty`` has no part in ``reward``; ``self.config`` has it.
     """
 
     num_draws = 8
+    draws_goals = True
+    rewards = ("dense",)
 
     def goal(self, draws: torch.Tensor) -> torch.Tensor:
         """Goal of an episode: (N, num_draws) random numbers, uniform in [0, 1) → (N, 3) [m]."""

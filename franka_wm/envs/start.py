@@ -1,0 +1,156 @@
+# pyright: reportArgumentType=false, reportCallIssue=false
+# (Warp's annotations know neither vectors nor shapes as tuples.)
+"""What is refused before a world is built: a goal or an object out of reach, a scene that the robot would start in."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Iterator
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import warp as wp
+
+from franka_wm.envs.config import FrankaConfig
+from franka_wm.envs.constants import MOST_OPEN
+from franka_wm.envs.kinematics import Kinematics
+from franka_wm.envs.robots import Robot, gripper, links, load_robot
+from franka_wm.envs.scene import Scene
+from franka_wm.envs.tasks import Task
+from franka_wm.errors import UserError
+
+FINGERS_ABOVE = 0.045
+"""From the tool back to the joints of a Franka Hand's fingers [m]."""
+
+
+class _Box(NamedTuple):
+    """Centre (3,), rotation (3, 3) and half sides (3,) of a box [m]."""
+
+    at: np.ndarray
+    rotation: np.ndarray
+    half: np.ndarray
+
+
+def check_robot(config: FrankaConfig, urdf_path: str | Path | None = None) -> None:
+    """Refuses a robot that cannot be loaded, a fixed goal out of its reach, and what :func:`check_start` refuses."""
+    robot = load_robot(config, urdf_path)
+    if config.fixed_goal and not Kinematics(robot).reachable(config.goal):
+        raise UserError(
+            f"goal={config.goal} m: out of the arm's reach; it reaches about 0.85 m from (0, 0, 0.333)"
+        )
+    check_start(config, robot)
+
+
+def check_task(task: Task, config: FrankaConfig, urdf_path: str | Path | None = None) -> FrankaConfig:
+    """The config, if a task that is given as an object can be played in it. Of one with a name the config knows."""
+    type(task).check(config)
+    if config.reward not in task.rewards:
+        raise UserError(f"reward={config.reward!r}: {type(task).__name__} has {', '.join(task.rewards)}")
+    check_start(config, load_robot(config, urdf_path))
+    return config
+
+
+def check_start(config: FrankaConfig, robot: Robot) -> None:
+    """Refuses a scene that hand or arm would start in, and objects on a table too high or low for the arm.
+
+    Meshes that stand still are not looked at: the box around one may be mostly empty.
+
+    Raises:
+        UserError: One line, with the name of what is in the way.
+    """
+    scene = config.resolved_scene
+    if scene is None:
+        return
+    if scene.top:
+        _check_reach(scene, Kinematics(robot))
+    frames = _link_frames(config, robot)
+    hand = list(_hand(frames[-1] * wp.transform(*robot.tool_frame)))
+    arm = list(_arm(frames)) if config.collisions != "hand" else []
+    for one in (scene.table, *scene.obstacles):
+        if one.shape == "mesh":
+            continue
+        under = one.half_height if one is scene.table else 0.0  # a table's place is that of its top
+        sides = np.array([*one.widths, 2 * one.half_height])
+        turn = wp.quat_from_axis_angle(wp.vec3(0.0, 0.0, 1.0), one.angle)
+        box = _box(wp.transform(wp.vec3(*one.at[:2], one.at[2] - under), turn), 0.5 * sides)
+        touched = {"hand": hand} if one is scene.table else {"hand": hand, "arm": arm}
+        for what, boxes in touched.items():
+            if any(_overlap(box, other) for other in boxes):
+                raise UserError(
+                    f"scene.{one.name}: stands in the {what} where it starts; move it (at), or start elsewhere (home)"
+                )
+    for one in scene.objects:
+        half = np.array([one.spread[0] + one.radius, one.spread[1] + one.radius, one.half_height])
+        box = _box(wp.transform(wp.vec3(*one.at, scene.top + one.half_height), wp.quat_identity()), half)
+        if any(_overlap(box, other) for other in hand):
+            raise UserError(
+                f"scene.{one.name}: {2 * one.half_height:g} m high, it may start in the hand; make it lower (size), or "
+                "move it (at, spread)"
+            )
+
+
+def _check_reach(scene: Scene, kinematics: Kinematics) -> None:
+    for one in scene.objects:
+        for i, j in itertools.product((-1, 1), repeat=2):
+            place = (
+                one.at[0] + i * one.spread[0],
+                one.at[1] + j * one.spread[1],
+                scene.top + one.half_height,
+            )
+            if not kinematics.reachable(place):
+                raise UserError(
+                    f"scene.table.at: with its top at {scene.top:g} m, {one.name} may start at "
+                    f"({', '.join(f'{x:.2f}' for x in place)}) m, out of the arm's reach; change it, or at and spread"
+                )
+
+
+def _link_frames(config: FrankaConfig, robot: Robot) -> list:
+    """Frames (``wp.transform``) of base and links where an episode starts, without its noise."""
+    frames = [wp.transform_identity()]
+    for q, parent, child, axis in zip(
+        config.start_pose, robot.parent_frames, robot.child_frames, robot.axes, strict=True
+    ):
+        turn = wp.transform(wp.vec3(0.0, 0.0, 0.0), wp.quat_from_axis_angle(wp.vec3(*axis), q))
+        frames.append(frames[-1] * wp.transform(*parent) * turn * wp.transform_inverse(wp.transform(*child)))
+    return frames
+
+
+def _hand(tool: wp.transform) -> Iterator[_Box]:
+    """Palm and open fingers as they are touched, in the frame of a tool that points along z."""
+    wide = MOST_OPEN + gripper.PAD_AWAY
+    for at, half in (
+        ((0.0, 0.0, -FINGERS_ABOVE - gripper.PALM_BELOW), gripper.PALM),
+        ((0.0, wide, gripper.PAD_ALONG - FINGERS_ABOVE), gripper.PAD),
+        ((0.0, -wide, gripper.PAD_ALONG - FINGERS_ABOVE), gripper.PAD),
+    ):
+        yield _box(tool * wp.transform(wp.vec3(*at), wp.quat_identity()), half)
+
+
+def _arm(frames: list) -> Iterator[_Box]:
+    """Boxes around what is touched of the links. The base stands still."""
+    for part in links.embedded_parts():
+        a, b, c = part.scale
+        if part.link:
+            yield _box(frames[part.link] * part.frame, (a, b, c) if part.box else (a, a, a + b))
+
+
+def _box(frame: wp.transform, half) -> _Box:
+    rotation = np.array(wp.quat_to_matrix(wp.transform_get_rotation(frame)), dtype=float).reshape(3, 3)
+    return _Box(
+        np.array(wp.transform_get_translation(frame), dtype=float), rotation, np.asarray(half, dtype=float)
+    )
+
+
+def _overlap(one: _Box, other: _Box) -> bool:
+    """Whether no plane parts them: their faces and the products of their edges are all that may
+    (Gottschalk et al., "OBBTree", 1996)."""
+    edges = [np.cross(a, b) for a, b in itertools.product(one.rotation.T, other.rotation.T)]
+    for axis in (*one.rotation.T, *other.rotation.T, *edges):
+        if (length := math.sqrt(axis @ axis)) < 1e-6:
+            continue  # parallel edges
+        reach = sum(np.abs(axis @ box.rotation) @ box.half for box in (one, other))
+        if abs(axis @ (other.at - one.at)) >= reach - 1e-6 * length:
+            return False
+    return True

@@ -1,0 +1,198 @@
+# pyright: reportArgumentType=false
+# (Warp's annotations do not know its own vectors.)
+"""Where episodes start: nothing touches anything, and what cannot be played is refused before it is built."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+import warp as wp
+
+from franka_wm.envs import FrankaConfig, FrankaEnv
+from franka_wm.envs.robots import load_robot
+from franka_wm.envs.scene import Scene
+from franka_wm.envs.start import _box, _hand, _link_frames, _overlap, check_robot
+from franka_wm.envs.tasks import Lift, Peg, Push, Task, TorchTask, register
+from franka_wm.envs.tasks.manipulation import READY
+from franka_wm.errors import UserError
+
+CUBE = {"name": "cube", "at": [0.5, 0.0]}
+
+
+TALL = {"name": "tall", "size": [0.05, 0.05, 0.5]}
+
+
+def wall(size: list[float], at: list[float]) -> dict:
+    return {"name": "wall", "size": size, "at": at}
+
+
+def block(height: float) -> dict:
+    return {"name": "block", "shape": "socket", "size": [0.09, 0.036, height], "at": [0.6, 0.2]}
+
+
+def configured(task: str = "lift", **changes: Any) -> FrankaConfig:
+    values = {"observations": ("state", "joint_target", "objects", "contacts"), "gravity_compensation": True}
+    return FrankaConfig(**(values | {"task": task, "pose_noise": 0.02} | changes))
+
+
+def test_objects_stand_apart_where_some_draws_leave_no_room() -> None:
+    """Of single draws in this room 4 % have no place for the last box: all are drawn anew then."""
+    boxes = [{"name": f"box{k}", "at": [0.5, 0.0], "spread": [0.07, 0.07]} for k in range(4)]
+    env = FrankaEnv(configured(scene={"objects": boxes}), num_envs=256, device="cpu", seed=3)
+    for _ in range(3):
+        places = env.reset()["objects"].view(256, 4, 13)[..., :2]
+        assert (torch.cdist(places, places) + torch.eye(4)).min() > 0.04 * 2**0.5  # circles around 4 cm boxes
+
+
+@pytest.mark.parametrize(
+    ("said", "changes"),
+    [
+        ("scene.tall: 0.5 m high, it may start in the hand", {"objects": [TALL]}),
+        ("scene.wall: stands in the hand", {"obstacles": [wall([0.1, 0.1, 0.1], [0.5, 0.0, 0.35])]}),
+        ("scene.wall: stands in the hand", {"obstacles": [wall([0.2, 0.01, 0.1], [0.5, 0.03, 0.31])]}),
+        ("scene.wall: stands in the arm", {"obstacles": [wall([0.1, 0.1, 0.3], [0.1, 0.0, 0.5])]}),
+        ("scene.table: stands in the hand", {"table": {"at": [0.35, 0.0, 0.3]}}),
+        ("scene.table.at: with its top at -0.6 m, cube may start", {"table": {"at": [0.35, 0.0, -0.6]}}),
+    ],
+)  # fmt: skip
+def test_a_scene_that_the_robot_would_start_in_is_refused(said: str, changes: dict) -> None:
+    config = configured(scene={"objects": [CUBE]} | changes, collisions="arm")
+    with pytest.raises(UserError) as caught:
+        check_robot(config)
+    assert said in str(caught.value) and "\n" not in str(caught.value)
+    with pytest.raises(UserError):
+        FrankaEnv(config, device="cpu")
+
+
+@pytest.mark.parametrize(("away", "touch"), [(2.7, True), (3.0, False)])
+def test_boxes_whose_edges_face_each_other(away: float, touch: bool) -> None:
+    """Cubes of half side 1, turned by 45° about z and about y: their edges meet 2 √2 apart."""
+    one, other = (
+        wp.transform(wp.vec3(x, 0.0, 0.0), wp.quat_from_axis_angle(wp.vec3(*axis), math.pi / 4))
+        for x, axis in ((0.0, (0.0, 0.0, 1.0)), (away, (0.0, 1.0, 0.0)))
+    )
+    assert _overlap(_box(one, (1, 1, 1)), _box(other, (1, 1, 1))) == touch
+
+
+def test_the_hand_is_where_the_simulator_has_it() -> None:
+    config = configured(pose_noise=0.0)
+    robot = load_robot(config)
+    expected = list(_hand(_link_frames(config, robot)[-1] * wp.transform(*robot.tool_frame)))
+    env = FrankaEnv(config, device="cpu")
+    env.reset()
+    model, bodies = env.simulation.model, env.simulation.warp.body_q.numpy()[0]
+    for label, box in zip(("hand/palm", "hand/pad0", "hand/pad1"), expected, strict=True):
+        shape = model.shape_label.index(label)
+        assert model.shape_body is not None and model.shape_transform is not None
+        frame = wp.transform(*bodies[model.shape_body.numpy()[shape]])
+        at = wp.transform_get_translation(frame * wp.transform(*model.shape_transform.numpy()[shape]))
+        assert np.abs(np.array(at) - box.at).max() < 1e-3
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"obstacles": [wall([0.1, 0.1, 0.5], [0.5, 0.0, -0.35])]},  # a table's leg, under the cube
+        {"obstacles": [wall([0.1, 0.1, 0.1], [0.5, 0.3, 0.35])]},  # beside the hand
+        {
+            "objects": [CUBE | {"at": [0.5, 0.3]}],
+            "obstacles": [wall([0.2, 0.01, 0.1], [0.5, 0.0, 0.18])],
+        },  # between fingers
+        {"objects": [CUBE, TALL | {"at": [0.5, 0.4]}]},
+    ],
+)
+def test_what_is_not_in_the_way_is_allowed(changes: dict) -> None:
+    check_robot(configured(scene={"objects": [CUBE]} | changes, collisions="arm"))
+
+
+def test_an_obstacle_over_a_tall_object_is_in_its_way() -> None:
+    tall = TALL | {"at": [0.5, 0.4]}
+    shelf = {"name": "shelf", "size": [0.2, 0.2, 0.02], "at": [0.5, 0.4, 0.4]}
+    with pytest.raises(UserError, match=r"scene.tall: stands in something else in 100 %"):
+        configured(scene={"objects": [tall], "obstacles": [shelf]})
+    configured(scene={"objects": [CUBE | {"at": [0.5, 0.4]}], "obstacles": [shelf]})
+
+
+@pytest.mark.parametrize(
+    ("said", "task", "objects"),
+    [
+        ("scene.cube: task=push asks for a place 0.2 m ahead of it, 0.98 m from", "push", [CUBE | {"at": [0.78, 0.0]}]),
+        ("scene.cube: 0.2 m wide; task=lift grasps it", "lift", [CUBE | {"size": [0.2, 0.2, 0.1]}]),
+        ("with room for the first, 0.015 m deep", "peg", [CUBE | {"size": [0.03, 0.03, 0.1]}, block(0.015)]),
+        ("with room for the first, 0.015 m deep", "peg", [CUBE | {"size": [0.05, 0.05, 0.1]}, block(0.04)]),
+    ],
+)  # fmt: skip
+def test_a_task_that_the_scene_makes_impossible_is_refused(said: str, task: str, objects: list) -> None:
+    with pytest.raises(UserError) as caught:
+        configured(task, scene={"objects": objects})
+    assert said in str(caught.value) and "\n" not in str(caught.value)
+
+
+def test_a_wide_object_may_be_pushed() -> None:
+    configured("push", scene={"objects": [CUBE | {"size": [0.1, 0.1, 0.04]}]})
+
+
+# -- tasks given as objects, and their classes ---------------------------------------------------------------
+
+
+def test_a_task_given_as_an_object_is_checked_as_one_with_a_name() -> None:
+    def made(task: type[Task], **changes: Any) -> FrankaEnv:
+        config = FrankaConfig(observations=("state",), gripper=True, **changes)
+        return FrankaEnv(config, device="cpu", task=task(config))
+
+    with pytest.raises(UserError, match="is about 2 objects, the scene has 1"):
+        made(Peg, scene={"objects": [CUBE]})
+    with pytest.raises(UserError, match="reward='normalized': Lift has dense, sparse"):
+        made(Lift, reward="normalized")
+    with pytest.raises(UserError, match=r"scene.tall: 0.5 m high, it may start in the hand"):
+        made(Lift, scene={"objects": [TALL]})
+
+
+def test_what_a_class_says_is_checked_as_it_is_written() -> None:
+    class Knock(TorchTask):
+        gripper = True
+        home = READY
+        scene = {"objects": [CUBE]}  # pyright: ignore[reportAssignmentType]
+
+    assert isinstance(Knock.scene, Scene) and Knock.scene.objects[0].name == "cube"
+    with pytest.raises(UserError, match=r"Bent.home=\(0, 1\): give 7 joint angles"):
+        type("Bent", (Task,), {"home": (0, 1)})
+    for wrong in (configured, Lift(configured())):
+        with pytest.raises(UserError, match="must be a class, a subclass of Task or TorchTask"):
+            register("wrong", wrong)
+
+
+def test_rewards_that_a_task_in_torch_does_not_have_are_refused(registries_as_before: None) -> None:
+    register("mine", type("Mine", (TorchTask,), {}))
+    with pytest.raises(UserError, match="reward='sparse': must be one of dense"):
+        FrankaConfig(task="mine", reward="sparse")
+    assert not FrankaConfig(task="mine").fixed_goal
+
+
+# -- what a name or a hand must not change --------------------------------------------------------------------
+
+
+def test_an_object_named_as_a_finger_is_not_felt() -> None:
+    env = FrankaEnv(
+        configured(scene={"objects": [CUBE | {"name": "pad0", "mass": 2.0}]}), device="cpu", seed=0
+    )
+    observation = env.reset()
+    for _ in range(5):
+        observation = env.step(observation.set("action", torch.zeros(1, env.action_dim)))["next"]
+    assert not observation["contacts"].any()
+
+
+def test_a_disc_moved_by_hand_lies_on_the_table() -> None:
+    """Else no cube on it is a success."""
+    config = configured("push", randomization={"object_size": 0.2, "table_height": 0.05})
+    env = FrankaEnv(config, num_envs=4, device="cpu", seed=0)
+    cubes = env.reset()["objects"][:, :3]
+    there = env.set_goal(cubes * torch.tensor([1.0, 1.0, 0.0]))
+    torch.testing.assert_close(env.simulation.tensors.task_goal[:, 2], cubes[:, 2], atol=1e-3, rtol=0)
+    assert (
+        Push.marker is not None and env.step(there.set("action", torch.zeros(4, 8)))["next", "success"].all()
+    )
