@@ -77,7 +77,7 @@ fuzz: $(DEV) ## damaged checkpoints, runs, datasets, robots and options for MINU
 lint: $(DEV) ## ruff check, ruff format --check, pyright
 	@$(BIN)/ruff check .
 	@$(BIN)/ruff format --check .
-	@$(BIN)/pyright
+	@$(BIN)/pyright --threads 2
 
 format: $(DEV) ## let ruff fix and format the code
 	@$(BIN)/ruff check --fix .

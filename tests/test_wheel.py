@@ -95,7 +95,8 @@ def test_train_writes_a_run(run_folder: Path) -> None:
 
 
 def test_evaluate_and_report(franka: Callable[..., str], run_folder: Path, tmp_path: Path) -> None:
-    franka("evaluate", f"checkpoint={run_folder}", f"out={tmp_path}", "episodes=4", "device=cpu")
+    quick = ("episodes=4", "device=cpu", "open_loop=false")
+    franka("evaluate", f"checkpoint={run_folder}", f"out={tmp_path}", *quick)
     assert json.loads((tmp_path / "evaluation.json").read_text())
     franka("report", str(run_folder), f"out={tmp_path}/page.html")
     assert "<html" in (tmp_path / "page.html").read_text()[:2000]

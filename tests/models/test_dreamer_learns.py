@@ -38,8 +38,8 @@ def test_it_remembers_what_is_not_seen_and_learns_to_act():
         **SIZES,
     )
     optimiser = torch.optim.AdamW(model.parameter_groups(2e-3), weight_decay=0.0)
-    for _ in range(1000):
-        losses = model.loss(hidden_velocity(32, 10))
+    for _ in range(600):
+        losses = model.loss(hidden_velocity(16, 10))
         optimiser.zero_grad()
         losses["loss"].backward()
         for group in optimiser.param_groups:

@@ -214,10 +214,10 @@ def test_a_kill_leaves_whole_episodes(tmp_path, make_schema, make_episode, load)
 
 
 @pytest.mark.slow
-def test_kills_at_ten_random_moments_leave_whole_episodes(tmp_path, make_schema, make_episode, load) -> None:
+def test_kills_at_random_moments_leave_whole_episodes(tmp_path, make_schema, make_episode, load) -> None:
     schema = make_schema(size=32)
     episodes = [make_episode(schema, i) for i in range(120)]
-    moments = [random.Random(i).uniform(0.0, 2.0) for i in range(10)]
+    moments = [random.Random(i).uniform(0.0, 2.0) for i in range(5)]
     _kill_and_go_on(tmp_path, schema, episodes, load, moments)
 
 
