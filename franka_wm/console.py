@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import os
 import re
 import shlex
 import shutil
@@ -51,6 +52,21 @@ def named_plugins(config: Mapping[str, object]) -> str:
     return " " + shlex.quote(f"plugins=[{','.join(map(str, names))}]")
 
 
+@contextmanager
+def _until_nobody_reads(stream: TextIO) -> Iterator[None]:
+    """A closed pipe (``… | head``) ends the command without a traceback.
+
+    Raises:
+        SystemExit: It was closed.
+    """
+    try:
+        yield
+    except BrokenPipeError:
+        # What Python would still flush at exit goes nowhere instead of into a traceback.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
+        sys.exit(1)
+
+
 class _Copied:
     """A stream whose text also goes into the log."""
 
@@ -65,7 +81,12 @@ class _Copied:
         except OSError as error:  # a full disk: what a run says must not end it
             _log = None
             self._stream.write(f"warning: nothing more is copied into train.log: {error}\n")
-        return self._stream.write(text)
+        with _until_nobody_reads(self._stream):
+            return self._stream.write(text)
+
+    def flush(self) -> None:
+        with _until_nobody_reads(self._stream):
+            self._stream.flush()
 
     def __eq__(self, other: object) -> bool:
         """Equal to the stream itself: libraries ask whether theirs is ``sys.stderr`` before they close it."""
@@ -90,6 +111,7 @@ def terminal_log() -> Iterator[None]:
     sys.stdout, sys.stderr = (_Copied(stream) for stream in streams)  # type: ignore[assignment]
     try:
         yield
+        sys.stdout.flush()  # here, where a closed pipe is caught, and not at exit
     finally:
         sys.stdout, sys.stderr = streams
         if _log is not None:

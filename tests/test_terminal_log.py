@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import os
 import sys
 from pathlib import Path
 
@@ -28,3 +29,16 @@ def test_a_library_that_asks_first_does_not_close_the_terminal(monkeypatch: pyte
     with terminal_log():
         assert sys.stderr is not stream and stream in (sys.stderr, sys.stdout)
         assert io.StringIO() not in (sys.stderr, sys.stdout)
+
+
+@pytest.mark.parametrize("flushed", [True, False])
+def test_a_closed_pipe_ends_a_command_quietly(flushed: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    """`… | head`; what is still to be flushed then goes nowhere."""
+    reads, writes = os.pipe()
+    os.close(reads)
+    with os.fdopen(writes, "w") as stream:
+        monkeypatch.setattr(sys, "stdout", stream)
+        with pytest.raises(SystemExit) as caught, terminal_log():
+            print("nobody reads this", flush=flushed)
+            assert not flushed
+        assert caught.value.code == 1

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import click
 
-from franka_wm.commands.arguments import check_run, verb, whole, word
+from franka_wm.commands.arguments import check_run, plugins, verb, whole, word
 from franka_wm.console import announced
 from franka_wm.data.lerobot.schema import FORMATS
 from franka_wm.errors import UserError
@@ -20,6 +20,7 @@ from franka_wm.errors import UserError
     "exact",
 )
 @word("workers", "writing processes", whole(0, 256), 2)
+@plugins
 def export(source: str, out: str, format: str, workers: int) -> None:
     """Write a run's replay as a LeRobot dataset.
 

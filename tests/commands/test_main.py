@@ -271,8 +271,9 @@ def test_outside_a_checkout_bench_says_so_and_list_still_lists(
     assert "tdmpc2" in capsys.readouterr().out
 
 
-def test_list_into_a_closed_pipe_leaves_no_traceback() -> None:
-    command = f"{sys.executable} -m franka_wm.commands.main list | true"
+@pytest.mark.parametrize("words", ["list", "train --help"])
+def test_a_closed_pipe_leaves_no_traceback(words: str) -> None:
+    command = f"{sys.executable} -m franka_wm.commands.main {words} | true"
     done = subprocess.run(["bash", "-c", command], capture_output=True, text=True, check=False)
     assert "Traceback" not in done.stderr
     assert "BrokenPipe" not in done.stderr

@@ -347,6 +347,44 @@ def test_a_saved_replay_is_exported(tmp_path, load, small_env) -> None:
     assert json.loads((out / "meta/franka_wm/provenance.json").read_text())["sessions"][0]["seed"] == 3
 
 
+def test_the_replay_of_a_run_of_an_own_task_is_exported_with_its_plugin(
+    tmp_path, load, small_env, capsys, monkeypatch
+) -> None:
+    from omegaconf import OmegaConf
+
+    from franka_wm.envs.tasks import _REGISTERED
+    from franka_wm.training.checkpoint import save_checkpoint
+
+    (tmp_path / "brought_by_a_plugin.py").write_text(
+        "from franka_wm.envs.tasks import Reach, register\n"
+        "class Near(Reach):\n"
+        "    goal_distance = True\n"
+        "register('near', Near)\n"
+    )
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.syspath_prepend(str(tmp_path))  # taken out again afterwards
+    monkeypatch.setattr("franka_wm.envs.tasks._REGISTERED", dict(_REGISTERED))
+    env = {
+        "kind": "franka",
+        "urdf_path": None,
+        "task": "near",
+        "episode_length": 5,
+        "observations": ["state"],
+    }
+    save_checkpoint(
+        tmp_path / "run" / "checkpoints" / "latest",
+        model=torch.nn.Linear(2, 2),
+        config=OmegaConf.create({"seed": 3, "plugins": ["brought_by_a_plugin"], "env": env}),
+        counters={},
+        replay=replay_of(small_env(2, episode_length=5), 12),
+    )
+    command = ["export", "source=run", "out=set", "workers=0"]
+    assert main(command) == 1 and "plugins=[MODULE]" in capsys.readouterr().err
+    assert main([*command, "plugins=[brought_by_a_plugin]"]) == 0
+    dataset = load(tmp_path / "set")
+    assert dataset.num_episodes == 4 and SUCCESS in dataset.features
+
+
 def test_schemas_of_several_cameras() -> None:
     from franka_wm.envs import FrankaConfig
 
