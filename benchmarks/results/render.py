@@ -17,9 +17,9 @@ from franka_wm.errors import UserError
 
 BEGIN, END = "<!-- results: written by `make results` -->", "<!-- end of results -->"
 LEGEND = (
-    "*7 of 10 seeds*: the row declares ten and seven were measured; the others have not been, none was left out for "
-    "its result. *6 at a time*: so many runs shared the machine, so each took longer than by itself; *alone (3 of 5 "
-    "runs)*: times of the three that had it to themselves. ¹ and ², an earlier commit: see below the tables."
+    "*m of n seeds*: the row declares n and m were measured; the others have not been, none was left out for its "
+    "result. *n at a time*: so many runs shared the machine, so each took longer than by itself; *alone (m of n "
+    "runs)*: times of those that had it to themselves. ¹ and ², an earlier commit: see below the tables."
 )
 """What README says of its tables' words."""
 HEAD = """# Results
@@ -423,8 +423,11 @@ def readme_tables(rows: Mapping[str, Row], place: Path = PLACE) -> str:
     if others:
         parts += [table(["other environments", "model, planner", "machine", "return", "wanted"], others), ""]
     if speed:
-        text = "*Collector* is TorchRL's, around the *captured step*"
-        parts += [f"Environment steps per second, resets included. {text}:", "", *speed]
+        text = (
+            "*Collector*: through TorchRL's, resets included. *raw*: Newton's physics, and images where there are "
+            "some, alone in one graph, without task, resets and TorchRL; measured in the same run"
+        )
+        parts += [f"Environment steps per second. {text}:", "", *speed]
     if aged:
         parts += ["¹ Measured before changes of the code; docs/results.md names them.", ""]
     if alike:
