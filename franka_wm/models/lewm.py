@@ -35,8 +35,8 @@ _COEFS = (
 
 
 class LeWorldModel(HistoryWorldModel):
-    """Encoder and action-conditioned predictor of embeddings, one loss for both (LeWorldModel, after LeJEPA,
-    Balestriero & LeCun 2025, arXiv:2511.08544).
+    """Encoder and action-conditioned predictor of embeddings, one loss for both (LeWorldModel, Maes et al. 2026,
+    arXiv:2603.19312; SIGReg is that of LeJEPA, Balestriero & LeCun 2025, arXiv:2511.08544).
 
     loss = mean squared error of the next embedding + `sigreg_coef` · SIGReg of the embeddings, for each time
     step over the batch. No stop-gradient, no teacher, no decoder, no reward. An embedding is a vision

@@ -18,12 +18,14 @@ feature                            shape, dtype        meaning
 ``next.done``                      (1,) bool           ``terminated`` or ``truncated``
 ``next.terminated``                (1,) bool           ended by the task
 ``next.truncated``                 (1,) bool           ended by time, or by a world that broke
-``next.success``                   (1,) bool           tool within ``success_distance`` of the goal
+``next.success``                   (1,) bool           what the task says; of reach: tool within
+                                                       ``success_distance`` of the goal
 ``joint_positions``                (7,) float32        [rad]; the first seven of the state
 ``tool_position``                  (3,) float32        [m]
 ``joint_target``                   (7,) float32        the servo's commanded angles [rad]
 ``observation.contacts``           (2,) float32        force at each finger [N], if it was observed
-``objects``                        (13 · K,) float32   of each object: position, quaternion, two velocities
+``objects``                        (13 · K,) float32   of each object: position, quaternion, two velocities;
+                                                       behind them numbers of drawers and doors
 ``seed``                           (3,) int64          seed of the run, world, episode: what the episode's draws
                                                        depend on; the episode is −1 where it is not known
 ``episode_key``                    (1,) int64          fingerprint of the episode's numbers
