@@ -34,6 +34,16 @@ def test_the_printed_scene(root: Path, tmp_path: Path, monkeypatch: pytest.Monke
     assert not observation["done"].any()
 
 
+def test_the_printed_environment_of_a_preset(root: Path) -> None:
+    page = (root / "docs" / "tasks.md").read_text()
+    code = next(b for b in re.findall(r"```python\n(.*?)```", page, re.DOTALL) if "conf.compose" in b)
+    names: dict = {}
+    exec(code.replace("1024", "2"), names)
+    env = names["env"]
+    assert (env.config.task, env.config.episode_length, env.config.pose_noise) == ("lift", 90, 0.02)
+    assert env.reset()["objects"].shape == (2, 13)
+
+
 def test_the_printed_mesh(root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     page = (root / "docs" / "tasks.md").read_text()
     surface = next(b for b in re.findall(r"```text\n(.*?)```", page, re.DOTALL) if b.startswith("v "))
