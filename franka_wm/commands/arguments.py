@@ -246,5 +246,5 @@ def verb(name: str, **settings: Any) -> Callable[[Any], Verb]:
 
 def no_such_option(name: str, known: Sequence[str]) -> str:
     """One line about an option that does not exist: the nearest one, or all."""
-    near = did_you_mean(name, known)
+    near = did_you_mean(name, known) or (f"; did you mean {known[0]}?" if len(known) == 1 else "")
     return f"{name}: no such option{near or '; there are ' + ', '.join(known) if known else ''}"

@@ -120,6 +120,9 @@ def _allowed(message: str, overrides: Sequence[str], options: Sequence[str]) -> 
             f"{place}.{key}" if place else str(key)
             for key in dict.fromkeys([*([] if place else options), *found])
         ]
+    above, _, name = place.rpartition(".")
+    if name in (OmegaConf.select(node, above) or ()):  # null here: it is given whole
+        return [place]
     return [*options, *(str(key) for key in node)]
 
 
