@@ -231,7 +231,7 @@ def test_a_signal_in_the_last_evaluation_leaves_what_can_go_on(tmp_path) -> None
         "was ended by SIGTERM.*resume=|process 0 has lost another one of this run.*resume=", said
     ), said
     assert not (folder / "evaluation.json").exists()
-    finished(begin(again, f"resume={folder}", "plugins=[]"), again)
+    run(again, f"resume={folder}", "plugins=[]")
     assert (again / "evaluation.json").exists()
 
 
@@ -277,7 +277,7 @@ def test_a_signal_saves_all(tmp_path, whole) -> None:
     updates = checkpoint(folder).counters["updates"]
     assert checkpoint(folder).processes == 2
     more = tmp_path / "more"
-    finished(begin(more, f"resume={folder}", f"trainer.updates={int(updates) + 3}"), more)
+    run(more, f"resume={folder}", f"trainer.updates={int(updates) + 3}")
 
 
 def test_a_killed_process_ends_the_others(tmp_path) -> None:
