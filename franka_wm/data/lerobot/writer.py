@@ -6,6 +6,7 @@ While a dataset is gathered, everything is in ``OUT.writing``:
     shards/shard-00000     a whole LeRobot dataset of some episodes
     shards/….partial       one that is being written; becomes the above by a rename when all of it has been checked
     merged                 all of them in one; becomes OUT by a rename
+    previous               what was at OUT before, until that rename
 
 So OUT is there whole or not at all, a kill at any moment loses no shard that was finished, and going on needs
 nothing but the folder. Several processes of one job write shards side by side, which the first one merges.
@@ -44,6 +45,9 @@ from franka_wm.files import unwritable
 from franka_wm.options import is_whole, whole_rule
 from franka_wm.untrusted import UntrustedFolder, linked_json, values_of
 
+PREVIOUS = "previous"
+"""Where a finished dataset waits, in ``OUT.writing``, while the one with more episodes takes its place."""
+
 SHARD_BYTES = 64_000_000
 """Images and numbers of one shard in memory, before they are compressed."""
 
@@ -61,6 +65,11 @@ def check_out(out: str | Path, *, resume: bool = False, resumable: bool = True) 
         raise UserError(f"out={out} exists; choose another folder{more}")
     if out.exists() and not (out / "meta" / "info.json").is_file():
         raise UserError(f"out={out} is not a LeRobot dataset; choose another folder")
+    if not resume and (previous := working / PREVIOUS).exists():
+        more = "go on with resume=true" if resumable else "choose another folder"
+        raise UserError(
+            f"{previous} holds the dataset of {out}, where a kill has left it; {more}, or move it back there"
+        )
     if _shards(working) and not resume:
         more = "go on with resume=true, or " if resumable else ""
         raise UserError(f"{working} holds an unfinished dataset; {more}remove {working}")
@@ -148,25 +157,25 @@ class DatasetWriter:
         try:
             wait_for_orphans(self.working / LOCK)
             self._recover()
-        except UserError:
-            if _shards(self.working):
-                self.close()
-            else:
+        except BaseException as error:
+            empty = not _shards(self.working) and not (self.working / PREVIOUS).exists()
+            if empty and isinstance(error, UserError):
                 self._remove_working()
+            self.close()
             raise
 
     def _recover(self) -> None:
         """Puts what a kill has left in order, and counts what is there."""
         state = self._state()
-        merged, previous = self.working / "merged", self.working / "previous"
-        if state.get("replacing"):  # killed while the finished dataset moved to its place
-            if merged.exists():
-                if previous.exists() and not self.out.exists():
-                    os.rename(previous, self.out)
-            else:  # it is in its place: what is left here is in it
+        merged, previous = self.working / "merged", self.working / PREVIOUS
+        if state.pop("replacing", False):  # killed while the finished dataset moved to its place
+            if self.out.exists() and not merged.exists():  # it is in its place: what is left here is in it
                 shutil.rmtree(self.working / "shards")
                 (self.working / "shards").mkdir()
-            shutil.rmtree(previous, ignore_errors=True)
+                shutil.rmtree(previous, ignore_errors=True)
+            self._write_state(state)  # before `merged` goes: without it the shards would seem to be in OUT
+        if previous.exists() and not self.out.exists():
+            os.rename(previous, self.out)
         shutil.rmtree(merged, ignore_errors=True)
         for folder in (self.working / "shards").glob("*" + PARTIAL):
             shutil.rmtree(folder)
@@ -212,8 +221,10 @@ class DatasetWriter:
                 )
 
     def _save_state(self, **more: Any) -> None:
+        self._write_state({"schema": self.schema.to_dict(), "sessions": self._sessions} | more)
+
+    def _write_state(self, state: dict[str, Any]) -> None:
         path = self.working / "writer.json"
-        state = {"schema": self.schema.to_dict(), "sessions": self._sessions} | more
         path.with_suffix(".new").write_text(json.dumps(state, indent=1), encoding="utf-8")
         path.with_suffix(".new").replace(path)
 
@@ -324,7 +335,7 @@ class DatasetWriter:
         self.flush()
         self._save_state(replacing=True)
         if self.out.exists():
-            os.rename(self.out, self.working / "previous")
+            os.rename(self.out, self.working / PREVIOUS)
         os.rename(merged, self.out)
         self._remove_working()
 
@@ -341,6 +352,8 @@ class DatasetWriter:
 
     def _remove_working(self) -> None:
         self.close()
+        for part in ("shards", PREVIOUS):  # before writer.json, which says that they are in OUT
+            shutil.rmtree(self.working / part, ignore_errors=True)
         shutil.rmtree(self.working)
 
     def close(self) -> None:

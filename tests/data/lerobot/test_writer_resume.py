@@ -5,11 +5,13 @@ from __future__ import annotations
 import json
 import os
 import random
+import shutil
 import signal
 import subprocess
 import sys
 import time
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pyarrow.parquet as pq
@@ -96,27 +98,94 @@ def test_goes_on_with_what_is_finished(tmp_path, make_schema, make_episode, load
     assert [p.name for p in tmp_path.iterdir()] == ["set"]
 
 
+def _merged(out: Path, schema, episodes, write, *, before: int) -> Path:
+    """``OUT.writing`` as a kill leaves it before the first rename: of these episodes, so many are at OUT."""
+    working = out.with_name(out.name + ".writing")
+    if before:
+        write(out, schema, episodes[:before])
+    provenance = describe(policy="test", seed=0, config={})
+    with DatasetWriter(
+        out, schema, provenance=provenance, workers=0, shard_frames=1, resume=before > 0
+    ) as writer:
+        writer.add(episodes[before:])
+        writer.flush()
+        roots = ([out] if before else []) + sorted((working / "shards").iterdir())
+        merge(working / "merged", roots, {"schema": schema.to_dict(), "sessions": []})
+        writer._save_state(replacing=True)
+    return working
+
+
 @pytest.mark.parametrize("moved", [False, True])
 def test_a_kill_while_the_finished_dataset_moves(
     tmp_path, moved, make_schema, make_episode, write, load
 ) -> None:
-    schema = make_schema()
+    schema, out = make_schema(), tmp_path / "set"
     episodes = [make_episode(schema, i) for i in range(3)]
-    out, working = write(tmp_path / "set", schema, episodes[:2]), tmp_path / "set.writing"
-    with DatasetWriter(out, schema, provenance={}, workers=0, resume=True) as writer:
-        writer.add(episodes[2:])
-        writer.flush()
-        merge(
-            working / "merged",
-            [out, *sorted((working / "shards").iterdir())],
-            {"schema": schema.to_dict(), "sessions": []},
-        )
-        writer._save_state(replacing=True)
+    working = _merged(out, schema, episodes, write, before=2)
     os.rename(out, working / "previous")
     if moved:
         os.rename(working / "merged", out)
     write(out, schema, [], resume=True)
     compare(load(out), schema, episodes)
+
+
+@pytest.mark.parametrize("before", [0, 2])
+@pytest.mark.parametrize("refused", [True, False])
+def test_going_on_after_that_may_be_refused_or_killed_too(
+    tmp_path, monkeypatch, before, refused, make_schema, make_episode, write, load
+) -> None:
+    """Of what was merged already but is not in its place, the shards stay until it is."""
+    schema, out = make_schema(), tmp_path / "set"
+    episodes = [make_episode(schema, i) for i in range(4)]
+    working = _merged(out, schema, episodes, write, before=before)
+    if before:
+        os.rename(out, working / "previous")
+    with monkeypatch.context() as patched, pytest.raises(UserError if refused else KeyboardInterrupt):
+        if not refused:
+            patched.setattr(DatasetWriter, "_check_schema", _interrupted)
+        write(out, make_schema(size=8), [], resume=True)
+    write(out, schema, [], resume=True)
+    compare(load(out), schema, episodes)
+
+
+def _interrupted(*_: object) -> None:
+    raise KeyboardInterrupt
+
+
+def test_nobody_is_told_to_remove_what_was_finished(tmp_path, make_schema, make_episode, write, load) -> None:
+    schema, out = make_schema(), tmp_path / "set"
+    episodes = [make_episode(schema, i) for i in range(2)]
+    working = _merged(out, schema, episodes, write, before=1)
+    os.rename(out, working / "previous")
+    for resumable in (True, False):
+        with pytest.raises(UserError, match=r"previous holds the dataset of .*move it back") as told:
+            write(out, schema, [], resumable=resumable)
+        assert " remove " not in str(told.value) and ("resume=true" in str(told.value)) == resumable
+    os.rename(working / "previous", out)
+    compare(load(out), schema, episodes[:1])
+
+
+def test_a_kill_while_what_was_merged_is_removed(
+    tmp_path, monkeypatch, make_schema, make_episode, write, load
+) -> None:
+    """Which files of a folder go first is the file system's choice: here what tells that they may go."""
+    schema, out = make_schema(), tmp_path / "set"
+    episodes = [make_episode(schema, i) for i in range(3)]
+    remove = shutil.rmtree
+
+    def killed(path: str | Path, **options: Any) -> None:
+        if (state := Path(path, "writer.json")).exists():
+            state.unlink()
+            raise KeyboardInterrupt
+        remove(path, **options)
+
+    for part, resume in ((episodes[:2], False), (episodes[2:], True)):
+        with monkeypatch.context() as patched, pytest.raises(KeyboardInterrupt):
+            patched.setattr(shutil, "rmtree", killed)
+            write(out, schema, part, resume=resume)
+    write(out, schema, [], resume=True)
+    compare(load(out), schema, episodes)
+    assert [p.name for p in tmp_path.iterdir()] == ["set"]
 
 
 def test_two_writers_do_not_mix(tmp_path, make_schema, make_episode) -> None:
