@@ -11,6 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from franka_wm import processes
 from franka_wm.data.lerobot.cache import Cache, Say, open_cache
 from franka_wm.data.lerobot.mapping import FeatureMap, map_features
 from franka_wm.data.lerobot.source import Source, find_dataset, read_source
@@ -64,7 +65,7 @@ def open_dataset(
         normalize_actions: Scale actions to [−1, 1]; ``None``: where the dataset is not of this package.
         cache_dir: Where caches are kept; ``~/.cache/franka_wm/datasets`` if not given.
         in_memory: Keep everything in the device's memory, else read from the disk's cache; ``None``: where it
-            takes at most half of what is free.
+            takes at most half of what is free, for every process of a job, each of which calls this.
         workers: Processes that decode; ``None``: all cores.
         frame_stack, future: See :class:`RecordedWindows`.
         fps, action_dim: Frames per second and size of actions of the environment that is to be acted in.
@@ -220,7 +221,9 @@ def _load(
         free = free_memory(device)
         if free is None:  # the system does not tell: what it has in all
             free = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
-        in_memory = sum(c.nbytes for c in caches) <= MEMORY_SHARE * free
+        fits = sum(c.nbytes for c in caches) <= MEMORY_SHARE * free
+        # Windows are drawn where the data lies: a process that drew elsewhere would not draw its part of a batch.
+        in_memory = all(processes.objects(fits))
     arrays: dict[str, list[Tensor]] = {}
     for name in caches[0].arrays:
         parts = [torch.from_numpy(np.asarray(c.arrays[name])) for c in caches]

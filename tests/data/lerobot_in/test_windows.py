@@ -12,6 +12,7 @@ import torch
 from scipy.stats import chisquare
 
 from franka_wm import processes
+from franka_wm.data.lerobot import opening
 from franka_wm.errors import UserError
 
 LENGTHS = (5, 4, 7)
@@ -45,6 +46,7 @@ def test_processes_divide_each_batch(pictures: Path, opened: Callable, monkeypat
     def drawn(count: int, rank: int) -> list[torch.Tensor]:
         monkeypatch.setattr(processes, "count", lambda: count)
         monkeypatch.setattr(processes, "rank", lambda: rank)
+        monkeypatch.setattr(processes, "objects", lambda mine: [mine] * count)
         windows = opened(pictures, keys=["joints"], batch_size=12 // count, future=True)
         batches = [windows.sample() for _ in range(3)]
         return [torch.cat((one["joints"], one["future", "joints"]), -1) for one in batches]
@@ -52,6 +54,18 @@ def test_processes_divide_each_batch(pictures: Path, opened: Callable, monkeypat
     parts = zip(*(drawn(3, rank) for rank in range(3)), strict=True)
     for part, whole in zip(parts, drawn(1, 0), strict=True):
         assert [len(one) for one in part] == [4, 4, 4] and torch.equal(torch.cat(part), whole)
+
+
+@pytest.mark.parametrize(
+    ("free", "other_fits", "in_memory"), [(10**12, True, True), (10**12, False, False), (0, True, False)]
+)
+def test_processes_agree_on_where_the_data_lies(
+    free: int, other_fits: bool, in_memory: bool, pictures: Path, opened: Callable, monkeypatch
+) -> None:
+    """One GPU may have less room than another one: with generators of two kinds their parts would overlap."""
+    monkeypatch.setattr(opening, "free_memory", lambda device: free)
+    monkeypatch.setattr(processes, "objects", lambda mine: [mine, other_fits])
+    assert opened(pictures, keys=["joints"]).recording.in_memory == in_memory
 
 
 def test_rewards_are_bounded_by_all_that_were_recorded(pictures: Path, opened: Callable) -> None:
