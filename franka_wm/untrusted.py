@@ -149,12 +149,16 @@ class UntrustedFolder:
     def check_links(self, below: str | Path = "") -> None:
         """Refuse every link in the folder, or in the folder `below` in it, that leaves the former.
 
+        So is a pipe or a device: whoever opened it might wait for ever.
+
         Raises:
             UserError: it names the first one.
         """
         for path in sorted((self.root / below).rglob("*")):
             if path.is_symlink():
                 self._inside(path.relative_to(self.root))
+            if not path.is_file() and not path.is_dir() and path.exists():
+                raise UserError(f"{path} is no file; remove it.")
 
 
 def linked_json(path: Path) -> dict[str, Any]:

@@ -18,6 +18,7 @@ from franka_wm.errors import UserError
 from franka_wm.untrusted import MOST_JSON, MOST_YAML, UntrustedFolder, check_image, check_video, values_of
 
 SECRET = "hunter2-of-this-machine"
+INFO = {"codebase_version": "v3.0", "features": {}, "fps": 10, "total_episodes": 1, "total_frames": 1}
 
 
 @pytest.fixture
@@ -112,6 +113,22 @@ def test_links_out_of_a_dataset_are_refused(name: str, tmp_path: Path) -> None:
         (root / name).symlink_to(target)
         with pytest.raises(UserError, match=says):
             read_source(root)
+
+
+@pytest.mark.parametrize("linked", [False, True])
+def test_pipes_in_a_dataset_are_refused(linked: bool, tmp_path: Path) -> None:
+    """Also where a link of the Hub's cache leads to one."""
+    root = tmp_path / "datasets--a--b" / "snapshots" / "0"
+    pipe = root / "meta" / "episodes" / "chunk-000" / "file-000.parquet"
+    pipe.parent.mkdir(parents=True)
+    (root / "meta" / "info.json").write_text(json.dumps(INFO))
+    if linked:
+        pipe.symlink_to(tmp_path / "datasets--a--b" / "blob")
+    os.mkfifo(pipe.resolve())
+    held = os.open(pipe, os.O_RDWR)  # opening it would wait for ever otherwise
+    with pytest.raises(UserError, match=r"file-000\.parquet is no file; remove it"):
+        read_source(root)
+    os.close(held)
 
 
 def test_links_within_the_folder_are_followed(run: Path) -> None:

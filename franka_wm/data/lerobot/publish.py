@@ -168,11 +168,15 @@ def stage_dataset(root: Path, place: Path, *, repo_id: str, license: str) -> Pat
 
 
 def _check_links(root: Path) -> None:
-    """Raises ``UserError`` at a link to anything but a file of the dataset that is sent as well."""
+    """Raises ``UserError`` at a pipe, or at a link to anything but a file of the dataset that is sent as well."""
     home = root.resolve()
     for path in sorted(root.rglob("*")):
         name = path.relative_to(root).as_posix()
-        if not path.is_symlink() or not _goes(name):
+        if not _goes(name):
+            continue
+        if not path.is_symlink():
+            if not path.is_file() and not path.is_dir():
+                raise UserError(f"publish: root={root}: {name} is no file; remove it")
             continue
         target = path.resolve()
         inside = target.is_file() and target.is_relative_to(home)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import shutil
 from email.message import Message
 from pathlib import Path
@@ -123,6 +124,15 @@ def test_links_out_of_a_dataset_are_not_followed(hub, publish, copy, tmp_path) -
     place.mkdir()
     stage_dataset(copy, place, repo_id="user/arm", license="mit")
     assert (place / "meta" / "notes.txt").read_text() == (copy / "meta" / "info.json").read_text()
+
+
+def test_pipes_in_a_dataset_are_refused(copy, tmp_path) -> None:
+    pipe = copy / "data" / "chunk-000" / "file-001.parquet"
+    os.mkfifo(pipe)
+    held = os.open(pipe, os.O_RDWR)  # opening it would wait for ever otherwise
+    with pytest.raises(UserError, match=r"data/chunk-000/file-001\.parquet is no file; remove it"):
+        stage_dataset(copy, tmp_path / "place", repo_id="user/arm", license="mit")
+    os.close(held)
 
 
 def test_a_folder_stays_as_it_is_and_what_is_shown_is_what_goes(hub, publish, copy) -> None:
