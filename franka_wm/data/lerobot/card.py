@@ -5,12 +5,14 @@ from __future__ import annotations
 import contextlib
 from collections.abc import Mapping
 from importlib.metadata import PackageNotFoundError, metadata
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from huggingface_hub import DatasetCard, DatasetCardData, ModelCard, ModelCardData
 
+from franka_wm.data.lerobot.decode import video_frames
 from franka_wm.data.lerobot.paths import without_paths
 from franka_wm.data.lerobot.provenance import read_provenance
 from franka_wm.data.lerobot.schema import OWN_FOLDER, PROVENANCE
@@ -198,16 +200,8 @@ def _first_episode(source: Source, name: str, kind: str) -> np.ndarray:
         group = pq.ParquetFile(data).read_row_group(0, columns=[name, "episode_index"])
         rows = zip(group[name].to_pylist(), group["episode_index"].to_pylist(), strict=True)
         return np.stack([decode_png(cell["bytes"]) for cell, episode in rows if episode == 0])
-    import av
-
-    length = int(source.lengths[0])
-    frames = []
-    with av.open(str(source.video_path(name, 0, 0))) as video:
-        for frame in video.decode(video=0):
-            frames.append(frame.to_ndarray(format="rgb24"))
-            if len(frames) == length:
-                break
-    return np.stack(frames)
+    frames = islice(video_frames(source.video_path(name, 0, 0)), int(source.lengths[0]))
+    return np.stack([frame.to_ndarray(format="rgb24") for frame, _ in frames])
 
 
 def model_card(folder: Path, *, repo_id: str, license: str) -> str:

@@ -13,7 +13,7 @@ from __future__ import annotations
 import io
 import json
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -150,7 +150,6 @@ class VideoJob:
 
     def run(self) -> int:
         """Decodes it; returns the number of frames."""
-        import av
         from av.error import FFmpegError
         from av.video.reformatter import VideoReformatter
 
@@ -162,22 +161,20 @@ class VideoJob:
         seen: list[int] = []
         frames = 0
         try:
-            with av.open(self.path) as container:
-                stream = container.streams.video[0]
-                stream.thread_type = "AUTO"
-                for frame in container.decode(stream):
-                    if frame.pts is None or stream.time_base is None:
-                        raise UserError(f"{self.path}: a frame without a time")
-                    frames += 1
-                    row = row_at.get(round(float(frame.pts * stream.time_base) * self.fps))
-                    if row is None:
-                        continue
-                    image = reformatter.reformat(frame, format="rgb24").to_ndarray()
-                    for name, height, width in self.targets:
-                        arrays[name][row] = resized(image, height, width)
-                    seen.append(row)
+            for frame, time in video_frames(self.path):
+                frames += 1
+                row = row_at.get(round(time * self.fps))
+                if row is None:
+                    continue
+                image = reformatter.reformat(frame, format="rgb24").to_ndarray()
+                for name, height, width in self.targets:
+                    arrays[name][row] = resized(image, height, width)
+                seen.append(row)
         except (FFmpegError, OSError, IndexError) as error:
-            raise UserError(f"{self.path} cannot be decoded: {error}") from error
+            raise UserError(
+                f"{self.path} cannot be decoded ({error}); copy it again, or record it with frames of at most "
+                f"{MOST_PIXELS:,} pixels"
+            ) from error
         if frames != total:
             raise UserError(
                 f"{self.path} has {frames} frames, its episodes have {total} rows: the encoder dropped or added "
@@ -204,6 +201,35 @@ class VideoJob:
                     )
                 out[first + k] = int(row) + k
         return out
+
+
+def video_frames(path: str | Path) -> Iterator[tuple[Any, float]]:
+    """The frames of a video with their times [s]. None has more than :data:`MOST_PIXELS` pixels.
+
+    Raises:
+        UserError: Frames are larger, or have no time.
+        av.error.FFmpegError, OSError, IndexError: It cannot be decoded, or is no video.
+    """
+    import av
+
+    def check(width: int, height: int) -> None:
+        if width * height > MOST_PIXELS:
+            raise UserError(
+                f"{path} has frames of {width} × {height} pixels, the most is {MOST_PIXELS:,}; record it smaller"
+            )
+
+    # A frame of a few bytes may fill the memory as it is decoded. Decoders round sizes up before they compare.
+    bound = {"max_pixels": str(2 * MOST_PIXELS)}
+    with av.open(str(path), options=bound) as container:
+        stream = container.streams.video[0]
+        check(stream.width, stream.height)
+        stream.thread_type = "AUTO"
+        stream.codec_context.options = bound
+        for frame in container.decode(stream):
+            check(frame.width, frame.height)
+            if frame.pts is None or stream.time_base is None:
+                raise UserError(f"{path}: a frame without a time")
+            yield frame, float(frame.pts * stream.time_base)
 
 
 def resized(image: np.ndarray, height: int, width: int) -> np.ndarray:

@@ -391,30 +391,3 @@ def test_damaged_rows(pictures: Path, opened: Callable, tmp_path: Path) -> None:
     nan = [[0.0, float("nan")]] + [[0.0, 0.0]] * 15
     with pytest.raises(UserError, match=r"observation\.joints holds a number that is not finite"):
         opened(rewritten("nan", lambda t: with_column(t, "observation.joints", nan)))
-
-
-def test_frames_and_rows_do_not_agree(video: Path, opened: Callable, tmp_path: Path) -> None:
-    """A dropped frame shifts all that follow: refused, not trained on."""
-    import av
-
-    root = tmp_path / "data"
-    shutil.copytree(video, root)
-    path = next((root / "videos" / "observation.images.side").rglob("*.mp4"))
-    with av.open(str(path)) as old:
-        frames = [frame.to_ndarray(format="rgb24") for frame in old.decode(video=0)]
-    assert len(frames) == 16
-    for kept, message in ((15, "has 15 frames, its episodes have 16 rows"), (17, "has 17 frames")):
-        with av.open(str(path), "w", format="mp4") as new:
-            stream = new.add_stream("mpeg4", rate=10)
-            stream.width = stream.height = 32  # type: ignore[attr-defined]
-            for picture in (frames + frames)[:kept]:
-                for packet in stream.encode(av.VideoFrame.from_ndarray(picture)):  # type: ignore[attr-defined]
-                    new.mux(packet)
-            new.mux(stream.encode(None))  # type: ignore[attr-defined]
-        with pytest.raises(UserError, match=message) as error:
-            opened(root)
-        assert "\n" not in str(error.value)
-    path.write_bytes(b"no video")
-    with pytest.raises(UserError, match="cannot be decoded"):
-        opened(root)
-    assert folders(tmp_path / "cache") == []
