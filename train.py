@@ -80,7 +80,7 @@ def main(cfg: DictConfig) -> float | None:
     if processes.is_first():
         run.close()
         say(f"page:    {write_page(run.folder)}")
-    run.export(trainer.experience)  # what each has gathered
+    run.finish(trainer.experience)  # exports what each has gathered
     say(f"results: {run.folder}")
     return None if found is None else score(found.policies)
 

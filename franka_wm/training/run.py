@@ -267,26 +267,27 @@ class Run:
         sys.exit(INTERRUPTED)
 
     def close(self) -> None:
-        """Closes the loggers, and says in the run's folder that it has ended, and what it took."""
+        """Closes the loggers."""
         close_loggers(self.loggers)
-        write_finished(self.folder)
 
     def keep(self) -> None:
         """Keeps the folder from now on, whatever comes: training begins."""
         global _begun
         _begun = None
 
-    def export(self, experience: Callable[[], TensorDictBase | None]) -> None:
+    def finish(self, experience: Callable[[], TensorDictBase | None]) -> None:
         """What ``export`` in the configuration asks for: the replay's whole episodes as a LeRobot dataset.
 
-        Each process of a job calls this.
+        The run's folder says then that it has ended, and what it took: a sweep leaves it alone. Each process of a job
+        calls this.
 
         Args:
             experience: Gives the replay, oldest step first; called only if something is exported.
         """
-        if self.settings.export.kind == "none":
-            return
-        export_run(self.settings.values, experience(), folder=self.folder)
+        if self.settings.export.kind != "none":
+            export_run(self.settings.values, experience(), folder=self.folder)
+        if processes.is_first():
+            write_finished(self.folder)
 
 
 def start(cfg: DictConfig) -> Run:

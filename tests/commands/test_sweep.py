@@ -31,6 +31,7 @@ SMOKE = [
     "trainer.updates=4",
 ]
 SMALL = ["evaluation.episodes=2", "evaluation.video_episodes=0", "logger.names=[csv]"]
+FEW = ["planner.num_samples=8", "planner.num_elites=4"]
 BREAKS = "trainer.lr=1e30,1e-3"
 KEEPS = "+hydra.callbacks.kept._target_=hydra.experimental.callbacks.PickleJobInfoCallback"
 """What each job returns to Hydra's sweeper."""
@@ -103,6 +104,40 @@ def test_a_job_is_refused_before_anything_is_written(swept, tmp_path: Path) -> N
     done = sweep(tmp_path, "seed=0,1", "hydra.sweep.subdir=one")
     assert "jobs 0 and 1 would both write into" in done.stderr and done.stderr.count("\n") == 1
     assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.slow
+def test_a_job_is_finished_once_it_has_exported(tmp_path: Path) -> None:
+    """The same sweep again makes the dataset that is missing, and leaves alone one that is there."""
+    (tmp_path / "full.py").write_text(
+        "from pathlib import Path\n"
+        "from franka_wm.data.lerobot.writer import DatasetWriter\n"
+        "from franka_wm.errors import UserError\n"
+        "def merge(self):\n"
+        "    if not Path('room').exists():\n"
+        "        raise UserError('the disk is full')\n"
+        "    merged(self)\n"
+        "merged, DatasetWriter._merge = DatasetWriter._merge, merge\n"
+    )
+    job = tmp_path / "sweep" / "0-reach"
+    finished, dataset = job / "finished.json", job / "dataset" / "meta" / "info.json"
+
+    def again() -> str:
+        exports = ("plugins=[full]", "export=lerobot", "export.workers=1")
+        done = sweep(tmp_path, *exports, *FEW, "evaluation.during=[]")
+        assert done.returncode == int(not finished.exists()), done.stdout + done.stderr
+        return done.stdout + done.stderr
+
+    assert "error: job 0: the disk is full" in again()
+    assert list((job / "dataset.writing" / "shards").iterdir()) and not finished.exists()
+    (tmp_path / "room").touch()
+    said = again()
+    assert "job 0 goes on where it stopped" in said and "dataset: " in said and "written before" not in said
+    written = dataset.read_bytes(), dataset.stat().st_mtime_ns
+    assert finished.exists() and not (job / "dataset.writing").exists()
+    finished.unlink()  # ended between the two
+    assert f"dataset: {job / 'dataset'} was written before" in again() and finished.exists()
+    assert (dataset.read_bytes(), dataset.stat().st_mtime_ns) == written
 
 
 def test_a_search_needs_its_plugin_and_its_direction(tmp_path: Path, capsys) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -9,10 +10,11 @@ from typing import TYPE_CHECKING, Any
 
 from franka_wm.data.image_storage import newest
 from franka_wm.data.lerobot.episodes import cut_replay
-from franka_wm.data.lerobot.provenance import describe
+from franka_wm.data.lerobot.provenance import describe, read_provenance
 from franka_wm.data.lerobot.schema import schema_for
 from franka_wm.data.lerobot.writer import DatasetWriter
 from franka_wm.errors import UserError
+from franka_wm.untrusted import values_of
 
 if TYPE_CHECKING:
     from tensordict import TensorDictBase
@@ -140,37 +142,74 @@ def export_replay(
 def export_run(settings: Mapping[str, Any], data: TensorDictBase | None, *, folder: Path) -> Exported | None:
     """The end of a training run: what ``export`` in its configuration asks for. Each process of a job calls this.
 
+    A run that goes on, and had written its dataset before, does not write it again.
+
     Args:
         settings: The run's resolved configuration, plain; ``export`` has ``kind`` (none, lerobot), ``out`` (``None``:
             ``dataset`` in the run's folder), ``format``, ``workers`` and ``repo_id`` (published there if given).
         data: The replay, oldest step first; ``None`` if there is none.
         folder: Folder of the run.
+
+    Returns:
+        What became of it; ``None`` if nothing was written.
     """
+    from franka_wm import processes
+    from franka_wm.console import say
+
     wanted = settings["export"]
     if wanted["kind"] == "none":
         return None
-    if data is None:
+    out, done = Path(wanted["out"] or folder / "dataset"), None
+    if processes.objects(processes.is_first() and written_before(settings, out))[0]:
+        say(f"dataset: {out} was written before")
+    elif data is None:
         raise UserError(
-            "export=lerobot: this run has gathered nothing; export the dataset that it was trained on"
+            "export=lerobot: this run has gathered nothing"
+            + ("; export the dataset that it was trained on" if settings.get("resume") is None else _NOT_KEPT)
         )
-    done = export_replay(
-        data,
-        config=arm_config(settings),
-        out=wanted["out"] or folder / "dataset",
-        seed=int(settings["seed"]),
-        policy=f"training run, {settings['collector']['policy']}",
-        settings=settings,
-        format=wanted["format"],
-        workers=int(wanted["workers"]),
-    )
-    tell(done)
-    from franka_wm import processes
-
+    else:
+        done = export_replay(
+            data,
+            config=arm_config(settings),
+            out=out,
+            seed=int(settings["seed"]),
+            policy=f"training run, {settings['collector']['policy']}",
+            settings=settings,
+            format=wanted["format"],
+            workers=int(wanted["workers"]),
+        )
+        tell(done)
     if wanted["repo_id"] and processes.is_first():
         from franka_wm.data.lerobot.publish import publish_dataset
 
-        publish_dataset(done.out, wanted["repo_id"])
+        publish_dataset(out, wanted["repo_id"])
     return done
+
+
+_NOT_KEPT = (
+    ", and the checkpoint was saved without experience; begin it again in another folder, "
+    "with trainer.checkpoint_replay=true"
+)
+
+
+def written_before(settings: Mapping[str, Any], out: Path) -> bool:
+    """Whether the run that this one goes on with ended after it had written the dataset ``out``.
+
+    Raises:
+        UserError: What is there cannot be read.
+    """
+    if settings.get("resume") is None or not out.exists():
+        return False
+    with values_of(str(out), "choose another export.out"):
+        found = read_provenance(out)
+        here = json.loads(json.dumps(dict(settings)))
+        there = [] if found is None else [session["config"] for session in found["sessions"]]
+        return [_alike(one) for one in there] == [_alike(here)]
+
+
+def _alike(config: Mapping[str, Any]) -> dict[str, Any]:
+    """What of a run's configuration stays as it goes on."""
+    return {key: value for key, value in config.items() if key not in ("resume", "plugins", "device", "gpus")}
 
 
 def check_export(settings: Mapping[str, Any]) -> None:
@@ -186,5 +225,5 @@ def check_export(settings: Mapping[str, Any]) -> None:
         return
     schema_for(replace(arm_config(settings), frame_stack=1), format=wanted["format"])
     out = wanted["out"]
-    if out and Path(out).exists():
+    if out and Path(out).exists() and not written_before(settings, Path(out)):
         raise UserError(f"export.out={out} exists; choose another folder")

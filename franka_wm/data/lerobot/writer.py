@@ -70,7 +70,7 @@ def check_out(out: str | Path, *, resume: bool = False, resumable: bool = True) 
         raise UserError(
             f"{previous} holds the dataset of {out}, where a kill has left it; {more}, or move it back there"
         )
-    if _shards(working) and not resume:
+    if _shards(working) and not resume and (resumable or not _made_again(working)):
         more = "go on with resume=true, or " if resumable else ""
         raise UserError(f"{working} holds an unfinished dataset; {more}remove {working}")
     why = unwritable(working)
@@ -80,6 +80,12 @@ def check_out(out: str | Path, *, resume: bool = False, resumable: bool = True) 
 
 def _working(out: Path) -> Path:
     return out.with_name(out.name + ".writing")
+
+
+def _made_again(working: Path) -> bool:
+    """Whether what is there is of an export, which is made again from its replay instead of going on."""
+    path = working / "writer.json"
+    return path.is_file() and linked_json(path).get("resumable") is False
 
 
 def _shards(working: Path) -> list[Path]:
@@ -98,7 +104,8 @@ class DatasetWriter:
         workers: Writing processes; 0 writes in this one, which needs no time to start and gathers nothing meanwhile.
         shard_frames: Steps in a shard; by their size if not given. A kill loses the shards that are not finished.
         resume: Go on with what is in ``OUT.writing``, and add to ``OUT`` if it is there.
-        resumable: Whether whoever gathers it has ``resume``; an export does not, and is made again instead.
+        resumable: Whether whoever gathers it has ``resume``; an export does not, and is made again instead: what a
+            killed one has left in ``OUT.writing`` is removed.
 
     Attributes:
         episodes, frames: Written or waiting to be, with those of earlier sessions; of several processes, this one's.
@@ -167,11 +174,12 @@ class DatasetWriter:
     def _recover(self) -> None:
         """Puts what a kill has left in order, and counts what is there."""
         state = self._state()
+        if not self._resumable and state.get("resumable") is False:
+            self._remove_shards()
         merged, previous = self.working / "merged", self.working / PREVIOUS
         if state.pop("replacing", False):  # killed while the finished dataset moved to its place
             if self.out.exists() and not merged.exists():  # it is in its place: what is left here is in it
-                shutil.rmtree(self.working / "shards")
-                (self.working / "shards").mkdir()
+                self._remove_shards()
                 shutil.rmtree(previous, ignore_errors=True)
             self._write_state(state)  # before `merged` goes: without it the shards would seem to be in OUT
         if previous.exists() and not self.out.exists():
@@ -192,6 +200,10 @@ class DatasetWriter:
         earlier = state["sessions"] if kept else []
         self._sessions = [*earlier, {"first_shard": self._next_shard} | self._session]
         self._save_state()
+
+    def _remove_shards(self) -> None:
+        shutil.rmtree(self.working / "shards")
+        (self.working / "shards").mkdir()
 
     def _state(self) -> dict[str, Any]:
         path = self.working / "writer.json"
@@ -221,7 +233,8 @@ class DatasetWriter:
                 )
 
     def _save_state(self, **more: Any) -> None:
-        self._write_state({"schema": self.schema.to_dict(), "sessions": self._sessions} | more)
+        kind = {} if self._resumable else {"resumable": False}
+        self._write_state({"schema": self.schema.to_dict(), "sessions": self._sessions} | kind | more)
 
     def _write_state(self, state: dict[str, Any]) -> None:
         path = self.working / "writer.json"

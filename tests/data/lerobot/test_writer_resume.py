@@ -188,6 +188,24 @@ def test_a_kill_while_what_was_merged_is_removed(
     assert [p.name for p in tmp_path.iterdir()] == ["set"]
 
 
+def test_an_export_that_was_killed_is_made_again(tmp_path, make_schema, make_episode, write, load) -> None:
+    """Of what was collected, which only ``resume`` goes on with, nothing is removed."""
+    schema, out = make_schema(), tmp_path / "set"
+    episodes = [make_episode(schema, i) for i in range(3)]
+    for resumable in (True, False):
+        with DatasetWriter(out, schema, provenance={}, workers=0, resumable=resumable) as writer:
+            writer.add(episodes[:2])
+            writer.flush()
+        if resumable:
+            with pytest.raises(UserError, match="unfinished"):
+                write(out, schema, episodes, resumable=False)
+            shutil.rmtree(writer.working)
+    with pytest.raises(UserError, match="unfinished"):
+        write(out, schema, episodes)
+    compare(load(write(out, schema, episodes, resumable=False)), schema, episodes)
+    assert [p.name for p in tmp_path.iterdir()] == ["set"]
+
+
 def test_two_writers_do_not_mix(tmp_path, make_schema, make_episode) -> None:
     schema = make_schema()
     with DatasetWriter(tmp_path / "set", schema, provenance={}, workers=0, shard_frames=1) as writer:

@@ -1,0 +1,49 @@
+"""The end of a run that exports: what it finds of itself when it goes on."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from franka_wm.data.lerobot.export import check_export, export_run, written_before
+from franka_wm.data.lerobot.provenance import describe
+from franka_wm.data.lerobot.schema import PROVENANCE
+from franka_wm.errors import UserError
+
+RUN: dict[str, Any] = {
+    "resume": None,
+    "device": "cpu",
+    "seed": 0,
+    "trainer": {"updates": 4},
+    "export": {"kind": "lerobot", "out": None, "format": "exact", "repo_id": None},
+    "env": {"kind": "franka", "image_size": 16},
+}
+
+
+def test_a_dataset_is_that_of_the_run_which_goes_on(tmp_path: Path, make_schema, make_episode, write) -> None:
+    schema = make_schema()
+    out = write(
+        tmp_path / "set",
+        schema,
+        [make_episode(schema, 0)],
+        provenance=describe(policy="p", seed=0, config=RUN),
+    )
+    again = RUN | {"resume": "run", "device": "cuda"}
+    exports = {"export": RUN["export"] | {"out": str(out)}}
+    assert written_before(again, out) and not written_before(again, tmp_path / "none")
+    for other in (RUN, again | {"trainer": {"updates": 8}}):  # from the beginning; and farther
+        assert not written_before(other, out)
+        with pytest.raises(UserError, match=r"export\.out=.*set exists"):
+            check_export(other | exports)
+    for damaged in ("{}", '{"sessions": 3}', '{"sessions": [{}]}'):
+        (out / PROVENANCE).write_text(damaged)
+        with pytest.raises(UserError, match=r"another form than was written.*choose another export\.out"):
+            written_before(again, out)
+
+
+def test_a_run_without_experience_says_why(tmp_path: Path) -> None:
+    for resume, says in ((None, "that it was trained on"), ("run", r"trainer\.checkpoint_replay=true")):
+        with pytest.raises(UserError, match=rf"has gathered nothing.*{says}"):
+            export_run(RUN | {"resume": resume}, None, folder=tmp_path)
