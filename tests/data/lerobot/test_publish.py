@@ -126,6 +126,25 @@ def test_links_out_of_a_dataset_are_not_followed(hub, publish, copy, tmp_path) -
     assert (place / "meta" / "notes.txt").read_text() == (copy / "meta" / "info.json").read_text()
 
 
+@pytest.mark.parametrize("format", ["exact", "video_near_lossless"])
+def test_the_first_episode_may_be_in_any_file(
+    format, make_schema, make_episode, write, load, tmp_path
+) -> None:
+    """LeRobot's own tools leave the numbers of files as they were when they delete the episodes of the first."""
+    from lerobot.datasets.dataset_tools import delete_episodes
+
+    schema = make_schema(format)
+    episodes = [make_episode(schema, i) for i in range(2)]
+    root = write(tmp_path / "set", schema, episodes, shard_frames=7)
+    delete_episodes(load(root), [0], output_dir=tmp_path / "less", repo_id="test/less")
+    assert not (tmp_path / "less" / "data" / "chunk-000" / "file-000.parquet").exists()
+    images = []
+    for name, one in (("less", tmp_path / "less"), ("one", write(tmp_path / "one", schema, episodes[1:]))):
+        cards.make_image(one, tmp_path / f"{name}.gif")
+        images.append((tmp_path / f"{name}.gif").read_bytes())
+    assert images[0] == images[1]
+
+
 def test_pipes_in_a_dataset_are_refused(copy, tmp_path) -> None:
     pipe = copy / "data" / "chunk-000" / "file-001.parquet"
     os.mkfifo(pipe)
