@@ -96,9 +96,9 @@ def publish_staged(
             write_card(staged, repo_id)
             return
         with explained(repo_id):
-            check_name(api, repo_id, kind, update)
+            check_name(api, repo_id, kind, private, update)
             with announced(f"sending {len(files)} files"):
-                send(api, staged, repo_id, kind, private, update)
+                send(api, staged, repo_id, kind, private)
                 if kind == "dataset":
                     _tag(api, repo_id)
     address = f"{api.endpoint}/{'datasets/' if kind == 'dataset' else ''}{repo_id}"
@@ -232,17 +232,33 @@ def hub_client(repo_id: str) -> Any:
     return HfApi()
 
 
-def check_name(api: Any, repo_id: str, kind: str, update: bool) -> None:
-    if not update and api.repo_exists(repo_id=repo_id, repo_type=kind):
+def check_name(api: Any, repo_id: str, kind: str, private: bool, update: bool) -> None:
+    """Raises ``UserError`` if the repository holds something and is not to be changed, or if anybody could see it.
+
+    One that holds nothing is taken: an upload that failed has left it.
+    """
+    from huggingface_hub.errors import GatedRepoError, RepositoryNotFoundError
+
+    try:
+        there = api.repo_info(repo_id=repo_id, repo_type=kind)
+    except GatedRepoError:  # it is there, and not ours
+        raise
+    except RepositoryNotFoundError:
+        return
+    if not update and {one.rfilename for one in there.siblings or ()} - {".gitattributes"}:
         raise UserError(
             f"publish: {repo_id} exists already; choose another repo_id, or replace what is there with update=true"
         )
+    if private and not there.private:  # the Hub keeps what it is
+        raise UserError(
+            f"publish: {repo_id} is public; give private=false, make it private on the Hub, or choose another repo_id"
+        )
 
 
-def send(api: Any, folder: Path, repo_id: str, kind: str, private: bool, update: bool) -> None:
+def send(api: Any, folder: Path, repo_id: str, kind: str, private: bool) -> None:
     """All of a staged folder, which has what :func:`files_of` lists and no more, in one commit. What an
     earlier version left there goes in it: readers would take it for ours."""
-    api.create_repo(repo_id=repo_id, private=private, repo_type=kind, exist_ok=update)
+    api.create_repo(repo_id=repo_id, private=private, repo_type=kind, exist_ok=True)
     api.upload_folder(
         repo_id=repo_id,
         folder_path=folder,

@@ -69,6 +69,19 @@ def test_a_dataset_goes_with_our_card_and_tag(hub, publish, dataset) -> None:
     assert repo["tags"] == {"v3.0": f"{repo['commits']:040x}"}
 
 
+def test_what_was_public_stays_public_and_what_was_empty_is_filled(hub, publish, dataset) -> None:
+    """Private is what is said, and the Hub does not change it of a repository that is there."""
+    repo = {"files": {".gitattributes": b"", "mine": b"1"}, "private": False, "tags": {}, "commits": 1}
+    hub.repos["datasets/user/arm"] = repo
+    one_line(publish(f"root={dataset}", "repo_id=user/arm", "update=true"), "is public", "private=false")
+    assert repo["commits"] == 1 and repo["files"]["mine"] == b"1"
+    one_line(publish(f"root={dataset}", "repo_id=user/arm"), "exists already")
+    repo["private"] = True
+    del repo["files"]["mine"]  # as an upload leaves it that failed
+    done = publish(f"root={dataset}", "repo_id=user/arm")
+    assert done.returncode == 0 and "README.md" in repo["files"], done.stderr
+
+
 def test_a_dry_run_sends_nothing_and_writes_the_card(hub, publish, dataset, tmp_path) -> None:
     done = publish(f"root={dataset}", "repo_id=user/arm", "--dry-run", token=None)
     assert done.returncode == 0, done.stderr
