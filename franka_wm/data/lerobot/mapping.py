@@ -60,8 +60,8 @@ class FeatureMap:
 
     @property
     def image_features(self) -> list[str]:
-        """All features that are images."""
-        return [feature for feature, _ in self.images.values()]
+        """All features that are images, each once."""
+        return list(dict.fromkeys(feature for feature, _ in self.images.values()))
 
     def to_dict(self) -> dict[str, Any]:
         """Plain values for JSON, without the notes."""

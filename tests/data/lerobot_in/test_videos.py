@@ -1,4 +1,4 @@
-"""Videos of datasets that cannot be used: frames that are missing, too many or too large."""
+"""Videos of datasets: what reads them, and frames that are missing, too many or too large."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ from typing import Any
 import av
 import numpy as np
 import pytest
+import torch
 
 from franka_wm.data.lerobot import decode
 from franka_wm.data.lerobot.card import make_image
@@ -31,6 +32,12 @@ def write_frames(path: Path, frames: list[np.ndarray]) -> None:
             for packet in (*encoder.encode(image), *encoder.encode(None)):
                 packet.stream, packet.pts, packet.dts, packet.time_base = stream, k, k, Fraction(1, 10)
                 file.mux(packet)
+
+
+def test_one_video_for_two_entries(video: Path, opened: Callable) -> None:
+    side = "observation.images.side"
+    batch = opened(video, features={"pixels": side, "pixels_again": side}).windows(torch.arange(10))
+    assert torch.equal(batch["pixels"], batch["pixels_again"]) and batch["pixels"].any()
 
 
 def test_frames_have_as_many_pixels_as_images_may(
