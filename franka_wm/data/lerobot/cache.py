@@ -15,6 +15,7 @@ are removed. It is built under another name and renamed, and only one process bu
 
 from __future__ import annotations
 
+import glob
 import hashlib
 import json
 import os
@@ -105,7 +106,7 @@ def open_cache(
             # Another process may have built it while this one waited.
             if (cache := _read(folder, say)) is not None:
                 return cache
-            for left_over in parent.glob(f"{name}.writing-*"):
+            for left_over in parent.glob(f"{glob.escape(name)}.writing-*"):
                 shutil.rmtree(left_over)
             temporary = parent / f"{name}.writing-{uuid.uuid4().hex[:8]}"
             try:

@@ -160,6 +160,17 @@ def test_killed_while_building(moment: str, pictures: Path, opened: Callable, tm
     assert ".writing-" not in left
 
 
+def test_what_a_kill_has_left_is_removed(pictures: Path, opened: Callable, tmp_path: Path) -> None:
+    """Also of a dataset whose name has signs that stand for others in a pattern."""
+    root = tmp_path / "data[1]*"
+    shutil.copytree(pictures, root)
+    opened(root)
+    (whole,) = (tmp_path / "cache").glob("*/")
+    left = whole.rename(whole.with_name(f"{whole.name}.writing-0123"))
+    opened(root)
+    assert whole.is_dir() and not left.exists()
+
+
 def running(pid: int) -> bool:
     """Whether a process is there and no zombie."""
     try:
