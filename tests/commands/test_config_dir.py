@@ -49,7 +49,10 @@ def test_several_processes_are_started(mine: list[str], monkeypatch: pytest.Monk
     ("words", "said"),
     [
         (["env.fsp=20"], "env.fsp: no such option; did you mean env.fps?"),
-        (["env.scene.objects=[]"], "env.scene.objects: no such option; did you mean env.scene?"),  # null there
+        (
+            ["env.scene.objects=[]"],
+            "env.scene.objects: no such option; did you mean env.scene?",
+        ),  # null there
         (["env.fps=0"], "fps=0: must be above 0"),
         (["hydra.searchpath=[file://other]"], "name all folders in hydra.searchpath="),
     ],
