@@ -80,7 +80,8 @@ def play_episodes(
         seed: Seed of the episodes' poses and goals.
         episodes: Fewer than there are worlds: the first ones. Nothing is decided for the others.
         first_world: As for :func:`begin`.
-        video: Called before every step, to take an image; after the last one the worlds have been reset.
+        video: Called before every step of these episodes, to take an image, until the longest has ended; what is
+            simulated after that are others.
 
     Returns:
         Batch size (N,), or (episodes,), all float32, of each world's first episode up to its true last observation.
@@ -109,7 +110,7 @@ def play_episodes(
         motion.start()
     with evaluating(policy), set_exploration_type(ExplorationType.DETERMINISTIC):
         for _ in range(env.config.episode_length):
-            if video is not None:
+            if video is not None and bool(running.any()):
                 video()
             decided = policy(tensordict) if count == n else _decide_for_some(policy, tensordict, count)
             tensordict, following = env.step_and_maybe_reset(decided)

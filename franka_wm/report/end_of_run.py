@@ -102,7 +102,10 @@ def film(settings: RunSettings, folder: Path, policy: Any, name: str, found: Eva
         lines.append(ending(played, policy_name(name), number, arm))
         frames.clear()
     fps = _slow(arm.config.fps)
-    beside = torch.cat(films, 1)
+    longest = max(map(len, films))  # shorter ones stand still at their ends
+    beside = torch.cat(
+        [torch.cat([one, one[-1:].expand(longest - len(one), *one.shape[1:])]) for one in films], 1
+    )
     beside = torch.cat([beside, beside[-1:].expand(fps, *beside.shape[1:])])  # a second to look at the end
     film = tile_frames(draw_labels(beside, lines))
     write_video(film, folder / "video.mp4", fps=fps)

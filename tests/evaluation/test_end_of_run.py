@@ -72,6 +72,27 @@ def test_the_video_shows_the_worst_episodes_again(settled, tmp_path: Path, monke
     assert (tmp_path / "video.mp4").stat().st_size > 1000
 
 
+def test_of_an_episode_that_ends_early_the_video_shows_no_other(settled, tmp_path: Path, monkeypatch) -> None:
+    """Its last frame stands still until the longest beside it has ended."""
+    few = ("env.substeps=1", "env.episode_length=8", "evaluation.episodes=4", "evaluation.video_episodes=4")
+    ends = ("env.terminate_on_success=true", "env.success_distance=0.25", "evaluation.video_size=32")
+    cfg = settled("scale=smoke", "device=cpu", *few, *ends)
+    env = build.make_evaluation_env(cfg)
+    policies = {"policy": build.make_scripted_policies(env)["ik"]}
+    results = evaluate_run(cfg, tmp_path, env, policies, counters={}, say=lambda text: None)
+    shown: list[torch.Tensor] = []
+    monkeypatch.setattr(end_of_run, "draw_labels", lambda frames, lines: shown.append(frames) or frames)
+    report_run(cfg, tmp_path, env, policies, results, rows=[])
+    rows = results.episodes["policy"]
+    lengths = rows["length"].int().tolist()
+    assert 1 < min(lengths) < max(lengths)
+    frames = shown[0]
+    assert len(frames) == max(lengths) + end_of_run._slow(env.config.fps)
+    for beside, number in enumerate(worst(rows, 4)):
+        moved = (frames[1:, beside] != frames[:-1, beside]).flatten(1).any(1)
+        assert moved.tolist() == [k < lengths[number] - 1 for k in range(len(moved))]
+
+
 def test_the_worst_are_those_without_success_and_then_those_with_the_least_return() -> None:
     found = {"success": torch.tensor([1.0, 0.0, 1.0, 0.0]), "return": torch.tensor([5.0, 3.0, 1.0, 2.0])}
     assert worst(TensorDict(found, [4]), 3) == [3, 1, 2]
