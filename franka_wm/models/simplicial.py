@@ -103,6 +103,11 @@ class SimplicialWorldModel(WorldModel):
         register_statistics(self, observation_dim)
         if action_masks is None:
             self.action_masks = None
+        elif "task" not in self.observation_sizes:
+            raise ValueError(
+                "these tasks have actions of different sizes, and which are a task's own is told by the observation "
+                "task: add task to model.observations"
+            )
         else:
             self.register_buffer("action_masks", torch.tensor(action_masks), persistent=False)
 

@@ -91,6 +91,7 @@ def test_sizes_are_known_before_worlds_are_built(words, settled) -> None:
             "reads 'pixels', here are goal, joint_target, objects, state, ",
         ),
         ((*TASKS, "model=muzero", "planner=gumbel"), "model=muzero has discrete actions"),
+        ((*TASKS, "model.observations=[state]"), "model=tdmpc2: .* add task to model.observations"),
     ],
 )
 def test_a_model_that_does_not_fit_is_refused_before_worlds_are_built(words, said, settled) -> None:
