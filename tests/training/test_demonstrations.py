@@ -12,8 +12,10 @@ import torch
 from safetensors.torch import load_file
 
 from franka_wm.commands import main as cli
-from franka_wm.data.lerobot import cache, open_dataset
+from franka_wm.data.lerobot import cache, collect, open_dataset
 from franka_wm.errors import UserError
+from franka_wm.evaluation.closed_loop import begin
+from franka_wm.evaluation.protocol import held_out_seeds
 from franka_wm.training import build
 from franka_wm.training.check import check
 from franka_wm.training.demos import open_demonstrations
@@ -126,13 +128,22 @@ def test_what_is_evaluated_never_begins_along_them(pushes: Path, train, monkeypa
     assert built and all(env.simulation.starts is None for env in built)
 
 
-def test_none_is_an_episode_of_the_evaluation(demos: Path, settled) -> None:
-    recorded = open_dataset(demos, window=1, batch_size=1, validation_fraction=0.0, say=lambda line: None)
+def test_none_is_an_episode_of_the_evaluation(demos: Path, settled, tmp_path: Path, monkeypatch) -> None:
     run = settled("scale=smoke", *ARM, "evaluation.episodes=64")
-    first = build.make_evaluation_env(run).reset()["state"]
-    starts = torch.cat([one["state"][one["is_init"].squeeze(-1)] for one in recorded.batches(100)])
-    assert starts.shape == (6, first.shape[-1])
-    assert torch.cdist(starts, first).min() > 1e-3
+    (held_out,) = held_out_seeds(1)  # which evaluation plays, not the seed that its worlds are built with
+    evaluated = begin(build.make_evaluation_env(run), held_out)["state"]
+
+    def nearest(root: Path) -> torch.Tensor:
+        """(episodes,): how far each begins from the nearest of the evaluation, the largest of its entries."""
+        recorded = open_dataset(root, window=1, batch_size=1, validation_fraction=0.0, say=lambda line: None)
+        starts = torch.cat([one["state"][one["is_init"].squeeze(-1)] for one in recorded.batches(100)])
+        return (starts[:, None] - evaluated).abs().amax(-1).amin(1)
+
+    assert nearest(demos).shape == (6,) and nearest(demos).min() > 1e-2
+    monkeypatch.setattr(collect, "derive_seed", lambda *_: held_out)
+    leak = tmp_path / "leak"
+    assert cli.main(["collect", f"out={leak}", "policy=ik", "episodes=3", "num_envs=3", *ARM]) == 0
+    assert nearest(leak).max() < 1e-5  # such a meeting would be seen
 
 
 def test_those_that_are_not_finite_are_refused_before_worlds_are_built(
