@@ -302,21 +302,37 @@ class Sum(Objective):
         return score
 
 
-class ActionPenalty(Objective):
+Masked = Callable[[Tensor, Tensor], Tensor]
+"""z (..., D), actions (..., A) -> actions with 0 in the entries that the task of z has not."""
+
+
+class _OfActions(Objective):
+    """What costs by the actions alone, where tasks share a model: by the entries that the task of a plan has."""
+
+    def __init__(self, weight: float, masked: Masked | None = None) -> None:
+        self.weight, self.masked = _penalty(type(self).__name__, weight), masked
+
+    def _own(self, trajectory: Tensor, actions: Tensor) -> Tensor:
+        """Actions (E, S, H, A), or differences of some, in the entries that count."""
+        return actions if self.masked is None else self.masked(trajectory[:, :, :1], actions)
+
+
+class ActionPenalty(_OfActions):
     """Minus `weight` times the squared size of the actions, Σ_t |a_t|².
+
+    Args:
+        weight: of the sum.
+        masked: see `Masked`; None: all entries count.
 
     Raises:
         ValueError: a negative weight.
     """
 
-    def __init__(self, weight: float) -> None:
-        self.weight = _penalty("ActionPenalty", weight)
-
     def __call__(self, trajectory: Tensor, actions: Tensor) -> Tensor:
-        return -self.weight * actions.square().sum(dim=(-2, -1))
+        return -self.weight * self._own(trajectory, actions).square().sum(dim=(-2, -1))
 
 
-class PolicyPenalty(Objective):
+class PolicyPenalty(_OfActions):
     """Minus `weight` times the squared distance of the first action from the policy's own, |a_0 - π(z_0)|².
 
     Planning maximises errors of the model along with returns. Near the policy's actions the model was trained, so
@@ -325,17 +341,23 @@ class PolicyPenalty(Objective):
 
     Args:
         policy: z (..., D) -> actions (..., A), without noise.
+        weight: of the distance.
+        masked: see `Masked`; None: all entries count.
 
     Raises:
         ValueError: a negative weight.
     """
 
-    def __init__(self, policy: Callable[[Tensor], Tensor], weight: float) -> None:
-        self.policy, self.weight = policy, _penalty("PolicyPenalty", weight)
+    def __init__(
+        self, policy: Callable[[Tensor], Tensor], weight: float, masked: Masked | None = None
+    ) -> None:
+        super().__init__(weight, masked)
+        self.policy = policy
 
     def __call__(self, trajectory: Tensor, actions: Tensor) -> Tensor:
         own = self.policy(trajectory[:, :1, 0])  # all candidates start at the same latent
-        return -self.weight * (actions[:, :, 0] - own).square().sum(-1)
+        away = self._own(trajectory, (actions[:, :, 0] - own).unsqueeze(2)).squeeze(2)
+        return -self.weight * away.square().sum(-1)
 
 
 class GoalPolicyPenalty(Objective):
@@ -362,18 +384,22 @@ class GoalPolicyPenalty(Objective):
         raise ValueError("a GoalPolicyPenalty has no goal yet: plan with its bind(tensordict)")
 
 
-class Smoothness(Objective):
+class Smoothness(_OfActions):
     """Minus `weight` times the squared changes of the action, Σ_{t>0} |a_t - a_{t-1}|².
 
     Bound to an observation, it also counts the change from the last executed action to the first planned
     one: otherwise replanning at every step leaves what is executed as rough as before.
 
+    Args:
+        weight: of the sum.
+        masked: see `Masked`; None: all entries count.
+
     Raises:
         ValueError: a negative weight.
     """
 
-    def __init__(self, weight: float) -> None:
-        self.weight = _penalty("Smoothness", weight)
+    def __init__(self, weight: float, masked: Masked | None = None) -> None:
+        super().__init__(weight, masked)
         self._last: Tensor | None = None  # (E, A)
         self._acted: Tensor | None = None  # (E, 1)
 
@@ -385,7 +411,7 @@ class Smoothness(Objective):
                 to the next step; after a reset there is none), and `is_init` (E, 1) bool: where True, the
                 action belongs to another episode and does not count.
         """
-        bound = Smoothness(self.weight)
+        bound = Smoothness(self.weight, self.masked)
         last = tensordict.get("action", None)
         if last is not None:
             is_init = tensordict.get("is_init", None)
@@ -396,10 +422,10 @@ class Smoothness(Objective):
         return bound
 
     def __call__(self, trajectory: Tensor, actions: Tensor) -> Tensor:
-        change = actions.diff(dim=2).square().sum(dim=(-2, -1))
+        change = self._own(trajectory, actions.diff(dim=2)).square().sum(dim=(-2, -1))
         if self._last is not None and self._acted is not None:
-            first = (actions[:, :, 0] - self._last.unsqueeze(1)).square().sum(-1)
-            change = change + self._acted * first
+            first = self._own(trajectory, actions[:, :, :1] - self._last[:, None, None]).squeeze(2)
+            change = change + self._acted * first.square().sum(-1)
         return -self.weight * change
 
 

@@ -197,11 +197,12 @@ def make_objective(run: RunSettings, model: WorldModel) -> Objective | None:
             steps_weight=o.steps_weight,
         )
     parts: list[tuple[float, Objective]] = [(1.0, chosen)]
+    masked = getattr(model, "masked", None)
     if o.action_penalty:
-        parts.append((1.0, planning.ActionPenalty(o.action_penalty)))
+        parts.append((1.0, planning.ActionPenalty(o.action_penalty, masked)))
     if o.policy_penalty:
         if model.has_policy:
-            own = planning.PolicyPenalty(partial(model.policy, deterministic=True), o.policy_penalty)
+            own = planning.PolicyPenalty(partial(model.policy, deterministic=True), o.policy_penalty, masked)
         elif model.has_goal_policy and isinstance(chosen, planning.GoalImage):
             towards = partial(model.goal_policy, deterministic=True)
             own = planning.GoalPolicyPenalty(towards, chosen, o.policy_penalty)
@@ -209,7 +210,7 @@ def make_objective(run: RunSettings, model: WorldModel) -> Objective | None:
             raise UserError(f"objective.policy_penalty: model={run.model.name} has no policy; leave it at 0")
         parts.append((1.0, own))
     if o.smoothness_penalty:
-        parts.append((1.0, planning.Smoothness(o.smoothness_penalty)))
+        parts.append((1.0, planning.Smoothness(o.smoothness_penalty, masked)))
     return chosen if len(parts) == 1 else planning.Sum(parts)
 
 

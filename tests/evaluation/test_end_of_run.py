@@ -87,7 +87,7 @@ def test_of_an_episode_that_ends_early_the_video_shows_no_other(settled, tmp_pat
     lengths = rows["length"].int().tolist()
     assert 1 < min(lengths) < max(lengths)
     frames = shown[0]
-    assert len(frames) == max(lengths) + end_of_run._slow(env.config.fps)
+    assert len(frames) == max(lengths) + end_of_run._slow(cfg.env.arm.fps)
     for beside, number in enumerate(worst(rows, 4)):
         moved = (frames[1:, beside] != frames[:-1, beside]).flatten(1).any(1)
         assert moved.tolist() == [k < lengths[number] - 1 for k in range(len(moved))]

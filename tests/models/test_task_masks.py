@@ -13,6 +13,7 @@ from torch.nn import functional as F
 from franka_wm.models import make
 from franka_wm.planning import MPPI, RewardPlusValue
 from franka_wm.policies.planner import PlannerPolicy
+from franka_wm.training import build
 from small_tdmpc2 import randomise
 
 MASKS = [[1.0, 1.0, 0.0], [1.0, 1.0, 1.0]]
@@ -102,6 +103,30 @@ def test_plans_of_a_task_do_not_depend_on_it() -> None:
     policy = PlannerPolicy.for_model(made, planner, objective=RewardPlusValue.of(made), explore=False)
     seen = batch.select("state", "task").set("is_init", torch.ones(2, 1, dtype=torch.bool))
     assert policy(seen)["action"].shape == (2, 3)
+
+
+def test_plans_of_a_task_cost_nothing_by_it(settled) -> None:
+    """What an objective takes for actions, and for their changes since the last, which a planner chose as it liked."""
+    tasks = [f"~env.tasks.{name}" for name in ("track", "lift", "pick", "stack", "drawer", "peg")]
+    for name in ("action", "policy", "smoothness"):
+        run = settled("device=cpu", "scale=smoke", "env=multitask", *tasks, f"objective.{name}_penalty=30")
+        for made, independent in ((model().eval(), True), (model(None).eval(), False)):
+            objective = build.make_objective(run, made)
+            assert objective is not None
+            z = made.encode(windows([0, 1])[:, 0])
+            trajectory = z[:, None, None].expand(-1, 1, 4, -1)
+            actions, last = torch.rand(2, 1, 3, 3) - 0.5, torch.rand(2, 3) - 0.5
+            other, moved = actions.clone(), last.clone()
+            other[..., 0, 2] += 0.5
+            moved[:, 2] += 0.3
+            with torch.no_grad():
+                one, two, three = (
+                    objective.bind(TensorDict({"action": before}, [2]))(trajectory, plan).squeeze(1)
+                    for before, plan in ((last, actions), (last, other), (moved, actions))
+                )
+            assert bool(one[0] == two[0]) == independent and one[1] != two[1]
+            if name == "smoothness":
+                assert bool(one[0] == three[0]) == independent and one[1] != three[1]
 
 
 def test_no_reward_reaches_another_task() -> None:
