@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import fields
 from typing import TYPE_CHECKING
 
 import torch
@@ -26,6 +27,7 @@ from franka_wm.training import build
 from franka_wm.training.demos import check_demonstrations
 from franka_wm.training.loggers import check_loggers
 from franka_wm.training.settings import RunSettings
+from franka_wm.training.settings.groups import ObjectiveSettings
 from franka_wm.training.spaces import Spaces
 from franka_wm.training.storage_budget import check_memory
 
@@ -62,8 +64,11 @@ def check(run: RunSettings) -> None:
         raise UserError(
             "env=none: without an environment there must be data; use dataset=lerobot dataset.root=…"
         )
-    else:
-        _ = run.actor
+    elif run.actor != "policy" and run.collector.planner_worlds:  # no error: files of tuned values set it
+        say(
+            f"collector.planner_worlds={run.collector.planner_worlds}: is for collector.policy=policy and does nothing "
+            f"here, where the worlds act by {run.actor}"
+        )
     _check_hindsight(run)
     _check_future(run)
     _check_objective(run)
@@ -160,20 +165,35 @@ def _check_future(run: RunSettings) -> None:
 
 def _check_objective(run: RunSettings) -> None:
     """Options without effect; a run that goes on keeps those that it began with."""
-    if run.objective_name != "reward_value" or run.resume is not None:
+    if run.resume is not None:
         return
-    for option, default in (("metric", "l2"), ("summed", True), ("steps_weight", 0)):
-        if (given := getattr(run.objective, option)) != default:
-            raise UserError(f"objective.{option}={given}: is of objective=goal_image; leave it at {default}")
+    model = f"model={run.model.name}"
+    if run.model.options.get("reward_head") and not run.model.family.has_value:
+        raise UserError(
+            f"model.reward_head=true: no objective reads it, since {model} has no value; leave it at false"
+        )
+    if run.objective_name == "goal_image":
+        return
+    options = [(option, "is of objective=goal_image") for option in ("metric", "summed", "steps_weight")]
+    if run.is_discrete or run.objective_name is None:
+        why = f"{model} plans without an objective"
+        options += [(f"{name}_penalty", why) for name in ("action", "smoothness", "policy")]
+    for option, why in options:
+        given, default = getattr(run.objective, option), getattr(ObjectiveSettings(), option)
+        if given != default:
+            raise UserError(f"objective.{option}={given}: {why}; leave it at {default}")
 
 
 def _check_demonstrations(run: RunSettings) -> None:
     if run.replay.demos is None:
         if run.resume is not None:  # it keeps what it began with
             return
-        for option in ("demo_resets", "demo_reset_updates", "demo_updates"):
-            if given := getattr(run.replay, option):
-                raise UserError(f"replay.{option}={given}: needs demonstrations, replay.demos=FOLDER")
+        given = {f"replay.{f.name}": (getattr(run.replay, f.name), f.default) for f in fields(run.replay)}
+        given = {name: of for name, of in given.items() if name.startswith("replay.demo_")}
+        given["model.imitation_coef"] = (run.model.options.get("imitation_coef", 0.0), 0.0)
+        for option, (value, default) in given.items():
+            if value != default:
+                raise UserError(f"{option}={value}: needs demonstrations, replay.demos=FOLDER")
         return
     if run.replay.demo_reset_updates and not run.replay.demo_resets:
         raise UserError(

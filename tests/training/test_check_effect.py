@@ -1,0 +1,44 @@
+"""Options that would do nothing are refused, or said where files of tuned values set them."""
+
+from __future__ import annotations
+
+import pytest
+
+from franka_wm.errors import UserError
+from franka_wm.training.check import check
+
+MUZERO = ("env=reach_fixed", "model=muzero", "planner=mcts")
+LEWM = ("env=reach_goal_image", "model=lewm")
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (("model.imitation_coef=10",), "model.imitation_coef=10: needs demonstrations, replay.demos=FOLDER"),
+        (("replay.demo_share=0.3",), "replay.demo_share=0.3: needs demonstrations"),
+        (("replay.demo_share_end=0.1",), "replay.demo_share_end=0.1: needs demonstrations"),
+        ((*MUZERO, "objective.action_penalty=1"), "objective.action_penalty=1: model=muzero plans without"),
+        ((*MUZERO, "objective.policy_penalty=1"), "objective.policy_penalty=1: model=muzero plans without"),
+        ((*MUZERO, "objective.smoothness_penalty=1"), "objective.smoothness_penalty=1: model=muzero plans"),
+        (
+            (*MUZERO, "objective.name=reward_value", "objective.action_penalty=1"),
+            "plans without an objective",
+        ),
+        ((*MUZERO, "objective.summed=false"), "objective.summed=False: is of objective=goal_image"),
+        ((*LEWM, "model.reward_head=true"), "model.reward_head=true: no objective reads it"),
+    ],
+)
+def test_what_would_do_nothing_is_refused(words: tuple[str, ...], said: str, settled) -> None:
+    with pytest.raises(UserError, match=said) as refused:
+        check(settled("device=cpu", "scale=smoke", *words))
+    assert "\n" not in str(refused.value)
+
+
+def test_worlds_of_the_planner_are_said_where_the_policy_does_not_act(settled, capsys) -> None:
+    """Files of tuned values set them, so that they are no error."""
+    words = ("device=cpu", "scale=smoke", "collector.planner_worlds=2")
+    check(settled(*words, "collector.noise=0.3"))
+    assert "planner_worlds" not in capsys.readouterr().out
+    for actor in ("random", "planner"):
+        check(settled(*words, f"collector.policy={actor}", "collector.noise=0.3"))
+        assert "collector.planner_worlds=2: is for collector.policy=policy" in capsys.readouterr().out
