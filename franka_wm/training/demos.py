@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 from tensordict import TensorDict
@@ -83,7 +84,7 @@ def start_along(env: Environment, shown: Demonstrations, share: float) -> None:
 
 
 def check_demonstrations(run: RunSettings) -> None:
-    """Refuses demonstrations whose actions or rewards mean something else, as far as their datasets say it.
+    """Refuses demonstrations whose actions, rewards or images mean something else, as far as their datasets say it.
 
     Raises:
         UserError: One line.
@@ -100,30 +101,36 @@ def check_demonstrations(run: RunSettings) -> None:
             "replay.demos: demonstrations are of one task, env=multitask has several; leave it at null"
         )
     from franka_wm.data.lerobot.opening import read_datasets
-    from franka_wm.data.lerobot.provenance import other_option, read_provenance
+    from franka_wm.data.lerobot.provenance import MEANING, VIEWS, other_option, read_provenance
 
     arm = run.env.arm if run.is_arm else None
+    if arm is not None and share:
+        _check_seen(share, "run", vars(arm.randomization))
     try:
         sources, _ = read_datasets(run.replay.demos, fps=arm and arm.fps, action_dim=arm and arm.action_dim)
     except UserError as error:
         raise UserError(str(error).replace("dataset.root=", "replay.demos=")) from error
     if arm is None:
         return
+    looks = {*(run.model.observations or ())} & {*Spaces.of_config(arm).image_sizes}
     for source in sources:
         sessions = (read_provenance(source.root) or {}).get("sessions", ())
-        for session in sessions:
+        for session in sessions if share else ():
             recorded = session.get("config", {}).get("env", {})
-            drawn = {"run": vars(arm.randomization), "dataset": recorded.get("randomization", {})}
-            for where, ranges in drawn.items():
-                unseen = next((name for name in UNSEEN if share and ranges.get(name)), None)
-                if unseen is not None:
-                    raise UserError(
-                        f"replay.demo_resets={share}: this {where} has env.randomization.{unseen}={ranges[unseen]}, "
-                        "which no observation shows; leave one of them at 0"
-                    )
-        changed = other_option(sessions, vars(arm))
+            _check_seen(share, "dataset", recorded.get("randomization", {}))
+        changed = other_option(sessions, vars(arm), (*MEANING, *VIEWS) if looks else MEANING)
         if changed is not None:
             name, there = changed
             raise UserError(
                 f"replay.demos={source.root}: recorded with env.{name}={there}, this run has {getattr(arm, name)}"
             )
+
+
+def _check_seen(share: float, where: str, drawn: Mapping[str, Any]) -> None:
+    """Refuses randomization without which a demonstrated state is another one."""
+    unseen = next((name for name in UNSEEN if drawn.get(name)), None)
+    if unseen is not None:
+        raise UserError(
+            f"replay.demo_resets={share}: this {where} has env.randomization.{unseen}={drawn[unseen]}, which no "
+            "observation shows; leave one of them at 0"
+        )

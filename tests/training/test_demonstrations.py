@@ -1,7 +1,9 @@
 """Runs with demonstrations: what fits is mixed in, what does not is refused, and none is an evaluation's episode."""
 
+import json
 import shutil
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -12,13 +14,14 @@ import torch
 from safetensors.torch import load_file
 
 from franka_wm.commands import main as cli
-from franka_wm.data.lerobot import cache, collect, open_dataset
+from franka_wm.data.lerobot import cache, collect, open_dataset, opening
+from franka_wm.data.lerobot.schema import PROVENANCE
 from franka_wm.errors import UserError
 from franka_wm.evaluation.closed_loop import begin
 from franka_wm.evaluation.protocol import held_out_seeds
 from franka_wm.training import build
 from franka_wm.training.check import check
-from franka_wm.training.demos import open_demonstrations
+from franka_wm.training.demos import check_demonstrations, open_demonstrations
 from franka_wm.training.history import read_rows
 from franka_wm.training.learner import Learner
 from franka_wm.training.run import Run
@@ -251,6 +254,60 @@ def test_states_that_no_observation_shows_are_refused(pushes: Path, settled) -> 
         UserError, match=r"this run has env\.randomization\.object_size=0.1, which no observation"
     ):
         check(run)
+
+
+def test_the_runs_own_are_refused_whatever_the_dataset_says(pushes: Path, settled, tmp_path: Path) -> None:
+    """Also where it says nothing: others' datasets have no provenance."""
+    foreign = tmp_path / "foreign"
+    shutil.copytree(pushes, foreign)
+    (foreign / PROVENANCE).unlink()
+    words = ("scale=smoke", *GRIPPER, f"replay.demos={foreign}", "replay.demo_resets=0.5")
+    check_demonstrations(settled(*words))
+    with pytest.raises(UserError, match=r"this run has env\.randomization\.object_size=0.1"):
+        check_demonstrations(settled(*words, "env.randomization.object_size=0.1"))
+
+
+@pytest.mark.parametrize(
+    ("there", "changes", "message"),
+    [
+        (
+            {"task": "drawer", "drawer_opening": 0.1},
+            ("env=drawer", "env.action_scale=0.085"),
+            "drawer_opening=0.1",
+        ),
+        ({"show_goal": True}, ("env=reach_pixels",), "recorded with env.show_goal=True, this run has False"),
+        (
+            {"cameras": ["wrist"]},
+            ("env=reach_pixels",),
+            r"recorded with env.cameras=\['wrist'\], this run has",
+        ),
+        ({"camera_height": 0.7}, ("env=reach_pixels",), "recorded with env.camera_height=0.7"),
+        ({"image_size": 32}, ("env=reach_pixels",), "recorded with env.image_size=32"),
+    ],
+)
+def test_other_rewards_and_other_images_are_refused(
+    demos: Path, settled, tmp_path: Path, monkeypatch, there, changes, message
+) -> None:
+    """Of images where the model reads some; further cameras' have names of their own."""
+    model = ("model=tdmpc2_pixels",) if "env=reach_pixels" in changes else ()
+    run = settled("scale=smoke", *ARM, *changes, *model, f"replay.demos={tmp_path / 'demos'}")
+    shutil.copytree(demos, tmp_path / "demos")
+    monkeypatch.setattr(
+        opening, "read_datasets", lambda *_, **__: ([SimpleNamespace(root=tmp_path / "demos")], [])
+    )
+
+    def recorded(**options: Any) -> None:
+        same = {**run.values["env"], **({"cameras": ["front", "side"]} if model else {})}
+        written = {"sessions": [{"config": {"env": {**same, **options}}}]}
+        (tmp_path / "demos" / PROVENANCE).write_text(json.dumps(written))
+
+    recorded()
+    check_demonstrations(run)
+    recorded(**there)
+    with pytest.raises(UserError, match=message):
+        check_demonstrations(run)
+    if model:
+        check_demonstrations(run.changed(model={"observations": ["state"]}))
 
 
 @pytest.mark.parametrize(

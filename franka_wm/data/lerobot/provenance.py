@@ -42,22 +42,38 @@ def describe(
 ACTIONS = ("action_mode", "action_scale")
 """Options of the arm that give recorded actions their meaning."""
 MEANING = (
-    *("task", "reward", *ACTIONS, "action_penalty", "success_distance"),
+    *("task", "reward", *ACTIONS, "action_penalty", "success_distance", "drawer_opening"),
     "terminate_on_success",
 )
 """Those that give actions, rewards and ends their meaning."""
+VIEWS = (
+    *("cameras", "camera_distance", "camera_height", "camera_target_height", "camera_target_distance"),
+    *("camera_fov_degrees", "image_size", "show_goal"),
+)
+"""Those that give images their meaning."""
 
 
 def other_option(
     sessions: Iterable[Mapping[str, Any]], env: Mapping[str, Any], names: Iterable[str] = MEANING
 ) -> tuple[str, Any] | None:
-    """The first of these options that sessions were recorded with another value of than ``env`` has, and that value."""
+    """The first of these options that sessions were recorded with another value of than ``env`` has, and that value.
+
+    Of cameras the first counts: its images have no name that tells it from others.
+    """
     for session in sessions:
         recorded = session.get("config", {}).get("env", {})
         for name in names:
-            if name in recorded and name in env and recorded[name] != env[name]:
+            if (
+                name in recorded
+                and name in env
+                and _telling(name, recorded[name]) != _telling(name, env[name])
+            ):
                 return name, recorded[name]
     return None
+
+
+def _telling(name: str, value: Any) -> Any:
+    return [*value][:1] if name == "cameras" else value
 
 
 def _version(package: str) -> str | None:
