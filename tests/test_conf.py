@@ -105,6 +105,13 @@ def test_a_scale_of_ones_own(tmp_path: Path) -> None:
     assert (cfg.trainer.updates, cfg.model.latent_dim) == (77, 128)
 
 
+def test_a_smoke_run_evaluates_each_task_once() -> None:
+    assert compose("scale=smoke").evaluation.episodes == 4
+    assert compose("scale=smoke", "env=multitask").evaluation.episodes == 8
+    assert compose("scale=smoke", "env=multitask", "~env.tasks.peg").evaluation.episodes == 7
+    assert compose("scale=smoke", "env=multitask", "evaluation.episodes=9").evaluation.episodes == 9
+
+
 def test_an_unknown_size_says_which_there_are() -> None:
     with pytest.raises(OmegaConfBaseException, match="size=huge: must be one of smoke, laptop, gpu"):
         OmegaConf.to_container(compose("size=huge"), resolve=True)

@@ -77,6 +77,11 @@ def at_size(*values: Any, _root_: DictConfig) -> Any:
     return _column("size", _root_.size, values)
 
 
+def one_each(count: int, *, _root_: DictConfig) -> int:
+    """``${one_each:4}``: 4; of several tasks at once as many as there are tasks, if these are more."""
+    return max(count, len(_root_.env.get("tasks") or ()))
+
+
 def run_name(resume: str | None, env: str, seed: Any) -> str:
     """What a run's folder is called, after its time: as the run that it goes on from, else by environment and seed."""
     parts = Path(resume or "").parts
@@ -88,5 +93,5 @@ def run_name(resume: str | None, env: str, seed: Any) -> str:
     return name.strip("/. ") or f"{env}-{seed}"
 
 
-for resolver in (at_scale, at_size, run_name):
+for resolver in (at_scale, at_size, one_each, run_name):
     OmegaConf.register_new_resolver(resolver.__name__, resolver, replace=True)
