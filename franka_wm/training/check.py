@@ -272,6 +272,7 @@ def _check_parts(run: RunSettings) -> None:
     spaces = known_spaces(run)
     if run.is_offline or spaces is None:
         return
+    _say_unread(run, spaces)
     run = _with_encoder(run, spaces)
     model = sketch(run, spaces)
     if model is None:
@@ -289,6 +290,18 @@ def _check_parts(run: RunSettings) -> None:
     if model.has_next:
         build.make_planner(run, spaces.num_actions or spaces.action_dim)
     check_memory(run, model, spaces)
+
+
+def _say_unread(run: RunSettings, spaces: Spaces) -> None:
+    """Says which images are rendered and read by nothing that learns or plans."""
+    read = {*(run.model.observations or ())}
+    if run.pretrain.kind != "none":
+        read |= {*(run.first_stage().model.observations or ())}
+    if run.objective_name == "goal_image":
+        read |= {*goal_images(read).values()}
+    unread = [key for key in spaces.image_sizes if key not in read]
+    if unread:
+        say(f"not read by the model: {', '.join(unread)} (model.observations)")
 
 
 def known_spaces(run: RunSettings) -> Spaces | None:

@@ -1,4 +1,4 @@
-"""Options that would do nothing are refused, or said where files of tuned values set them."""
+"""What would have no effect: options are refused, or said where files of tuned values set them; images are said."""
 
 from __future__ import annotations
 
@@ -42,3 +42,22 @@ def test_worlds_of_the_planner_are_said_where_the_policy_does_not_act(settled, c
     for actor in ("random", "planner"):
         check(settled(*words, f"collector.policy={actor}", "collector.noise=0.3"))
         assert "collector.planner_worlds=2: is for collector.policy=policy" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("words", "unread"),
+    [
+        (("env=push_pixels", "model=tdmpc2_pixels"), "pixels_wrist"),
+        (("env=push_pixels", "model=tdmpc2_pixels", "model.observations=[pixels,pixels_wrist,state]"), None),
+        (("env=reach_pixels", "model=tdmpc2"), "pixels"),
+        (LEWM, None),
+        ((*LEWM, "env.cameras=[front,side]"), "pixels_side, goal_pixels_side"),
+        (("env=reach",), None),
+    ],
+)
+def test_images_that_nothing_reads_are_said(
+    words: tuple[str, ...], unread: str | None, settled, capsys
+) -> None:
+    check(settled("device=cpu", "scale=smoke", *words))
+    lines = [line for line in capsys.readouterr().out.splitlines() if "not read" in line]
+    assert lines == ([] if unread is None else [f"not read by the model: {unread} (model.observations)"])
