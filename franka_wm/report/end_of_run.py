@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import torch
 from tensordict import TensorDictBase
 
+from franka_wm.envs import FrankaEnv, MultiTaskEnv
 from franka_wm.envs.camera import project, whole_arm
+from franka_wm.envs.multitask_config import MultiTaskConfig
 from franka_wm.evaluation.closed_loop import play_episodes, success_distance
 from franka_wm.evaluation.protocol import Evaluation
 from franka_wm.evaluation.results import FILE, Result, last_row
@@ -57,15 +60,15 @@ def report_run(
     drawn = [*rows, last]
     if log is not None and last:
         log({name: value for name, value in last.items() if name.startswith("eval/")})
-    arm = arm_of(env)
+    arms = _arms(env)
     if x := axis(drawn):
         mark = success_distance(env)
         plot_learning_curves(drawn, folder / "curves.png", x=x, success_distance=mark)
-    if settings.evaluation.video_episodes and arm is not None:
+    if settings.evaluation.video_episodes and arms:
         name = acting(policies)
         frames = film(settings, folder, policies[name], name, found)
         if log_video is not None:
-            log_video(f"eval/{name}", frames, _slow(arm.config.fps))
+            log_video(f"eval/{name}", frames, _slow(next(iter(arms.values())).config.fps))
     Console(width=120).print(terminal(evaluation_tables(found.policies)[0]))
 
 
@@ -78,30 +81,31 @@ def film(settings: RunSettings, folder: Path, policy: Any, name: str, found: Eva
     """``video.mp4`` and ``last_frame.png``: the worst episodes of one policy at half speed, the goal drawn as a ring.
 
     They are played again, one after the other, from the same poses with the same random numbers. Each image says which
-    episode it is and how it ended.
+    episode it is and how it ended. Of several tasks at once each is shown, by as many episodes as each of the others.
     """
     rows = found.episodes[name]
-    env = make_evaluation_env(settings, num_envs=1)
-    arm = arm_of(env)
-    assert arm is not None
-    size, whole = settings.evaluation.video_size, whole_arm(arm.config, arm.kinematics)
-    frames: list[torch.Tensor] = []
-
-    def image() -> None:
-        view = arm.render(size, samples=2, config=whole)
-        marks = project(arm.goal, whole, size)
-        frames.append(draw_marker(view.cpu(), marks.cpu(), radius=size / 32))
-
+    config = settings.env.config
+    tasks = len(config.tasks) if isinstance(config, MultiTaskConfig) else 1
+    env = make_evaluation_env(settings, num_envs=tasks)
+    arms = _arms(env)
+    size = settings.evaluation.video_size
     films, lines = [], []
-    for number in worst(rows, settings.evaluation.video_episodes):
+    for number in _filmed(rows, settings.evaluation.video_episodes, found.worlds, tasks):
         k, world = divmod(number, found.worlds)
-        together = min(len(rows) - k * found.worlds, found.worlds)
-        with seeded(found.seeds[k], policy), drawing_for(world, 1, together):
-            played = play_episodes(env, policy, seed=found.seeds[k], first_world=world, video=image)
-        films.append(torch.stack(frames))
-        lines.append(ending(played, policy_name(name), number, arm))
-        frames.clear()
-    fps = _slow(arm.config.fps)
+        place = world % tasks  # worlds have tasks in turn, from the first one's
+        first, together = world - place, min(len(rows) - k * found.worlds, found.worlds)
+        task, arm = list(arms.items())[place]
+        frames, count = [], min(tasks, together - first)
+        image = partial(_image, arm, size, frames)
+        with seeded(found.seeds[k], policy), drawing_for(first, count, together):
+            played = play_episodes(
+                env, policy, seed=found.seeds[k], episodes=count, first_world=first, video=image
+            )
+        own: Any = played[place : place + 1]
+        films.append(torch.stack(frames[: int(own["length"])]))  # the other tasks' may be longer
+        who = policy_name(name) if tasks == 1 else f"{task}, {policy_name(name)}"
+        lines.append(ending(own, who, number, arm))
+    fps = _slow(next(iter(arms.values())).config.fps)
     longest = max(map(len, films))  # shorter ones stand still at their ends
     beside = torch.cat(
         [torch.cat([one, one[-1:].expand(longest - len(one), *one.shape[1:])]) for one in films], 1
@@ -111,6 +115,32 @@ def film(settings: RunSettings, folder: Path, policy: Any, name: str, found: Eva
     write_video(film, folder / "video.mp4", fps=fps)
     write_png(film[-1], folder / "last_frame.png")
     return film
+
+
+def _arms(env: Any) -> dict[str, FrankaEnv]:
+    """The arms of an environment by their tasks: one, or several at once; none of another library."""
+    if isinstance(env, MultiTaskEnv):
+        return env.envs
+    arm = arm_of(env)
+    return {} if arm is None else {arm.config.task: arm}
+
+
+def _image(arm: FrankaEnv, size: int, frames: list[torch.Tensor]) -> None:
+    """Adds what the first world shows now, (1, size, size, 3), to the frames."""
+    whole = whole_arm(arm.config, arm.kinematics)
+    view = arm.render(size, samples=2, config=whole)
+    marks = project(arm.goal, whole, size)
+    frames.append(draw_marker(view.cpu(), marks.cpu(), radius=size / 32))
+
+
+def _filmed(episodes: TensorDictBase, count: int, worlds: int, tasks: int) -> list[int]:
+    """Numbers of the worst episodes, of each task as many, in order of the tasks; worlds have tasks in turn."""
+    numbers = torch.arange(len(episodes))
+    out = []
+    for task in range(tasks):
+        own = numbers[numbers % worlds % tasks == task]
+        out += own[worst(cast(TensorDictBase, episodes[own]), -(-count // tasks))].tolist()
+    return out
 
 
 def worst(episodes: TensorDictBase, count: int) -> list[int]:

@@ -10,7 +10,7 @@ from franka_wm.report.outcome import success_rates
 from franka_wm.report.run import RunFiles
 from franka_wm.report.table import Table, is_interval
 
-MISSING = "–"
+MISSING, MULTITASK = "–", "multitask"
 
 
 def tasks_table(runs: Iterable[RunFiles]) -> Table | None:
@@ -18,12 +18,15 @@ def tasks_table(runs: Iterable[RunFiles]) -> Table | None:
 
     A cell is the mean over runs, and their lowest and highest: success of the planner, or of the policy where no
     planner was measured; the return where a task does not say what success is. Of several distances the largest counts.
+    A run of several tasks at once has a cell for each, in a column of its own beside that of runs of one task.
     """
     cells: dict[str, dict[str, list[tuple[str, float]]]] = {}
     for run in runs:
+        several = _by_task(run)
+        family = f"{_family(run)}, {MULTITASK}" if several else _family(run)
         found = _outcome(run)
-        if found is not None:
-            cells.setdefault(task_of(run), {}).setdefault(_family(run), []).append(found)
+        for task, one in (several or ({} if found is None else {task_of(run): found})).items():
+            cells.setdefault(task, {}).setdefault(family, []).append(one)
     families = sorted({family for row in cells.values() for family in row})
     if len(cells) < 2 and len(families) < 2:
         return None
@@ -50,6 +53,15 @@ def task_of(run: RunFiles) -> str:
 def _family(run: RunFiles) -> str:
     model = run.config.get("model")
     return str(model.get("name", MISSING)) if isinstance(model, Mapping) else MISSING
+
+
+def _by_task(run: RunFiles) -> dict[str, tuple[str, float]]:
+    """How well a run of several tasks at once does each; none for a run of one."""
+    policy = next((name for name in SHOWN if name in run.policies), None)
+    rates = {} if policy is None else run.policies[policy].get("task_success")
+    if not isinstance(rates, Mapping):
+        return {}
+    return {str(task): ("%", 100.0 * rate["mean"]) for task, rate in rates.items() if is_interval(rate)}
 
 
 def _outcome(run: RunFiles) -> tuple[str, float] | None:

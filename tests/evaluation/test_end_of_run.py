@@ -93,6 +93,42 @@ def test_of_an_episode_that_ends_early_the_video_shows_no_other(settled, tmp_pat
         assert moved.tolist() == [k < lengths[number] - 1 for k in range(len(moved))]
 
 
+def test_of_several_tasks_the_worst_episodes_of_each_are_shown(settled, tmp_path: Path, monkeypatch) -> None:
+    """The very episodes: they have the same returns."""
+    left_out = [f"~env.tasks.{name}" for name in ("track", "lift", "pick", "stack", "drawer", "peg")]
+    lengths = {"reach": 4, "push": 6}
+    short = [
+        f"env.tasks.{name}.{key}"
+        for name, n in lengths.items()
+        for key in (f"episode_length={n}", "substeps=1")
+    ]
+    few = ("evaluation.episodes=5", "evaluation.video_episodes=6", "evaluation.video_size=32")
+    cfg = settled("scale=smoke", "device=cpu", "env=multitask", *left_out, *short, *few)
+    env = build.make_evaluation_env(cfg)
+    policies = {"policy": SmoothRandomPolicy(8, generator=torch.Generator().manual_seed(3))}
+    results = evaluate_run(cfg, tmp_path, env, policies, counters={}, say=lambda text: None)
+    rows = results.episodes["policy"]
+    said, shown, returns, play = [], [], [], end_of_run.play_episodes
+    monkeypatch.setattr(
+        end_of_run, "draw_labels", lambda frames, lines: (said.extend(lines), shown.append(frames), frames)[2]
+    )
+    monkeypatch.setattr(
+        end_of_run, "play_episodes", lambda *a, **k: (returns.append(play(*a, **k)), returns[-1])[1]
+    )
+    report_run(cfg, tmp_path, env, policies, results, rows=[])
+    numbers = [
+        k for task in (0, 1) for k in sorted(range(task, 5, 2), key=lambda k: float(rows["return"][k]))
+    ]
+    assert len(numbers) == 5  # all there are, also the fifth, without a world of the second task beside it
+    names = list(lengths)
+    assert said == [f"{names[k % 2]}, policy, no success, episode {k + 1}" for k in numbers]
+    for number, played in zip(numbers, returns, strict=True):
+        assert played["return"][number % 2] == rows["return"][number]
+    moved = (shown[0][1:] != shown[0][:-1]).flatten(2).any(2)
+    assert not moved[3:, :3].any() and moved[3:5, 3:].all()  # the reaches of four frames stand still
+    assert (tmp_path / "video.mp4").stat().st_size > 1000
+
+
 def test_the_worst_are_those_without_success_and_then_those_with_the_least_return() -> None:
     found = {"success": torch.tensor([1.0, 0.0, 1.0, 0.0]), "return": torch.tensor([5.0, 3.0, 1.0, 2.0])}
     assert worst(TensorDict(found, [4]), 3) == [3, 1, 2]

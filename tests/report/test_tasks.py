@@ -74,3 +74,12 @@ def test_what_was_measured_differently_is_not_averaged() -> None:
 def test_one_task_of_one_family_needs_no_table() -> None:
     assert tasks_table([run("push", "a", {"planner": success(0.5)})] * 2) is None
     assert tasks_table([RunFiles(Path("empty"))]) is None
+
+
+def test_a_run_of_several_tasks_stands_beside_those_of_one() -> None:
+    rates = {"push": interval(0.6), "lift": interval(0.25)}
+    several = run("", "tdmpc2", {"planner": success(0.4, task_success=rates)}, typed="multitask")
+    assert tasks_table([several]).rows == [["lift", "25 %"], ["push", "60 %"]]  # pyright: ignore[reportOptionalMemberAccess]
+    table = tasks_table([several, run("push", "tdmpc2", {"planner": success(0.9)})])
+    assert table is not None and table.header == ["task", "tdmpc2", "tdmpc2, multitask"]
+    assert table.rows == [["lift", "–", "25 %"], ["push", "90 %", "60 %"]]
