@@ -216,12 +216,12 @@ def one_line_errors(main: Callable[[DictConfig], object]) -> Callable[[DictConfi
     def wrapped(cfg: DictConfig) -> object:
         try:
             told = HydraConfig.get()
-            several.spread(cfg, int(told.job.num) if told.mode == RunMode.MULTIRUN else 0)
             if _sweep is not None:
                 with nullcontext() if _sweep.process == os.getpid() else terminal_log():
                     return _sweep.run(main, cfg)
             from franka_wm import processes
 
+            several.spread(cfg, int(told.job.num) if told.mode == RunMode.MULTIRUN else 0)
             if processes.restarted():
                 several.go_on(cfg, Path(told.runtime.output_dir))
             with one_line_refusals():
@@ -349,18 +349,20 @@ def check_command(arguments: list[str], folder: Path | None = None) -> str | Non
         folder: That of a sweep's job, which may go on with what it finds there.
     """
     from franka_wm import processes
-    from franka_wm.training.run import check_once, import_plugins, left_by, occupied, resumed, unwritable
+    from franka_wm.training.place import left_by, occupied, unwritable
+    from franka_wm.training.run import check_once, import_plugins, resumed
     from franka_wm.training.settings import RunSettings
 
     try:
         cfg = compose(arguments)
+        typed = cfg.copy()
         several.spread(cfg)
         import_plugins(cfg.plugins)
         if cfg.resume is not None:
             _, cfg = resumed(cfg, arguments)
         check_once(RunSettings.of(cfg, saved=cfg.resume is not None))
         if folder is not None and cfg.resume is None:
-            left_by(folder, cfg)
+            left_by(folder, typed)
             return unwritable(folder, "hydra.sweep.dir")
     except FrankaError as error:
         return str(error)

@@ -280,7 +280,8 @@ def _left(cfg: DictConfig, folder: Path) -> tuple[str, bool]:
     """Why a job that was started anew ends, and whether it has saved in its folder."""
     from franka_wm import processes
     from franka_wm.training.checkpoint import latest_checkpoint
-    from franka_wm.training.run import STOPPED, left_by
+    from franka_wm.training.place import left_by
+    from franka_wm.training.run import STOPPED
 
     mark = folder / STOPPED
     if processes.begun_again() and mark.is_file():

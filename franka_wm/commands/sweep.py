@@ -98,7 +98,7 @@ class Sweep:
         Raises:
             KeyboardInterrupt, SystemExit: Ctrl-C, which ends the sweep.
         """
-        from franka_wm.training.run import left_by
+        from franka_wm.training.place import left_by
 
         told = HydraConfig.get()
         number, folder = int(told.job.num), Path(told.runtime.output_dir)
@@ -113,6 +113,7 @@ class Sweep:
             if left is not None:
                 say(f"{name} goes on where it stopped")
                 cfg.resume = str(folder)
+            several.spread(cfg, number)
             if cfg.gpus == 1:
                 return main(cfg)
             paths = [one for one in told.overrides.hydra if one.startswith("hydra.searchpath=")]

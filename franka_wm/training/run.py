@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import fcntl
 import gc
 import importlib
 import logging
@@ -13,7 +12,7 @@ from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
-from typing import IO, Any, NoReturn
+from typing import Any, NoReturn
 
 import torch
 from hydra.core.hydra_config import HydraConfig
@@ -21,7 +20,7 @@ from omegaconf import DictConfig, OmegaConf
 from tensordict import TensorDictBase
 from torchrl.record.loggers import Logger
 
-from franka_wm import files, processes
+from franka_wm import processes
 from franka_wm.console import announced, log_to, resuming, say
 from franka_wm.data.demonstrations import Demonstrations
 from franka_wm.data.hindsight import Hindsight
@@ -39,17 +38,14 @@ from franka_wm.training.check import check
 from franka_wm.training.checkpoint import Checkpoint, latest_checkpoint, load_checkpoint
 from franka_wm.training.demos import open_demonstrations, start_along
 from franka_wm.training.loggers import close_loggers, log_config, log_video, make_loggers
-from franka_wm.training.settings import RunSettings, plain
+from franka_wm.training.place import lock_run_dir, occupied
+from franka_wm.training.settings import RunSettings
 from franka_wm.training.spaces import Spaces
 from franka_wm.training.tree import damaged
-from franka_wm.untrusted import UntrustedFolder
 from franka_wm.versions import FINISHED, write_finished, write_versions
 
 STOPPED = "stopped.txt"
 """Says in the folder of a run that it was asked to stop; while it is there, torchrun does not begin the run again."""
-
-SMALL_FILES = 65536
-"""Room for a run's configuration and first lines, which are written before there is anything to lose [bytes]."""
 
 
 def import_plugins(names: object) -> None:
@@ -85,59 +81,6 @@ def import_plugins(names: object) -> None:
 
 def _names_module(name: object) -> bool:
     return isinstance(name, str) and all(part.isidentifier() for part in name.split("."))
-
-
-def unwritable(folder: Path, option: str = "hydra.run.dir") -> str | None:
-    """Why ``folder`` cannot be made or written, in one line; ``None`` if it can. Leaves nothing behind."""
-    why = files.unwritable(folder, SMALL_FILES)
-    return why and f"{option}={folder}: {why}; choose another place for the results"
-
-
-def occupied(folder: Path, resume: str | None) -> str | None:
-    """Why a run may not write into ``folder``: another one's weights are there; ``None`` if it may.
-
-    A run that goes on from there may.
-    """
-    place = folder.resolve()
-    if resume is not None and place in (Path(resume).resolve(), *Path(resume).resolve().parents):
-        return None
-    try:
-        found = latest_checkpoint(place)
-    except UserError:  # there is none
-        return None
-    return (
-        f"hydra.run.dir={folder}: a run has left its weights there ({found}); go on with it by resume={folder}, or "
-        "choose another folder"
-    )
-
-
-def left_by(folder: Path, cfg: DictConfig) -> str | None:
-    """What a job of a sweep finds of itself: ``"finished"``, ``"begun"`` with weights to go on from, or ``None``.
-
-    Raises:
-        UserError: The weights there are those of other settings.
-    """
-    try:
-        latest_checkpoint(folder)
-    except UserError:  # there is none
-        return None
-    there = _leaves(UntrustedFolder(folder).yaml("config.yaml"))
-    here = _leaves(plain(cfg))
-    other = next((k for k in {**here, **there} if k != "resume" and here.get(k) != there.get(k)), None)
-    if other is not None:
-        raise UserError(
-            f"{folder} holds a run of other settings: {other} is {there.get(other)} there and {here.get(other)} here; "
-            "choose another folder with hydra.run.dir=…, or that of a sweep with hydra.sweep.dir=…"
-        )
-    return "finished" if (folder / FINISHED).is_file() else "begun"
-
-
-def _leaves(values: object, name: str = "") -> dict[str, object]:
-    """``{"env.fps": 20, …}`` of nested values."""
-    if not isinstance(values, dict) or not values:
-        return {name: values}
-    nested = [_leaves(value, f"{name}.{key}" if name else str(key)) for key, value in values.items()]
-    return {key: value for one in nested for key, value in one.items()}
 
 
 @dataclass
@@ -312,7 +255,8 @@ def start(cfg: DictConfig) -> Run:
         typed = list(told.overrides.task)
         # A job that found its own beginning in its folder goes on with the options of then.
         again = cfg.resume == str(folder) and not any(one.lstrip("+").startswith("resume=") for one in typed)
-        checkpoint, cfg = resumed(cfg, [] if again else typed)
+        # On the device of now: another GPU may be its turn, or there are fewer.
+        checkpoint, cfg = resumed(cfg, [f"device={cfg.device}"] if again else typed)
         _require_same(checkpoint)
     settings = RunSettings.of(cfg, saved=checkpoint is not None)
     if settings != _checked:
@@ -397,26 +341,6 @@ def check_once(settings: RunSettings) -> None:
     _checked = settings
 
 
-_LOCKS: list[IO[str]] = []  # open files: their locks last as long as the process
-
-
-def lock_run_dir(folder: Path) -> None:
-    """Locks a run's folder for as long as this process lives, so that no two runs write into one.
-
-    Raises:
-        UserError: Another run is writing there.
-    """
-    file = (folder / ".lock").open("w")
-    try:
-        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError as error:
-        file.close()
-        raise UserError(
-            f"another run is writing into {folder}; choose a folder with hydra.run.dir=…"
-        ) from error
-    _LOCKS.append(file)
-
-
 def resumed(cfg: DictConfig, overrides: list[str]) -> tuple[Checkpoint, DictConfig]:
     """The checkpoint, and its configuration with the values (not the groups) given on the command line.
 
@@ -436,7 +360,8 @@ def resumed(cfg: DictConfig, overrides: list[str]) -> tuple[Checkpoint, DictConf
             raise FrankaError(
                 f"{override}: a run that resumes keeps its {name}; leave it out, or change single values ({name}.key=…)"
             )
-        changes.append(override.lstrip("+"))
+        # Of device=spread the GPU that was chosen, which the configuration has.
+        changes.append(f"device={cfg.device}" if name == "device" else override.lstrip("+"))
     merged = OmegaConf.merge(OmegaConf.create(saved), OmegaConf.from_dotlist(changes))
     assert isinstance(merged, DictConfig)
     merged.resume = str(cfg.resume)

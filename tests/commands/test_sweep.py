@@ -9,18 +9,23 @@ import subprocess
 import sys
 import time
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import pytest
 import torch
+from hydra.core.hydra_config import HydraConfig
 from omegaconf import OmegaConf
 
 from forks import TRAIN, Fork, script, train_in_fork
 from franka_wm.commands import entry, several
-from franka_wm.commands.overrides import explain
+from franka_wm.commands.overrides import compose, explain
 from franka_wm.commands.several import refused_job, spread
 from franka_wm.errors import UserError
 from franka_wm.evaluation.results import read_result, score
+from franka_wm.training import run
 from franka_wm.training.checkpoint import latest_checkpoint, load_checkpoint
+from franka_wm.training.place import left_by
 
 SMOKE = [
     "env=reach",
@@ -270,6 +275,63 @@ def test_jobs_take_the_gpus_in_turn(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     with pytest.raises(UserError, match="device=spread: this machine has 0 usable CUDA devices"):
         spread(OmegaConf.create({"device": "spread"}))
+
+
+def begun(folder: Path, *overrides: str) -> None:
+    """What a run of these options leaves that has saved, as far as a sweep looks at it."""
+    (folder / "checkpoints" / "latest").mkdir(parents=True)
+    (folder / "checkpoints" / "latest" / "manifest.json").write_text("{}")
+    (folder / "config.yaml").write_text(OmegaConf.to_yaml(compose(overrides), resolve=True))
+
+
+def test_jobs_that_take_the_gpus_in_turn_go_on(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """Each has its own number in its folder; with one GPU less, job 1 goes on upon the first one."""
+    options = ["scale=smoke", "env=reach"]
+    for k in range(2):
+        begun(tmp_path / f"{k}-reach", *options, f"seed={k}", f"device=cuda:{k}")
+    command = [*options, "device=spread", "seed=0,1", f"hydra.sweep.dir={tmp_path}"]
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    monkeypatch.setattr(run, "check_once", lambda _: None)  # there is no GPU to look at
+    for there in (2, 1):
+        monkeypatch.setattr(torch.cuda, "device_count", lambda there=there: there)
+        found = entry.check_sweep(command)
+    job = (
+        {"num": 1},
+        {"output_dir": str(tmp_path / "1-reach")},
+        {"dir": str(tmp_path)},
+        {"hydra": [], "task": []},
+    )
+    told = OmegaConf.create(dict(zip(("job", "runtime", "sweep", "overrides"), job, strict=True)))
+    monkeypatch.setattr(HydraConfig, "get", lambda: told)
+    ran = []
+    found.run(ran.append, compose([*options, "seed=1", "device=spread"]))
+    assert [(cfg.device, cfg.resume) for cfg in ran] == [("cuda:0", str(tmp_path / "1-reach"))]
+    (tmp_path / "0-reach" / "config.yaml").write_text("device: cpu\n")
+    with pytest.raises(UserError, match="device is cpu there and spread here"):
+        left_by(tmp_path / "0-reach", OmegaConf.create({"device": "spread"}))
+
+
+def test_a_job_goes_on_upon_the_device_of_now(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    saved = SimpleNamespace(config={"device": "cuda:1", "seed": 0})
+    monkeypatch.setattr(run, "latest_checkpoint", Path)
+    monkeypatch.setattr(run, "load_checkpoint", lambda _: saved)
+    cfg = OmegaConf.create({"device": "cuda:0", "resume": str(tmp_path), "plugins": []})
+    assert run.resumed(cfg, ["device=spread"])[1].device == "cuda:0"  # resume=RUN was typed
+    told = {
+        "runtime": {"output_dir": str(tmp_path)},
+        "job": {"name": "train"},
+        "overrides": {"task": ["device=spread"]},
+    }
+    monkeypatch.setattr(HydraConfig, "get", lambda: OmegaConf.create(told))
+    monkeypatch.setattr(run, "_require_same", lambda _: None)
+
+    def read(cfg: Any, saved: bool) -> None:
+        assert saved and cfg.device == "cuda:0"
+        raise UserError("read")
+
+    monkeypatch.setattr(run.RunSettings, "of", read)
+    with pytest.raises(UserError, match="read"):
+        run.start(cfg)
 
 
 def test_ctrl_c_ends_the_sweep(tmp_path: Path) -> None:

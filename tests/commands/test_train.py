@@ -24,7 +24,7 @@ from franka_wm.errors import FrankaError
 from franka_wm.report.run import read_run
 from franka_wm.training.checkpoint import latest_checkpoint, load_checkpoint
 from franka_wm.training.history import read_rows
-from franka_wm.training.run import occupied
+from franka_wm.training.place import occupied
 from light import Answer, answers
 
 LENGTH = 20

@@ -21,7 +21,8 @@ from franka_wm.training import build
 from franka_wm.training.check import check
 from franka_wm.training.learner import Learner
 from franka_wm.training.load import load_agent
-from franka_wm.training.run import _LOCKS, Run, lock_run_dir
+from franka_wm.training.place import _LOCKS, lock_run_dir
+from franka_wm.training.run import Run
 from franka_wm.training.settings import RunSettings
 from franka_wm.training.stages import pretrain
 from franka_wm.training.trainer import Trainer
