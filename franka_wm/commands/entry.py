@@ -219,10 +219,8 @@ def one_line_errors(main: Callable[[DictConfig], object]) -> Callable[[DictConfi
             if _sweep is not None:
                 with nullcontext() if _sweep.process == os.getpid() else terminal_log():
                     return _sweep.run(main, cfg)
-            from franka_wm import processes
-
             several.spread(cfg, int(told.job.num) if told.mode == RunMode.MULTIRUN else 0)
-            if processes.restarted():
+            if several.goes_on(cfg):
                 several.go_on(cfg, Path(told.runtime.output_dir))
             with one_line_refusals():
                 return main(cfg)
@@ -348,7 +346,6 @@ def check_command(arguments: list[str], folder: Path | None = None) -> str | Non
     Args:
         folder: That of a sweep's job, which may go on with what it finds there.
     """
-    from franka_wm import processes
     from franka_wm.training.place import left_by, occupied, unwritable
     from franka_wm.training.run import check_once, import_plugins, resumed
     from franka_wm.training.settings import RunSettings
@@ -371,4 +368,4 @@ def check_command(arguments: list[str], folder: Path | None = None) -> str | Non
         return "hydra.run.dir=: names no folder; give one for the results, or leave it out"
     place = folder or Path(named or "outputs")
     problem = unwritable(place)
-    return problem if processes.restarted() else problem or occupied(place, cfg.resume)
+    return problem if several.goes_on(typed) else problem or occupied(place, cfg.resume)

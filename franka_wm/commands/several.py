@@ -140,9 +140,8 @@ def launch_job(overrides: list[str], cfg: DictConfig, folder: Path) -> None:
         UserError: This host has fewer GPUs, or the job failed.
         SystemExit: It was asked to stop, and has saved.
     """
+    # Without resume=, beside which no group may be named: the processes find what the job has saved, by JOB.
     command = ["train", *overrides, f"hydra.run.dir={quoted(str(folder))}"]
-    if cfg.resume is not None:
-        command.append(f"resume={quoted(str(cfg.resume))}")
     os.environ[JOB] = str(folder)
     handlers = {one: signal.getsignal(one) for one in (signal.SIGINT, signal.SIGTERM)}
     log = f"its lines above say why, or {folder / 'train.log'}"
@@ -258,8 +257,15 @@ def meet(options: list[str], device: str) -> None:
                 )
 
 
+def goes_on(cfg: DictConfig) -> bool:
+    """Whether this process looks for what its job has saved: the job was started anew, or is one of a sweep."""
+    from franka_wm import processes
+
+    return processes.restarted() or (JOB in os.environ and cfg.resume is None)
+
+
 def go_on(cfg: DictConfig, folder: Path) -> None:
-    """After a job was started anew: from what it had saved, if anything.
+    """Goes on from what a job has saved, if anything, where it :func:`goes_on`.
 
     The first process looks: others may see later what is on a disk of the network.
 
@@ -272,7 +278,8 @@ def go_on(cfg: DictConfig, folder: Path) -> None:
     if stopped:
         raise UserError(stopped)
     if left:
-        say(f"started anew: going on from {folder}")
+        if JOB not in os.environ:  # else who started it has said so
+            say(f"started anew: going on from {folder}")
         cfg.resume = str(folder)
 
 

@@ -15,6 +15,7 @@ from typing import Any
 import pytest
 import torch
 from hydra.core.hydra_config import HydraConfig
+from hydra.types import RunMode
 from omegaconf import OmegaConf
 
 from forks import TRAIN, Fork, script, train_in_fork
@@ -263,6 +264,31 @@ def test_jobs_of_several_processes_that_cannot_be(monkeypatch: pytest.MonkeyPatc
     assert refused_job(["scale=smoke", "gpus=2", "device=cpu"]) is None
     monkeypatch.setattr(several, "wanted", lambda _: (2, "cuda"))  # the extra may be missing
     assert refused_job([*several_gpus, "hydra/launcher=ray"]) is None  # its hosts may have them
+
+
+def test_a_begun_job_of_several_processes_keeps_its_groups(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """Its processes find what it has saved; ``resume=`` beside ``env=`` would be refused."""
+    options = ["env=reach", "scale=smoke", "gpus=2", "device=cpu"]
+    begun(tmp_path, *options)
+    cfg = compose(options)
+    cfg.resume = str(tmp_path)  # as the sweep has found it
+    began = []
+
+    def processes(command: list[str], *_: object) -> None:
+        began.append(command[1:])
+        assert entry.check_command(command[1:]) is None
+        told = {"mode": RunMode.RUN, "runtime": {"output_dir": str(tmp_path)}}
+        monkeypatch.setattr(HydraConfig, "get", lambda: OmegaConf.create(told))
+        entry.one_line_errors(began.append)(compose(command[1:]))
+
+    monkeypatch.setattr(several, "launch_verb", processes)
+    monkeypatch.setattr(entry, "_sweep", None)
+    several.launch_job(options, cfg, tmp_path)
+    command, goes_on = began
+    assert command == [*options, f"hydra.run.dir={tmp_path}"] and goes_on.resume == str(tmp_path)
+    assert "a run has left its weights there" in str(entry.check_command(command))  # not of a sweep
 
 
 def test_jobs_take_the_gpus_in_turn(monkeypatch: pytest.MonkeyPatch) -> None:
