@@ -357,7 +357,7 @@ def check_command(arguments: list[str], folder: Path | None = None) -> str | Non
         import_plugins(cfg.plugins)
         if cfg.resume is not None:
             _, cfg = resumed(cfg, arguments)
-        check_once(RunSettings.of(cfg, saved=cfg.resume is not None))
+        check_once(RunSettings.of(cfg, saved=cfg.resume is not None).of_one_gpu())
         if folder is not None and cfg.resume is None:
             left_by(folder, typed)
             return unwritable(folder, "hydra.sweep.dir")

@@ -52,10 +52,10 @@ def check(run: RunSettings) -> None:
     _check_windows(run)
     _check_evaluation(run)
     _check_planner(run)
-    if run.collector.planner_worlds > run.collector.num_envs:
+    if (c := run.collector).planner_worlds > c.num_envs:
         raise UserError(
-            f"collector.planner_worlds={run.collector.planner_worlds}: must be a whole number of at most "
-            f"collector.num_envs={run.collector.num_envs}; 0 leaves all worlds to the policy"
+            f"collector.planner_worlds={c.planner_worlds * run.parts}: must be a whole number of at most "
+            f"collector.num_envs={c.num_envs * run.parts}; 0 leaves all worlds to the policy"
         )
     _check_workers(run)
     if run.is_offline:
@@ -98,15 +98,16 @@ def _check_workers(run: RunSettings) -> None:
         raise UserError(
             f"{given}: is for env=gym and env=dm_control; leave it out, since the arm's worlds are one simulator"
         )
+    whole = worlds * run.parts
     if ray and not workers:
         raise UserError(
             f"collector=ray: say how many actors share the worlds: collector.workers=N, which divides "
-            f"collector.num_envs={worlds}; the cluster's cores, or fewer"
+            f"collector.num_envs={whole}; the cluster's cores, or fewer"
         )
     if workers and worlds % workers:
         raise UserError(
-            f"collector.workers={workers}: cannot share collector.num_envs={worlds} worlds equally; use a number that "
-            "divides them"
+            f"collector.workers={workers * run.parts}: cannot share collector.num_envs={whole} worlds equally; use a "
+            "number that divides them"
         )
     if ray:
         import_ray()
@@ -127,10 +128,11 @@ def _check_windows(run: RunSettings) -> None:
         f", and {before} before them for env.frame_stack" if before else ""
     )
     c, capacity = run.collector, run.replay.capacity
+    typed = f"replay.capacity={run.values['replay']['capacity']}"  # of all processes, as all numbers that are named
     if capacity < (steps := c.num_envs * (run.window + before + 1)):
         raise UserError(
-            f"replay.capacity={capacity}: must be at least {steps} for collector.num_envs="
-            f"{c.num_envs}: {asked_for}, and one more must fit"
+            f"{typed}: must be at least {steps * run.parts} for collector.num_envs="
+            f"{c.num_envs * run.parts}: {asked_for}, and one more must fit"
         )
     first = (-(-c.seed_steps // c.steps_per_batch) + 1) * c.steps_per_batch
     if first < run.window + before and not run.is_offline:
@@ -139,7 +141,7 @@ def _check_windows(run: RunSettings) -> None:
             f"{asked_for}: use at least collector.seed_steps={run.window + before}"
         )
     if capacity < c.num_envs * c.steps_per_batch:
-        raise UserError(f"replay.capacity={capacity}: smaller than one batch of the collector")
+        raise UserError(f"{typed}: smaller than one batch of the collector")
 
 
 def _check_hindsight(run: RunSettings) -> None:

@@ -11,7 +11,6 @@ import torch
 from tensordict import TensorDictBase
 from torchrl.data import ReplayBuffer
 
-from franka_wm import processes
 from franka_wm.data.memory import free_memory
 from franka_wm.device import resolve_device
 from franka_wm.errors import UserError
@@ -74,14 +73,15 @@ def check_memory(run: RunSettings, model: WorldModel, spaces: Spaces) -> None:
         try:  # memory is used as steps come, but some systems refuse what is larger than all of it
             torch.empty(step * r.capacity, dtype=torch.uint8)
         except (RuntimeError, TypeError) as error:  # the latter beyond 64 bits
-            raise UserError(_not_allocated(r.capacity, step, device)) from error
-    played = -(-e.episodes // processes.count())
+            raise UserError(_not_allocated(run, step, device)) from error
+    played = -(-e.episodes // run.parts)
     film = min(e.video_episodes, e.episodes) * run.env.episode_length * 3 * e.video_size**2
     parts = {
         "the model and its optimiser (model, size)": 16 * sum(x.numel() for x in model.parameters()),
-        f"experience (replay.capacity={r.capacity})": step * min(r.capacity, steps),
-        f"a batch (replay.batch_size={r.batch_size})": _bytes(model) * r.batch_size * run.window,
-        f"worlds (collector.num_envs={c.num_envs})": c.num_envs * (PER_WORLD + seen * c.steps_per_batch),
+        f"experience ({_capacity(run)})": step * min(r.capacity, steps),
+        f"a batch (replay.batch_size={r.batch_size * run.parts})": _bytes(model) * r.batch_size * run.window,
+        f"worlds (collector.num_envs={c.num_envs * run.parts})": c.num_envs
+        * (PER_WORLD + seen * c.steps_per_batch),
         f"worlds (evaluation.episodes={e.episodes})": played * (PER_WORLD + seen),
         "plans (planner.num_samples, planner.horizon)": 4 * played * planned * max(spaces.action_dim, 1),
         f"a video (evaluation.video_size={e.video_size})": film,
@@ -90,7 +90,7 @@ def check_memory(run: RunSettings, model: WorldModel, spaces: Spaces) -> None:
     if needed > free:
         name, most = max(parts.items(), key=lambda part: part[1])
         raise UserError(
-            f"{name}: at least {most / 1e9:.1f} GB, of {needed / 1e9:.1f} GB in all, do not fit into the "
+            f"{name}: at least {most / 1e9:.1f} GB{run.on_each}, of {needed / 1e9:.1f} GB in all, do not fit into the "
             f"{free / 1e9:.1f} GB that are free on {device}; lower it"
         )
 
@@ -125,22 +125,27 @@ def fill(
     free = free_memory(device)
     if free is not None and per_step * steps > free:
         raise UserError(
-            f"replay.capacity={run.replay.capacity}: {per_step * steps / 1e9:.1f} GB of experience "
+            f"{_capacity(run)}: {per_step * steps / 1e9:.1f} GB of experience{run.on_each} "
             f"({per_step / 1e3:.1f} kB a step) do not fit into the {free / 1e9:.1f} GB that are free on {device}; "
-            f"at most replay.capacity={int(0.9 * free / per_step)} would, less what learning needs"
+            f"at most replay.capacity={int(0.9 * free / per_step) * run.parts} would, less what learning needs"
         )
     try:
         replay.extend(batch)
     except RuntimeError as error:  # some systems refuse what is larger than all memory, used or not
         if not isinstance(error, torch.OutOfMemoryError) and "can't allocate memory" not in str(error):
             raise
-        raise UserError(_not_allocated(run.replay.capacity, per_step, device)) from error
+        raise UserError(_not_allocated(run, per_step, device)) from error
 
 
-def _not_allocated(capacity: int, per_step: float, device: torch.device) -> str:
+def _capacity(run: RunSettings) -> str:
+    """That of all processes, as it was typed."""
+    return f"replay.capacity={run.values['replay']['capacity']}"
+
+
+def _not_allocated(run: RunSettings, per_step: float, device: torch.device) -> str:
     return (
-        f"replay.capacity={capacity}: {per_step * capacity / 1e9:.1f} GB cannot be allocated on {device}; "
-        "use a smaller replay.capacity"
+        f"{_capacity(run)}: {per_step * run.replay.capacity / 1e9:.1f} GB{run.on_each} cannot be allocated on "
+        f"{device}; use a smaller replay.capacity"
     )
 
 

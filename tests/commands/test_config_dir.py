@@ -79,5 +79,7 @@ def test_a_job_of_several_processes_finds_the_presets_of_its_sweep(
     monkeypatch.setattr(sweeps.HydraConfig, "get", lambda: told)
     started = []
     monkeypatch.setattr(several, "launch_job", lambda overrides, cfg, folder: started.append(overrides))
-    Sweep(["job 0"], [tmp_path / "0"]).run(lambda cfg: None, OmegaConf.create({"resume": None, "gpus": 2}))
+    Sweep(["job 0"], [tmp_path / "0"]).run(
+        lambda cfg: None, OmegaConf.create({"resume": None, "gpus": 2, "device": "cpu"})
+    )
     assert started == [["env=kitchen", "gpus=2", path]]

@@ -1,5 +1,6 @@
 """Checkpoints whose experience is large, or does not fit on the disk."""
 
+import re
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -7,10 +8,12 @@ import pytest
 import torch
 from tensordict import TensorDict
 
+from franka_wm import processes
+from franka_wm.commands.entry import check_command
 from franka_wm.data.replay import make_replay
 from franka_wm.envs import FrankaConfig
 from franka_wm.errors import UserError
-from franka_wm.training import storage_budget
+from franka_wm.training import check, storage_budget
 from franka_wm.training.build import make_model
 from franka_wm.training.spaces import Spaces
 
@@ -86,6 +89,49 @@ def test_a_replay_that_memory_cannot_hold_is_refused(monkeypatch, settled) -> No
     storage_budget.fill(replay, batch, longer, updates=30)  # made before
     monkeypatch.setattr(storage_budget, "free_memory", lambda device: None)  # not known: not refused
     storage_budget.fill(replay, batch, cfg)
+
+
+@pytest.mark.parametrize(
+    "model", ["env=reach model=tdmpc2", "env=reach_pixels model=tdmpc2_pixels pretrain=vjepa"]
+)
+def test_a_gpu_must_have_room_for_its_part_alone(monkeypatch, settled, model: str) -> None:
+    """Who starts the processes asks that of each, and not of the whole job; lines name the job's numbers."""
+    words = [
+        *model.split(),
+        "scale=smoke",
+        "device=cuda",
+        "replay.capacity=4000000",
+        "evaluation.video_episodes=0",
+    ]
+    for module in (check, storage_budget):
+        monkeypatch.setattr(module, "resolve_device", lambda _: torch.device("cuda", 0))
+    spaces = Spaces.of_config(settled(*words).env.arm)
+    step = storage_budget._bytes(make_model(settled(*words), spaces, "meta"))
+    monkeypatch.setattr(storage_budget, "free_memory", lambda device: 3e6 * step)
+    refused = r"replay\.capacity=4000000\): at least {} GB{}, .*free on cuda:0"
+    assert re.search(refused.format(f"{4e-3 * step:.1f}", ""), str(check_command(words)))
+    assert check_command([*words, "gpus=2"]) is None
+    monkeypatch.setattr(storage_budget, "free_memory", lambda device: 1.9e6 * step)
+    said = refused.format(f"{2e-3 * step:.1f}", " on each of 2 GPUs")
+    assert re.search(said, str(check_command([*words, "gpus=2"])))
+    assert settled(*words, "gpus=2", "device=cpu").of_one_gpu().parts == 1  # all have one memory
+
+
+def test_a_process_names_the_numbers_of_the_whole_job(monkeypatch, settled) -> None:
+    job = ("scale=smoke", "device=cpu", "env=reach", "gpus=2")
+    monkeypatch.setattr(processes, "count", lambda: 2)
+    run = settled(*job, "replay.capacity=4000", "trainer.updates=10000000")
+    batch = TensorDict({"x": torch.zeros(4, 5, 250)}, [4, 5])  # 1 kB a step
+    replay = make_replay(capacity=2000, num_envs=4, window=2, batch_size=2, device="cpu")
+    monkeypatch.setattr(storage_budget, "free_memory", lambda device: 1e6)
+    said = r"=4000: .* on each of 2 GPUs \(1\.0 kB a step\) .*at most replay\.capacity=1800 would"
+    with pytest.raises(UserError, match=said):
+        storage_budget.fill(replay, batch, run)
+    with pytest.raises(UserError, match=r"planner_worlds=10: .* at most collector\.num_envs=8;"):
+        check.check(settled(*job, "collector.planner_worlds=10"))
+    least = r"replay\.capacity=21: must be at least 32 for collector\.num_envs=8: windows have 3 steps"
+    with pytest.raises(UserError, match=least):
+        check.check(settled(*job, "replay.capacity=21"))
 
 
 def test_what_cannot_be_allocated_is_one_line_as_well(monkeypatch, settled) -> None:

@@ -59,6 +59,7 @@ class RunSettings:
         resume: The run or the checkpoint that it goes on from.
         gpus: How many processes learn together, one for each GPU. In each of them worlds, batch and capacity are its
             part of what ``values`` holds for all.
+        parts: Of how many processes these are one's; 1: of all together.
     """
 
     values: Mapping[str, Any]
@@ -78,6 +79,7 @@ class RunSettings:
     dataset: DatasetSettings
     export: ExportSettings
     pretrain: PretrainSettings
+    parts: int = 1
 
     @classmethod
     def of(cls, cfg: DictConfig | Mapping[str, Any], *, saved: bool = False) -> RunSettings:
@@ -148,11 +150,11 @@ class RunSettings:
             name: {**self.values[name], **change} if isinstance(change, Mapping) else change
             for name, change in changes.items()
         }
-        return RunSettings.of({**self.values, **merged}, saved=True)
+        return self._read_again({**self.values, **merged})
 
     def first_stage(self) -> RunSettings:
         """The run that pretrains the encoder; its checkpoints resume the whole run, not the stage alone."""
-        return RunSettings.of(
+        return self._read_again(
             {
                 **self.values,
                 "whole_run": self.values,
@@ -160,9 +162,22 @@ class RunSettings:
                 "trainer": {**self.values["trainer"], "updates": self.pretrain.updates},
                 "replay": {**self.values["replay"], "future": False},  # for the goals of the second stage
                 "export": {**self.values["export"], "kind": "none"},
-            },
-            saved=True,
+            }
         )
+
+    def _read_again(self, values: Mapping[str, Any]) -> RunSettings:
+        """Other values, of as many processes as these are one's."""
+        found = RunSettings.of(values, saved=True)
+        return found if found.parts == self.parts else found._shared(self.parts)
+
+    def of_one_gpu(self) -> RunSettings:
+        """What one of its processes has: what must fit into its GPU. On the CPU all have one memory."""
+        return self._shared(self.gpus) if self.parts == 1 and self.device != "cpu" else self
+
+    @property
+    def on_each(self) -> str:
+        """Says in a message that its number is one GPU's, where what it names is of all."""
+        return f" on each of {self.parts} GPUs" if self.parts > 1 else ""
 
     def _shared(self, parts: int) -> RunSettings:
         """What one of so many processes has of the whole run."""
@@ -188,6 +203,7 @@ class RunSettings:
                 workers=c.workers // parts,
             ),
             replay=replace(r, batch_size=r.batch_size // parts, capacity=r.capacity // parts),
+            parts=parts,
         )
 
     # -- what follows from several options ------------------------------------------------------------------
