@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import logging
 import os
 import signal
@@ -9,7 +10,7 @@ import sys
 import tempfile
 import traceback
 import uuid
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -20,6 +21,7 @@ from franka_wm.commands.overrides import compose
 from franka_wm.console import quoted, resuming, say
 from franka_wm.errors import UserError
 from franka_wm.interrupt import INTERRUPTED
+from franka_wm.source import snapshot
 from franka_wm.untrusted import UntrustedFolder
 from franka_wm.versions import PACKAGES, usable_cores, versions
 
@@ -224,19 +226,27 @@ def enter(overrides: list[str]) -> list[str]:
     """Meets the other processes of the job; the overrides of this one. All write into one folder, the first one's.
 
     Raises:
-        UserError: The others cannot be met, versions or options differ, or a host has too few GPUs.
+        UserError: The others cannot be met; versions, options, configurations or code differ; or a host has too few
+            GPUs.
     """
     from franka_wm import processes
+    from franka_wm.training.place import leaves
+    from franka_wm.training.settings import plain
 
     own = [one for one in overrides if not one.startswith(("hydra.run.dir=", "gpus="))]
-    meet(own, wanted(overrides)[1])
+    meet(own, wanted(overrides)[1], leaves(plain(compose([one for one in own if one != "scale=auto"]))))
     folder = processes.objects(str(run_folder(overrides)))[0]
     own += [f"gpus={processes.count()}", f"hydra.run.dir={quoted(folder)}"]
     return own if processes.is_first() else [*own, "hydra.output_subdir=null"]
 
 
-def meet(options: list[str], device: str) -> None:
+def meet(options: list[str], device: str, configuration: Mapping[str, object] | None = None) -> None:
     """Meets the other processes of the job. All but the first one are silent, unless they end first.
+
+    Args:
+        options: As they were typed.
+        device: The configuration's.
+        configuration: What they compose to, ``{"env.fps": 20, …}``: files of one's own are the same everywhere, too.
 
     Raises:
         UserError: As for :func:`enter`.
@@ -247,14 +257,32 @@ def meet(options: list[str], device: str) -> None:
         sys.stdout = open(os.devnull, "w")  # noqa: SIM115  # as long as the process
     processes.join(cuda=device != "cpu")
     decisive = ("franka_wm", "python", "commit", *PACKAGES)
-    same = {"options": " ".join(options)} | {k: v for k, v in versions().items() if k in decisive}
-    for rank, theirs in enumerate(processes.objects(same)):
-        for name, value in theirs.items():
-            if value != same.get(name):
-                raise UserError(
-                    f"process {processes.rank()} has {name} {same.get(name)}, process {rank} {value}; start all of a "
-                    "job with the same command in the same environment"
-                )
+    _require_same({"options": " ".join(options)} | {k: v for k, v in versions().items() if k in decisive})
+    code = {name: _hash(content) for name, content in snapshot().items() if name.startswith("franka_wm/")}
+    for some in (configuration or {}, code):
+        if len({*processes.objects(_hash(repr(sorted(some.items())).encode()))}) > 1:
+            _require_same(some)
+
+
+def _require_same(mine: Mapping[str, object]) -> None:
+    """Checks that all processes say the same of the same names.
+
+    Raises:
+        UserError: It names the first in which another one differs from this one.
+    """
+    from franka_wm import processes
+
+    for rank, theirs in enumerate(processes.objects(mine)):
+        name = next((one for one in {**theirs, **mine} if theirs.get(one) != mine.get(one)), None)
+        if name is not None:
+            raise UserError(
+                f"process {processes.rank()} has {name} {mine.get(name)}, process {rank} {theirs.get(name)}; start all "
+                "of a job with the same command in the same environment"
+            )
+
+
+def _hash(content: bytes) -> str:
+    return hashlib.sha256(content).hexdigest()[:12]
 
 
 def goes_on(cfg: DictConfig) -> bool:

@@ -57,8 +57,8 @@ def left_by(folder: Path, cfg: DictConfig) -> str | None:
         latest_checkpoint(folder)
     except UserError:  # there is none
         return None
-    there = _leaves(UntrustedFolder(folder).yaml("config.yaml"))
-    here = _leaves(plain(cfg))
+    there = leaves(UntrustedFolder(folder).yaml("config.yaml"))
+    here = leaves(plain(cfg))
     if here.get("device") == "spread" and str(there.get("device")).startswith("cuda:"):
         here["device"] = there["device"]
     other = next((k for k in {**here, **there} if k != "resume" and here.get(k) != there.get(k)), None)
@@ -70,11 +70,11 @@ def left_by(folder: Path, cfg: DictConfig) -> str | None:
     return "finished" if (folder / FINISHED).is_file() else "begun"
 
 
-def _leaves(values: object, name: str = "") -> dict[str, object]:
+def leaves(values: object, name: str = "") -> dict[str, object]:
     """``{"env.fps": 20, …}`` of nested values."""
     if not isinstance(values, dict) or not values:
         return {name: values}
-    nested = [_leaves(value, f"{name}.{key}" if name else str(key)) for key, value in values.items()]
+    nested = [leaves(value, f"{name}.{key}" if name else str(key)) for key, value in values.items()]
     return {key: value for one in nested for key, value in one.items()}
 
 

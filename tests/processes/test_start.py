@@ -6,9 +6,11 @@ import os
 import socket
 import subprocess
 import sys
+from contextlib import nullcontext
 from datetime import timedelta
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import pytest
 import torch
@@ -21,6 +23,7 @@ from franka_wm.commands.overrides import compose, given
 from franka_wm.console import quoted
 from franka_wm.errors import UserError
 from franka_wm.training import run
+from franka_wm.versions import versions
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -93,6 +96,53 @@ def test_who_has_met_is_waited_for_longer(port) -> None:
         "time.sleep(15 * processes.rank())\nprocesses.wait()\nprocesses.leave(7)\n",
     )
     assert [status for status, _ in found] == [7, 7], found
+
+
+@pytest.mark.parametrize(
+    ("name", "there", "said"),
+    [
+        ("torch", "1.0", "has torch .*, process 0 1.0;"),
+        ("commit", None, "has commit 0123456789ab, process 0 None;"),
+        ("options", "env=reach", "has options env=lift, process 0 env=reach;"),
+        ("env.fps", 30, "has env.fps 20, process 0 30;"),
+        ("env.mine", 5, "has env.mine None, process 0 5;"),
+        ("franka_wm/processes.py", "abc", "has franka_wm/processes.py [0-9a-f]{12}, process 0 abc;"),
+        (None, None, None),
+    ],
+)
+def test_what_differs_between_hosts_is_one_line(monkeypatch, second, name, there, said) -> None:
+    """Of versions, the commit, options, what they compose to, and code."""
+
+    def told(mine: Any) -> list[Any]:
+        """What the first process, of another host, and this one say."""
+        if isinstance(mine, str):  # a hash of many things
+            return ["other" if name else mine, mine]
+        has = name in mine or (name == "env.mine" and "env.fps" in mine)
+        others = {**mine, name: there} if has else mine
+        return [{k: v for k, v in others.items() if v is not None}, mine]
+
+    monkeypatch.setenv("RANK", "0")  # which leaves the terminal as it is
+    monkeypatch.setattr(processes, "join", lambda **_: None)
+    monkeypatch.setattr(processes, "objects", told)
+    monkeypatch.setattr(several, "versions", lambda: versions() | {"commit": "0123456789ab"})
+    line = f"^process 1 {said} start all of a job"
+    with nullcontext() if said is None else pytest.raises(UserError, match=line):
+        several.meet(["env=lift"], "cpu", {"env.fps": 20, "env.task": "lift"})
+
+
+def test_processes_compare_what_their_options_compose_to(monkeypatch, second, tmp_path) -> None:
+    """A preset of one's own, whose name is the same on all hosts; not the folder, which the first process decides."""
+    (tmp_path / "env").mkdir()
+    (tmp_path / "env" / "mine.yaml").write_text("defaults: [reach, _self_]\nfps: 15\n")
+    met = []
+    monkeypatch.setattr(several, "meet", lambda options, *more: met.append(([*options], *more)))
+    monkeypatch.setattr(several, "run_folder", lambda _: tmp_path)
+    path = f"hydra.searchpath=[file://{tmp_path}]"
+    monkeypatch.setattr(processes, "objects", lambda mine: [mine, mine])
+    several.enter(["env=mine", path, "device=cpu", "gpus=2", "hydra.run.dir=here"])
+    [(options, device, configuration)] = met
+    assert options == ["env=mine", path, "device=cpu"] and device == "cpu"
+    assert configuration["env.fps"] == 15 and not any("hydra" in key for key in configuration)
 
 
 @pytest.mark.parametrize("restarts", ["", "0", "2"])
