@@ -28,6 +28,8 @@ from franka_wm.console import quoted, say, terminal_log
 from franka_wm.errors import REFUSALS, FrankaError, machine_refused
 from franka_wm.interrupt import INTERRUPTED
 
+ELSEWHERE = ("submitit_slurm", "ray")
+"""Launchers that take jobs to other machines: this one does not know their devices."""
 MOST_JOBS = 1000
 """Most runs of one sweep: each is checked before the first begins."""
 _sweep: Sweep | None = None
@@ -304,20 +306,29 @@ def with_scale(arguments: list[str], stream: TextIO | None = None, *, quiet: boo
     Args:
         stream: Where that is said.
         quiet: Say nothing, since nothing is trained.
+
+    Raises:
+        SystemExit: The device of other machines decides; one line says so.
     """
-    given = next((a for a in arguments if a.startswith("scale=")), None)
-    if given not in (None, "scale=auto"):
+    chosen = next((a for a in arguments if a.startswith("scale=")), None)
+    if chosen not in (None, "scale=auto"):
         return arguments
     if any(a.startswith("resume=") for a in arguments):
-        return [a for a in arguments if a != given]
+        return [a for a in arguments if a != chosen]
+    device = next((a.split("=", 1)[1] for a in arguments if a.startswith("device=")), "auto")
+    launcher = given(arguments, "hydra/launcher")
+    if launcher in ELSEWHERE and device == "auto":
+        fail(
+            f"hydra/launcher={launcher}: the device of this machine does not say how large runs on others are; add "
+            "scale=gpu, scale=laptop or scale=smoke"
+        )
     import torch
 
-    device = next((a.split("=", 1)[1] for a in arguments if a.startswith("device=")), "auto")
     on_gpu = device.startswith(("cuda", "spread")) or (device == "auto" and torch.cuda.is_available())
     scale = "gpu" if on_gpu else "laptop"
     if not quiet:
         say(f"scale={scale}, by the device; choose with scale=laptop, gpu or smoke", stream)
-    return [a for a in arguments if a != given] + [f"scale={scale}"]
+    return [a for a in arguments if a != chosen] + [f"scale={scale}"]
 
 
 def check_sweep(overrides: list[str]) -> Sweep:

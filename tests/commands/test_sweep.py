@@ -171,6 +171,20 @@ def test_folders_are_not_looked_for_where_a_launcher_may_take_jobs_to_other_mach
     assert capsys.readouterr().err == "error: replay.demos=elsewhere: no such folder\n"
 
 
+@pytest.mark.parametrize("launcher", ["submitit_slurm", "ray"])
+def test_jobs_on_other_machines_name_their_scale(launcher: str, capsys: pytest.CaptureFixture[str]) -> None:
+    """A login node without a GPU would make all of them small."""
+    command = ["env=lift", f"hydra/launcher={launcher}"]
+    for more in ([], ["scale=auto"]):
+        with pytest.raises(SystemExit):
+            entry.with_scale([*command, *more])
+        said = capsys.readouterr().err
+        assert said.startswith(f"error: hydra/launcher={launcher}: ") and "add scale=gpu, " in said
+    assert entry.with_scale([*command, "scale=gpu"]) == [*command, "scale=gpu"]
+    assert entry.with_scale([*command, "device=cuda"])[-1] == "scale=gpu"
+    assert entry.with_scale(["hydra/launcher=joblib", "device=cpu"])[-1] == "scale=laptop"
+
+
 def test_what_a_run_returns_is_better_the_higher() -> None:
     rate, distance, gain = ({"mean": x, "low": 0.0, "high": 1.0} for x in (0.25, 0.3, 7.0))
     assert score({"planner": {"success": rate, "return": gain}, "policy": {"return": gain}}) == 0.25
