@@ -68,7 +68,7 @@ def save_checkpoint(
     optimizer: Optimizers | None = None,
     replay: TensorDictBase | None = None,
     extra: Mapping[str, object] | None = None,
-    others: Callable[[], None] = lambda: None,
+    others: Callable[[], int | None] = lambda: 1,
 ) -> Path:
     """Write a checkpoint; an existing one at the same place is replaced, and is whole until it is.
 
@@ -83,7 +83,8 @@ def save_checkpoint(
         replay: the filled part of the buffer, tensors only, any batch dimensions.
         extra: nested dicts, lists and tuples of numbers, strings, None and tensors (a `torch.Generator`'s
             state, say).
-        others: called when only the parts of other processes are missing, see :mod:`franka_wm.training.shards`.
+        others: called when only the parts of other processes are missing, see :mod:`franka_wm.training.shards`;
+            returns how many processes there are.
 
     Returns:
         The folder, absolute.
@@ -107,8 +108,7 @@ def save_checkpoint(
         writing.mkdir()
         try:
             _write_contents(writing, _unwrap(model), optimizer, config, counters, replay, extra)
-            others()
-            write_manifest(writing, type(_unwrap(model)).__name__)
+            write_manifest(writing, type(_unwrap(model)).__name__, processes=others())
             _swap_in(writing, target)
         except Exception:
             shutil.rmtree(writing, ignore_errors=True)
@@ -233,7 +233,7 @@ class Checkpoint:
     @property
     def processes(self) -> int:
         """How many processes have saved it."""
-        return max(1, sum(name.startswith("rng") and name.endswith(".json") for name in self._manifest.files))
+        return self._manifest.processes
 
     def restore_rng(self, rank: int = 0) -> None:
         """Set torch's (CPU and CUDA), NumPy's and Python's global generators to their saved states.

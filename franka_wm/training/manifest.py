@@ -25,11 +25,13 @@ class Manifest(NamedTuple):
         model: class name of the model that was saved.
         files: name of every other file → `bytes` and `sha256`.
         written_by: version of the package that saved the model.
+        processes: how many have saved it, each its part.
     """
 
     model: str
     files: Mapping[str, Mapping[str, Any]]
     written_by: str | None
+    processes: int = 1
 
     def check_size(self, folder: Path, name: str) -> None:
         """Raise a `UserError` unless the file is there and as long as it was written."""
@@ -54,7 +56,12 @@ class Manifest(NamedTuple):
 
 
 def write_manifest(
-    folder: Path, model: str, *, written_by: str | None = __version__, saved_at_ns: int | None = None
+    folder: Path,
+    model: str,
+    *,
+    written_by: str | None = __version__,
+    saved_at_ns: int | None = None,
+    processes: int | None = None,
 ) -> None:
     """Write the manifest of all files of `folder`, and make sure that they have reached the disk.
 
@@ -62,6 +69,7 @@ def write_manifest(
         model: class name of the model.
         written_by: version of the package that saved it.
         saved_at_ns: when that was [ns]; now if None.
+        processes: how many have saved it; not said if None.
     """
     files = sorted(folder.iterdir())
     for path in files:
@@ -73,6 +81,8 @@ def write_manifest(
         "saved_at_ns": time.time_ns() if saved_at_ns is None else saved_at_ns,
         "files": {p.name: {"bytes": p.stat().st_size, "sha256": _sha256(p)} for p in files},
     }
+    if processes is not None:
+        manifest["processes"] = processes
     write_json(folder / MANIFEST, manifest)
     sync(folder / MANIFEST)
     sync(folder)
@@ -94,6 +104,10 @@ def read_manifest(folder: Path) -> Manifest:
             raise ValueError("files")
         if not files.keys() >= ALWAYS or not isinstance(model, str):
             raise ValueError("files")
+        said = sum(name.startswith("rng") and name.endswith(".json") for name in files)
+        processes = manifest.get("processes", max(1, said))  # earlier versions did not say it
+        if type(processes) is not int or processes < 1 or processes > max(1, said):
+            raise ValueError("processes")
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise UserError(
             f"checkpoint {folder} is damaged: {MANIFEST} cannot be read ({type(error).__name__}); "
@@ -104,7 +118,7 @@ def read_manifest(folder: Path) -> Manifest:
             f"checkpoint {folder} has format version {version}, this franka_wm {__version__} reads "
             f"{FORMAT_VERSION}; use the franka_wm that wrote it ({manifest.get('franka_wm', 'unknown')})."
         )
-    return Manifest(model, files, manifest.get("franka_wm"))
+    return Manifest(model, files, manifest.get("franka_wm"), processes)
 
 
 def saved_at(folder: Path) -> int:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -11,9 +12,10 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 from franka_wm import processes
+from franka_wm.errors import UserError
 from franka_wm.seeding import random_state
 from franka_wm.training.checkpoint import WRITING, Checkpoint, explained, replay_tree, save_checkpoint
-from franka_wm.training.tree import write_tree
+from franka_wm.training.tree import tree_files, write_tree
 
 
 def save_together(
@@ -26,11 +28,16 @@ def save_together(
         replay, moment: This process's own.
         common: What is the same in all of them, and what the first one alone knows: as for
             :func:`~franka_wm.training.checkpoint.save_checkpoint`.
+
+    Raises:
+        UserError: The folder cannot be written, or the first process does not see all parts.
     """
 
-    def others() -> None:
+    def others() -> int:
         processes.wait()  # the folder is there
         processes.wait()  # their parts are
+        _require_parts(folder, replay is not None)
+        return processes.count()
 
     if processes.is_first():
         extra = {**common.pop("extra"), "moment": moment}
@@ -42,15 +49,36 @@ def save_together(
     processes.wait()  # it is whole
 
 
+def _require_parts(folder: Path, with_replay: bool) -> None:
+    """Waits until the first process sees all parts: what others wrote to a disk of the network may come later."""
+    writing = _writing(folder)
+    kinds = ("rng", "moment", *(["replay"] if with_replay else []))
+    wanted = [(k, f) for k in range(1, processes.count()) for kind in kinds for f in tree_files(f"{kind}{k}")]
+    until = time.monotonic() + processes.SOON
+    while missing := [one for one in wanted if not (writing / one[1]).is_file()]:
+        if time.monotonic() > until:
+            k, file = missing[0]
+            raise UserError(
+                f"checkpoint {folder}: process 0 does not see {file}, which process {k} has written; the checkpoint "
+                "before is whole: give hydra.run.dir on a disk that all hosts see"
+            )
+        time.sleep(0.1)
+
+
+def _writing(folder: Path) -> Path:
+    """Where a checkpoint is until it is whole."""
+    target = folder.resolve()
+    return target.with_name(target.name + WRITING)
+
+
 def add_part(folder: Path, rank: int, *, replay: TensorDictBase | None, moment: Mapping[str, object]) -> None:
     """Adds what process ``rank`` > 0 has of its own to the checkpoint that the first one is writing.
 
     Raises:
         UserError: The folder cannot be written.
     """
-    target = folder.resolve()
-    writing = target.with_name(target.name + WRITING)
-    with explained(target):
+    writing = _writing(folder)
+    with explained(folder.resolve()):
         write_tree(writing, f"rng{rank}", random_state())
         write_tree(writing, f"moment{rank}", moment)
         if replay is not None:

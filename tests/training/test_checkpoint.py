@@ -1,10 +1,14 @@
 """Checkpoints: exact after a round trip."""
 
 import functools
+import itertools
+import json
 import random
+import threading
 from collections.abc import Callable
 from dataclasses import FrozenInstanceError
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -12,9 +16,10 @@ import torch
 from safetensors.torch import load_file
 from torch import Tensor, nn
 
+from franka_wm import processes
 from franka_wm.errors import UserError
 from franka_wm.training.checkpoint import latest_checkpoint, load_checkpoint, save_checkpoint
-from franka_wm.training.shards import add_part, own_experience, own_moment
+from franka_wm.training.shards import add_part, own_experience, own_moment, save_together
 from franka_wm.training.tree import read_tree, write_tree
 from small_checkpoint import Small, save, some_replay, train
 
@@ -317,6 +322,43 @@ def test_parts_of_several_processes_are_one_checkpoint(
     monkeypatch.setattr("franka_wm.processes.rank", lambda: 2)
     own = own_experience(found, torch.device("cpu"))
     assert own is not None and torch.equal(own["state"], whole["state"][8:])
+
+
+@pytest.mark.parametrize("lost", ["rng1.json", "moment1.safetensors", "replay1.safetensors", None])
+def test_a_checkpoint_without_the_part_of_another_process_is_not_made(
+    lost: str | None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Its disk may be another one, or it may be late: then the first waits. The manifest knows how many have saved."""
+    place, waits = tmp_path / "a", itertools.count()
+    model, counters = Small(), {"updates": 1}
+
+    def arrive() -> None:  # at the first of them the folder is there
+        if next(waits) == 0:
+            add_part(place, 1, replay=some_replay(), moment={})
+            if lost is not None:
+                (tmp_path / "a.writing" / lost).rename(tmp_path / lost)
+
+    monkeypatch.setattr(processes, "count", lambda: 2)
+    monkeypatch.setattr(processes, "wait", arrive)
+    monkeypatch.setattr(processes, "SOON", 0.3)
+    common: Any = {"model": model, "config": {}, "counters": counters, "extra": {}, "moment": {}}
+    if lost is not None:
+        with pytest.raises(UserError, match=f"process 0 does not see {lost}, which process 1 has written"):
+            save_together(place, replay=some_replay(), **common)
+        assert [*tmp_path.glob("a*")] == []
+        waits = itertools.count()
+        late = threading.Timer(0.1, lambda: (tmp_path / lost).rename(tmp_path / "a.writing" / lost))
+        monkeypatch.setattr(processes, "wait", lambda: (arrive(), late.start() if not late.ident else None))
+        monkeypatch.setattr(processes, "SOON", 30.0)
+    save_together(place, replay=some_replay(), **common)
+    assert load_checkpoint(place).processes == 2
+    manifest = json.loads((place / "manifest.json").read_text())
+    assert manifest.pop("processes") == 2
+    (place / "manifest.json").write_text(json.dumps(manifest))  # as earlier versions did
+    assert load_checkpoint(place).processes == 2
+    (place / "manifest.json").write_text(json.dumps(manifest | {"processes": 3}))
+    with pytest.raises(UserError, match=r"damaged: manifest\.json"):
+        load_checkpoint(place)
 
 
 def test_parts_that_do_not_fit_together_are_damage(tmp_path: Path) -> None:
