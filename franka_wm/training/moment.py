@@ -72,6 +72,14 @@ def go_on_drawing(
     return all([module.set_state(state, device) for module, state in there])
 
 
+def draw_anew(policies: Mapping[str, TensorDictModuleBase], seed: int) -> None:
+    """Lets policies that draw at random begin from ``seed``."""
+    for module in _drawing(policies).values():
+        for value in vars(module).values():
+            if isinstance(value, torch.Generator):
+                value.manual_seed(seed)
+
+
 def _drawing(policies: Mapping[str, TensorDictModuleBase]) -> dict[str, Drawing]:
     return {
         f"{name}/{path}": module

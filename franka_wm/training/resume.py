@@ -16,7 +16,7 @@ from franka_wm.errors import UserError
 from franka_wm.seeding import derive_seed
 from franka_wm.training.checkpoint import Checkpoint
 from franka_wm.training.history import read_rows
-from franka_wm.training.moment import go_on_drawing, put_back, restorable, same_worlds
+from franka_wm.training.moment import draw_anew, go_on_drawing, put_back, restorable, same_worlds
 from franka_wm.training.shards import own_experience, own_moment
 from franka_wm.training.storage_budget import fill
 from franka_wm.training.trainer import Trainer
@@ -60,6 +60,11 @@ def restore(trainer: Trainer, checkpoint: Checkpoint) -> None:
         elif env is not None and learner.updates < settings.trainer.updates:
             why = "holds no experience" if fits else f"is of collector.num_envs={there}, this run has {here}"
             say(f"  the checkpoint {why}: this run gathers anew and will not be the same")
+        if (
+            trainer.acting is not None
+        ):  # what is not put back below must not draw the run's first numbers again
+            again = derive_seed("policies", settings.seed, "resumed", learner.updates, *processes.parts())
+            draw_anew(trainer.acting.policies, again)
         if fits:
             _restore_moment(trainer, checkpoint, own_moment(checkpoint))
         else:

@@ -81,7 +81,8 @@ class Trainer:
     ):
         self.env, self.learner, self.settings, self.folder = env, learner, settings, folder
         if processes.count() > 1:  # the same weights, but not the same draws
-            torch.manual_seed(derive_seed("process", settings.seed, processes.rank()))
+            stage = ("first",) if "whole_run" in settings.values else ()
+            torch.manual_seed(derive_seed("process", settings.seed, processes.rank(), *stage))
         self.replay: Any = replay  # WindowReplay where there are worlds, else RecordedWindows
         self.model = learner.model
         self.actor = actor

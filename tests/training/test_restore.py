@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
 
@@ -131,16 +132,33 @@ def test_another_number_of_worlds(make: Make, checkpoint: Checkpoint, env: Frank
 
 
 def test_another_number_of_processes(make: Make, checkpoint: Checkpoint, monkeypatch, capsys) -> None:
-    """Random numbers start anew, from a seed of the process."""
+    """Random numbers start anew, from a seed of the process and of how far the run is."""
     monkeypatch.setattr(resume, "own_experience", lambda one, device: one.replay(device, 0))
-    monkeypatch.setattr(resume, "own_moment", lambda one: one.moment())
+    monkeypatch.setattr(resume, "own_moment", lambda one: {"worlds": one.moment()["worlds"]})
     monkeypatch.setattr(Checkpoint, "processes", 2)
     second = make()
     restore(second, checkpoint)
     (line,) = said(capsys)
     assert line.startswith("the checkpoint is of 2 processes, here are 1: random numbers start anew")
     assert torch.initial_seed() == derive_seed("process", second.settings.seed, 0, UPDATES)
-    assert len(second.replay) > 0
+    assert len(second.replay) > 0 and second.acting is not None
+    generator: Any = second.acting.policies["random"].generator
+    assert generator.initial_seed() == derive_seed("policies", second.settings.seed, "resumed", UPDATES)
+
+
+def test_two_stages_of_several_processes_draw_unlike_numbers(
+    make: Make, cfg: RunSettings, env: FrankaEnv, monkeypatch, tmp_path
+) -> None:
+    other, seeds = make(), []
+    parts: Any = {"env": env, "learner": other.learner, "replay": other.replay, "policies": {}, "loggers": []}
+    first = replace(cfg, values={**cfg.values, "whole_run": cfg.values})
+    for rank in range(2):
+        monkeypatch.setattr(processes, "count", lambda: 2)
+        monkeypatch.setattr(processes, "rank", lambda rank=rank: rank)
+        for settings in (first, cfg):
+            Trainer(**parts, actor="policy", settings=settings, folder=tmp_path, evaluate=dict)
+            seeds.append(torch.initial_seed())
+    assert len(set(seeds)) == 4 and seeds[1] == derive_seed("process", cfg.seed, 0)
 
 
 def test_room_is_for_what_comes_back_and_what_will_be_gathered(
