@@ -12,7 +12,7 @@ import socket
 import sys
 import time
 import uuid
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from datetime import timedelta
 from pathlib import Path
 from typing import Any
@@ -27,6 +27,9 @@ TIMEOUT = timedelta(minutes=30)
 
 LAST_WORDS = 1.0
 """So long does the first process outlive what it refuses [s]: others that refuse the same ask its store who says so."""
+
+PIECE = 2**20
+"""So much of the weights is compared at once [bytes]."""
 
 SEEN = ".seen"
 SOON = 90.0
@@ -300,15 +303,19 @@ def require_seen(folder: Path, option: str) -> None:
         raise UserError(f"rank {blind[0]} does not see {folder}: give {option} on a disk that all hosts see")
 
 
-def require_same(tensors: dict[str, Tensor]) -> None:
+def require_same(state: Mapping[str, Any]) -> None:
     """Checks that the weights of all processes are the same, bit for bit; waits for the device.
+
+    Args:
+        state: A module's ``state_dict()``; entries that are no tensors are left out.
 
     Raises:
         UserError: They are not; names the first that differ.
     """
     if count() == 1:
         return
-    sums = torch.stack([_bits(x).sum() for x in tensors.values()]).cpu()
+    tensors = {name: x for name, x in state.items() if isinstance(x, Tensor)}
+    sums = torch.stack([_hash(x) for x in tensors.values()]).cpu()
     found = objects(sums)
     for other, theirs in enumerate(found):
         different = [
@@ -321,10 +328,16 @@ def require_same(tensors: dict[str, Tensor]) -> None:
             )
 
 
-def _bits(x: Tensor) -> Tensor:
-    """The bits of a tensor as whole numbers, each with a weight of its own, so that exchanges are seen."""
-    whole = x.detach().reshape(-1).view(torch.uint8).to(torch.int64)
-    return whole * (torch.arange(whole.numel(), device=x.device) % 8191 + 1)
+def _hash(x: Tensor) -> Tensor:
+    """A whole number (,) in which each byte of a tensor has a weight of its own, so that exchanges are seen.
+
+    By pieces: whole numbers of all bytes would take many times the memory of the weights.
+    """
+    found = torch.zeros((), dtype=torch.int64, device=x.device)
+    weights = torch.arange(1, PIECE + 1, device=x.device)
+    for piece in x.detach().reshape(-1).view(torch.uint8).split(PIECE):
+        found = found * 1_000_003 + (weights[: len(piece)] * piece).sum()  # odd: what differs stays different
+    return found
 
 
 def _joined() -> bool:

@@ -16,6 +16,7 @@ import pytest
 import torch
 from omegaconf import OmegaConf
 from torch.distributed.elastic.multiprocessing.api import SubprocessContext
+from torch.utils._python_dispatch import TorchDispatchMode
 
 from franka_wm import processes
 from franka_wm.commands import several
@@ -239,3 +240,63 @@ def test_statistics_of_unequal_parts(monkeypatch) -> None:
     mean, std = processes.pooled(*moments[0])
     torch.testing.assert_close(mean, torch.cat(parts).mean(0))
     torch.testing.assert_close(std, torch.cat(parts).std(0))
+
+
+def _exchanged(x: torch.Tensor, other: int) -> torch.Tensor:
+    """`x` with its first entry in the place of another one."""
+    x = x.clone()
+    x[[0, other]] = x[[other, 0]]
+    return x
+
+
+LARGE = torch.arange(600_000, dtype=torch.float32)  # more than two pieces
+
+
+@pytest.mark.parametrize(
+    "there",
+    [
+        {"b": _exchanged(LARGE, 1)},
+        {"b": _exchanged(LARGE, 8191)},
+        {"b": _exchanged(LARGE, processes.PIECE // 4)},
+        {"b": _exchanged(LARGE, 2 * processes.PIECE // 4 + 7)},
+        {"b": LARGE.index_fill(0, torch.tensor(500_000), 500_000.03125)},  # the last bit
+        {"b": LARGE.index_fill(0, torch.tensor(0), -0.0)},
+        {"a": torch.tensor(2), "c": torch.tensor(1)},  # exchanged weights
+        {"d": torch.tensor([True, False])},
+        {"e": torch.tensor([1.0, 1.0078125], dtype=torch.bfloat16)},
+        {},
+    ],
+)
+def test_weights_that_are_no_longer_the_same_end_the_run(monkeypatch, there: dict[str, torch.Tensor]) -> None:
+    """Also those whose sums are: the first that differs is named. What is no tensor is not compared."""
+    weights = {"a": torch.tensor(1), "b": LARGE, "c": torch.tensor(2), "d": torch.tensor([False, True])}
+    weights |= {"e": torch.ones(2, dtype=torch.bfloat16), "f": torch.zeros(0)}
+    heard = []
+    monkeypatch.setattr(processes, "count", lambda: 2)
+    monkeypatch.setattr(processes, "objects", lambda mine: heard.append(mine) or [heard[0], mine])
+    processes.require_same({**weights, "size": torch.Size([3])})
+    first = rf"\(first {next(iter(there), '')}, {len(there)} in all\)"
+    line = f"weights of process 1 are no longer those of process 0 {first}"
+    with pytest.raises(UserError, match=line) if there else nullcontext():
+        processes.require_same({**weights, **there, "size": torch.Size([4])})
+
+
+def test_comparing_weights_takes_little_memory(monkeypatch) -> None:
+    made = []
+
+    class Watch(TorchDispatchMode):
+        def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+            out = func(*args, **(kwargs or {}))
+            if (
+                isinstance(out, torch.Tensor)
+                and out.untyped_storage().data_ptr() != large.untyped_storage().data_ptr()
+            ):
+                made.append(out.nbytes)
+            return out
+
+    large = torch.zeros(8_000_000)
+    monkeypatch.setattr(processes, "count", lambda: 2)
+    monkeypatch.setattr(processes, "objects", lambda mine: [mine, mine])
+    with Watch():
+        processes.require_same({"large": large})
+    assert made and max(made) <= 8 * processes.PIECE < large.nbytes

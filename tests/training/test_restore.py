@@ -146,6 +146,19 @@ def test_another_number_of_processes(make: Make, checkpoint: Checkpoint, monkeyp
     assert generator.initial_seed() == derive_seed("policies", second.settings.seed, "resumed", UPDATES)
 
 
+def test_weights_that_differ_between_processes_are_not_saved(make: Make, monkeypatch) -> None:
+    """What was saved before stays; see ``tests/processes/test_start.py`` for what is seen."""
+    trainer = make("apart")
+    latest = trainer.save()
+    with monkeypatch.context() as patched:
+        patched.setattr(processes, "count", lambda: 2)
+        patched.setattr(processes, "objects", lambda mine: [mine, mine + 1])
+        trainer.learner.updates = 7
+        with pytest.raises(UserError, match="weights of process 1 are no longer those of process 0"):
+            trainer.save()
+    assert load_checkpoint(latest).counters["updates"] == 0
+
+
 def test_two_stages_of_several_processes_draw_unlike_numbers(
     make: Make, cfg: RunSettings, env: FrankaEnv, monkeypatch, tmp_path
 ) -> None:
