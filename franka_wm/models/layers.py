@@ -375,6 +375,11 @@ class GaussianPolicy(nn.Module):
         """Squared error (,) of the mode against actions (..., action_dim), 0 where not `shown` (..., 1): the mean."""
         return ((self(z, deterministic=True) - action).square() * shown).mean()
 
+    @staticmethod
+    def all_shown(shown: Tensor) -> Tensor:
+        """Whether (,) all steps are demonstrations, in the batches of all processes: they share them unequally."""
+        return processes.mean(shown.all().float()) == 1
+
 
 class RunningScale(nn.Module):
     """Running 5-95 percentile range of values, at least 1, by which a policy loss is divided.

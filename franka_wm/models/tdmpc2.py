@@ -333,7 +333,7 @@ class TDMPC2(SimplicialWorldModel):
         if self.imitation_coef and shown is not None:
             # Values that have seen demonstrations alone know no other actions: then the policy imitates alone,
             # and the encoder learns for it, too (MoDem's first phase).
-            alone = shown.all()
+            alone = self.policy_head.all_shown(shown)
             z = torch.where(alone, encoded[:-1], detached[:-1])
             error = self.policy_head.imitation_error(z, action, shown.transpose(0, 1))
             policy_loss = torch.where(alone, 0.0, policy_loss) + self.imitation_coef * error

@@ -7,15 +7,17 @@ from tensordict import TensorDictBase
 from tensordict.nn import InteractionType, TensorDictModuleBase
 from tensordict.nn.probabilistic import interaction_type
 
+from franka_wm import processes
 from franka_wm.policies.planner import CONTEXT
 
 
 class ExploringPolicy(TensorDictModuleBase):
     """A policy whose worlds explore unlike each other, so that planners and critics see more than its own actions.
 
-    World k of N adds Gaussian noise of standard deviation `noise` · k / (N - 1) to its actions, as the actors of Ape-X
-    (arXiv:1803.00933) have an ε each. The last `planner_worlds` act with `planner` instead: a planner that is judged
-    but never gathers meets states and actions that its model has not seen (arXiv:2502.03550).
+    World k of N, of all processes, adds Gaussian noise of standard deviation `noise` · k / (N - 1) to its actions, as
+    the actors of Ape-X (arXiv:1803.00933) have an ε each. The last `planner_worlds` of each process act with `planner`
+    instead: a planner that is judged but never gathers meets states and actions that its model has not seen
+    (arXiv:2502.03550).
 
     Nothing is changed where TorchRL's exploration type is not RANDOM.
 
@@ -23,7 +25,7 @@ class ExploringPolicy(TensorDictModuleBase):
         policy: Writes `action` (N, A) in [-1, 1].
         noise: Standard deviation of the noisiest world, in units of the action.
         planner: Writes `action` and `plan`.
-        planner_worlds: How many of the worlds, the last ones, act with it.
+        planner_worlds: How many of this process's worlds, the last ones, act with it.
 
     Raises:
         ValueError: Planner worlds without a planner.
@@ -59,7 +61,9 @@ class ExploringPolicy(TensorDictModuleBase):
             return tensordict
         if self.noise:
             # From the end: one world alone has all of the noise.
-            std = torch.linspace(self.noise, 0.0, worlds, device=action.device).flip(0).unsqueeze(-1)
+            whole, own = worlds * processes.count(), worlds * processes.rank()
+            std = torch.linspace(self.noise, 0.0, whole, device=action.device).flip(0).unsqueeze(-1)
+            std = std[own : own + worlds]
             action = (action + std * torch.randn_like(action)).clamp(-1.0, 1.0)
         if self.planner is not None:
             keys = dict.fromkeys([*self.planner.in_keys, "action", "plan", *CONTEXT])

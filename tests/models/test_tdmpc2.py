@@ -4,6 +4,7 @@ import pytest
 import torch
 from tensordict import TensorDict
 
+from franka_wm import processes
 from franka_wm.models import make
 from small_tdmpc2 import optimiser_of, point_mass, randomise, small, update, windows
 
@@ -289,3 +290,22 @@ def test_among_demonstrations_alone_the_policy_and_the_encoder_imitate():
         "encoder",
         "policy_head",
     }
+
+
+def test_a_policy_imitates_alone_where_the_windows_of_all_processes_are_demonstrations(monkeypatch):
+    """This one's are, another one's are not: processes share them unequally."""
+    model, batch = small(imitation_coef=2.0), windows()
+    randomise(model)
+    model.eval()
+    batch["demonstrated"] = torch.ones(6, 3, 1, dtype=torch.bool)
+
+    def loss():
+        torch.manual_seed(0)
+        return model.loss(batch)["loss"].item()
+
+    alone = loss()
+    with monkeypatch.context() as patched:
+        patched.setattr(model.policy_head, "all_shown", lambda shown: torch.tensor(False))
+        among_others = loss()
+    monkeypatch.setattr(processes, "mean", lambda x: x / 2)
+    assert loss() == among_others != alone

@@ -6,6 +6,7 @@ from tensordict import TensorDict
 from tensordict.nn import TensorDictModuleBase
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
+from franka_wm import processes
 from franka_wm.policies import ExploringPolicy
 
 WORLDS = 5
@@ -43,6 +44,18 @@ def test_noise_grows_from_none_in_the_first_world_to_all_of_it_in_the_last() -> 
     actions = torch.stack([policy(root())["action"] for _ in range(4000)]).squeeze(-1)
     torch.testing.assert_close(actions.std(0), torch.linspace(0, 0.2, WORLDS), atol=0.01, rtol=0)
     torch.testing.assert_close(actions.mean(0), torch.full((WORLDS,), 0.1), atol=0.02, rtol=0)
+
+
+def test_noise_grows_over_the_worlds_of_all_processes(monkeypatch: pytest.MonkeyPatch) -> None:
+    policy, told = ExploringPolicy(Constant(0.0), noise=0.2), []
+    monkeypatch.setattr(torch, "randn_like", torch.ones_like)
+    told.append(policy(root())["action"])
+    monkeypatch.setattr(processes, "count", lambda: 3)
+    for rank in range(3):
+        monkeypatch.setattr(processes, "rank", lambda rank=rank: rank)
+        told.append(policy(root())["action"])
+    torch.testing.assert_close(told[0].squeeze(-1), torch.linspace(0, 0.2, WORLDS))
+    torch.testing.assert_close(torch.cat(told[1:]).squeeze(-1), torch.linspace(0, 0.2, 3 * WORLDS))
 
 
 def test_no_gradient_is_recorded_and_worlds_need_a_planner() -> None:

@@ -259,6 +259,27 @@ def test_a_process_has_its_part_of_the_whole(monkeypatch: pytest.MonkeyPatch) ->
     assert own.changed(seed=1).collector.num_envs == own.collector.num_envs
 
 
+def test_processes_share_the_demonstrations_of_a_batch(settled, monkeypatch: pytest.MonkeyPatch) -> None:
+    """As many in all as one process has: a tenth of eight is one, though a tenth of two is none."""
+    words = ("env=lift", "scale=smoke", "device=cpu", "replay.demos=there", "replay.batch_size=8")
+    words += (
+        "replay.demo_share=0.1",
+        "replay.demo_share_end=0.9",
+        "trainer.updates=100",
+        "replay.demo_updates=3",
+    )
+    one = settled(*words)
+    monkeypatch.setattr("franka_wm.processes.count", lambda: 4)
+    found = []
+    for rank in range(4):
+        monkeypatch.setattr("franka_wm.processes.rank", lambda rank=rank: rank)
+        own = settled(*words, "gpus=4")
+        found.append([own.demo_windows(update) for update in (0, 3, 25, 50, 100)])
+        assert max(found[-1]) <= own.replay.batch_size
+    whole = [one.demo_windows(update) for update in (0, 3, 25, 50, 100)]
+    assert [sum(each) for each in zip(*found, strict=True)] == whole == [8, 1, 2, 4, 7]
+
+
 def test_each_gpu_has_worlds_of_every_task(settled) -> None:
     """Eight tasks on two GPUs; four worlds on each, or seven and a half tasks, are refused before anything is built."""
     few = ("env=multitask", "gpus=2", "replay.batch_size=8")

@@ -234,14 +234,20 @@ class RunSettings:
         return self.model.window if self.replay.window is None else self.replay.window
 
     def demo_windows(self, update: int) -> int:
-        """How many windows of the batch of this update are demonstrations."""
+        """How many windows of this process's batch are demonstrations at this update: its part of the job's."""
         r, total = self.replay, self.trainer.updates
         if r.demos is None:
             return 0
         if update < r.demo_updates:
             return r.batch_size
         end = r.demo_share if r.demo_share_end is None else r.demo_share_end
-        return round(r.batch_size * (r.demo_share + (end - r.demo_share) * min(1.0, update / max(1, total))))
+        share = r.demo_share + (end - r.demo_share) * min(1.0, update / max(1, total))
+        whole = round(self.parts * r.batch_size * share)
+        if self.parts == 1:
+            return whole
+        from franka_wm import processes  # here: it imports torch
+
+        return processes.own_part(whole)[1]
 
     def demo_starts_from(self, update: int) -> float:
         """From which part of demonstrations on episodes begin at this update: the end at first, then all of them."""
