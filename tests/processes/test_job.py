@@ -6,6 +6,7 @@ import functools
 import json
 import os
 import re
+import shutil
 import signal
 import socket
 import subprocess
@@ -297,8 +298,8 @@ def test_a_killed_process_ends_the_others(tmp_path) -> None:
 
 
 def test_torchrun_starts_a_job_anew(tmp_path) -> None:
-    """Two agents as two hosts; after a process has died, all begin again from what was saved."""
-    folder = tmp_path / "anew"
+    """Two agents as two hosts; after a process has died, all begin again from what was saved, as resumed by hand."""
+    folder, before, again = (tmp_path / name for name in ("anew", "before", "again"))
     with socket.socket() as one:
         one.bind(("localhost", 0))
         port = one.getsockname()[1]
@@ -310,10 +311,19 @@ def test_torchrun_starts_a_job_anew(tmp_path) -> None:
         if (folder / "checkpoints" / "latest" / "manifest.json").exists():
             break
         time.sleep(0.1)
-    os.kill(workers(folder)[1], signal.SIGKILL)
+    ended = workers(folder)
+    os.kill(ended[1], signal.SIGKILL)
+    while {*ended.values()} & {*workers(folder).values()}:
+        time.sleep(0.05)
+    shutil.copytree(folder, before)  # those that begin anew take seconds to load what they need
     said = "".join(finished(job, folder, log=f"log{k}") for k, job in enumerate(jobs))
     assert f"started anew: going on from {folder}" in said and "updates 400/400" in said
     assert checkpoint(folder).counters["updates"] == 400
+    left = checkpoint(before).counters["updates"]
+    assert 0 < left < 400
+    finished(begin(again, f"resume={before}"), again)
+    one, other = bits(folder), bits(again)
+    assert [name for name in one if one[name] != other[name]] == []
 
 
 def test_torchrun_does_not_begin_a_stopped_job_again(tmp_path) -> None:
