@@ -79,6 +79,14 @@ def test_an_experiment_is_its_measured_row(name: str, measured_by: str, words: t
     }
 
 
+@pytest.mark.parametrize("env", ["lift", "push"])
+def test_a_task_with_a_gripper_is_its_measured_row(env: str) -> None:
+    rows = yaml.safe_load((ROOT / "benchmarks" / "results" / "rows.yaml").read_text(encoding="utf-8"))["rows"]
+    measured = flat(compose("scale=gpu", *shlex.split(rows[f"{env}-gpu"]["arguments"])))
+    named = flat(compose(f"env={env}", "scale=gpu"))
+    assert {k for k in named if named[k] != measured[k]} <= {*OF_MEASURING, "evaluation.during"}
+
+
 @pytest.mark.parametrize(("name", "scale"), list(product(options("experiment"), SCALES)))
 def test_every_experiment_at_every_scale(name: str, scale: str) -> None:
     assert flat(compose(f"experiment={name}", f"scale={scale}"))["scale"] == scale
