@@ -55,7 +55,8 @@ def check_task(task: Task, config: FrankaConfig, urdf_path: str | Path | None = 
 def check_start(config: FrankaConfig, robot: Robot) -> None:
     """Refuses a scene that hand or arm would start in, and objects on a table too high or low for the arm.
 
-    Meshes that stand still are not looked at: the box around one may be mostly empty.
+    Meshes that stand still are not looked at: the box around one may be mostly empty. Nor are arms
+    and hands that are not Franka's.
 
     Raises:
         UserError: One line, with the name of what is in the way.
@@ -65,6 +66,8 @@ def check_start(config: FrankaConfig, robot: Robot) -> None:
         return
     if scene.top:
         _check_reach(scene, Kinematics(robot))
+    if not links.is_franka(robot):
+        return
     frames = _link_frames(config, robot)
     hand = list(_hand(frames[-1] * wp.transform(*robot.tool_frame)))
     arm = list(_arm(frames)) if config.collisions != "hand" else []

@@ -5,6 +5,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -15,7 +16,7 @@ import warp as wp
 from franka_wm.envs import FrankaConfig, FrankaEnv
 from franka_wm.envs.robots import load_robot
 from franka_wm.envs.scene import Scene
-from franka_wm.envs.start import _box, _hand, _link_frames, _overlap, check_robot
+from franka_wm.envs.start import _box, _hand, _link_frames, _overlap, check_robot, check_start
 from franka_wm.envs.tasks import Lift, Peg, Push, Task, TorchTask, register
 from franka_wm.envs.tasks.manipulation import READY
 from franka_wm.errors import UserError
@@ -107,6 +108,16 @@ def test_the_hand_is_where_the_simulator_has_it() -> None:
 )
 def test_what_is_not_in_the_way_is_allowed(changes: dict) -> None:
     check_robot(configured(scene={"objects": [CUBE]} | changes, collisions="arm"))
+
+
+def test_another_hand_is_not_guessed_at() -> None:
+    config = configured(scene={"objects": [CUBE], "obstacles": [wall([0.1, 0.1, 0.1], [0.5, 0.0, 0.35])]})
+    robot = load_robot(config)
+    with pytest.raises(UserError, match=r"scene.wall: stands in the hand"):
+        check_start(config, robot)
+    other = robot.tool_frame.copy()
+    other[2] -= 0.05
+    check_start(config, replace(robot, tool_frame=other))
 
 
 def test_an_obstacle_over_a_tall_object_is_in_its_way() -> None:

@@ -54,6 +54,14 @@ def embedded_parts() -> tuple[Part, ...]:
     return _embedded()[1]
 
 
+def is_franka(robot: Robot) -> bool:
+    """Whether joints and tool are where those of a Franka arm with its hand are."""
+    known = _embedded()[0]
+    return np.allclose(known.parent_frames, robot.parent_frames, atol=1e-3) and np.allclose(
+        known.tool_frame, robot.tool_frame, atol=1e-3
+    )
+
+
 def add_link_colliders(builder: newton.ModelBuilder, robot: Robot, *, itself: bool) -> None:
     """Capsules and boxes around all links, unseen, where hand and fingers have theirs already.
 
