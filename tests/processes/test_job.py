@@ -321,7 +321,7 @@ def test_torchrun_starts_a_job_anew(tmp_path) -> None:
     assert checkpoint(folder).counters["updates"] == 400
     left = checkpoint(before).counters["updates"]
     assert 0 < left < 400
-    finished(begin(again, f"resume={before}"), again)
+    run(again, f"resume={before}")
     one, other = bits(folder), bits(again)
     assert [name for name in one if one[name] != other[name]] == []
 

@@ -186,7 +186,8 @@ class GripperTask(Task):
             )
         if cls.grasps and cls.least_objects and config.resolved_scene is not None:
             first, most = config.resolved_scene.objects[0], 1 + config.randomization.object_size
-            if most * min(first.widths) >= 2 * MOST_OPEN:
+            # A mesh has its width from the box around it, and may be grasped where it is thinner.
+            if first.shape != "mesh" and most * min(first.widths) >= 2 * MOST_OPEN:
                 raise UserError(
                     f"scene.{first.name}: {most * min(first.widths):g} m wide; task={config.task} grasps it, and the "
                     f"fingers open {2 * MOST_OPEN:g} m: make it narrower (size)"

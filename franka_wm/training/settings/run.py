@@ -59,7 +59,7 @@ class RunSettings:
         resume: The run or the checkpoint that it goes on from.
         gpus: How many processes learn together, one for each GPU. In each of them worlds, batch and capacity are its
             part of what ``values`` holds for all.
-        parts: Of how many processes these are one's; 1: of all together.
+        parts: Number of processes that share the run, where these are one's; 1: they are of all together.
     """
 
     values: Mapping[str, Any]
