@@ -29,6 +29,7 @@ LAST_WORDS = 1.0
 """So long does the first process outlive what it refuses [s]: others that refuse the same ask its store who says so."""
 
 PIECE = 2**20
+_WHOLE = {1: torch.uint8, 2: torch.int16, 4: torch.int32, 8: torch.int64}
 """So much of the weights is compared at once [bytes]."""
 
 SEEN = ".seen"
@@ -329,13 +330,14 @@ def require_same(state: Mapping[str, Any]) -> None:
 
 
 def _hash(x: Tensor) -> Tensor:
-    """A whole number (,) in which each byte of a tensor has a weight of its own, so that exchanges are seen.
+    """A whole number (,) in which each entry of a tensor has a weight of its own, so that exchanges are seen.
 
-    By pieces: whole numbers of all bytes would take many times the memory of the weights.
+    By pieces: whole numbers of 64 bits for all entries would take twice the memory of the weights, and more.
     """
     found = torch.zeros((), dtype=torch.int64, device=x.device)
     weights = torch.arange(1, PIECE + 1, device=x.device)
-    for piece in x.detach().reshape(-1).view(torch.uint8).split(PIECE):
+    size = x.element_size()
+    for piece in x.detach().reshape(-1).view(_WHOLE.get(size, torch.uint8)).split(PIECE // size):
         found = found * 1_000_003 + (weights[: len(piece)] * piece).sum()  # odd: what differs stays different
     return found
 

@@ -317,7 +317,10 @@ def with_scale(arguments: list[str], stream: TextIO | None = None, *, quiet: boo
         return [a for a in arguments if a != chosen]
     device = next((a.split("=", 1)[1] for a in arguments if a.startswith("device=")), "auto")
     launcher = given(arguments, "hydra/launcher")
-    if launcher in ELSEWHERE and device == "auto":
+    here = (
+        launcher == "ray" and given(arguments, "hydra.launcher.ray.init.address") is None
+    )  # its own cluster
+    if launcher in ELSEWHERE and device == "auto" and not here:
         fail(
             f"hydra/launcher={launcher}: the device of this machine does not say how large runs on others are; add "
             "scale=gpu, scale=laptop or scale=smoke"

@@ -172,7 +172,7 @@ class Scene:
         return out
 
     def _check_room(self) -> None:
-        """Refuses a scene whose bodies overlap, an obstacle or one another, in nearly every draw, or hang over."""
+        """Refuses a scene whose bodies overlap, an obstacle or one another, in any of some draws, or hang over."""
         table = self.table
         for body in self.objects:
             for k in range(2):

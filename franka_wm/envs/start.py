@@ -17,7 +17,7 @@ from franka_wm.envs.config import FrankaConfig
 from franka_wm.envs.constants import MOST_OPEN
 from franka_wm.envs.kinematics import Kinematics
 from franka_wm.envs.robots import Robot, gripper, links, load_robot
-from franka_wm.envs.scene import Scene
+from franka_wm.envs.scene import Scene, Solid
 from franka_wm.envs.tasks import Task
 from franka_wm.errors import UserError
 
@@ -55,8 +55,8 @@ def check_task(task: Task, config: FrankaConfig, urdf_path: str | Path | None = 
 def check_start(config: FrankaConfig, robot: Robot) -> None:
     """Refuses a scene that hand or arm would start in, and objects on a table too high or low for the arm.
 
-    Meshes that stand still are not looked at: the box around one may be mostly empty. Nor are arms
-    and hands that are not Franka's.
+    Of round things counts the box inside them, and meshes are not looked at, since the box around one may be mostly
+    empty. Nor are arms and hands that are not Franka's.
 
     Raises:
         UserError: One line, with the name of what is in the way.
@@ -75,9 +75,8 @@ def check_start(config: FrankaConfig, robot: Robot) -> None:
         if one.shape == "mesh":
             continue
         under = one.half_height if one is scene.table else 0.0  # a table's place is that of its top
-        sides = np.array([*one.widths, 2 * one.half_height])
         turn = wp.quat_from_axis_angle(wp.vec3(0.0, 0.0, 1.0), one.angle)
-        box = _box(wp.transform(wp.vec3(*one.at[:2], one.at[2] - under), turn), 0.5 * sides)
+        box = _box(wp.transform(wp.vec3(*one.at[:2], one.at[2] - under), turn), _filled(one))
         touched = {"hand": hand} if one is scene.table else {"hand": hand, "arm": arm}
         for what, boxes in touched.items():
             if any(_overlap(box, other) for other in boxes):
@@ -85,13 +84,26 @@ def check_start(config: FrankaConfig, robot: Robot) -> None:
                     f"scene.{one.name}: stands in the {what} where it starts; move it (at), or start elsewhere (home)"
                 )
     for one in scene.objects:
-        half = np.array([one.spread[0] + one.radius, one.spread[1] + one.radius, one.half_height])
+        if one.shape == "mesh":
+            continue
+        half = np.array([*one.spread, 0.0]) + _filled(one)
         box = _box(wp.transform(wp.vec3(*one.at, scene.top + one.half_height), wp.quat_identity()), half)
         if any(_overlap(box, other) for other in hand):
             raise UserError(
                 f"scene.{one.name}: {2 * one.half_height:g} m high, it may start in the hand; make it lower (size), or "
                 "move it (at, spread)"
             )
+
+
+def _filled(one: Solid) -> np.ndarray:
+    """Half sides (3,) of a box that a solid fills [m]: of a round one the largest inside it."""
+    radius, high = 0.5 * one.widths[0], one.half_height
+    if one.shape == "sphere":
+        return np.full(3, radius / math.sqrt(3))
+    if one.shape in ("cylinder", "capsule"):
+        side = radius / math.sqrt(2)
+        return np.array([side, side, high - radius * (one.shape == "capsule")])
+    return np.array([0.5 * one.widths[0], 0.5 * one.widths[1], high])
 
 
 def _check_reach(scene: Scene, kinematics: Kinematics) -> None:
@@ -132,11 +144,14 @@ def _hand(tool: wp.transform) -> Iterator[_Box]:
 
 
 def _arm(frames: list) -> Iterator[_Box]:
-    """Boxes around what is touched of the links. The base stands still."""
+    """Boxes in what is touched of the links. The base stands still."""
     for part in links.embedded_parts():
         a, b, c = part.scale
         if part.link:
-            yield _box(frames[part.link] * part.frame, (a, b, c) if part.box else (a, a, a + b))
+            yield _box(
+                frames[part.link] * part.frame,
+                (a, b, c) if part.box else (a / math.sqrt(2), a / math.sqrt(2), b),
+            )
 
 
 def _box(frame: wp.transform, half) -> _Box:

@@ -66,8 +66,8 @@ def check(run: RunSettings) -> None:
         )
     elif run.actor != "policy" and run.collector.planner_worlds:  # no error: files of tuned values set it
         say(
-            f"collector.planner_worlds={run.collector.planner_worlds}: is for collector.policy=policy and does nothing "
-            f"here, where the worlds act by {run.actor}"
+            f"collector.planner_worlds={run.collector.planner_worlds * run.parts}: is for collector.policy=policy "
+            f"and does nothing here, where the worlds act by {run.actor}"
         )
     _check_hindsight(run)
     _check_future(run)

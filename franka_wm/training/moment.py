@@ -11,6 +11,7 @@ from tensordict.nn import TensorDictModuleBase
 from torchrl.collectors import Collector
 
 from franka_wm.envs import Environment, FrankaEnv, MultiTaskEnv
+from franka_wm.seeding import derive_seed
 from franka_wm.training.build import arm_of
 
 
@@ -73,11 +74,11 @@ def go_on_drawing(
 
 
 def draw_anew(policies: Mapping[str, TensorDictModuleBase], seed: int) -> None:
-    """Lets policies that draw at random begin from ``seed``."""
-    for module in _drawing(policies).values():
+    """Lets policies that draw at random begin from ``seed``, each with numbers of its own."""
+    for name, module in _drawing(policies).items():
         for value in vars(module).values():
             if isinstance(value, torch.Generator):
-                value.manual_seed(seed)
+                value.manual_seed(derive_seed(name, seed))
 
 
 def _drawing(policies: Mapping[str, TensorDictModuleBase]) -> dict[str, Drawing]:

@@ -175,6 +175,9 @@ def test_folders_are_not_looked_for_where_a_launcher_may_take_jobs_to_other_mach
 def test_jobs_on_other_machines_name_their_scale(launcher: str, capsys: pytest.CaptureFixture[str]) -> None:
     """A login node without a GPU would make all of them small."""
     command = ["env=lift", f"hydra/launcher={launcher}"]
+    if launcher == "ray":  # on this machine, where no other is named
+        assert entry.with_scale([*command, "device=auto"])[-1].startswith("scale=")
+        command += ["hydra.launcher.ray.init.address=auto"]
     for more in ([], ["scale=auto"]):
         with pytest.raises(SystemExit):
             entry.with_scale([*command, *more])

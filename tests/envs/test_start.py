@@ -24,6 +24,7 @@ from franka_wm.errors import UserError
 CUBE = {"name": "cube", "at": [0.5, 0.0]}
 
 
+BALL = {"name": "ball", "shape": "sphere", "size": [0.15], "at": [0.341, 0.226, 0.433]}
 TALL = {"name": "tall", "size": [0.05, 0.05, 0.5]}
 
 
@@ -55,6 +56,7 @@ def test_objects_stand_apart_where_some_draws_leave_no_room() -> None:
         ("scene.tall: 0.5 m high, it may start in the hand", {"objects": [TALL]}),
         ("scene.wall: stands in the hand", {"obstacles": [wall([0.1, 0.1, 0.1], [0.5, 0.0, 0.35])]}),
         ("scene.wall: stands in the hand", {"obstacles": [wall([0.2, 0.01, 0.1], [0.5, 0.03, 0.31])]}),
+        ("scene.ball: stands in the hand", {"obstacles": [BALL | {"at": [0.5, 0.15, 0.36]}]}),
         ("scene.wall: stands in the arm", {"obstacles": [wall([0.1, 0.1, 0.3], [0.1, 0.0, 0.5])]}),
         ("scene.table: stands in the hand", {"table": {"at": [0.35, 0.0, 0.3]}}),
         ("scene.table.at: with its top at -0.6 m, cube may start", {"table": {"at": [0.35, 0.0, -0.6]}}),
@@ -104,6 +106,8 @@ def test_the_hand_is_where_the_simulator_has_it() -> None:
             "obstacles": [wall([0.2, 0.01, 0.1], [0.5, 0.0, 0.18])],
         },  # between fingers
         {"objects": [CUBE, TALL | {"at": [0.5, 0.4]}]},
+        {"obstacles": [BALL]},  # corners of the box around it are in the palm
+        {"obstacles": [BALL | {"shape": "cylinder", "size": [0.15, 0.4], "at": [0.36, 0.226, 0.433]}]},
     ],
 )
 def test_what_is_not_in_the_way_is_allowed(changes: dict) -> None:

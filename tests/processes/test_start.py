@@ -264,6 +264,7 @@ LARGE = torch.arange(600_000, dtype=torch.float32)  # more than two pieces
         {"a": torch.tensor(2), "c": torch.tensor(1)},  # exchanged weights
         {"d": torch.tensor([True, False])},
         {"e": torch.tensor([1.0, 1.0078125], dtype=torch.bfloat16)},
+        {"g": torch.tensor([0.99610901, 1.0])},  # as many in the sum of their bytes
         {},
     ],
 )
@@ -271,6 +272,7 @@ def test_weights_that_are_no_longer_the_same_end_the_run(monkeypatch, there: dic
     """Also those whose sums are: the first that differs is named. What is no tensor is not compared."""
     weights = {"a": torch.tensor(1), "b": LARGE, "c": torch.tensor(2), "d": torch.tensor([False, True])}
     weights |= {"e": torch.ones(2, dtype=torch.bfloat16), "f": torch.zeros(0)}
+    weights["g"] = torch.tensor([1.0, 0.99610901])
     heard = []
     monkeypatch.setattr(processes, "count", lambda: 2)
     monkeypatch.setattr(processes, "objects", lambda mine: heard.append(mine) or [heard[0], mine])

@@ -124,7 +124,7 @@ def test_a_process_names_the_numbers_of_the_whole_job(monkeypatch, settled) -> N
     batch = TensorDict({"x": torch.zeros(4, 5, 250)}, [4, 5])  # 1 kB a step
     replay = make_replay(capacity=2000, num_envs=4, window=2, batch_size=2, device="cpu")
     monkeypatch.setattr(storage_budget, "free_memory", lambda device: 1e6)
-    said = r"=4000: .* on each of 2 GPUs \(1\.0 kB a step\) .*at most replay\.capacity=1800 would"
+    said = r"=4000: .* on each of 2 processes \(1\.0 kB a step\) .*at most replay\.capacity=1800 would"
     with pytest.raises(UserError, match=said):
         storage_budget.fill(replay, batch, run)
     with pytest.raises(UserError, match=r"planner_worlds=10: .* at most collector\.num_envs=8;"):

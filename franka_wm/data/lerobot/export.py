@@ -208,8 +208,9 @@ def written_before(settings: Mapping[str, Any], out: Path) -> bool:
 
 
 def _alike(config: Mapping[str, Any]) -> dict[str, Any]:
-    """What of a run's configuration stays as it goes on."""
-    return {key: value for key, value in config.items() if key not in ("resume", "plugins", "device", "gpus")}
+    """What of a run's configuration stays as it goes on. A checkpoint's model says more: what it was built with."""
+    kept = {key: value for key, value in config.items() if key not in ("resume", "plugins", "device", "gpus")}
+    return kept | {"model": config["model"]["name"]}
 
 
 def check_export(settings: Mapping[str, Any]) -> None:

@@ -176,8 +176,9 @@ class RunSettings:
 
     @property
     def on_each(self) -> str:
-        """Says in a message that its number is one GPU's, where what it names is of all."""
-        return f" on each of {self.parts} GPUs" if self.parts > 1 else ""
+        """Says in a message that its number is one process's, where what it names is of all."""
+        what = "processes" if self.device == "cpu" else "GPUs"
+        return f" on each of {self.parts} {what}" if self.parts > 1 else ""
 
     def _shared(self, parts: int) -> RunSettings:
         """What one of so many processes has of the whole run."""

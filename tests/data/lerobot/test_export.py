@@ -17,6 +17,7 @@ RUN: dict[str, Any] = {
     "device": "cpu",
     "seed": 0,
     "trainer": {"updates": 4},
+    "model": {"name": "tdmpc2", "value_low": None},
     "export": {"kind": "lerobot", "out": None, "format": "exact", "repo_id": None},
     "env": {"kind": "franka", "image_size": 16},
 }
@@ -30,10 +31,11 @@ def test_a_dataset_is_that_of_the_run_which_goes_on(tmp_path: Path, make_schema,
         [make_episode(schema, 0)],
         provenance=describe(policy="p", seed=0, config=RUN),
     )
-    again = RUN | {"resume": "run", "device": "cuda"}
+    again = RUN | {"resume": "run", "device": "cuda", "model": {"name": "tdmpc2", "value_low": -3.2}}
     exports = {"export": RUN["export"] | {"out": str(out)}}
     assert written_before(again, out) and not written_before(again, tmp_path / "none")
-    for other in (RUN, again | {"trainer": {"updates": 8}}):  # from the beginning; and farther
+    # From the beginning, farther, and of another family.
+    for other in (RUN, again | {"trainer": {"updates": 8}}, again | {"model": {"name": "dreamer"}}):
         assert not written_before(other, out)
         with pytest.raises(UserError, match=r"export\.out=.*set exists"):
             check_export(other | exports)
