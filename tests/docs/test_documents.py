@@ -136,7 +136,7 @@ VERBS = list(commands("franka-wm"))
 
 
 def choices(overrides: list[str]) -> Iterator[list[str]]:
-    """What a sweep would run: every value of a list ``a=1,2``, the other lists at their first; intervals, too."""
+    """What a sweep would run: every value of a list ``a=1,2``, the ends of a range, the other lists at their first."""
     parsed = OverridesParser.create().parse_overrides(overrides)
     values = [
         [f"{o.input_line.partition('=')[0]}={o.value().start}"]
@@ -149,7 +149,7 @@ def choices(overrides: list[str]) -> Iterator[list[str]]:
     first = [options[0] for options in values]
     yield first
     for k, options in enumerate(values):
-        for option in options[1:]:
+        for option in options[-1:] if parsed[k].is_range_sweep() else options[1:]:
             yield [*first[:k], option, *first[k + 1 :]]
 
 

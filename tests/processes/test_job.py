@@ -294,7 +294,7 @@ def test_a_killed_process_ends_the_others(tmp_path) -> None:
     assert advice is not None, said
     updates = int(checkpoint(folder).counters["updates"])
     assert not workers(folder)
-    finished(begin(tmp_path / "on", advice[1], f"trainer.updates={updates + 2}"), tmp_path / "on")
+    run(tmp_path / "on", advice[1], f"trainer.updates={updates + 2}")
 
 
 def test_torchrun_starts_a_job_anew(tmp_path) -> None:
