@@ -29,8 +29,9 @@ LAST_WORDS = 1.0
 """So long does the first process outlive what it refuses [s]: others that refuse the same ask its store who says so."""
 
 PIECE = 2**20
-_WHOLE = {1: torch.uint8, 2: torch.int16, 4: torch.int32, 8: torch.int64}
 """So much of the weights is compared at once [bytes]."""
+_WHOLE = {1: torch.uint8, 2: torch.int16, 4: torch.int32, 8: torch.int64}
+"""Size of an entry [bytes] → whole numbers of that size."""
 
 SEEN = ".seen"
 SOON = 90.0
