@@ -124,6 +124,20 @@ def test_another_hand_is_not_guessed_at() -> None:
     check_start(config, replace(robot, tool_frame=other))
 
 
+def test_a_drawer_that_seldom_leaves_no_room_is_refused() -> None:
+    """In 3 of 256 draws, none of them among the first 32: drawing the cube anew does not move the drawer."""
+    drawer = {
+        "name": "chest",
+        "kind": "drawer",
+        "travel": 0.12,
+        "at": [0.7, 0.0],
+        "spread": [0.03, 0.05],
+        "turn": 0.1,
+    }
+    with pytest.raises(UserError, match=r"scene.cube: stands in something else in 1 % of 256 draws"):
+        configured(scene={"objects": [CUBE | {"at": [0.295, 0.2]}], "articulated": [drawer]})
+
+
 def test_an_obstacle_over_a_tall_object_is_in_its_way() -> None:
     tall = TALL | {"at": [0.5, 0.4]}
     shelf = {"name": "shelf", "size": [0.2, 0.2, 0.02], "at": [0.5, 0.4, 0.4]}
