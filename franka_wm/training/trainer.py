@@ -219,8 +219,8 @@ class Trainer:
             return  # trained weights know their scale
         if self._vectors:
             mean, std = (torch.cat([statistics[key][i] for key in self._vectors]) for i in (0, 1))
-            device, least = self.learner.device, self.settings.trainer.least_deviation
-            self.model.set_observation_statistics(mean.to(device), std.to(device).clamp_min(least))
+            device = self.learner.device
+            self.model.set_observation_statistics(mean.to(device), std.to(device).clamp_min(1e-3))
         if self._standardized:
             self.model.set_image_statistics({key: statistics[key] for key in self._standardized})
 

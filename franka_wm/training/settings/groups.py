@@ -96,7 +96,6 @@ class TrainerSettings:
     checkpoint_every: float = real(120.0, above=0, unit="seconds")
     checkpoint_replay: bool | None = flag(None, null="up to 8 GB")
     standardize: bool = flag(True)
-    least_deviation: float = real(1e-3, above=0)
 
 
 @dataclass(frozen=True)
