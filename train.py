@@ -39,7 +39,7 @@ def main(cfg: DictConfig) -> float | None:
     run = start(cfg)
     env, eval_env = run.build_environments()
     replay, spaces = run.build_experience(env)
-    pretrain(run, env, replay, spaces)
+    pretrain(run, env, replay, spaces, diagnose=diagnose_training)
     model = build.make_model(run.settings, spaces, run.device)
     policies = build.make_agent_policies(run.settings, model, env, spaces, purpose="training")
     eval_policies = build.make_agent_policies(run.settings, model, eval_env, spaces)

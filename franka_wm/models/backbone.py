@@ -16,7 +16,7 @@ from franka_wm.untrusted import linked_json
 
 IMAGENET_MEAN, IMAGENET_STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
 _WEIGHTS = ("model.safetensors", "checkpoints/latest/model.safetensors")
-_PREFIXES = ("target_encoder.", "encoder.", "encoder.network.")
+_PREFIXES = ("target_encoder.", "target_encoder.network.", "encoder.", "encoder.network.")
 
 
 def read_encoder(path: str | Path) -> dict[str, Tensor]:
@@ -24,7 +24,7 @@ def read_encoder(path: str | Path) -> dict[str, Tensor]:
 
     Args:
         path: `model.safetensors`, the folder it is in, or a run's folder. Read are the keys under
-            `target_encoder.` (a teacher, if there is one) or `encoder.`.
+            `target_encoder.` (a teacher, if there is one) or `encoder.`, or those of a `network` in it.
 
     Raises:
         ValueError: no such file, not safetensors, or no vision transformer in it.

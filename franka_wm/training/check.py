@@ -304,6 +304,19 @@ def _say_unread(run: RunSettings, spaces: Spaces) -> None:
     unread = [key for key in spaces.image_sizes if key not in read]
     if unread:
         say(f"not read by the model: {', '.join(unread)} (model.observations)")
+    if run.pretrain.kind != "none":
+        _say_unseen(run, spaces)
+
+
+def _say_unseen(run: RunSettings, spaces: Spaces) -> None:
+    """Says which images the model reads that its encoder, frozen by then, never learned from."""
+    shown = run.first_stage().model.observations or ()
+    unseen = [key for key in run.model.observations or () if key in spaces.image_sizes and key not in shown]
+    if unseen:
+        say(
+            f"the first stage does not see {', '.join(unseen)}, which the model reads: "
+            f"'pretrain.model.observations=[{','.join([*shown, *unseen])}]'"
+        )
 
 
 def known_spaces(run: RunSettings) -> Spaces | None:

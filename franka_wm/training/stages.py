@@ -7,6 +7,8 @@ can be gained by making them easier.
 from __future__ import annotations
 
 import gc
+from collections.abc import Callable
+from typing import TYPE_CHECKING
 
 from franka_wm import processes
 from franka_wm.console import say
@@ -22,9 +24,19 @@ from franka_wm.training.run import Run
 from franka_wm.training.spaces import Spaces
 from franka_wm.training.trainer import Trainer
 
+if TYPE_CHECKING:
+    from tensordict import TensorDictBase
+
+    from franka_wm.models.base import WorldModel
+
 
 def pretrain(
-    run: Run, env: Environment | None, experience: WindowReplay | RecordedWindows, spaces: Spaces
+    run: Run,
+    env: Environment | None,
+    experience: WindowReplay | RecordedWindows,
+    spaces: Spaces,
+    *,
+    diagnose: Callable[[WorldModel, TensorDictBase], tuple[dict[str, float], str | None]] | None = None,
 ) -> None:
     """The first stage, if the settings ask for one; ``model.encoder_from`` then names its checkpoint.
 
@@ -36,6 +48,7 @@ def pretrain(
         env: The training worlds; ``None`` on recorded data.
         experience: Recorded windows; not used where there are worlds.
         spaces: Sizes of observations and actions.
+        diagnose: As of the trainer: a frozen encoder that has collapsed cannot recover later.
     """
     settings = run.settings
     begun = run.checkpoint if run.checkpoint is not None and "whole_run" in run.checkpoint.config else None
@@ -63,6 +76,7 @@ def pretrain(
         evaluate=dict,
         spaces=spaces,
         validation=run.validation,
+        diagnose=diagnose,
     )
     if begun is not None:
         restore(trainer, begun)

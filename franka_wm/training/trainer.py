@@ -408,9 +408,11 @@ class Trainer:
             if latest.exists()
             else "no checkpoint was written"
         )
+        own = "whole_run" in self.settings.values and self.settings.trainer.lr is None  # of a first stage
         raise UserError(
-            f"training broke: {', '.join(broken[:3])} not finite at update {self.learner.updates}; lower trainer.lr "
-            f"({self.learner.lr:g}) or trainer.grad_clip ({self.learner.grad_clip:g}); {saved}"
+            f"training broke: {', '.join(broken[:3])} not finite at update {self.learner.updates}; lower "
+            f"{'pretrain.model.lr' if own else 'trainer.lr'} ({self.learner.lr:g}) or trainer.grad_clip "
+            f"({self.learner.grad_clip:g}); {saved}"
         )
 
     def moment(self) -> dict[str, object]:

@@ -204,6 +204,17 @@ def test_its_own_weights_rebuild_it_without_the_pretrained_checkpoint(jepa_folde
     assert torch.equal(again.encode(batch), model.encode(batch)) and again.frozen
 
 
+def test_the_teacher_of_another_one_is_read(tmp_path):
+    model = small(collapse="ema")
+    with torch.no_grad():
+        for weight in model.encoder.parameters():
+            weight.add_(1.0)
+    save_file({k: v.contiguous() for k, v in model.state_dict().items()}, tmp_path / "model.safetensors")
+    found = read_encoder(tmp_path)
+    for name, weight in model.target_encoder.network.state_dict().items():
+        assert torch.equal(found[name], weight), name
+
+
 def test_what_is_no_checkpoint_is_refused_in_one_line(tmp_path, jepa_folder):
     (tmp_path / "other").mkdir()
     save_file({"head.weight": torch.zeros(2)}, tmp_path / "other" / "model.safetensors")

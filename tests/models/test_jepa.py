@@ -85,6 +85,46 @@ def test_context_and_targets_come_from_the_right_encoders(dots):
     assert calls == [("encoder", visible), ("target_encoder", 16)]
 
 
+@pytest.mark.parametrize("recipe", ["ijepa", "vjepa"])
+def test_each_block_is_asked_for_its_own_tokens_of_the_teacher(recipe, dots, monkeypatch):
+    """Against a plain loop; what is answered depends on which token is asked for."""
+    model = small(recipe=recipe)
+    with torch.no_grad():
+        for weight in model.encoder.parameters():
+            weight.mul_(1.5)
+    batch = dots.windows(3, 2)
+    clips = model._as_clips(batch)
+    answers = torch.randn(model.encoder.num_patches * clips.shape[1], 32)
+    asked = []
+
+    def answer(context, seen, targets, frames):
+        asked.append(targets)
+        return answers[targets]
+
+    monkeypatch.setattr(model.predictor, "forward", answer)
+    loss = model.loss(batch)["loss_prediction"]
+    tokens = torch.nn.functional.layer_norm(model.target_encoder(clips), (32,))
+    distance = torch.nn.functional.l1_loss if recipe == "vjepa" else torch.nn.functional.smooth_l1_loss
+    losses = [
+        distance(answers[index], tokens[n, index])
+        for n, groups in enumerate(asked[0].tolist())
+        for group in groups
+        for index in group
+    ]
+    torch.testing.assert_close(loss, torch.stack(losses).mean())
+
+
+def test_what_it_encodes_is_of_the_teacher(dots):
+    model, alone = small(), small(collapse="none")
+    with torch.no_grad():
+        for weight in [*model.encoder.parameters(), *alone.encoder.parameters()]:
+            weight.mul_(1.5)
+    batch = dots.windows(3, 2)
+    images = batch["pixels"].flatten(0, 1).unsqueeze(1)
+    for one, network in ((model, model.target_encoder), (alone, alone.encoder)):
+        torch.testing.assert_close(one.encode(batch).flatten(0, 1), network(images).mean(1).detach())
+
+
 def test_the_teacher_follows_its_schedule(dots):
     model = small(ema_start=0.9, ema_end=1.0, ema_steps=4)
     assert isinstance(model.target_encoder, ViT)

@@ -61,3 +61,13 @@ def test_images_that_nothing_reads_are_said(
     check(settled("device=cpu", "scale=smoke", *words))
     lines = [line for line in capsys.readouterr().out.splitlines() if "not read" in line]
     assert lines == ([] if unread is None else [f"not read by the model: {unread} (model.observations)"])
+
+
+def test_images_that_only_the_second_stage_reads_are_said(settled, capsys) -> None:
+    words = ("env=reach_goal_image", "env.cameras=[front,side]", "model=action_world_model", "planner=cem")
+    words = (*words, "model.observations=[pixels,pixels_side]", "pretrain=jepa", "scale=smoke", "device=cpu")
+    check(settled(*words))
+    said = "the first stage does not see pixels_side, which the model reads: "
+    assert f"{said}'pretrain.model.observations=[pixels,pixels_side]'" in capsys.readouterr().out.splitlines()
+    check(settled(*words, "pretrain.model.observations=[pixels,pixels_side]"))
+    assert "first stage" not in capsys.readouterr().out

@@ -146,10 +146,12 @@ def test_the_first_stage_leaves_no_replay_behind(settled, tmp_path: Path) -> Non
         storages = [one for one in gc.get_objects() if isinstance(one, LazyTensorStorage)]
         return sum(one.initialized for one in storages)
 
+    seen = []
     gc.collect()
     before = filled()
-    pretrain(run, env, replay, spaces)
+    pretrain(run, env, replay, spaces, diagnose=lambda model, _: seen.append(type(model)) or ({}, None))
     assert filled() == before
+    assert {one.__name__ for one in seen} == {"JEPA"}  # which could collapse
 
 
 def test_a_family_without_an_encoder_to_replace(settled) -> None:
