@@ -6,7 +6,8 @@ Both explore when TorchRL's exploration type is RANDOM, as it is inside a collec
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from functools import partial
+from functools import partial, wraps
+from typing import Any
 
 import torch
 from tensordict import TensorDict, TensorDictBase
@@ -98,12 +99,20 @@ class GoalGuide:
         return torch.cat((first, self.policy(z[:, 1:], goals[:, 1:])), dim=1)
 
 
-def _compiled(function: Callable[..., Tensor]) -> Callable[..., Tensor]:
-    """`function` of latents compiled, for latents that lie in memory as a model returns them: one kind less."""
-    compiled = torch.compile(function, dynamic=False)
+def compiled(function: Callable[..., Any]) -> Callable[..., Any]:
+    """`function` of latents compiled, for latents that lie in memory as a model returns them: one kind less.
 
-    def call(z: Tensor, *given: Tensor, **options: bool) -> Tensor:
-        return compiled(z.contiguous(), *given, **options)
+    After 8 shapes torch runs a function as it is: iCEM has as many for one number of environments. So the limit is
+    raised, for everything that is compiled.
+    """
+    import torch._dynamo.config as dynamo
+
+    dynamo.recompile_limit = max(dynamo.recompile_limit, RECOMPILES)
+    fast = torch.compile(function, dynamic=False)
+
+    @wraps(function, updated=())  # callers look for `deterministic` in its signature
+    def call(z: Tensor, *given: Tensor, **options: bool) -> Any:
+        return fast(z.contiguous(), *given, **options)
 
     return call
 
@@ -193,13 +202,9 @@ class PlannerPolicy(TensorDictModuleBase):
         if precision not in PRECISIONS:
             raise ValueError(f"precision={precision!r}: must be one of {', '.join(PRECISIONS)}")
         if compile:
-            import torch._dynamo.config as dynamo
-
-            # After 8 shapes torch runs a function as it is: iCEM has as many for one number of environments.
-            dynamo.recompile_limit = max(dynamo.recompile_limit, RECOMPILES)
-            next = _compiled(next)
+            next = compiled(next)
             if prior is not None and not isinstance(prior, GoalGuide):
-                prior = _compiled(prior)
+                prior = compiled(prior)
             objective = as_objective(objective).compiled()
         self.precision = precision
         self.objective = as_objective(objective)

@@ -15,7 +15,7 @@ from franka_wm.planning.mcts import MCTS
 from franka_wm.planning.tree import Recurrent
 from franka_wm.policies.capture import GraphCache
 from franka_wm.policies.graph_key import graph_key
-from franka_wm.policies.planner import captures
+from franka_wm.policies.planner import captures, compiled
 from franka_wm.seeding import share_of_worlds
 
 
@@ -59,7 +59,7 @@ class SearchPolicy(TensorDictModuleBase):
     ) -> None:
         super().__init__()
         if compile:
-            recurrent = torch.compile(recurrent, dynamic=False)
+            recurrent = compiled(recurrent)
         self.in_keys = list(observation_keys)
         self.out_keys = ["action", "search_policy", "search_value"]
         self.search, self.explore, self.model, self.generator = search, explore, model, generator

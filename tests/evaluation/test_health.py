@@ -157,6 +157,21 @@ def test_a_perfect_prior_leaves_nothing_to_gain(point_model, states: TensorDict)
     assert found["better"] < 0.1
 
 
+def test_a_compiled_planner_s_prior_is_asked_for_its_mode(
+    model: TDMPC2, batch: TensorDict, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    compiled = torch.compile
+    monkeypatch.setattr(torch, "compile", lambda function, **_: compiled(function, backend="eager"))
+    planner = MPPI(action_dim=2, horizon=2, num_samples=16, num_elites=4, iterations=1, num_policy_samples=4)
+    found = []
+    for wanted in (False, True):
+        policy = PlannerPolicy.for_model(model.eval(), planner, compile=wanted)
+        torch.manual_seed(0)
+        found.append(planner_health(policy, batch[:6, 0]))
+    assert found[1]["prior"] == pytest.approx(found[0]["prior"])
+    assert found[1]["plan"] == pytest.approx(found[0]["plan"])
+
+
 def test_pairs_are_narrower_than_their_parts() -> None:
     """Episodes differ much more than the two policies do on the same one."""
     base = torch.linspace(-50, 0, 60)

@@ -1,5 +1,6 @@
 # pyright: reportArgumentType=false, reportAttributeAccessIssue=false, reportCallIssue=false, reportOptionalMemberAccess=false, reportIncompatibleMethodOverride=false
 import copy
+from functools import partial
 
 import pytest
 import torch
@@ -155,6 +156,17 @@ def test_a_compiled_search_decides_the_same(monkeypatch):
     assert calls == ["recurrent"]
     for key in ("action", "search_policy", "search_value"):
         torch.testing.assert_close(plain[key], fast[key])
+
+
+def test_a_compiled_search_stays_compiled_for_many_numbers_of_worlds(monkeypatch):
+    from torch._dynamo import config, reset
+
+    reset()
+    monkeypatch.setattr(torch, "compile", partial(torch.compile, backend="eager"))
+    with config.patch(recompile_limit=8, fail_on_recompile_limit_hit=True):  # the limit is torch's own
+        policy = acting(compile=True)
+        for worlds in range(1, 13):
+            assert policy(TensorDict({"state": torch.ones(worlds, 1)}, [worlds]))["action"].shape == (worlds,)
 
 
 def test_its_own_generator_makes_actions_repeat():
