@@ -203,8 +203,12 @@ class TwoHotSymlog(nn.Module):
         return torch.cat([one.flatten() for one in beyond]).float().mean()
 
     def decode(self, logits: Tensor) -> Tensor:
-        """Logits (..., bins) -> expected value (..., 1), the expectation taken in symlog space."""
-        return symexp((logits.softmax(-1) * self.support).sum(-1, keepdim=True))
+        """Logits (..., bins) -> expected value (..., 1), the expectation taken in symlog space.
+
+        In the support's precision, also under autocast: bfloat16's probabilities shift a value of 50 by up to 1.
+        """
+        probabilities = logits.softmax(-1, dtype=self.support.dtype)
+        return symexp((probabilities * self.support).sum(-1, keepdim=True))
 
     def loss(self, logits: Tensor, target: Tensor) -> Tensor:
         """Soft cross-entropy: logits (..., bins), target scalars (..., 1) -> (..., 1), broadcasting.

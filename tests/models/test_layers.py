@@ -56,6 +56,18 @@ def test_two_hot_round_trip_over_the_whole_range():
     torch.testing.assert_close(symexp(symlog(x)), x, rtol=1e-4, atol=1e-5)
 
 
+def test_two_hot_values_are_exact_under_autocast():
+    """CUDA computes a softmax in float32 there, a CPU in bfloat16."""
+    code, x = TwoHotSymlog(), torch.tensor([[50.0], [-37.0], [900.0]])
+    logits = (code.encode(x) + 1e-30).log().to(torch.bfloat16)  # as a head returns them
+    with torch.autocast("cpu", torch.bfloat16):
+        found = code.decode(logits)
+    assert found.dtype == torch.float32
+    torch.testing.assert_close(found, code.decode(logits.float()), rtol=1e-5, atol=1e-5)
+    wide = TwoHotSymlog().double()
+    assert wide.decode(logits.double()).dtype == torch.float64
+
+
 def test_two_hot_clamps_what_is_out_of_range():
     code = TwoHotSymlog(bins=11, low=-1.0, high=1.0)
     p = code.encode(torch.tensor([[-1e6], [1e6]]))
