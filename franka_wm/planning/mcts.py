@@ -89,9 +89,6 @@ class MCTS:
 
     def __post_init__(self) -> None:
         check_arguments(MCTS, vars(self), "planner", self.ranges)
-        # No path is longer than the number of simulations.
-        if self.max_depth is not None and self.max_depth >= self.num_simulations:
-            self.max_depth = None
 
     @torch.no_grad()
     def search(
@@ -132,7 +129,7 @@ class MCTS:
             raise ValueError(f"root_embedding must be ({envs}, Z), got {tuple(root_embedding.shape)}")
         if self.kernels is not False:
             return self._walked(root_logits, root_value, root_embedding, recurrent, explore, generator)
-        tree = Tree(self.num_simulations + 1, root_value, root_embedding, self.max_depth)
+        tree = Tree(self.num_simulations + 1, root_value, root_embedding, self._limit())
         rule = (_Puct if self.variant == "puct" else _Gumbel)(self, tree, root_logits, explore, generator)
         for node in range(1, self.num_simulations + 1):
             off_path, actions_of = rule.choose(node)
@@ -174,7 +171,7 @@ class MCTS:
             embedding,
             prior,
             noise,
-            max_depth=self.max_depth,
+            max_depth=self._limit(),
             tiny=_tiny(value),
             options=options,
             considered=considered,
@@ -203,6 +200,10 @@ class MCTS:
             {"action": action} | {key: x.to(value.dtype) for key, x in found.items()},
             batch_size=[len(logits)],
         )
+
+    def _limit(self) -> int | None:
+        """`max_depth` where it matters: no path is longer than the number of simulations."""
+        return None if self.max_depth is None or self.max_depth >= self.num_simulations else self.max_depth
 
     def _halving(self) -> list[int]:
         return sequential_halving(
