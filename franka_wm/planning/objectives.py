@@ -284,7 +284,7 @@ class Sum(Objective):
                     f"the weight of {type(objective).__name__} in a Sum must be finite, got {weight}"
                 )
         self.terms = [(float(weight), as_objective(objective)) for weight, objective in terms]
-        self.in_keys = [key for _, objective in self.terms for key in objective.in_keys]
+        self.in_keys = list(dict.fromkeys(key for _, objective in self.terms for key in objective.in_keys))
 
     def compiled(self) -> Sum:
         """The same sum of compiled terms."""

@@ -303,6 +303,11 @@ class PlannerPolicy(TensorDictModuleBase):
         """The prior of the present decision."""
         return self.prior.bind(tensordict) if isinstance(self.prior, GoalGuide) else self.prior
 
+    def _asked(self, tensordict: TensorDictBase) -> Prior | None:
+        """The same for a search: none towards a goal where no candidate is the policy's, as images would be encoded."""
+        unread = isinstance(self.prior, GoalGuide) and getattr(self.planner, "num_policy_samples", None) == 0
+        return None if unread else self.bound_prior(tensordict)
+
     def _captures(self, inputs: TensorDictBase) -> bool:
         return captures(self.capture, inputs[self.in_keys[0]])
 
@@ -318,7 +323,7 @@ class PlannerPolicy(TensorDictModuleBase):
                 z,
                 self._next_in_float32 if low else self.next,
                 self.objective.bind(tensordict),
-                prior=self.bound_prior(tensordict),
+                prior=self._asked(tensordict),
                 previous=tensordict.get("plan", None),
                 is_init=is_init,
                 explore=explore,

@@ -166,6 +166,7 @@ def test_a_sum_adds_weighted_terms_and_binds_them(trajectory, actions):
     image, smooth = GoalImage(encode_goal), Smoothness(1.0)
     nested = Sum([(0.3, Sum([(2.0, image), (1.0, ActionPenalty(1.0))])), (4.0, smooth)])
     assert nested.in_keys == ["goal_pixels"]
+    assert Sum([(1.0, image), (1.0, nested)]).in_keys == ["goal_pixels"]  # each once
     expected = (
         0.6 * image.bind(td)(trajectory, actions)
         + 0.3 * ActionPenalty(1.0)(trajectory, actions)

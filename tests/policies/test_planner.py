@@ -11,7 +11,7 @@ from torchrl.envs import InitTracker, TransformedEnv
 from torchrl.envs.utils import ExplorationType, check_env_specs, set_exploration_type
 
 from franka_wm.models import WorldModel, make
-from franka_wm.planning import CEM, ICEM, MPPI, GoalDistance, GradientPlanner
+from franka_wm.planning import CEM, ICEM, MPPI, GoalDistance, GoalImage, GradientPlanner
 from franka_wm.policies import ModelPolicy, PlannerPolicy
 from franka_wm.policies.planner import Guide
 from points import GOAL, Points
@@ -300,6 +300,37 @@ def test_what_is_compiled_sees_latents_of_one_kind(monkeypatch):
         compile=True,
     )(observation())
     assert {shape for shape, _ in kinds} == {(3, 4, 2), (3, 16, 2)} and len(kinds) == 2
+
+
+class Towards(Exact):
+    """Its policy acts towards an image, whose encodings it counts."""
+
+    has_goal_policy, encoded = True, 0
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.image_sizes = {"pixels": 4}
+
+    def encode_goal(self, observation):
+        self.encoded += 1
+        return observation.get("pixels").float().flatten(1)[:, :2]
+
+    def goal_policy(self, z, goal, deterministic=False):
+        return (goal - z).clamp(-1, 1)
+
+
+@pytest.mark.parametrize(("samples", "encodings"), [(0, 1), (2, 2)])
+def test_an_image_of_a_goal_is_encoded_for_the_policy_only_where_it_proposes(samples, encodings):
+    model = Towards()
+    acting = PlannerPolicy.for_model(
+        model,
+        CEM(action_dim=2, horizon=2, num_samples=16, num_elites=4, num_policy_samples=samples),
+        objective=GoalImage(model.encode_goal),
+    )
+    seen = observation().set("goal_pixels", torch.zeros(3, 4, 4, 3, dtype=torch.uint8))
+    acting(seen.clone())
+    assert model.encoded == encodings
+    assert acting.bound_prior(seen) is not None  # what is asked of it otherwise
 
 
 def test_capture_is_refused_where_there_is_no_gpu():
