@@ -104,7 +104,7 @@ class ICEM(CEM):
     @property
     def num_kept(self) -> int:
         """R: elites that are carried on."""
-        return int(self.reuse * self.num_elites)
+        return int(self.reuse * self.num_elites + 1e-9)  # 0.29 · 100 is a little less than 29
 
     def population(self) -> list[int]:
         """How many candidates are drawn in each iteration; the reused elites come on top."""

@@ -155,6 +155,13 @@ def test_what_it_returns_as_plan_is_what_it_takes_as_previous():
         search.plan(torch.zeros(3, 2), still, spy, previous=first["best"])
 
 
+@pytest.mark.parametrize(
+    ("reuse", "elites", "kept"), [(0.29, 100, 29), (0.57, 100, 57), (0.3, 4, 1), (1.0, 7, 7)]
+)
+def test_rounding_costs_no_elite(reuse, elites, kept):
+    assert ICEM(action_dim=1, num_samples=200, num_elites=elites, reuse=reuse).num_kept == kept
+
+
 def test_without_reuse_nothing_but_the_mean_is_carried():
     search = ICEM(action_dim=2, horizon=4, reuse=0.0)
     plan = search.plan(torch.zeros(3, 2), still, Spy())["plan"]
