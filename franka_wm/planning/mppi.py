@@ -94,7 +94,7 @@ class MPPI(ElitePlanner):
     def _elites(self, scores: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Scores (E, S) -> the elites' scores, weights and indices, each (E, num_elites)."""
         index, elite, valid = best(scores, self.num_elites)
-        gap = elite - elite.amax(1, keepdim=True)  # at most 0, so that exp cannot overflow
+        gap = elite - elite.amax(1, keepdim=True)  # 0 for the best, so that -1e9 is below all that count
         if self.normalize:
             gap = gap / (elite.std(1, keepdim=True, correction=0) + 1e-6)
         # Finite instead of -inf: if no candidate is valid, the weights are uniform, not nan.

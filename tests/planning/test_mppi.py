@@ -179,12 +179,19 @@ def test_a_prior_that_fails_cannot_poison_the_plan():
     assert all(torch.isfinite(value).all() for value in result.values())
 
 
-def test_large_rewards_do_not_overflow():
-    def objective(trajectory, actions):
-        return 1e5 + 60 * GoalDistance(torch.zeros(2))(trajectory, actions)
+@pytest.mark.parametrize("offset", [1e5, -1e11])
+def test_what_is_added_to_all_scores_does_not_matter(offset):
+    """Also where it is below what stands for a candidate without a score."""
 
-    result = planner(normalize=False).plan(torch.randn(2, 2), step, objective, generator=seeded())
-    assert all(torch.isfinite(value).all() for value in result.values())
+    def plan(offset):
+        def objective(trajectory, actions):
+            scores = offset + 60 * GoalDistance(torch.zeros(2))(trajectory, actions)
+            return torch.where(torch.arange(scores.shape[1]) % 2 == 0, torch.nan, scores)
+
+        search, z = planner(normalize=False, num_elites=256), torch.ones(2, 2, dtype=torch.float64)
+        return search.plan(0.4 * z, step, objective, generator=seeded())["plan"]
+
+    torch.testing.assert_close(plan(offset), plan(0.0), atol=1e-3, rtol=0)
 
 
 def test_temperature_acts_on_normalised_scores_and_weighs_a_healthy_number_of_elites():
