@@ -125,12 +125,12 @@ def sigma(node, c_visit=50.0, c_scale=0.1):
     return torch.tensor([scale * (x - low) / max(high - low, 1e-8) for x in q], dtype=torch.float64)
 
 
-def gumbel(considered, simulations):
-    """Without noise."""
+def gumbel(considered, simulations, *scales):
+    """Without noise; `scales` are c_visit and c_scale."""
     levels = sequential_halving(considered, simulations)
 
     def choose(root, node, simulation):
-        moves, improved = range(len(node.prior)), node.logits + sigma(node)
+        moves, improved = range(len(node.prior)), node.logits + sigma(node, *scales)
         if node is root:
             turn = [m for m in moves if root.visits(m) == levels[simulation]]
             return max(turn, key=improved.tolist().__getitem__)

@@ -27,17 +27,18 @@ def mcts(request):
 # ------------------------------------------------------------------ the plain searches
 
 
+@pytest.mark.parametrize("weights", [(), (0.5, 5.0)], ids=["default", "other"])
 @pytest.mark.parametrize(
     ("simulations", "max_depth"), [(1, None), (2, None), (30, None), (70, None), (30, 1), (30, 3)]
 )
-def test_puct_makes_the_visits_of_a_plain_search(mcts, simulations, max_depth):
+def test_puct_makes_the_visits_of_a_plain_search(mcts, simulations, max_depth, weights):
+    given = dict(zip(("pb_c_init", "pb_c_base"), weights, strict=False))
     for seed in range(2 if simulations < 70 else 1):
         model = RandomModel(seed)
-        found = mcts(num_actions=MOVES, num_simulations=simulations, max_depth=max_depth).search(
-            *model.root(), model.recurrent
-        )
+        search = mcts(num_actions=MOVES, num_simulations=simulations, max_depth=max_depth, **given)
+        found = search.search(*model.root(), model.recurrent)
         for world in range(3):
-            root = plain_search(model, world, simulations, puct(), max_depth)
+            root = plain_search(model, world, simulations, puct(*weights), max_depth)
             assert found["visits"][world].tolist() == [root.visits(m) for m in range(MOVES)]
             assert found["value"][world].item() == pytest.approx(root.mean)
             policy = torch.tensor([root.visits(m) / simulations for m in range(MOVES)], dtype=torch.float64)
@@ -49,7 +50,9 @@ def test_puct_makes_the_visits_of_a_plain_search(mcts, simulations, max_depth):
     ("simulations", "considered", "max_depth"),
     [(1, 16, None), (2, 16, None), (16, 16, None), (70, 16, None), (30, 3, None), (10, 1, None), (30, 16, 2)],
 )
-def test_gumbel_makes_the_visits_of_a_plain_search(mcts, simulations, considered, max_depth):
+@pytest.mark.parametrize("scales", [(), (2.0, 0.1), (50.0, 0.01)], ids=["default", "visit", "scale"])
+def test_gumbel_makes_the_visits_of_a_plain_search(mcts, simulations, considered, max_depth, scales):
+    given = dict(zip(("c_visit", "c_scale"), scales, strict=False))
     for seed in range(2 if simulations < 70 else 1):
         model = RandomModel(seed, moves=6)
         found = mcts(
@@ -58,13 +61,15 @@ def test_gumbel_makes_the_visits_of_a_plain_search(mcts, simulations, considered
             variant="gumbel",
             max_num_considered_actions=considered,
             max_depth=max_depth,
+            **given,
         ).search(*model.root(), model.recurrent)
         for world in range(3):
-            root = plain_search(model, world, simulations, gumbel(min(considered, 6), simulations), max_depth)
+            rule = gumbel(min(considered, 6), simulations, *scales)
+            root = plain_search(model, world, simulations, rule, max_depth)
             visits = [root.visits(m) for m in range(6)]
             assert found["visits"][world].tolist() == visits
             assert found["value"][world].item() == pytest.approx(root.mean)
-            score = root.logits + sigma(root)
+            score = root.logits + sigma(root, *scales)
             torch.testing.assert_close(found["policy"][world], score.softmax(-1))
             most = [m for m in range(6) if visits[m] == max(visits)]
             assert found["action"][world] == max(most, key=lambda m: float(score[m]))
@@ -283,6 +288,14 @@ def test_dirichlet_noise_lets_puct_look_at_what_the_prior_forbids(mcts):
     assert len(explored.unique(dim=0)) > 3  # each environment has its own noise
     quiet = mcts(num_actions=3, num_simulations=25, dirichlet_fraction=0.0)
     assert (quiet.search(*args, explore=True)["visits"][:, 1:] == 0).all()
+
+
+@pytest.mark.parametrize("alpha", [0.03, 30.0])
+def test_the_noise_of_the_root_is_as_wide_as_asked(alpha):
+    settings = MCTS(num_actions=4, dirichlet_alpha=alpha, dirichlet_fraction=0.5)
+    found = mcts_module._root_prior(settings, torch.zeros(4000, 4), True, torch.Generator().manual_seed(0))
+    expected = 0.5 * (0.25 * 0.75 / (4 * alpha + 1)) ** 0.5  # of a symmetric Dirichlet distribution
+    torch.testing.assert_close(found.std(0), torch.full((4,), expected), rtol=0.05, atol=0)
 
 
 @pytest.mark.parametrize(("temperature", "power"), [(1.0, 1.0), (0.5, 2.0)])

@@ -126,6 +126,16 @@ def test_far_goals_are_approached_at_full_speed_and_bounds_hold(name):
         result = planner.plan(z, push, GoalDistance(goal), explore=explore, generator=seeded())
         for entry in (result["action"], result["plan"], sequence(result)):
             assert entry.min() >= 0.2 and entry.max() <= 0.7
+    shown = []  # nor is anything beyond them asked of the model, whatever a policy says
+
+    def score(trajectory, actions):
+        shown.append(actions.detach())
+        return GoalDistance(goal)(trajectory, actions)
+
+    guided = make(name, low=0.2, high=0.7, num_policy_samples=3)
+    guided.plan(z, push, score, prior=lambda z: torch.full_like(z, 9.0), generator=seeded())
+    assert all(actions.min() >= 0.2 and actions.max() <= 0.7 for actions in shown) and shown
+    assert (shown[0] > 0.69).all((-2, -1)).any()  # the policy was asked
     plan = sequence(planner.plan(z, push, GoalDistance(goal), generator=seeded()))
     assert (plan[..., 0] > 0.6).float().mean() > 0.9 and (plan[..., 1] < 0.3).float().mean() > 0.9
 

@@ -14,6 +14,7 @@ from franka_wm.planning import CEM, MCTS, MPPI
 from franka_wm.planning.objectives import ActionPenalty, GoalDistance, Sum
 from franka_wm.policies import PlannerPolicy, SearchPolicy, capture
 from franka_wm.policies.capture import GraphCache
+from franka_wm.seeding import drawing_for
 
 on_gpu = pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
 
@@ -155,6 +156,7 @@ def test_a_policy_captures_anew_when_settings_mode_or_planner_change(recorded, m
         lambda: setattr(policy, "planner", small(CEM)),
         lambda: model.eval(),
         lambda: setattr(policy, "explore", True),
+        lambda: setattr(policy, "precision", "bfloat16"),
     ):
         before = len(recorded)
         decide()
@@ -162,6 +164,17 @@ def test_a_policy_captures_anew_when_settings_mode_or_planner_change(recorded, m
         change()
         decide()
         assert len(recorded) == before + 1
+
+
+def test_a_captured_plan_is_of_one_share_of_the_worlds(monkeypatch):
+    """It draws for some of the worlds; another share of them must not replay it."""
+    monkeypatch.setattr("franka_wm.policies.planner.captures", lambda *_: True)
+    policy, keys = PlannerPolicy.for_model(small_model(), small(MPPI), explore=True), []
+    policy._graphs = lambda decide, inputs, *, key, **_: (keys.append(key), decide(inputs))[1]  # type: ignore[assignment]
+    for first in (0, 0, 2):
+        with drawing_for(first, 2, 4):
+            policy(observation(2))
+    assert keys[0] == keys[1] != keys[2]
 
 
 def test_a_policy_captures_anew_when_its_objective_changes(recorded, monkeypatch):
