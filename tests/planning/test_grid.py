@@ -139,6 +139,7 @@ CASES: dict[str, Callable[[], Case]] = {
     "linear": toy(Linear, lambda m: RewardPlusValue(m.reward, m.value, m.discount)),
     "goal": toy(Goal, lambda m: GoalDistance(m.encode(TensorDict({"state": torch.ones(ENVS, 2)}, [ENVS])))),
     "context": toy(Context, lambda m: GoalDistance(torch.ones(2), embed=m.embed)),
+    "dreamer": learned("dreamer", deter_dim=16, hidden_dim=16, codes=4, classes=4, blocks=2, bins=41),
     "tdmpc2": learned("tdmpc2", latent_dim=16, encoder_dim=16, hidden_dim=16),
 }
 
