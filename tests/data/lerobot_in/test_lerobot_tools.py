@@ -5,44 +5,33 @@ from __future__ import annotations
 import importlib.util
 import json
 import os
-import subprocess
-import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
+from lerobot_tools import Tools
+
 pytestmark = pytest.mark.slow
 
-BIN = Path(sys.executable).parent
+
+@pytest.fixture(scope="module")
+def tools(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Tools]:
+    """LeRobot's programs, offline and away from the user's own data."""
+    home = tmp_path_factory.mktemp("home")
+    homes = {"HF_HOME": str(home / "hf"), "HF_LEROBOT_HOME": str(home / "lerobot")}
+    programs = Tools(os.environ | homes | {"HF_HUB_OFFLINE": "1", "OMP_NUM_THREADS": "1"})
+    yield programs
+    programs.close()
 
 
 @pytest.fixture
-def tool(tmp_path: Path) -> Callable[..., str]:
-    """Runs one of LeRobot's programs, offline and away from the user's own data; what it said."""
-
-    def run(name: str, *options: str) -> str:
-        environment = os.environ | {
-            "HF_HUB_OFFLINE": "1",
-            "OMP_NUM_THREADS": "1",
-            "HF_HOME": str(tmp_path / "hf"),
-            "HF_LEROBOT_HOME": str(tmp_path / "lerobot"),
-        }
-        done = subprocess.run(
-            [str(BIN / name), *options],
-            capture_output=True,
-            text=True,
-            env=environment,
-            cwd=tmp_path,
-            timeout=600,
-        )
-        said = done.stdout + done.stderr
-        assert done.returncode == 0, said[-3000:]
-        return said
-
-    return run
+def tool(tools: Tools, tmp_path: Path) -> Callable[..., str]:
+    """Runs one of them in the test's folder; what it said."""
+    return partial(tools, tmp_path)
 
 
 def states(windows: Any) -> np.ndarray:
