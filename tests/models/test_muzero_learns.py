@@ -75,11 +75,14 @@ def test_it_learns_a_chain_from_its_own_searches(variant):
             optimiser.zero_grad()
             losses["loss"].backward()
             optimiser.step()
-        final = episodes(Chain(torch.arange(5)), decides, Chain.STEPS)
-        right = right + 1 if final["next", "reward"].sum((1, 2)).tolist() == Chain.BEST else 0
         z = model.encode(TensorDict({"state": torch.eye(5)}, [5]))
         policy = model.policy(z, deterministic=True)
-        if right >= 3 and torch.equal(policy, Chain.ON):
+        if not torch.equal(policy, Chain.ON):  # searches take time
+            right = 0
+            continue
+        final = episodes(Chain(torch.arange(5)), decides, Chain.STEPS)
+        right = right + 1 if final["next", "reward"].sum((1, 2)).tolist() == Chain.BEST else 0
+        if right >= 3:
             break
     assert right >= 3  # several rounds in a row, so that it is no luck
     # Each part has learned what it is for, not only their sum.
