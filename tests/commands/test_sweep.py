@@ -18,7 +18,7 @@ from hydra.core.hydra_config import HydraConfig
 from hydra.types import RunMode
 from omegaconf import OmegaConf
 
-from forks import TRAIN, Fork, script, train_in_fork
+from forks import TRAIN, Fork, script, spare, torchrun_in_fork, train_in_fork
 from franka_wm.commands import entry, several
 from franka_wm.commands.overrides import compose, explain
 from franka_wm.commands.several import refused_job, spread
@@ -44,9 +44,9 @@ KEEPS = "+hydra.callbacks.kept._target_=hydra.experimental.callbacks.PickleJobIn
 
 
 def sweep(place: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
-    return train_in_fork(
-        "--multirun", *SMOKE, *SMALL, KEEPS, *arguments, f"hydra.sweep.dir={place / 'sweep'}", cwd=place
-    )
+    """In a fork; so are the processes of a job that has several."""
+    words = ("--multirun", *SMOKE, *SMALL, KEEPS, *arguments, f"hydra.sweep.dir={place / 'sweep'}")
+    return spare().fork(torchrun_in_fork(script(TRAIN, *words)), place)
 
 
 def returned(job: Path) -> float | None:
@@ -214,9 +214,9 @@ def test_jobs_of_other_processes_are_looked_after_as_well(tmp_path: Path, launch
     plugin = f"hydra_plugins.hydra_{launcher.partition('_')[0]}_launcher"
     pytest.importorskip(plugin, reason=f"hydra/launcher={launcher} is not installed")
     rates = "trainer.lr=1e30,1e-3" if launcher == "joblib" else "trainer.lr=1e30,1e-3,2e-3"
-    command = [sys.executable, str(TRAIN), "--multirun", f"hydra/launcher={launcher}", *LAUNCHERS[launcher]]
-    command += [*SMOKE, *SMALL, rates, f"hydra.sweep.dir={tmp_path}/sweep"]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=400)
+    command = ["--multirun", f"hydra/launcher={launcher}", *LAUNCHERS[launcher], *SMOKE, *SMALL, *FEW, rates]
+    command += ["evaluation.during=[]", f"hydra.sweep.dir={tmp_path}/sweep"]
+    done = train_in_fork(*command, cwd=tmp_path)  # its jobs are processes of their own
     assert done.returncode == 1 and "Traceback" not in done.stderr, done.stderr
     failed = [line for line in done.stderr.splitlines() if line.startswith("error: ")]
     count = 1 + rates.count(",")
@@ -224,7 +224,7 @@ def test_jobs_of_other_processes_are_looked_after_as_well(tmp_path: Path, launch
     logs = [(tmp_path / "sweep" / f"{k}-reach" / "train.log").read_text() for k in range(count)]
     assert "training broke" in logs[0] and all("results: " in log for log in logs[1:])
     if launcher == "joblib":
-        again = subprocess.run(command, capture_output=True, text=True, timeout=240)
+        again = train_in_fork(*command, cwd=tmp_path)
         assert again.returncode == 1 and "job 1 (trainer.lr=0.001) was finished before" in again.stdout
 
 

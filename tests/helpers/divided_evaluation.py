@@ -1,8 +1,7 @@
-"""Evaluations whose episodes two processes divide: ``python divided_evaluation.py RANK FOLDER``."""
+"""Evaluations whose episodes two processes divide."""
 
 from __future__ import annotations
 
-import sys
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
@@ -73,12 +72,12 @@ def evaluated(name: str, folder: Path) -> dict[str, Any]:
     }
 
 
-if __name__ == "__main__":
-    rank, folder = int(sys.argv[1]), Path(sys.argv[2])
-    torch.set_num_threads(1)
-    distributed.init_process_group("gloo", init_method=f"file://{folder}/meet", rank=rank, world_size=2)
+def together(folder: Path) -> None:
+    """What one process of the job does: it writes what it has found into a folder."""
+    distributed.init_process_group("gloo")
     for name in CASES:
         (folder / name).mkdir(exist_ok=True)
-    torch.save({name: evaluated(name, folder / name) for name in CASES}, folder / f"found{rank}.pt")
+    found = {name: evaluated(name, folder / name) for name in CASES}
+    torch.save(found, folder / f"found{processes.rank()}.pt")
     processes.wait()
     processes.leave()

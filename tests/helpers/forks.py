@@ -82,6 +82,9 @@ class Fork:
         except BaseException:
             traceback.print_exc()
         finally:
+            loky = sys.modules.get("joblib.externals.loky.reusable_executor")
+            if loky is not None and loky._executor is not None:  # its processes are waited for below
+                loky._executor.shutdown(kill_workers=True)
             if "multiprocessing.util" in sys.modules:  # its exit handler, as in forks of its own
                 sys.modules["multiprocessing.util"]._exit_function()
             sys.stdout.flush()
@@ -153,9 +156,22 @@ class Spare:
     ) -> subprocess.CompletedProcess[str]:
         """Run `work`, which can be pickled, in a fork of it to its end; its exit status and output."""
         with tempfile.TemporaryDirectory() as folder:
-            self._here.sendall(pickle.dumps((work, cwd, Path(folder, "log"), seconds)))
-            pickle.load(self._answers)
-            found = pickle.load(self._answers)
+            self.begin(work, cwd, Path(folder, "log"), seconds)
+            return self.end()
+
+    def begin(self, work: Callable[[], Any], cwd: Path, log: Path, seconds: float = 240.0) -> int:
+        """Begin such a fork; its process number. Nothing else can be asked for before `end`.
+
+        Args:
+            work, cwd, log: As for a `Fork`.
+            seconds: It is killed after so long, and `end` fails.
+        """
+        self._here.sendall(pickle.dumps((work, cwd, log, seconds)))
+        return pickle.load(self._answers)
+
+    def end(self) -> subprocess.CompletedProcess[str]:
+        """Wait for the fork that has begun; its exit status and output."""
+        found = pickle.load(self._answers)
         if isinstance(found, AssertionError):
             raise found
         return found
@@ -176,24 +192,29 @@ def spare() -> Spare:
 
 def job_in_fork(count: int, *arguments: str, cwd: Path) -> subprocess.CompletedProcess[str]:
     """The same by so many processes, as torchrun starts them on one host; exit status: the first that is not 0."""
-    return spare().fork(functools.partial(_job, count, arguments), cwd)
+    return ranks_in_forks([script(TRAIN, *arguments)] * count, cwd)
 
 
-def _job(count: int, arguments: tuple[str, ...]) -> None:
+def ranks_in_forks(works: list[Callable[[], Any]], cwd: Path) -> subprocess.CompletedProcess[str]:
+    """What each process of a job does, in the environment that torchrun would give it."""
+    return spare().fork(functools.partial(_ranks, works), cwd)
+
+
+def _ranks(works: list[Callable[[], Any]]) -> None:
     with socket.socket() as one:
         one.bind(("localhost", 0))
         port = one.getsockname()[1]
-    common = {"WORLD_SIZE": count, "LOCAL_WORLD_SIZE": count, "TORCHELASTIC_RUN_ID": "forks"}
+    common = {"WORLD_SIZE": len(works), "LOCAL_WORLD_SIZE": len(works), "TORCHELASTIC_RUN_ID": "forks"}
     common |= {"MASTER_ADDR": "localhost", "MASTER_PORT": port}
     forks = []
-    for rank in range(count):
+    for rank, work in enumerate(works):
         pid = os.fork()
         if pid == 0:
             status = 1
             try:
                 own = {"RANK": rank, "LOCAL_RANK": rank}
                 os.environ.update({name: str(value) for name, value in (common | own).items()})
-                _script(TRAIN, arguments)
+                work()
             except BaseException:  # a job ends by os._exit
                 traceback.print_exc()
             finally:
@@ -201,6 +222,68 @@ def _job(count: int, arguments: tuple[str, ...]) -> None:
         forks.append(pid)
     found = [os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1]) for pid in forks]
     sys.exit(next(filter(None, found), 0))
+
+
+def torchrun_in_fork(work: Callable[[], Any]) -> Callable[[], Any]:
+    """`work` for a fork; the processes that torchrun starts there are forks of it.
+
+    Each leaves its number in `rankK.pid` in the working directory.
+    """
+    return functools.partial(_torchrun, work)
+
+
+def _torchrun(work: Callable[[], Any]) -> None:
+    from torch.distributed.elastic.multiprocessing.subprocess_handler import subprocess_handler
+
+    subprocess_handler.Popen = _Rank  # pyright: ignore[reportAttributeAccessIssue]
+    work()
+
+
+class _Rank(subprocess.Popen):
+    """``PYTHON [-u] FILE …`` or ``PYTHON [-u] -m MODULE …`` in a session of its own, as a fork of this process."""
+
+    def __init__(self, args: tuple[str, ...], env: dict[str, str], **options: Any) -> None:
+        super().__init__(args, env=env, **options)
+        Path(f"rank{env['RANK']}.pid").write_text(str(self.pid))
+
+    def _execute_child(self, args: tuple[str, ...], *options: Any) -> None:
+        environment = options[5]
+        self.pid = os.fork()
+        if self.pid == 0:
+            words = args[2:] if args[1] == "-u" else args[1:]
+            os._exit(self._run(words, environment))
+        self._child_created = True
+
+    @staticmethod
+    def _run(words: tuple[str, ...], environment: dict[str, str]) -> int:
+        status = 1
+        try:
+            os.setsid()
+            for one in (signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT):  # torchrun has handlers
+                signal.signal(one, signal.SIG_DFL)
+            signal.signal(signal.SIGINT, signal.default_int_handler)
+            os.environ.clear()
+            os.environ.update(environment)
+            GlobalHydra.instance().clear()
+            for name, module in list(
+                sys.modules.items()
+            ):  # plugins, which torchrun's process has loaded to look at
+                if str(getattr(module, "__file__", "")).startswith(os.getcwd()):
+                    del sys.modules[name]
+            if words[0] == "-m":
+                sys.argv = list(words[1:])
+                runpy.run_module(words[1], run_name="__main__", alter_sys=True)
+            else:
+                _script(Path(words[0]), words[1:])
+            status = 0
+        except SystemExit as end:
+            status = end.code if isinstance(end.code, int) else int(end.code is not None)
+        except BaseException:
+            traceback.print_exc()
+        finally:
+            sys.stdout.flush()
+            sys.stderr.flush()
+        return status
 
 
 def train_in_fork(*arguments: str, cwd: Path) -> subprocess.CompletedProcess[str]:

@@ -1,8 +1,7 @@
-"""Every family learns from parts of batches in several processes: ``python parts_of_batches.py RANK FOLDER``."""
+"""Every family learns from parts of batches in several processes."""
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -16,7 +15,7 @@ from torch.overrides import TorchFunctionMode
 from franka_wm import models, processes
 from franka_wm.training.learner import Learner
 
-UPDATES, BATCH, ACTIONS, MOVES = 20, 8, 2, 5
+UPDATES, BATCH, ACTIONS, MOVES = 8, 8, 2, 5
 IMAGE = {"pixels": (16, 16, 3)}
 VECTORS = {"state": 3, "joint_target": 2}
 DENSE = dict(latent_dim=32, simnorm_dim=8, encoder_dim=32, hidden_dim=32)
@@ -151,14 +150,13 @@ def learn(name: str) -> dict[str, Tensor]:
     return {key: value for key, value in model.state_dict().items() if isinstance(value, Tensor)}
 
 
-if __name__ == "__main__":
-    rank, folder = int(sys.argv[1]), Path(sys.argv[2])
-    torch.set_num_threads(1)
-    distributed.init_process_group("gloo", init_method=f"file://{folder}/meet", rank=rank, world_size=2)
+def together(folder: Path) -> None:
+    """What one process of the job does: the first writes the weights of all families into a folder."""
+    distributed.init_process_group("gloo")
     found = {name: learn(name) for name in FAMILIES}
     processes.wait()
     for tensors in found.values():
         processes.require_same(tensors)
-    if rank == 0:
+    if processes.rank() == 0:
         torch.save(found, folder / "learned.pt")
     processes.leave()

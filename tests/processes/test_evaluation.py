@@ -3,19 +3,17 @@
 from __future__ import annotations
 
 import json
-import os
-import subprocess
-import sys
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import pytest
 import torch
 
-from divided_evaluation import CASES, evaluated
+from divided_evaluation import CASES, evaluated, together
+from forks import ranks_in_forks
 from franka_wm import processes
 
-HELPER = Path(__file__).parents[1] / "helpers" / "divided_evaluation.py"
 TOLD = ("policies", "protocol", "point")
 pytestmark = [pytest.mark.slow]
 
@@ -24,12 +22,8 @@ pytestmark = [pytest.mark.slow]
 def divided(tmp_path_factory) -> tuple[Path, list[dict[str, Any]]]:
     """Folder, and what each of two processes has found."""
     folder = tmp_path_factory.mktemp("divided")
-    environment = {**os.environ, "OMP_NUM_THREADS": "1"}
-    ranks = [
-        subprocess.Popen([sys.executable, str(HELPER), str(rank), str(folder)], env=environment)
-        for rank in range(2)
-    ]
-    assert [rank.wait(timeout=400) for rank in ranks] == [0, 0]
+    done = ranks_in_forks([partial(together, folder)] * 2, folder)
+    assert done.returncode == 0, done.stdout + done.stderr
     return folder, [torch.load(folder / f"found{rank}.pt", weights_only=False) for rank in range(2)]
 
 

@@ -21,7 +21,7 @@ import torch
 from safetensors.torch import load_file
 from tensordict import TensorDict
 
-from forks import job_in_fork, train_in_fork
+from forks import TRAIN, job_in_fork, script, spare, torchrun_in_fork, train_in_fork
 from franka_wm.console import quoted, resuming
 from franka_wm.envs import FrankaConfig, FrankaEnv
 from franka_wm.evaluation.protocol import evaluate_agent
@@ -31,7 +31,7 @@ from franka_wm.training.load import load_agent
 ROOT = Path(__file__).resolve().parents[2]
 SMOKE = [
     "env=reach", "scale=smoke", "device=cpu", "env.episode_length=12", "evaluation.episodes=4", "evaluation.during=[]",
-    "logger=none",
+    "evaluation.video_episodes=0", "logger=none",
 ]  # fmt: skip
 TORCHRUN = ["-m", "torch.distributed.run"]
 pytestmark = [pytest.mark.slow]
@@ -46,15 +46,8 @@ def begin(
 ) -> subprocess.Popen:
     """A job in the background, within a folder; what it says is in ``FOLDER.log``."""
     out = folder.with_suffix(f".{log}").open("w")
-    kept = [] if any("resume=" in one for one in overrides) else SMOKE  # a run that resumes has its own
-    command = [
-        sys.executable,
-        *before,
-        str(ROOT / "train.py"),
-        *kept,
-        *overrides,
-        f"hydra.run.dir={quoted(str(folder))}",
-    ]
+    command = [sys.executable, *before, str(TRAIN), *SMOKE, *overrides]
+    command += [f"hydra.run.dir={quoted(str(folder))}"]
     environment = {**os.environ, "OMP_NUM_THREADS": "1", "TORCH_DISABLE_SHARE_RDZV_TCP_STORE": "1"}
     return subprocess.Popen(command, stdout=out, stderr=subprocess.STDOUT, env=environment, cwd=within)
 
@@ -65,6 +58,27 @@ def finished(job: subprocess.Popen, folder: Path, *, status: int = 0, log: str =
     said = folder.with_suffix(f".{log}").read_text()
     assert code == status, said
     return said
+
+
+class Forks:
+    """``train.py gpus=2 …`` in a fork, as are the processes that it starts; one at a time."""
+
+    def __init__(self, folder: Path, *overrides: str) -> None:
+        words = (*SMOKE, *overrides, f"hydra.run.dir={quoted(str(folder))}")
+        work = torchrun_in_fork(script(TRAIN, *words))
+        self._place = folder.parent
+        self.pid = spare().begin(work, self._place, folder.parent / "log")
+
+    def workers(self) -> dict[int, int]:
+        """Rank -> process number, of those that live."""
+        found = {k: int((self._place / f"rank{k}.pid").read_text()) for k in range(2)}
+        return {rank: pid for rank, pid in found.items() if Path(f"/proc/{pid}").exists()}
+
+    def finished(self, status: int) -> str:
+        """What it has said, when it has ended with this status."""
+        done = spare().end()
+        assert done.returncode == status, done.stdout + done.stderr
+        return done.stdout + done.stderr
 
 
 def workers(folder: Path) -> dict[int, int]:
@@ -83,12 +97,11 @@ def workers(folder: Path) -> dict[int, int]:
     return found
 
 
-def saved(folder: Path, job: subprocess.Popen) -> None:
+def saved(folder: Path) -> None:
     """Waits for the first checkpoint of a job."""
     for _ in range(1200):
         if (folder / "checkpoints" / "latest" / "manifest.json").exists():
             return
-        assert job.poll() is None, folder.with_suffix(".log").read_text()
         time.sleep(0.1)
     raise AssertionError("no checkpoint")
 
@@ -207,9 +220,7 @@ def acts_in_evaluation(folder: Path, what: str) -> None:
 def test_an_exception_in_the_evaluation_of_one_process_ends_all(tmp_path) -> None:
     acts_in_evaluation(tmp_path, "raise KeyError('of a plugin')")
     folder = tmp_path / "run"
-    said = finished(
-        begin(folder, "gpus=2", "plugins=[acts]", "trainer.updates=4", within=tmp_path), folder, status=1
-    )
+    said = Forks(folder, "gpus=2", "plugins=[acts]", "trainer.updates=4").finished(1)
     assert "KeyError: 'of a plugin'" in said and not (folder / "evaluation.json").exists()
     assert checkpoint(folder).counters["updates"] == 4
 
@@ -217,8 +228,7 @@ def test_an_exception_in_the_evaluation_of_one_process_ends_all(tmp_path) -> Non
 def test_a_signal_in_an_evaluation_saves_all(tmp_path) -> None:
     acts_in_evaluation(tmp_path, "os.kill(os.getpid(), signal.SIGTERM)")
     folder, curves = tmp_path / "run", ("evaluation.during=[policy]", "evaluation.every=4")
-    job = begin(folder, "gpus=2", "plugins=[acts]", "trainer.updates=400", *curves, within=tmp_path)
-    said = finished(job, folder, status=130)
+    said = Forks(folder, "gpus=2", "plugins=[acts]", "trainer.updates=400", *curves).finished(130)
     assert said.count("stopped; go on with") == 1 and said.count("eval/policy/return") == 1
     assert checkpoint(folder).counters["updates"] == 10  # those of a batch
 
@@ -226,8 +236,7 @@ def test_a_signal_in_an_evaluation_saves_all(tmp_path) -> None:
 def test_a_signal_in_the_last_evaluation_leaves_what_can_go_on(tmp_path) -> None:
     acts_in_evaluation(tmp_path, "os.kill(os.getpid(), signal.SIGTERM)")
     folder, again = tmp_path / "run", tmp_path / "again"
-    job = begin(folder, "gpus=2", "plugins=[acts]", "trainer.updates=4", within=tmp_path)
-    said = finished(job, folder, status=1)
+    said = Forks(folder, "gpus=2", "plugins=[acts]", "trainer.updates=4").finished(1)
     assert re.search(
         "was ended by SIGTERM.*resume=|process 0 has lost another one of this run.*resume=", said
     ), said
@@ -270,10 +279,10 @@ def test_another_number_of_processes_goes_on(half, tmp_path) -> None:
 @pytest.mark.parametrize("whole", [False, True], ids=["SIGTERM to one", "Ctrl-C"])
 def test_a_signal_saves_all(tmp_path, whole) -> None:
     folder = tmp_path / "stopped"
-    job = begin(folder, "gpus=2", "trainer.updates=100000", "trainer.checkpoint_every=1")
-    saved(folder, job)
-    os.kill(*(job.pid, signal.SIGINT) if whole else (workers(folder)[1], signal.SIGTERM))
-    said = finished(job, folder, status=130)
+    job = Forks(folder, "gpus=2", "trainer.updates=100000", "trainer.checkpoint_every=1")
+    saved(folder)
+    os.kill(*(job.pid, signal.SIGINT) if whole else (job.workers()[1], signal.SIGTERM))
+    said = job.finished(130)
     assert said.count("stopped; go on with") == 1
     updates = checkpoint(folder).counters["updates"]
     assert checkpoint(folder).processes == 2
@@ -283,17 +292,17 @@ def test_a_signal_saves_all(tmp_path, whole) -> None:
 
 def test_a_killed_process_ends_the_others(tmp_path) -> None:
     folder = tmp_path / "killed"
-    job = begin(folder, "gpus=2", "trainer.updates=100000", "trainer.checkpoint_every=1")
-    saved(folder, job)
-    number = workers(folder)[1]
+    job = Forks(folder, "gpus=2", "trainer.updates=100000", "trainer.checkpoint_every=1")
+    saved(folder)
+    number = job.workers()[1]
     os.kill(number, signal.SIGKILL)
     started = time.monotonic()
-    said = finished(job, folder, status=1)
+    said = job.finished(1)
     assert time.monotonic() - started < 60
     advice = re.search(rf"process 1 of the run \(pid {number}\) was ended by SIGKILL.*(resume=\S+)", said)
     assert advice is not None, said
     updates = int(checkpoint(folder).counters["updates"])
-    assert not workers(folder)
+    assert not job.workers()
     run(tmp_path / "on", advice[1], f"trainer.updates={updates + 2}")
 
 
@@ -307,10 +316,7 @@ def test_torchrun_starts_a_job_anew(tmp_path) -> None:
     nodes = (*TORCHRUN, "--nnodes=2", "--nproc-per-node=1", "--local-addr=localhost", *meeting)
     updates = ("trainer.updates=400", "trainer.checkpoint_every=1")
     jobs = [begin(folder, *updates, before=nodes, log=f"log{k}") for k in range(2)]
-    for _ in range(1200):
-        if (folder / "checkpoints" / "latest" / "manifest.json").exists():
-            break
-        time.sleep(0.1)
+    saved(folder)
     ended = workers(folder)
     os.kill(ended[1], signal.SIGKILL)
     while {*ended.values()} & {*workers(folder).values()}:
@@ -330,7 +336,7 @@ def test_torchrun_does_not_begin_a_stopped_job_again(tmp_path) -> None:
     folder = tmp_path / "stopped"
     nodes = (*TORCHRUN, "--standalone", "--nproc-per-node=2", "--max-restarts=1")
     job = begin(folder, "trainer.updates=100000", "trainer.checkpoint_every=1", before=nodes)
-    saved(folder, job)
+    saved(folder)
     os.kill(workers(folder)[1], signal.SIGTERM)
     said = finished(job, folder, status=1)
     line = f"stopped; go on with: {resuming(folder, {})}"
@@ -368,10 +374,10 @@ def test_an_exception_in_one_process_ends_all(tmp_path) -> None:
     ],
 )
 def test_what_cannot_be_started_is_one_line(tmp_path, overrides, says) -> None:
-    if "device=auto" in overrides and torch.cuda.is_available():
+    if torch.cuda.is_available():
         pytest.skip("there are GPUs")
     folder = tmp_path / "none"
-    said = finished(begin(folder, *overrides), folder, status=1)
+    said = Forks(folder, *overrides).finished(1)
     assert [line for line in said.splitlines() if says in line] and "Traceback" not in said
     assert not folder.exists()
 

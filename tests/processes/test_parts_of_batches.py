@@ -1,28 +1,20 @@
 """Two processes with half of each batch learn what one process learns from all of it, in every family."""
 
-import os
-import subprocess
-import sys
-from pathlib import Path
+from functools import partial
 
 import pytest
 import torch
 
-from parts_of_batches import FAMILIES, learn
-
-HELPER = Path(__file__).parents[1] / "helpers" / "parts_of_batches.py"
+from forks import ranks_in_forks
+from parts_of_batches import FAMILIES, learn, together
 
 
 @pytest.fixture(scope="module")
 def learned(tmp_path_factory) -> dict[str, dict[str, torch.Tensor]]:
     """Family -> weights that two processes have learned together."""
     folder = tmp_path_factory.mktemp("processes")
-    environment = {**os.environ, "OMP_NUM_THREADS": "1"}
-    ranks = [
-        subprocess.Popen([sys.executable, str(HELPER), str(rank), str(folder)], env=environment)
-        for rank in range(2)
-    ]
-    assert [rank.wait(timeout=300) for rank in ranks] == [0, 0]
+    done = ranks_in_forks([partial(together, folder)] * 2, folder)
+    assert done.returncode == 0, done.stdout + done.stderr
     return torch.load(folder / "learned.pt", weights_only=True)
 
 
