@@ -28,6 +28,7 @@ from franka_wm.training.settings import RunSettings
 ROOT = Path(__file__).resolve().parents[1]
 
 LONG = (
+    "tests/processes/test_job.py",
     "tests/training/test_undisturbed.py",
     "tests/training/test_resume.py",
     "tests/commands/test_train.py",
