@@ -28,7 +28,6 @@ from franka_wm.evaluation.protocol import evaluate_agent
 from franka_wm.training.checkpoint import Checkpoint, latest_checkpoint, load_checkpoint
 from franka_wm.training.load import load_agent
 
-ROOT = Path(__file__).resolve().parents[2]
 SMOKE = [
     "env=reach", "scale=smoke", "device=cpu", "env.episode_length=12", "evaluation.episodes=4", "evaluation.during=[]",
     "evaluation.video_episodes=0", "logger=none",
