@@ -42,7 +42,10 @@ def test_train_from_a_dataset(root: Path, tmp_path: Path) -> None:
 
 
 CONF = "hydra.searchpath=[file://examples/conf]"
-RUN = ("scale=smoke", "logger=none", "evaluation.video_episodes=0", "device=cpu")
+RUN = (
+    "scale=smoke", "logger=none", "device=cpu", "evaluation.video_episodes=0", "evaluation.during=[]",
+    "evaluation.episodes=2", "trainer.updates=10", "env.episode_length=12",
+)  # fmt: skip
 
 
 @pytest.mark.slow  # four runs of train.py
