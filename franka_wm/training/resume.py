@@ -26,6 +26,9 @@ OTHER_DEVICE = (
     "the checkpoint is of another kind of device: random numbers start anew; this run will not be the same"
 )
 
+CUT_SHORT = ("next", "truncated")
+"""Kept by runs that export, not by older ones."""
+
 
 def restore(trainer: Trainer, checkpoint: Checkpoint) -> None:
     """Goes on from a checkpoint as if there had been no interruption, on the CPU to the bit.
@@ -87,6 +90,9 @@ def _fitting(trainer: Trainer, experience: TensorDictBase) -> TensorDictBase:
     """
     assert trainer.env is not None
     gathered = trainer.env.fake_tensordict()
+    if CUT_SHORT in trainer.kept and CUT_SHORT not in experience.keys(True):  # of an older run
+        experience = experience.clone(recurse=False)
+        experience.set(CUT_SHORT, torch.zeros_like(experience.get(("next", "terminated"))))
     for key in trainer.kept:
         if key not in experience.keys(True):
             name = key if isinstance(key, str) else ".".join(map(str, key))

@@ -227,7 +227,7 @@ class Trainer:
     @property
     def kept(self) -> list[NestedKey]:
         """Keys of a step that go into the replay."""
-        exported = ["success"] if self.settings.export.kind != "none" else []
+        exported = ["success", "truncated"] if self.settings.export.kind != "none" else []
         after = [("next", key) for key in (*self._keys, "reward", "terminated", *exported)]
         return [*self._keys, "action", "is_init", *self._extra, *after]
 

@@ -21,7 +21,7 @@ from franka_wm.errors import UserError
 from franka_wm.training import build, storage_budget
 from franka_wm.training.checkpoint import latest_checkpoint, load_checkpoint
 from franka_wm.training.learner import Learner
-from franka_wm.training.resume import restore
+from franka_wm.training.resume import CUT_SHORT, restore
 from franka_wm.training.run import Run
 from franka_wm.training.settings import RunSettings
 from franka_wm.training.trainer import Trainer, _of_all
@@ -406,15 +406,19 @@ def test_statistics_of_several_processes_are_means_over_their_episodes() -> None
     assert found == {"episodes": 12, "success": 0.75, "success/lift": 0.25, "episodes/lift": 4, "overflow": 3}
 
 
-def test_a_run_that_exports_keeps_what_the_task_says(train, tmp_path: Path) -> None:
-    """The dataset is for other models, too: objects that this one does not read, and the task's own success."""
+def test_a_run_that_exports_keeps_what_the_task_says(train, tmp_path: Path, monkeypatch, capsys) -> None:
+    """The dataset is for other models, too: objects that this one does not read, the task's own success, and which
+    episodes were cut short; of an older run, which did not keep that, the others."""
     words = ("env=push", "env.substeps=1", "env.episode_length=8", "model.observations=[state,goal]")
-    train(
-        *words,
-        "evaluation.during=[]",
-        "export=lerobot",
-        f"export.out={tmp_path}/set",
-        folder=tmp_path / "run",
-    )
+    words = (*words, "evaluation.during=[]", "export=lerobot", "export.workers=1")
+    run = train(*words, f"export.out={tmp_path}/set", folder=tmp_path / "run")
     features = json.loads((tmp_path / "set" / "meta" / "info.json").read_text())["features"]
     assert {SUCCESS, OBJECTS, GOAL} <= features.keys()
+    assert (replay := run.replay()) is not None and bool(replay["next", "truncated"].any())
+    kept = Trainer.kept.fget
+    with monkeypatch.context() as older:
+        older.setattr(Trainer, "kept", property(lambda self: [key for key in kept(self) if key != CUT_SHORT]))
+        train(*words, "trainer.updates=10", folder=tmp_path / "older")
+    assert "lost an object are missing" in capsys.readouterr().out
+    more = train(f"resume={tmp_path}/older", "trainer.updates=20", folder=tmp_path / "on").replay()
+    assert more is not None and bool(more["next", "truncated"].any())

@@ -192,15 +192,15 @@ def cut_replay(
     first_world: int = 0,
     discrete: torch.Tensor | None = None,
 ) -> tuple[list[Episode], int]:
-    """Whole episodes of a replay buffer, which keeps no flag for the end by time.
+    """Whole episodes of a replay buffer, which may keep no flag for the end by time.
 
-    An episode is whole if its first step is there and it either terminated or has ``episode_length`` steps. The
-    oldest may have lost their start, the newest have not ended; a world that broke, or a run that was resumed,
-    leaves one that is cut short.
+    An episode is whole if its first step is there and it terminated, was truncated or has ``episode_length`` steps.
+    The oldest may have lost their start, the newest have not ended; a run that was resumed leaves one without an end.
+    Without ``truncated``, so does every episode that was cut short: an object was lost, or a world broke.
 
     Args:
         data: (worlds, time), oldest step first: observations, ``action``, ``is_init`` and, under ``next``,
-            observations, ``reward``, ``terminated``, and ``success`` if the schema has it.
+            observations, ``reward``, ``terminated``, ``truncated`` if it was kept, ``success`` if the schema has it.
         schema: What is kept.
         seed: Seed of the run.
         episode_length: Steps of the environment's episodes.
@@ -217,7 +217,10 @@ def cut_replay(
     time = torch.arange(first.shape[1], device=first.device)
     start = torch.where(first, time, -1).cummax(1).values
     age = time - start + 1
-    whole = (start >= 0) & (terminated | (age == episode_length))
+    over = terminated | (age == episode_length)
+    if (truncated := data.get(("next", "truncated"), None)) is not None:
+        over = over | truncated[..., 0]
+    whole = (start >= 0) & over
     data = data.clone(recurse=False)
     after = data.get("next").clone(recurse=False)
     after["done"] = whole.unsqueeze(-1)

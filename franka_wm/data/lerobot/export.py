@@ -80,7 +80,7 @@ def export_replay(
 
     Args:
         data: (worlds, time), oldest step first: observations, ``action``, ``is_init`` and, under ``next``,
-            observations, ``reward``, ``terminated``, ``success`` if it is there.
+            observations, ``reward``, ``terminated``, ``truncated`` and ``success`` if they are there.
         config: The environment's.
         out, format, workers: As for :class:`~franka_wm.data.lerobot.writer.DatasetWriter`.
         seed: Seed of the run.
@@ -95,6 +95,7 @@ def export_replay(
         UserError: There is no whole episode, or it cannot be written.
     """
     from franka_wm import processes
+    from franka_wm.console import say
     from franka_wm.envs.discretize import discrete_action_table
     from franka_wm.envs.tasks import goal_distance, make_task
 
@@ -102,6 +103,11 @@ def export_replay(
         stacked = [str(key) for key in data.keys() if str(key).startswith(("pixels", "goal_pixels"))]  # noqa: SIM118
         data, config = newest(data, stacked, config.frame_stack), replace(config, frame_stack=1)
     after = data.get("next")
+    if "truncated" not in after.keys() and config.num_objects and config.end_when_lost:  # noqa: SIM118
+        say(
+            "export: this replay does not say which episodes were cut short, so those that lost an object are missing; "
+            "a run with export=lerobot keeps them"
+        )
     known = ("state", "joint_target", "objects", "contacts", "goal")
     keys = [key for key in data.keys() if key in known or str(key).startswith(("pixels", "goal_pixels"))]  # noqa: SIM118
     keys = [str(key) for key in keys if key in after.keys()]  # noqa: SIM118

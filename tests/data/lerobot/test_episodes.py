@@ -120,7 +120,9 @@ def test_missing_observations_are_named(make_schema) -> None:
         EpisodeCutter(make_schema(), seed=0).push(data)
 
 
-def test_a_replay_gives_whole_episodes_only(make_schema) -> None:
+@pytest.mark.parametrize("keeps", [True, False], ids=["with truncated", "without"])
+def test_a_replay_gives_whole_episodes_only(make_schema, keeps: bool) -> None:
+    """Those that were cut short are whole; without a flag for it, nobody knows that they ended."""
     ends = np.zeros((2, STEPS), bool)
     ends[0, LENGTH - 1 :: LENGTH] = True  # all by time
     ends[1, [2, 10, 14, 22, 30, 38, 46, 54]] = True  # 3 (cut short), 8, 4 (terminated), 8, 8, …
@@ -128,14 +130,20 @@ def test_a_replay_gives_whole_episodes_only(make_schema) -> None:
     data["next", "terminated"] = torch.zeros_like(data["next", "terminated"])
     data["next", "terminated"][1, 14] = True
     data["next", "terminated"][1, 54] = True  # at its last step: it is over, and was not cut off
+    data["next", "truncated"] = data["next", "done"] & ~data["next", "terminated"]
     data["is_init"][0, 0] = False  # the oldest has lost its start
     kept = data.clone()
-    for key in ("done", "truncated"):
+    for key in ("done", *(() if keeps else ("truncated",))):
         del data["next", key]
     episodes, partial = cut_replay(data, make_schema(), seed=4, episode_length=LENGTH)
     lengths = {world: [e.length for e in episodes if e.rows[SEED][0, 1] == world] for world in (0, 1)}
-    assert lengths == {0: [8] * 6, 1: [8, 4, 8, 8, 8, 8, 8]}
-    assert partial == 4  # the first of each world, and the steps after the last end of each
+    assert lengths == {0: [8] * 6, 1: [3] * keeps + [8, 4, 8, 8, 8, 8, 8]}
+    assert partial == 4 - keeps  # the first of each world, and the steps after the last end of each
+    if keeps:
+        cut = next(e for e in episodes if e.length == 3)
+        assert cut.rows[TRUNCATED][:, 0].tolist() == cut.rows[DONE][:, 0].tolist() == [False, False, True]
+        assert not cut.rows[TERMINATED].any()
+        assert np.array_equal(cut.terminal[STATE], kept["next", "state"][1, 2].numpy())
     ended = next(e for e in episodes if e.length == 4)
     assert ended.rows[TERMINATED][-1, 0]
     assert not ended.rows[TRUNCATED][-1, 0]
