@@ -416,6 +416,7 @@ def test_a_run_that_exports_keeps_what_the_task_says(train, tmp_path: Path, monk
     assert {SUCCESS, OBJECTS, GOAL} <= features.keys()
     assert (replay := run.replay()) is not None and bool(replay["next", "truncated"].any())
     kept = Trainer.kept.fget
+    assert kept is not None
     with monkeypatch.context() as older:
         older.setattr(Trainer, "kept", property(lambda self: [key for key in kept(self) if key != CUT_SHORT]))
         train(*words, "trainer.updates=10", folder=tmp_path / "older")

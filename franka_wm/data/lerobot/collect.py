@@ -66,7 +66,7 @@ def gather(
 
     Args:
         source: Who acts where. The worlds' seed is derived from ``seed`` and the number of episodes that are there
-            already; the feature ``seed`` says it.
+            already, and so is the policy's where there are any; the feature ``seed`` says it.
         out, workers, shard_frames, resume: As for :class:`~franka_wm.data.lerobot.writer.DatasetWriter`.
         episodes: In all.
         format: Format of images.
@@ -111,8 +111,9 @@ def gather(
         chosen = _Choice(quota, success_only)
         wanted = int(quota[first : first + worlds].sum())
         cutter = EpisodeCutter(schema, seed=seed, first_world=first, discrete=_table(source.env))
+        again = (source.policy,) if writer.resumed else ()  # else it would draw the first session's numbers
         # From here on: a collector tries its policy. Planners draw from torch's generator.
-        with interruptible() as stop, seeded(seed), drawing_for(first, worlds, whole_job):
+        with interruptible() as stop, seeded(seed, *again), drawing_for(first, worlds, whole_job):
             collector = Collector(
                 source.env,
                 source.policy,

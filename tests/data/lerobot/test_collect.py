@@ -110,6 +110,14 @@ def test_worlds_can_be_played_again(collected, load, small_env) -> None:
     assert not done[:, :-1].any()
 
 
+def test_what_is_added_is_not_drawn_again(tmp_path, load) -> None:
+    words = ["collect", f"out={tmp_path}/set", "num_envs=2", "workers=0", "env=reach", *SMALL[2:]]
+    for episodes in (2, 4):
+        assert main([*words, f"episodes={episodes}", "resume=true"]) == 0
+    actions = column(load(tmp_path / "set"), ACTION).reshape(4, 6, -1)
+    assert len(np.unique(actions[:, 0], axis=0)) == 4
+
+
 def test_provenance_says_how(collected) -> None:
     provenance = read_provenance(collected)
     assert provenance is not None
