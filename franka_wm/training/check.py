@@ -383,6 +383,7 @@ def _check_dataset(run: RunSettings) -> None:
             features=run.dataset.features,
             keys=run.model.observations,
             image_size=run.dataset.image_size,
+            normalize_actions=run.dataset.normalize_actions,
             fps=arm and arm.fps,
             action_dim=arm and arm.action_dim,
         )

@@ -107,9 +107,17 @@ def check_demonstrations(run: RunSettings) -> None:
     if arm is not None and share:
         _check_seen(share, "run", vars(arm.randomization))
     try:
-        sources, _ = read_datasets(run.replay.demos, fps=arm and arm.fps, action_dim=arm and arm.action_dim)
+        sources, mappings = read_datasets(
+            run.replay.demos, normalize_actions=False, fps=arm and arm.fps, action_dim=arm and arm.action_dim
+        )
     except UserError as error:
         raise UserError(str(error).replace("dataset.root=", "replay.demos=")) from error
+    if not all(one.ours for one in mappings):
+        others = next(s.root for s, one in zip(sources, mappings, strict=True) if not one.ours)
+        raise UserError(
+            f"replay.demos={others}: was not recorded by this package, so its actions would be scaled to [−1, 1] and "
+            "mean something else; record demonstrations with franka-wm collect"
+        )
     if arm is None:
         return
     looks = {*(run.model.observations or ())} & {*Spaces.of_config(arm).image_sizes}

@@ -2,6 +2,7 @@
 
 import json
 import shutil
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -15,6 +16,7 @@ from safetensors.torch import load_file
 
 from franka_wm.commands import main as cli
 from franka_wm.data.lerobot import cache, collect, open_dataset, opening
+from franka_wm.data.lerobot.mapping import FeatureMap, map_features
 from franka_wm.data.lerobot.schema import PROVENANCE
 from franka_wm.errors import UserError
 from franka_wm.evaluation.closed_loop import begin
@@ -239,6 +241,33 @@ def test_data_that_mean_something_else_are_refused(demos: Path, settled, changes
     check(settled("scale=smoke", "env=none", "device=cpu", *words[-3:]))
 
 
+def test_actions_that_would_be_scaled_are_refused_where_the_model_acts(
+    demos: Path, settled, tmp_path: Path, monkeypatch
+) -> None:
+    words = ("scale=smoke", "device=cpu", "dataset=lerobot", "trainer=offline", f"dataset.root={demos}")
+    for changes in (["dataset.normalize_actions=true"], []):
+        with monkeypatch.context() as others:
+            if not changes:
+                others.setattr(opening, "map_features", others_features)
+                with pytest.raises(UserError, match=r"replay\.demos=.*was not recorded by this package"):
+                    check(settled("scale=smoke", *ARM, f"replay.demos={demos}"))
+            run = settled(*words, *ARM, *changes, "dataset.workers=1")
+            with pytest.raises(UserError, match=r"would be scaled to \[−1, 1\].*use env=none") as refused:
+                check(run)
+            assert "\n" not in str(refused.value)
+            with pytest.raises(
+                UserError, match=r"would be scaled to"
+            ):  # also of the Hub's, which no check sees
+                build.open_recorded(run, torch.device("cpu"))
+            check(settled(*words, "env=none", *changes))
+            check(settled(*words, *ARM, "dataset.normalize_actions=false"))
+
+
+def others_features(*given: Any, **options: Any) -> FeatureMap:
+    """As if somebody else had recorded them."""
+    return replace(map_features(*given, **options), ours=False)
+
+
 def test_rewards_of_another_task_are_said(demos: Path, settled, capsys) -> None:
     words = ("scale=smoke", *ARM, "dataset=lerobot", "trainer=offline", f"dataset.root={demos}")
     check(settled(*words))
@@ -293,7 +322,9 @@ def test_other_rewards_and_other_images_are_refused(
     run = settled("scale=smoke", *ARM, *changes, *model, f"replay.demos={tmp_path / 'demos'}")
     shutil.copytree(demos, tmp_path / "demos")
     monkeypatch.setattr(
-        opening, "read_datasets", lambda *_, **__: ([SimpleNamespace(root=tmp_path / "demos")], [])
+        opening,
+        "read_datasets",
+        lambda *_, **__: ([SimpleNamespace(root=tmp_path / "demos")], [SimpleNamespace(ours=True)]),
     )
 
     def recorded(**options: Any) -> None:

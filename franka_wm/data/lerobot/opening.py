@@ -77,17 +77,21 @@ def open_dataset(
     roots = [Path(r) for r in _as_list(root)] + [find_dataset(name) for name in _as_list(repo_id)]
     device = torch.empty(0, device=device).device  # with its index
     sources, mappings = read_datasets(
-        roots, features=features, keys=keys, image_size=image_size, fps=fps, action_dim=action_dim
+        roots,
+        features=features,
+        keys=keys,
+        image_size=image_size,
+        normalize_actions=normalize_actions,
+        fps=fps,
+        action_dim=action_dim,
     )
     caches = [
         open_cache(s, m, cache_dir=cache_dir, workers=workers, say=say)
         for s, m in zip(sources, mappings, strict=True)
     ]
-    ours = all(m.ours for m in mappings)
     notes = [note for m, c in zip(mappings, caches, strict=True) for note in (*m.notes, *c.notes)]
     episodes, low, high = _join(caches)
-    scale = not ours if normalize_actions is None else normalize_actions
-    scale = scale and not mappings[0].discrete
+    scale = _scales(mappings, normalize_actions)
     if scale:
         notes.append(
             f"actions are scaled to [−1, 1] from {np.array2string(low, precision=3, suppress_small=True)} … "
@@ -137,6 +141,7 @@ def read_datasets(
     features: Mapping[str, str | Sequence[str]] | None = None,
     keys: Sequence[str] | None = None,
     image_size: int | Sequence[int] | None = None,
+    normalize_actions: bool | None = None,
     fps: float | None = None,
     action_dim: int | None = None,
 ) -> tuple[list[Source], list[FeatureMap]]:
@@ -170,7 +175,18 @@ def read_datasets(
             f"the dataset's actions have {size} numbers, the environment's {action_dim}; "
             "choose the env that it was recorded in (or its env.action_mode), or another dataset"
         )
+    if action_dim is not None and _scales(mappings, normalize_actions):
+        raise UserError(
+            f"{roots[0]}: actions would be scaled to [−1, 1] by what the data spans, and mean something else in the "
+            "environment; use env=none to train alone, or dataset.normalize_actions=false if they are in its units"
+        )
     return sources, mappings
+
+
+def _scales(mappings: Sequence[FeatureMap], normalize_actions: bool | None) -> bool:
+    """Whether actions are scaled by what the data spans: as asked, else where a dataset is not of this package."""
+    asked = not all(one.ours for one in mappings) if normalize_actions is None else normalize_actions
+    return asked and not mappings[0].discrete
 
 
 def _as_list(value: Any) -> list[Any]:

@@ -274,11 +274,12 @@ def test_moments_of_images(foreign, pictures: Path, opened: Callable) -> None:
 
 
 def test_what_does_not_fit_the_environment_is_refused(pictures: Path, opened: Callable) -> None:
-    opened(pictures, keys=["joints", "pixels"], fps=10, action_dim=3)
+    opened(pictures, keys=["joints", "pixels"], fps=10)
     for options, message in (
         ({"keys": ["state"]}, "gives no 'state'; observations there: joints, gripper, pixels"),
         ({"fps": 30.0}, "10 frames per second, the environment 30"),
         ({"action_dim": 7}, "have 3 numbers, the environment's 7"),
+        ({"action_dim": 3}, "would be scaled"),
     ):
         with pytest.raises(UserError, match=message):
             opened(pictures, **options)
