@@ -94,11 +94,19 @@ class TableJob:
         return starts[episode] + frame
 
     def _values(self, column: Any, feature: str, size: int) -> np.ndarray:
-        flat = column
+        import pyarrow.compute as pc
+
+        flat, even = column, True
         while hasattr(flat, "flatten") and hasattr(flat.type, "value_type"):
+            even = even and len(pc.unique(pc.call_function("list_value_length", [flat]))) <= 1
             flat = flat.flatten()
         values = flat.to_numpy(zero_copy_only=False)
-        if column.null_count or values.dtype.kind not in "fiub" or values.size != len(column) * size:
+        if (
+            not even
+            or column.null_count
+            or values.dtype.kind not in "fiub"
+            or values.size != len(column) * size
+        ):
             raise UserError(f"{self.path}: {feature} should have {size} numbers in every row and has not")
         values = values.reshape(len(column), size)
         with np.errstate(over="ignore"):  # a number that float32 cannot hold is none either

@@ -41,7 +41,10 @@ def decode_png(data: bytes) -> np.ndarray:
     """
     from PIL import Image
 
-    with Image.open(io.BytesIO(data)) as image:
-        if image.width * image.height > MOST_PIXELS:
-            raise ValueError(f"an image of {image.width} × {image.height} pixels")
-        return np.asarray(image.convert("RGB"))
+    try:
+        with Image.open(io.BytesIO(data)) as image:
+            if image.width * image.height > MOST_PIXELS:
+                raise ValueError(f"an image of {image.width} × {image.height} pixels")
+            return np.asarray(image.convert("RGB"))
+    except Image.DecompressionBombError as error:  # of many more: Pillow asks before we can
+        raise ValueError(str(error)) from error

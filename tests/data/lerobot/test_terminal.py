@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import io
 import shutil
+import struct
+import zlib
 
 import av
 import numpy as np
@@ -82,3 +84,13 @@ def test_png_is_exact_for_any_decoder(shape) -> None:
     with av.open(io.BytesIO(encode_png(picture)), format="png_pipe") as container:
         frame = next(container.decode(video=0))
     assert np.array_equal(frame.to_ndarray(format="rgb24"), picture)
+
+
+@pytest.mark.parametrize("side", [9_000, 20_000])
+def test_a_png_of_too_many_pixels_is_no_value(side: int) -> None:
+    """Its header alone says so: refused by us, or by Pillow before."""
+    data = encode_png(np.zeros((1, 1, 3), np.uint8))
+    header = b"IHDR" + struct.pack(">IIBBBBB", side, side, 8, 2, 0, 0, 0)
+    bomb = data[:12] + header + struct.pack(">I", zlib.crc32(header)) + data[33:]
+    with pytest.raises(ValueError, match="pixels"):
+        decode_png(bomb)

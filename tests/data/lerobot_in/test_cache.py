@@ -402,3 +402,16 @@ def test_damaged_rows(pictures: Path, opened: Callable, tmp_path: Path) -> None:
     nan = [[0.0, float("nan")]] + [[0.0, 0.0]] * 15
     with pytest.raises(UserError, match=r"observation\.joints holds a number that is not finite"):
         opened(rewritten("nan", lambda t: with_column(t, "observation.joints", nan)))
+
+    def uneven(table: pa.Table) -> pa.Table:
+        """As many numbers as there should be, in other rows: all that follow would be shifted."""
+        kind = pa.list_(pa.float32())
+        rows = pa.array([[0.0], [1.0, 2.0, 3.0]] + [[0.0, 0.0]] * 14, kind)
+        at = table.column_names.index("observation.joints")
+        changed = table.set_column(at, pa.field("observation.joints", kind), rows)
+        return changed.replace_schema_metadata(None)
+
+    with pytest.raises(
+        UserError, match=r"observation\.joints should have 2 numbers in every row and has not"
+    ):
+        opened(rewritten("uneven", uneven))
