@@ -390,6 +390,7 @@ def _check_dataset(run: RunSettings) -> None:
         if arm is not None:
             _check_same_observations(run, mappings[0])
             _check_same_actions(arm, sources)
+            _check_same_views(run, sources)
 
 
 def _check_same_observations(run: RunSettings, recorded: FeatureMap) -> None:
@@ -430,4 +431,27 @@ def _check_same_actions(arm: FrankaConfig, sources: Sequence[Source]) -> None:
             say(
                 f"dataset {source.root}: recorded with env.{name}={there}, this run has {getattr(arm, name)}; "
                 "its rewards and ends are those of then"
+            )
+
+
+def _check_same_views(run: RunSettings, sources: Sequence[Source]) -> None:
+    """What a model that acts has learned to see, the arm's cameras must show; sizes are compared elsewhere."""
+    from franka_wm.data.lerobot.provenance import VIEWS, other_option, read_provenance
+
+    arm, family = run.env.arm, run.model.family
+    looks = {*(run.model.observations or ())} & {*Spaces.of_config(arm).image_sizes}
+    if not looks or not (family.has_next or family.has_policy):
+        return
+    named = (
+        "image_size",
+        *(("cameras",) if run.dataset.features else ()),
+    )  # those may be chosen for the dataset
+    for source in sources:
+        sessions = (read_provenance(source.root) or {}).get("sessions", ())
+        changed = other_option(sessions, vars(arm), [name for name in VIEWS if name not in named])
+        if changed is not None:
+            name, there = changed
+            raise UserError(
+                f"dataset.root={source.root}: recorded with env.{name}={there}, this run has {getattr(arm, name)}, so "
+                f"images show something else; use env.{name}={there}, or env=none to train alone"
             )

@@ -5,7 +5,7 @@ import shutil
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 import pyarrow as pa
@@ -17,18 +17,22 @@ from safetensors.torch import load_file
 from franka_wm.commands import main as cli
 from franka_wm.data.lerobot import cache, collect, open_dataset, opening
 from franka_wm.data.lerobot.mapping import FeatureMap, map_features
+from franka_wm.data.lerobot.provenance import ACTIONS, other_option
 from franka_wm.data.lerobot.schema import PROVENANCE
 from franka_wm.errors import UserError
 from franka_wm.evaluation.closed_loop import begin
 from franka_wm.evaluation.protocol import held_out_seeds
 from franka_wm.training import build
-from franka_wm.training.check import check
+from franka_wm.training.check import _check_same_views, check
 from franka_wm.training.demos import check_demonstrations, open_demonstrations
 from franka_wm.training.history import read_rows
 from franka_wm.training.learner import Learner
 from franka_wm.training.run import Run
 from franka_wm.training.spaces import Spaces
 from franka_wm.training.trainer import Trainer
+
+if TYPE_CHECKING:
+    from franka_wm.data.lerobot.source import Source
 
 ARM = ("env=reach", "env.substeps=1", "env.episode_length=8", "seed=0", "device=cpu")
 
@@ -266,6 +270,51 @@ def test_actions_that_would_be_scaled_are_refused_where_the_model_acts(
 def others_features(*given: Any, **options: Any) -> FeatureMap:
     """As if somebody else had recorded them."""
     return replace(map_features(*given, **options), ours=False)
+
+
+@pytest.mark.parametrize(
+    "there",
+    [{"camera_height": 0.7}, {"show_goal": True}, {"cameras": ["wrist", "front"]}, {"image_size": 32}],
+)
+def test_a_model_that_sees_acts_where_it_sees_the_same(
+    settled, tmp_path: Path, there: dict[str, Any]
+) -> None:
+    words = ("scale=smoke", "device=cpu", "dataset=lerobot", "trainer=offline", "dataset.root=there")
+    words = (*words, "env=reach_pixels", "model=tdmpc2_pixels")
+    run, source = settled(*words), cast("Source", SimpleNamespace(root=tmp_path))
+    (tmp_path / PROVENANCE).parent.mkdir(parents=True)
+
+    def recorded(**options: Any) -> None:
+        written = {"sessions": [{"config": {"env": {**run.values["env"], **options}}}]}
+        (tmp_path / PROVENANCE).write_text(json.dumps(written))
+
+    recorded()
+    _check_same_views(run, [source])
+    recorded(**there)
+    _check_same_views(run.changed(model={"observations": ["state"]}), [source])
+    if "image_size" in there:  # as dataset.image_size makes it
+        return _check_same_views(run, [source])
+    with pytest.raises(
+        UserError, match=rf"recorded with env\.{next(iter(there))}=.*images show something else"
+    ):
+        _check_same_views(run, [source])
+    chosen = settled(*words, "dataset.features={pixels: observation.images.front}")
+    if "cameras" in there:
+        _check_same_views(chosen, [source])
+    return None
+
+
+def test_ee_scale_gives_actions_of_the_tool_their_meaning() -> None:
+    mine = {"action_mode": "ee_delta", "ee_scale": 0.05}
+
+    def other(**recorded: Any) -> tuple[str, Any] | None:
+        return other_option([{"config": {"env": recorded}}], mine, ACTIONS)
+
+    assert other(action_mode="ee_delta", ee_scale=0.02) == ("ee_scale", 0.02)
+    assert other(action_mode="ee_delta", ee_scale=0.05) is None
+    assert other(action_mode="ee_delta") is None  # of an older dataset, which does not say it
+    mine["action_mode"] = "joint_delta"  # reads it nowhere
+    assert other(action_mode="joint_delta", ee_scale=0.02) is None
 
 
 def test_rewards_of_another_task_are_said(demos: Path, settled, capsys) -> None:

@@ -98,7 +98,7 @@ class TableJob:
 
         flat, even = column, True
         while hasattr(flat, "flatten") and hasattr(flat.type, "value_type"):
-            even = even and len(pc.unique(pc.call_function("list_value_length", [flat]))) <= 1
+            even = even and len(pc.call_function("list_value_length", [flat]).unique()) <= 1
             flat = flat.flatten()
         values = flat.to_numpy(zero_copy_only=False)
         if (

@@ -39,8 +39,8 @@ def describe(
     }
 
 
-ACTIONS = ("action_mode", "action_scale")
-"""Options of the arm that give recorded actions their meaning."""
+ACTIONS = ("action_mode", "action_scale", "ee_scale")
+"""Options of the arm that give recorded actions their meaning; the last one those of ``ee_delta`` alone."""
 MEANING = (
     *("task", "reward", *ACTIONS, "action_penalty", "success_distance", "drawer_opening"),
     "terminate_on_success",
@@ -60,9 +60,12 @@ def other_option(
 
     Of cameras the first counts: its images have no name that tells it from others.
     """
+    unread = "" if env.get("action_mode") == "ee_delta" else "ee_scale"
     for session in sessions:
         recorded = session.get("config", {}).get("env", {})
         for name in names:
+            if name == unread:
+                continue
             if (
                 name in recorded
                 and name in env

@@ -27,7 +27,7 @@ from typing import Any
 import numpy as np
 
 from franka_wm.data.lerobot.episodes import Episode
-from franka_wm.data.lerobot.provenance import other_option, read_provenance
+from franka_wm.data.lerobot.provenance import MEANING, VIEWS, other_option, read_provenance
 from franka_wm.data.lerobot.schema import Schema
 from franka_wm.data.lerobot.shard import check_episode
 from franka_wm.data.lerobot.shard_workers import (
@@ -224,7 +224,8 @@ class DatasetWriter:
                     f"out={self.out}: what is there has other {what}; give the same env and format, or another out"
                 )
             env = self._session.get("config", {}).get("env", {})
-            changed = other and other_option(other["sessions"], json.loads(json.dumps(env)))
+            names = (*MEANING, *VIEWS) if self.schema.images else MEANING
+            changed = other and other_option(other["sessions"], json.loads(json.dumps(env)), names)
             if changed:
                 name, there = changed
                 raise UserError(

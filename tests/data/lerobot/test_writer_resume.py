@@ -60,6 +60,24 @@ def test_actions_that_mean_something_else_are_not_mixed(tmp_path, make_schema, m
             assert writer.resumed == 1
 
 
+def test_images_of_another_camera_are_not_mixed(tmp_path, make_schema, make_episode) -> None:
+    """Where there are images; without any, nobody sees the difference."""
+    for observations in (("pixels", "state"), ("state",)):
+        schema, out = make_schema(observations=observations), tmp_path / str(len(observations))
+
+        def options(height: float) -> dict:
+            provenance = describe(policy="p", seed=1, config={"env": {"camera_height": height}})
+            return {"provenance": provenance, "workers": 0, "shard_frames": 1}
+
+        with DatasetWriter(out, schema, **options(0.5)) as writer:
+            writer.add([make_episode(schema, 0)])
+        if schema.images:
+            with pytest.raises(UserError, match=r"recorded with env\.camera_height=0\.5, this has 0\.7"):
+                DatasetWriter(out, schema, **options(0.7), resume=True)
+        with DatasetWriter(out, schema, **options(0.5 if schema.images else 0.7), resume=True) as writer:
+            assert writer.resumed == 1
+
+
 def test_goes_on_with_what_is_finished(tmp_path, make_schema, make_episode, load) -> None:
     schema = make_schema()
     episodes = [make_episode(schema, i) for i in range(6)]
