@@ -7,9 +7,11 @@ from dataclasses import asdict, dataclass, field
 from typing import Any
 
 from franka_wm.data.lerobot import schema
+from franka_wm.data.lerobot.provenance import read_provenance
 from franka_wm.data.lerobot.source import Source
 from franka_wm.errors import UserError
 from franka_wm.options import is_whole
+from franka_wm.untrusted import values_of
 
 AFTER = {
     "reward": schema.REWARD,
@@ -113,7 +115,7 @@ def map_features(
     given = None if not features else {key: _names(key, value) for key, value in features.items()}
     notes: list[str] = []
     if given is None:
-        observed, left_out = _by_convention(there, ours)
+        observed, left_out = _by_convention(there, ours, _recorded_as(source) if ours else {})
         if left_out:
             notes.append(f"not read: {', '.join(left_out)}; name what you need under dataset.features")
     else:
@@ -200,7 +202,7 @@ def image_shape(source: Source, name: str) -> tuple[int, int]:
 
 
 def _by_convention(
-    there: Mapping[str, Mapping[str, Any]], ours: bool
+    there: Mapping[str, Mapping[str, Any]], ours: bool, recorded_as: Mapping[str, str]
 ) -> tuple[dict[str, tuple[str, ...]], list[str]]:
     observed: dict[str, tuple[str, ...]] = {}
     left_out: list[str] = []
@@ -210,6 +212,7 @@ def _by_convention(
             key = f"pixels_{camera}" if "pixels" in observed else "pixels"
             if name == schema.IMAGE_PREFIX + "goal" or (ours and camera.startswith("goal_")):
                 key = "goal_pixels" + camera.removeprefix("goal")
+            key = recorded_as.get(name, key)  # also where the first camera was not recorded
             usable = not is_depth(spec) and len(spec["shape"]) == 3
         elif name.startswith(_OBSERVATION):
             key = name.removeprefix(_OBSERVATION).replace(".", "_")
@@ -224,6 +227,16 @@ def _by_convention(
         else:
             observed[key] = (name,)
     return observed, left_out
+
+
+def _recorded_as(source: Source) -> dict[str, str]:
+    """Images of a dataset of ours → what the arm called them, as far as it says so."""
+    with values_of(str(source.root), "copy or download the dataset again"):
+        names = ((read_provenance(source.root) or {}).get("schema") or {}).get("sources") or {}
+        pictures = ("pixels", "goal_pixels")
+        return {
+            feature: key for feature, key in names.items() if key.startswith(pictures) and key.isidentifier()
+        }
 
 
 def _terminated_note(after: Mapping[str, str]) -> str:

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import json
 import re
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +13,7 @@ import pytest
 import torch
 
 from franka_wm.data.lerobot.mapping import map_features
+from franka_wm.data.lerobot.schema import PROVENANCE
 from franka_wm.data.lerobot.source import Source, read_source
 from franka_wm.errors import UserError
 
@@ -69,6 +72,27 @@ def test_a_dataset_of_this_package() -> None:
     mapping = map_features(source({"observation.state": VECTOR, "action": VECTOR, **OURS}))
     assert mapping.ours
     assert set(mapping.vectors) == {"state", "goal", "joint_target"}
+
+
+def test_an_image_is_called_what_it_was_called_when_recorded(tmp_path: Path) -> None:
+    """Also where the first camera is not there; of older datasets, and of others, the first image is ``pixels``."""
+    wrist = "observation.images.wrist"
+    data = source({wrist: PICTURE, "action": VECTOR, **OURS})
+    assert map_features(data).images == {"pixels": (wrist, (8, 10, 3))}
+    (tmp_path / PROVENANCE).parent.mkdir(parents=True)
+    data = replace(data, root=tmp_path)
+    for said, key in (
+        ({"sources": {wrist: "pixels_wrist"}}, "pixels_wrist"),
+        ({"sources": {wrist: "action"}}, "pixels"),
+        (None, "pixels"),
+    ):
+        (tmp_path / PROVENANCE).write_text(json.dumps({"sessions": [], "schema": said}))
+        assert map_features(data).images == {key: (wrist, (8, 10, 3))}
+    (tmp_path / PROVENANCE).write_text(json.dumps({"schema": {"sources": [3]}}))
+    with pytest.raises(UserError, match="another form than was written"):
+        map_features(data)
+    others = {name: one for name, one in data.features.items() if name != "seed"}
+    assert not map_features(replace(data, info={"fps": 10, "features": others})).ours
 
 
 def test_discrete_actions() -> None:
