@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 from franka_wm.data.image_storage import newest
 from franka_wm.data.lerobot.episodes import cut_replay
+from franka_wm.data.lerobot.hub import check_repo_id
 from franka_wm.data.lerobot.provenance import describe, read_provenance
 from franka_wm.data.lerobot.schema import schema_for
 from franka_wm.data.lerobot.writer import DatasetWriter
@@ -216,7 +217,8 @@ def written_before(settings: Mapping[str, Any], out: Path) -> bool:
 def _alike(config: Mapping[str, Any]) -> dict[str, Any]:
     """What of a run's configuration stays as it goes on. A checkpoint's model says more: what it was built with."""
     kept = {key: value for key, value in config.items() if key not in ("resume", "plugins", "device", "gpus")}
-    return kept | {"model": config["model"]["name"]}
+    export = {key: value for key, value in config["export"].items() if key != "repo_id"}  # where, not what
+    return kept | {"model": config["model"]["name"], "export": export}
 
 
 def check_export(settings: Mapping[str, Any]) -> None:
@@ -231,6 +233,14 @@ def check_export(settings: Mapping[str, Any]) -> None:
     if wanted["kind"] == "none":
         return
     schema_for(replace(arm_config(settings), frame_stack=1), format=wanted["format"])
+    if wanted["repo_id"]:
+        from franka_wm.data.lerobot.publish import hub_client
+
+        try:
+            check_repo_id(wanted["repo_id"])
+            hub_client(wanted["repo_id"])
+        except UserError as error:
+            raise UserError(f"export.repo_id={wanted['repo_id']}: {error}") from error
     out = wanted["out"]
     if out and Path(out).exists() and not written_before(settings, Path(out)):
         raise UserError(f"export.out={out} exists; choose another folder")

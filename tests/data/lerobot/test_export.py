@@ -5,7 +5,9 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+import huggingface_hub
 import pytest
+from huggingface_hub import constants
 
 from franka_wm.data.lerobot.export import check_export, export_run, written_before
 from franka_wm.data.lerobot.provenance import describe
@@ -34,6 +36,9 @@ def test_a_dataset_is_that_of_the_run_which_goes_on(tmp_path: Path, make_schema,
     again = RUN | {"resume": "run", "device": "cuda", "model": {"name": "tdmpc2", "value_low": -3.2}}
     exports = {"export": RUN["export"] | {"out": str(out)}}
     assert written_before(again, out) and not written_before(again, tmp_path / "none")
+    assert written_before(
+        again | {"export": RUN["export"] | {"repo_id": "user/set"}}, out
+    )  # where it goes then
     # From the beginning, farther, and of another family.
     for other in (RUN, again | {"trainer": {"updates": 8}}, again | {"model": {"name": "dreamer"}}):
         assert not written_before(other, out)
@@ -49,3 +54,24 @@ def test_a_run_without_experience_says_why(tmp_path: Path) -> None:
     for resume, says in ((None, "that it was trained on"), ("run", r"trainer\.checkpoint_replay=true")):
         with pytest.raises(UserError, match=rf"has gathered nothing.*{says}"):
             export_run(RUN | {"resume": resume}, None, folder=tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("repo_id", "offline", "token", "says"),
+    [
+        ("set", False, "hf_x", r"must be user/name"),
+        ("user/set", True, "hf_x", "HF_HUB_OFFLINE is set"),
+        ("user/set", False, None, "no token for the Hub"),
+        ("user/set", False, "hf_x", None),
+    ],
+)
+def test_what_cannot_be_published_is_said_before_the_run(repo_id, offline, token, says, monkeypatch) -> None:
+    monkeypatch.setattr(constants, "HF_HUB_OFFLINE", offline)
+    monkeypatch.setattr(huggingface_hub, "get_token", lambda: token)
+    run = RUN | {"export": RUN["export"] | {"repo_id": repo_id}}
+    if says is None:
+        return check_export(run)
+    with pytest.raises(UserError, match=rf"export\.repo_id={repo_id}: .*{says}") as refused:
+        check_export(run)
+    assert "\n" not in str(refused.value)
+    return None
