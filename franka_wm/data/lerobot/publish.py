@@ -253,6 +253,10 @@ def check_name(api: Any, repo_id: str, kind: str, private: bool, update: bool) -
         raise UserError(
             f"publish: {repo_id} is public; give private=false, make it private on the Hub, or choose another repo_id"
         )
+    if there.private and not private:
+        raise UserError(
+            f"publish: {repo_id} is private; give private=true, make it public on the Hub, or choose another repo_id"
+        )
 
 
 def send(api: Any, folder: Path, repo_id: str, kind: str, private: bool) -> None:

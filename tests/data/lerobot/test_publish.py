@@ -61,7 +61,10 @@ def test_a_dataset_goes_with_our_card_and_tag(hub, publish, dataset) -> None:
     one_line(again, "exists already", "update=true")
     repo["files"]["data/chunk-000/file-007.parquet"] = b"of an earlier version"
     before = repo["commits"]
-    done = publish(f"root={dataset}", "repo_id=user/arm", "update=true", "private=false")
+    shown = publish(f"root={dataset}", "repo_id=user/arm", "update=true", "private=false")
+    one_line(shown, "is private", "private=true")  # the Hub would keep it so
+    assert repo["commits"] == before
+    done = publish(f"root={dataset}", "repo_id=user/arm", "update=true")
     assert done.returncode == 0, done.stderr
     assert "data/chunk-000/file-007.parquet" not in repo["files"]
     assert repo["files"]["README.md"].decode() != card  # another license
