@@ -46,10 +46,15 @@ _PARTS = ("planner", "policy")
     click.Choice([*FORMATS]),
     "exact",
 )
-@word("num_envs", "worlds at once, on all GPUs; collector.num_envs if not given", whole(1), metavar="N")
+@word(
+    "num_envs",
+    "worlds at once, on all GPUs; if not given collector.num_envs, of an agent 64, and no more than episodes",
+    whole(1),
+    metavar="N",
+)
 @word("gpus", "of this host, one process each; with device=cpu so many on the CPU", whole(1), 1)
 @word("workers", "writing processes, of each GPU", whole(0, 256), 2)
-@word("shard_frames", "steps in one file, at most", whole(1), metavar="N")
+@word("shard_frames", "steps in one file, at least: each ends with an episode", whole(1), metavar="N")
 @word("success_only", "keep only episodes that end in success", FLAG, False)
 @word(
     "noise", "of the expert's actions, standard deviation; it recovers from that", real(0.0, 2.0), metavar="X"
