@@ -11,6 +11,7 @@ import pyarrow.parquet as pq
 import pytest
 
 from dataset_episodes import as_picture, check_terminals, compare
+from franka_wm.data.lerobot import merge as merging
 from franka_wm.data.lerobot.merge import merge, merge_terminals
 from franka_wm.data.lerobot.schema import ACTION, DONE, STATE
 from franka_wm.data.lerobot.shard import ENCODERS, arrow_schema, write_shard
@@ -314,6 +315,15 @@ def test_a_video_that_lost_frames_is_noticed(tmp_path, monkeypatch, make_schema,
     schema = make_schema("video_near_lossless")
     with pytest.raises(UserError, match="14 frames were written, 13 can be read"):
         write_shard(tmp_path / "shard", schema, [make_episode(schema, i, 7) for i in range(2)])
+
+
+def test_a_merge_that_goes_wrong_is_noticed(tmp_path, monkeypatch, make_schema, make_episode, write) -> None:
+    schema = make_schema()
+    roots = [write(tmp_path / str(i), schema, [make_episode(schema, i)]) for i in range(2)]
+    whole = merging._move_rows
+    monkeypatch.setattr(merging, "_move_rows", lambda *given: whole(*given[:3], 0, 0))  # keeps their numbers
+    with pytest.raises(UserError, match="not numbered one after the other"):
+        merge(tmp_path / "merged", roots, {})
 
 
 def test_no_writing_without_room_says_so(tmp_path, make_schema) -> None:

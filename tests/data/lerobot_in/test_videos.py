@@ -18,8 +18,12 @@ from franka_wm.data.lerobot.card import make_image
 from franka_wm.errors import UserError
 
 
-def write_frames(path: Path, frames: list[np.ndarray]) -> None:
-    """A video at ten frames per second, each an image of its own, whatever size the first one has."""
+def write_frames(path: Path, frames: list[np.ndarray], every: int = 1) -> None:
+    """A video at ten frames per second, each an image of its own, whatever size the first one has.
+
+    Args:
+        every: Tenths of a second from one to the next.
+    """
     with av.open(str(path), "w", format="mp4") as file:
         stream: Any = file.add_stream("mjpeg", rate=10)
         stream.height, stream.width = frames[0].shape[:2]
@@ -30,7 +34,8 @@ def write_frames(path: Path, frames: list[np.ndarray]) -> None:
             encoder.pix_fmt, encoder.time_base = "yuvj420p", Fraction(1, 10)
             image = av.VideoFrame.from_ndarray(frame, format="rgb24")
             for packet in (*encoder.encode(image), *encoder.encode(None)):
-                packet.stream, packet.pts, packet.dts, packet.time_base = stream, k, k, Fraction(1, 10)
+                packet.stream, packet.time_base = stream, Fraction(1, 10)
+                packet.pts = packet.dts = k * every
                 file.mux(packet)
 
 
@@ -91,3 +96,16 @@ def test_frames_and_rows_do_not_agree(video: Path, opened: Callable, tmp_path: P
     with pytest.raises(UserError, match="cannot be decoded"):
         opened(root)
     assert not list((tmp_path / "cache").glob("*/"))
+
+
+def test_frames_at_other_times_than_their_rows(video: Path, opened: Callable, tmp_path: Path) -> None:
+    """As many as there should be, at half the rate; and two episodes that begin at one time."""
+    root = tmp_path / "data"
+    shutil.copytree(video, root)
+    for path in root.rglob("*.mp4"):
+        write_frames(path, [np.zeros((32, 32, 3), np.uint8)] * 16, every=2)
+    with pytest.raises(UserError, match="8 of 16 rows have no frame at their time"):
+        opened(root)
+    job = decode.VideoJob("a.mp4", "f", 10, [0, 1], [0.0, 0.4], [], "")
+    with pytest.raises(UserError, match="two episodes claim frame 4"):
+        job._row_at(np.array([[0, 5, 0], [5, 4, 0]]))

@@ -13,6 +13,10 @@ from scipy.stats import chisquare
 
 from franka_wm import processes
 from franka_wm.data.lerobot import opening
+from franka_wm.data.lerobot.episodes import complete
+from franka_wm.data.lerobot.schema import DONE, EPISODE_KEY, SEED, TRUNCATED, schema_for
+from franka_wm.data.lerobot.writer import DatasetWriter
+from franka_wm.envs import FrankaConfig
 from franka_wm.errors import UserError
 
 LENGTHS = (5, 4, 7)
@@ -301,3 +305,33 @@ def test_refused(pictures: Path, foreign, tmp_path: Path, opened: Callable) -> N
     assert opened([pictures, wide], image_size=32).image_sizes["pixels"] == (32, 32, 3)
     with pytest.raises(UserError, match=r"dataset\.root=FOLDER or dataset\.repo_id"):
         opened(None)
+
+
+def test_actions_are_those_of_rows_that_have_one(opened: Callable, tmp_path: Path) -> None:
+    """The row of the last observation holds none, but a 0, which is far from these."""
+    schema = schema_for(FrankaConfig(observations=("state", "joint_target")))
+    rng, actions = np.random.default_rng(0), []
+    with DatasetWriter(tmp_path / "set", schema, provenance={"config": {}}, workers=0) as writer:
+        for number in range(3):
+            rows, terminal = {}, {}
+            for name, feature in schema.features.items():
+                if name in (SEED, EPISODE_KEY):
+                    continue
+                values = rng.uniform(0.5, 0.9, (5, *feature["shape"])).astype(schema.numpy_dtype(name))
+                rows[name] = values[:4].copy()
+                if name in schema.observed:
+                    terminal[name] = values[4]
+                if feature["dtype"] == "bool":
+                    rows[name][:] = False
+            rows[DONE][-1] = rows[TRUNCATED][-1] = True
+            actions.append(rows["action"])
+            writer.add([complete(rows, terminal, seed=(0, number, 0))])
+        writer.finish()
+    recorded = np.concatenate(actions)
+    windows = opened(tmp_path / "set")
+    assert len(windows) == 3 * 3 and windows.recording.mapping.ours  # the last observation is known
+    assert np.array_equal(windows.statistics()["action"].min, recorded.min(0))
+    assert np.allclose(windows.statistics()["action"].mean, recorded.mean(0), atol=1e-6)
+    scaled = opened(tmp_path / "set", normalize_actions=True)
+    assert np.array_equal(scaled.action_low, recorded.min(0))
+    assert np.array_equal(scaled.action_high, recorded.max(0))
