@@ -30,6 +30,7 @@ from franka_wm.training.settings import RunSettings
 from franka_wm.training.settings.groups import ObjectiveSettings
 from franka_wm.training.spaces import Spaces
 from franka_wm.training.storage_budget import check_memory
+from franka_wm.training.unread import say_unread
 
 if TYPE_CHECKING:
     from franka_wm.data.lerobot.mapping import FeatureMap
@@ -274,7 +275,7 @@ def _check_parts(run: RunSettings) -> None:
     spaces = known_spaces(run)
     if run.is_offline or spaces is None:
         return
-    _say_unread(run, spaces)
+    say_unread(run, spaces)
     run = _with_encoder(run, spaces)
     model = sketch(run, spaces)
     if model is None:
@@ -292,31 +293,6 @@ def _check_parts(run: RunSettings) -> None:
     if model.has_next:
         build.make_planner(run, spaces.num_actions or spaces.action_dim)
     check_memory(run, model, spaces)
-
-
-def _say_unread(run: RunSettings, spaces: Spaces) -> None:
-    """Says which images are rendered and read by nothing that learns or plans."""
-    read = {*(run.model.observations or ())}
-    if run.pretrain.kind != "none":
-        read |= {*(run.first_stage().model.observations or ())}
-    if run.objective_name == "goal_image":
-        read |= {*goal_images(read).values()}
-    unread = [key for key in spaces.image_sizes if key not in read]
-    if unread:
-        say(f"not read by the model: {', '.join(unread)} (model.observations)")
-    if run.pretrain.kind != "none":
-        _say_unseen(run, spaces)
-
-
-def _say_unseen(run: RunSettings, spaces: Spaces) -> None:
-    """Says which images the model reads that its encoder, frozen by then, never learned from."""
-    shown = run.first_stage().model.observations or ()
-    unseen = [key for key in run.model.observations or () if key in spaces.image_sizes and key not in shown]
-    if unseen:
-        say(
-            f"the first stage does not see {', '.join(unseen)}, which the model reads: "
-            f"'pretrain.model.observations=[{','.join([*shown, *unseen])}]'"
-        )
 
 
 def known_spaces(run: RunSettings) -> Spaces | None:

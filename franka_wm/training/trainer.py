@@ -403,11 +403,9 @@ class Trainer:
         if not broken:
             return
         latest = self.folder / "checkpoints" / "latest"
-        saved = (
-            f"the last checkpoint before is whole: {latest}"
-            if latest.exists()
-            else "no checkpoint was written"
-        )
+        saved = "no checkpoint was written"
+        if latest.exists():
+            saved = f"the last checkpoint before is whole: {latest}"
         own = "whole_run" in self.settings.values and self.settings.trainer.lr is None  # of a first stage
         raise UserError(
             f"training broke: {', '.join(broken[:3])} not finite at update {self.learner.updates}; lower "
