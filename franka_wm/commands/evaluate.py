@@ -52,7 +52,7 @@ def evaluate(checkpoint: str, out: str | None, overrides: Sequence[str] = (), **
     place = own if out is None else Path(out)
     check_folder(place)
     check_run("evaluate", "checkpoint", checkpoint)
-    check_larger(place, options["episodes"])
+    check_larger(place, options["episodes"], checkpoint)
     from franka_wm.commands.evaluate_checkpoint import Options, run
 
     run(Options(checkpoint=checkpoint, out=place, overrides=tuple(overrides), **options))
@@ -78,22 +78,30 @@ def check_folder(folder: Path) -> None:
         raise UserError(f"evaluate: out={folder}: {why}; give another folder for the results")
 
 
-def check_larger(folder: Path, episodes: int) -> None:
+def check_larger(folder: Path, episodes: int, checkpoint: str) -> None:
     """Whether a result of more episodes would be lost there; asked before anything is played.
 
+    A result of a checkpoint of more or fewer updates may go: it says nothing of this one.
+
     Raises:
-        UserError: It would.
+        UserError: It would, or there is no checkpoint to compare it with.
     """
     if not (folder / "evaluation.json").is_file():
         return
     from franka_wm.evaluation.results import read_result
 
     try:
-        there = read_result(folder / "evaluation.json").episodes
+        there = read_result(folder / "evaluation.json")
     except UserError:  # nobody can read it
         return
-    if there > episodes:
-        raise UserError(
-            f"evaluate: {folder} holds a result of {there} episodes, which one of {episodes} would replace; "
-            "give out=FOLDER, or more episodes="
-        )
+    if there.episodes <= episodes:
+        return
+    if there.updates is not None:
+        from franka_wm.training.load import find_checkpoint
+
+        if there.updates != find_checkpoint(checkpoint).counters.get("updates"):
+            return
+    raise UserError(
+        f"evaluate: {folder} holds a result of {there.episodes} episodes, which one of {episodes} would replace; "
+        "give out=FOLDER, or more episodes="
+    )

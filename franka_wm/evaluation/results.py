@@ -65,20 +65,31 @@ class Result:
         return max((int(one.get("episodes", 0)) for one in self.policies.values()), default=0)
 
     @property
+    def updates(self) -> float | None:
+        """After how many updates of the weights, where it says so."""
+        found = self.protocol.get("updates")
+        return found if isinstance(found, (int, float)) and not isinstance(found, bool) else None
+
+    @property
     def told(self) -> str:
-        """Who measured it, over how many episodes."""
-        return f"{self.protocol.get('by', self.path.name)}, {self.episodes} episodes"
+        """Who measured it, over how many episodes, after how many updates."""
+        after = "" if self.updates is None else f" after {self.updates:,.0f} updates"
+        return f"{self.protocol.get('by', self.path.name)}, {self.episodes} episodes{after}"
 
 
 def results(folder: str | Path) -> list[Result]:
-    """All results in a run's folder, the one with most episodes first; of equal ones the command's, which says more.
+    """All results in a run's folder: of the latest weights first, of the same weights the one with most episodes.
+
+    Of equal ones the command's comes first, which says more. Where one does not say how many updates its weights had,
+    episodes alone count.
 
     Raises:
         UserError: a file that cannot be read, or is of an older form.
     """
     run = UntrustedFolder(Path(folder))
     found = [_result(run, name) for name in (f"evaluation/{FILE}", FILE) if run.path(name)]
-    return sorted(found, key=lambda one: -one.episodes)
+    known = all(one.updates is not None for one in found)
+    return sorted(found, key=lambda one: ((known and one.updates) or 0, one.episodes), reverse=True)
 
 
 def read_result(path: str | Path) -> Result:

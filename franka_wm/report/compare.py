@@ -181,7 +181,7 @@ def _told(result: Result) -> str:
 
 
 def _measured(runs: Mapping[str, RunFiles]) -> str:
-    """By whom, where a run was measured more than once, or planned otherwise: shown is what rests on most episodes."""
+    """By whom, where a run was measured more than once, or planned otherwise: shown is the first."""
     found = [one for run in runs.values() for one in run.results]
     if all(len(run.results) < 2 for run in runs.values()) and not any(
         _OTHERWISE in one.protocol for one in found

@@ -31,7 +31,7 @@ def headline(run: RunFiles, warned: Sequence[str]) -> str:
 
 
 def result(run: RunFiles) -> str:
-    """Tables and bars of the result with most episodes; the others folded."""
+    """Tables and bars of the first result; the others folded."""
     if not run.results:
         return ""
     shown, *others = run.results

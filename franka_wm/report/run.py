@@ -8,7 +8,8 @@
     checkpoints/…           counters and the logged rows; without a checkpoint, rows come from ``csv/``
     video.mp4, last_frame.png, imagined.mp4, imagined.png, masks.png    images
     evaluation/             what ``franka-wm evaluate`` wrote: evaluation.json, timing.json and images. Of two
-                            evaluation.json the one with more episodes is shown first, and the other is named
+                            evaluation.json that of later weights is shown first, of the same weights the one with
+                            more episodes; the other is named
 
 ``timing.json`` holds {policy: {"seconds_per_decision", "worlds"}}.
 
@@ -42,7 +43,7 @@ class RunFiles:
         config: as the run saved it; interpolations are never resolved here.
         overrides: typed after ``train.py``, of Hydra's own only where configurations of the user's are.
         versions: of packages and machine.
-        results: of the run's end and of ``franka-wm evaluate``; the one with most episodes, which is shown, first.
+        results: of the run's end and of ``franka-wm evaluate``; the one that is shown first, see `results`.
         rows: logged while training, and what its end found.
         counters: of the checkpoint: ``updates``, ``env_steps``, ``seconds``.
         images: name -> path, of `IMAGES`.

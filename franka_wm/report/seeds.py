@@ -15,7 +15,7 @@ ENOUGH = 3
 
 
 def read_evaluation(run: str | Path) -> Result:
-    """What was measured of a run: of several results the one with most episodes.
+    """What was measured of a run: of several results that of the latest weights, of these the one with most episodes.
 
     Raises:
         UserError: There is none, or it cannot be read.
