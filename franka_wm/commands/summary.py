@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import click
 
 from franka_wm.commands.arguments import verb
+from franka_wm.errors import UserError
 
 if TYPE_CHECKING:
     from franka_wm.evaluation.results import Result
@@ -26,8 +27,12 @@ def summary(folders: tuple[str, ...]) -> None:
     from franka_wm.report.seeds import evaluated, read_evaluation
 
     groups: dict[str, dict[Path, Result]] = {}
+    seen: set[Path] = set()
     for folder in folders:
         for run in evaluated(folder, print):
+            if run.resolve() in seen:
+                raise UserError(f"summary: {run} is given twice; each run counts once")
+            seen.add(run.resolve())
             with malformed(run):
                 groups.setdefault(but_for_the_seed(read_config(run)), {})[run] = read_evaluation(run)
     for group in groups.values():
@@ -49,7 +54,16 @@ def table(group: Mapping[Path, Result], *, several: bool) -> str:
     by = sorted({str(one.protocol.get("by", one.path)) for one in found})
     return (
         f"{runs} of {episodes} episodes each: {cells_told(len(found))}\n"
-        f"measured by {' and '.join(by)}; of a run measured twice, what rests on more episodes\n\n"
-        + seeds_table([one.policies for one in found])
-        + "\n" * several
+        f"measured by {' and '.join(by)}; of a run measured twice, its later weights, of these what rests on more "
+        f"episodes\n{_apart(found)}\n" + seeds_table([one.policies for one in found]) + "\n" * several
     )
+
+
+def _apart(found: Sequence[Result]) -> str:
+    """A line for each of what should be the same in all runs of one mean, and is not."""
+    lines = ""
+    for name, what in (("updates", "updates"), ("franka_wm", "versions of franka_wm")):
+        values = list(dict.fromkeys(str(one.protocol.get(name, "unknown")) for one in found))
+        if len(values) > 1:
+            lines += f"note: the runs are of different {what}: {', '.join(values)}\n"
+    return lines

@@ -123,6 +123,33 @@ def test_runs_of_different_tasks_are_not_averaged(tmp_path, capsys):
     assert "1 run (1-reach_fixed)" in out and "| planner | 2.00 | 100 |" in out
 
 
+def test_a_run_given_twice_is_refused(tmp_path, capsys):
+    """By any name, and by itself beside its sweep."""
+    (tmp_path / "multirun.yaml").touch()
+    for k in range(2):
+        (tmp_path / f"{k}-reach").mkdir()
+        (tmp_path / f"{k}-reach" / "evaluation.json").write_text(written(0.01, 1.0))
+    (tmp_path / "link").symlink_to(tmp_path / "1-reach")
+    for words in (["0-reach", "0-reach/"], ["1-reach", "link"], [".", "1-reach"]):
+        assert main(["summary", *(f"{tmp_path}/{word}" for word in words)]) == 1
+        assert "is given twice; each run counts once" in capsys.readouterr().err
+
+
+def test_runs_of_other_updates_or_versions_are_told(tmp_path, capsys):
+    for k, (updates, version) in enumerate([(4000, "0.1"), (4000, "0.1"), (2000, "0.2")]):
+        (tmp_path / str(k)).mkdir()
+        found = json.loads(written(0.01, 1.0))
+        found["protocol"] |= {"updates": updates, "franka_wm": version}
+        (tmp_path / str(k) / "evaluation.json").write_text(json.dumps(found))
+    runs = [str(tmp_path / str(k)) for k in range(3)]
+    assert main(["summary", *runs[:2]]) == 0
+    assert "note:" not in capsys.readouterr().out
+    assert main(["summary", *runs]) == 0
+    out = capsys.readouterr().out
+    assert "note: the runs are of different updates: 4000, 2000\n" in out
+    assert "note: the runs are of different versions of franka_wm: 0.1, 0.2\n\n| policy" in out
+
+
 def test_a_sweep_with_a_link_out_of_it_is_refused(tmp_path, capsys):
     sweep, other = tmp_path / "sweep", tmp_path / "other"
     for folder in (sweep, other):
