@@ -10,7 +10,7 @@ from pathlib import Path
 import benchmarks.results
 from benchmarks.results import confirm, plots, records, render, running
 from benchmarks.results.rows import Row, choose, load_rows
-from benchmarks.results.state import state
+from benchmarks.results.state import state, unmeasured
 from franka_wm.errors import FrankaError
 from franka_wm.files import atomic_write
 from franka_wm.source import ROOT
@@ -25,10 +25,12 @@ def overview(rows: Mapping[str, Row], place: Path) -> str:
     for name, row in rows.items():
         found = records.read(row, place)
         kind, reasons = state(row, found)
-        have = f"{len(found)}/{len(row.seeds)}" if row.seeds else f"{len(found)}/1"
+        declared = len(row.seeds)
+        have = f"{declared - len(unmeasured(row, found))}/{declared}" if row.seeds else f"{len(found)}/1"
         judged = [] if kind in ("missing", "mixed") else render.verdicts(row, found)
         if kind == "stale" and (same := confirm.confirmed(row, found, place)):
-            kind, reasons = "confirmed", [f"{len(reasons)} files changed, nothing else: {same['date']}"]
+            kind = "confirmed"
+            reasons = [f"{render.changed_told(reasons)} changed, nothing else: {same['date']}"]
         if len(reasons) > SHOWN:
             reasons = [*reasons[:SHOWN], f"{len(reasons) - SHOWN} more, see docs/results.md"]
         more = [
@@ -128,6 +130,9 @@ def main(arguments: list[str] | None = None) -> int:
                 extra=chosen.extra,
             )
             work = [(row, chosen.seeds or row.seeds) for row in (choose(rows, name) for name in chosen.rows)]
+            for row, seeds in work:
+                for seed in seeds:
+                    records.check_seed(row, seed, "--seeds")
             if chosen.missing:
                 work = [
                     (row, left)
@@ -142,7 +147,7 @@ def main(arguments: list[str] | None = None) -> int:
             row = choose(rows, chosen.row)
             for path in chosen.runs:
                 if row.script is not None:
-                    record = records.record_benchmark(row, path, commit=chosen.commit)
+                    record = records.record_benchmark(row, path, jobs=chosen.jobs, commit=chosen.commit)
                 else:
                     record = records.record_run(row, path, jobs=chosen.jobs, commit=chosen.commit)
                 print(records.write(record, chosen.results))

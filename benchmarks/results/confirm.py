@@ -19,7 +19,7 @@ from datetime import date
 from pathlib import Path
 from typing import Any
 
-from benchmarks.results.records import PLACE, read, read_json
+from benchmarks.results.records import PLACE, code_key, read, read_json
 from benchmarks.results.rows import Row
 from benchmarks.results.running import prepare
 from benchmarks.results.state import Record, changes, composed
@@ -98,6 +98,7 @@ def confirm(row: Row, place: Path = PLACE) -> Path:
                 {
                     "row": row.name,
                     "measured": commits[0],
+                    "code": _codes(records),
                     "command": shlex.join(["python", "train.py", *short(row)]),
                     "date": date.today().isoformat(),
                     "files": finished["source"],
@@ -144,10 +145,19 @@ def confirmed(row: Row, records: Sequence[Record], place: Path = PLACE) -> Recor
     from franka_wm.source import differing
 
     found = read_json(place / "confirmed" / f"{row.name}.json")
-    if not found or {str(record["commit"]).removesuffix("+") for record in records} != {found["measured"]}:
+    commits = {str(record["commit"]) for record in records}
+    if not found or {commit.removesuffix("+") for commit in commits} != {found["measured"]}:
+        return None
+    # An earlier version did not name the code: a commit alone says which it is, one with "+" does not.
+    if found["code"] != _codes(records) if "code" in found else any(one.endswith("+") for one in commits):
         return None
     now = composed(tuple(shlex.split(records[0]["command"])[2:]))
     return found if not differing(found["files"]) and found["config"] == now else None
+
+
+def _codes(records: Sequence[Record]) -> list[str]:
+    """What all records' code is, by the names of its files."""
+    return sorted({code_key(record["code"]) for record in records})
 
 
 def _git(*words: str) -> None:

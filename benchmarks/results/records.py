@@ -43,7 +43,8 @@ def record_run(row: Row, folder: Path, *, jobs: int, commit: str | None = None) 
         commit: Of the code, where the run could not tell.
 
     Raises:
-        UserError: It did not finish, was resumed, is not a run of this row, or ran on another kind of machine.
+        UserError: It did not finish, was resumed, is not a run of this row and one of its seeds, or ran on another
+            kind of machine.
     """
     versions, finished, found = (
         read_json(folder / f"{name}.json") for name in ("versions", "finished", "evaluation")
@@ -53,6 +54,7 @@ def record_run(row: Row, folder: Path, *, jobs: int, commit: str | None = None) 
         raise UserError(f"{folder}: not the folder of a run that finished; results need the whole run")
     if config.get("resume"):
         raise UserError(f"{folder}: a run that was resumed; results need runs in one piece")
+    check_seed(row, config["seed"], folder)
     typed = overrides(folder)
     check_arguments(row, typed, folder)
     check_machine(row, versions, folder)
@@ -70,8 +72,14 @@ def record_run(row: Row, folder: Path, *, jobs: int, commit: str | None = None) 
     }
 
 
-def record_benchmark(row: Row, file: Path, *, commit: str | None = None) -> dict[str, Any]:
+def record_benchmark(row: Row, file: Path, *, jobs: int = 1, commit: str | None = None) -> dict[str, Any]:
     """What a benchmark wrote with ``--out``.
+
+    Args:
+        row: The row that it measures.
+        file: What it wrote.
+        jobs: How many runs shared the machine, itself included.
+        commit: Of the code, where the run could not tell.
 
     Raises:
         UserError: The file is not one of a benchmark, was made with other arguments, or on another kind of machine.
@@ -84,7 +92,7 @@ def record_benchmark(row: Row, file: Path, *, commit: str | None = None) -> dict
     return {
         "row": row.name,
         "command": shlex.join(row.command),
-        **_made_with(found["machine"], 1, commit),
+        **_made_with(found["machine"], jobs, commit),
         "rows": found["rows"],
         "code": {"files": found["machine"]["source"], "config": {}, "composed": found.get("composed", {})},
     }
@@ -104,6 +112,16 @@ def check_arguments(row: Row, typed: Sequence[str], where: Any) -> None:
             f"with {a}" for a in sorted(given - wanted)
         ]
         raise UserError(f"{where}: not a run of {row.name}, started {', '.join(apart)}")
+
+
+def check_seed(row: Row, seed: Any, where: Any) -> None:
+    """Refuses a run of a seed that the row does not declare: its means would be of other runs than it says.
+
+    Raises:
+        UserError: It says which are declared.
+    """
+    if row.seeds and seed not in row.seeds:
+        raise UserError(f"{where}: seed {seed} is none of {row.name}'s, {row.seeds[0]} – {row.seeds[-1]}")
 
 
 def check_script(row: Row, typed: Sequence[str] | None, where: Any) -> None:
@@ -153,8 +171,7 @@ def overrides(folder: Path) -> list[str]:
 
 def write(record: Mapping[str, Any], place: Path = PLACE) -> Path:
     """The record as a file of its row, and its code beside the rows; whole or not at all."""
-    code = json.dumps(record["code"], indent=1, sort_keys=True) + "\n"
-    key = hashlib.sha256(code.encode()).hexdigest()[:12]
+    code, key = _code_text(record["code"]), code_key(record["code"])
     name = f"seed-{record['seed']}" if "seed" in record else "run"
     path = place / record["row"] / f"{name}.json"
     with atomic_write(place / CODE / f"{key}.json") as temporary:
@@ -162,6 +179,15 @@ def write(record: Mapping[str, Any], place: Path = PLACE) -> Path:
     with atomic_write(path) as temporary:
         temporary.write_text(to_json({**record, "code": key}))
     return path
+
+
+def code_key(code: Mapping[str, Any]) -> str:
+    """The name of the file of a record's code: equal for equal code alone."""
+    return hashlib.sha256(_code_text(code).encode()).hexdigest()[:12]
+
+
+def _code_text(code: Mapping[str, Any]) -> str:
+    return json.dumps(code, indent=1, sort_keys=True) + "\n"
 
 
 def read(row: Row, place: Path = PLACE) -> list[dict[str, Any]]:

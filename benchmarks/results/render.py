@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import shlex
-from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,14 +11,16 @@ from typing import Any
 from benchmarks.results.confirm import confirmed
 from benchmarks.results.records import BESIDE, PLACE, read
 from benchmarks.results.rows import Row
-from benchmarks.results.state import Record, numbers, state, unmeasured
+from benchmarks.results.state import Record, apart, numbers, state, unmeasured
+from benchmarks.results.times import company, cores, duration, grouped, machine, seconds, timed
 from franka_wm.errors import UserError
 
 BEGIN, END = "<!-- results: written by `make results` -->", "<!-- end of results -->"
 LEGEND = (
     "*m of n seeds*: the row declares n and m were measured; the others have not been, none was left out for its "
     "result. *n at a time*: so many runs shared the machine, so each took longer than by itself; *alone (m of n "
-    "runs)*: times of those that had it to themselves. ¹ and ², an earlier commit: see below the tables."
+    "runs)*: times of those that had it to themselves; *beside other work*: none had. ¹ and ², an earlier commit: see "
+    "below the tables."
 )
 """What README says of its tables' words."""
 HEAD = """# Results
@@ -41,7 +42,6 @@ POLICIES = {
     "expert": "the task's expert",
 }
 DISCRETE_ORACLE = "search with the same actions"
-COUNTS = {1: "One CPU core", 2: "Two CPU cores"}
 
 
 @dataclass(frozen=True)
@@ -91,8 +91,8 @@ def verdicts(row: Row, records: Sequence[Record]) -> list[tuple[str, str, bool]]
     for name, wanted in row.wanted.items():
         policy = row.acting(records[0]["policies"])
         if name == "minutes":
-            slowest = max(map(seconds, timed(records)))
-            reached = duration(slowest) + company(records)
+            slowest = max(map(seconds, timed(records, beside=row.beside)))
+            reached = duration(slowest) + company(records, beside=row.beside)
             found.append((f"≤ {wanted:g} min of training", reached, slowest <= 60 * wanted))
         elif name == "distance_cm":
             mean = _mean([DISTANCE.of(record, policy) for record in records])
@@ -122,33 +122,6 @@ def verdicts(row: Row, records: Sequence[Record]) -> list[tuple[str, str, bool]]
                 (f"worst seed ≥ {wanted:g} % within {cm} cm", f"{worst:.1f} %", worst >= wanted - 1e-9)
             )
     return found
-
-
-def seconds(record: Record) -> float:
-    """Training, of both stages where there are two."""
-    training = record["training"]
-    return training["seconds"] + training.get("pretraining_seconds", 0)
-
-
-def timed(records: Sequence[Record]) -> Sequence[Record]:
-    """The runs whose times count: those that had the machine to themselves, if there are any."""
-    return [record for record in records if record["machine"]["jobs"] == 1] or records
-
-
-def company(records: Sequence[Record]) -> str:
-    """What to say after the times of ``timed``: which of the runs these are, and how many ran at a time."""
-    jobs = sorted({record["machine"]["jobs"] for record in timed(records)})
-    if jobs == [1]:
-        alone = len(timed(records))
-        return "" if alone == len(records) else f" alone ({alone} of {len(records)} runs)"
-    return f", {' – '.join(map(str, dict.fromkeys((jobs[0], jobs[-1]))))} at a time"
-
-
-def duration(*values: float) -> str:
-    """``42 s`` or ``8.1 min``, with bounds if given."""
-    minutes = values[0] >= 120
-    first, *others = (f"{value / 60:.1f}" if minutes else f"{value:.0f}" for value in values)
-    return (f"{first} ({' – '.join(others)})" if others else first) + (" min" if minutes else " s")
 
 
 # -- the page -----------------------------------------------------------------------------------------------
@@ -190,18 +163,7 @@ def part(row: Row, records: Sequence[Record], judged: tuple[str, list[str]], pla
         )
     lines += [_provenance(row, records), ""]
     if kind == "stale":
-        files = ", ".join(f"`{reason}`" for reason in reasons)
-        if same := confirmed(row, records, place):
-            lines += [
-                f"Measured before changes of {len(reasons)} files that change nothing a short run shows: on "
-                f"{same['date']} `{same['command']}` gave the same weights and episodes with that code and with "
-                f"today's, bit for bit. <details><summary>Files</summary>{files}</details>",
-                "",
-            ]
-        else:
-            many = f"{len(reasons)} files" if len(reasons) > 1 else "one file"
-            opened = f"<details><summary>Files</summary>{files}</details>"
-            lines += [f"**Measured before changes of {many}.** {opened}", ""]
+        lines += [_since(reasons, confirmed(row, records, place)), ""]
     if missing := unmeasured(row, records):
         one = "seed" if len(missing) == 1 else "seeds"
         lines += [
@@ -219,6 +181,37 @@ def part(row: Row, records: Sequence[Record], judged: tuple[str, list[str]], pla
         seeds = _each_seed(row, records)
         lines += ["<details><summary>Every seed</summary>", "", seeds, "", "</details>", ""]
     return "\n".join(lines)
+
+
+def _since(reasons: Sequence[str], same: Record | None) -> str:
+    """What has changed since a row was measured, and whether a short run showed anything of it."""
+    files, values = apart(reasons)
+    changed = changed_told(reasons)
+    if same:
+        text = (
+            f"Measured before changes of {changed} that change nothing a short run shows: on "
+            f"{same['date']} `{same['command']}` gave the same weights and episodes with that code and with "
+            f"today's, bit for bit."
+        )
+    else:
+        text = f"**Measured before changes of {changed}.**"
+    if values:
+        text += f" Of the configuration: {', '.join(f'`{value}`' for value in values)}."
+    named = ", ".join(f"`{name}`" for name in files)
+    return text + (f" <details><summary>Files</summary>{named}</details>" if files else "")
+
+
+def changed_told(reasons: Sequence[str]) -> str:
+    """How many files changed, and how many values of the configuration."""
+    files, values = apart(reasons)
+    parts = [f"{len(files)} files" if len(files) > 1 else "one file"] if files else []
+    if values:
+        parts.append(
+            f"{len(values)} values of its configuration"
+            if len(values) > 1
+            else "one value of its configuration"
+        )
+    return " and ".join(parts)
 
 
 def _over_seeds(records: Sequence[Record]) -> str:
@@ -281,15 +274,18 @@ def _provenance(row: Row, records: Sequence[Record]) -> str:
     """Machine, versions, commit, date; of runs also seeds, episodes, what training took, arguments not in the row."""
     allowed = row.section.threads
     fewer = allowed and any(record["machine"]["threads"] < allowed for record in records)
-    machines = grouped(records) + (f" (up to {allowed} threads are allowed)" if fewer else "")
+    machines = grouped(records, beside=row.beside) + (
+        f" (up to {allowed} threads are allowed)" if fewer else ""
+    )
     commits = ", ".join(dict.fromkeys(_commit(record) for record in records))
     dates = " – ".join(dict.fromkeys(f(record["date"] for record in records) for f in (min, max)))
     made = records[0]["versions"]
     with_what = f"{machines}; torch {made['torch']}, Newton {made['newton']}; commit {commits}, {dates}."
     if row.script is not None:
         return with_what
-    times = [seconds(record) for record in timed(records)]
-    commands = [record["training"]["command_seconds"] for record in timed(records)]
+    timing = timed(records, beside=row.beside)
+    times = [seconds(record) for record in timing]
+    commands = [record["training"]["command_seconds"] for record in timing]
     spread = (_mean(times), min(times), max(times)) if len(times) > 1 else (times[0],)
     whole = duration(_mean(commands))
     training = records[0]["training"]
@@ -298,8 +294,8 @@ def _provenance(row: Row, records: Sequence[Record]) -> str:
     typed = " or ".join(dict.fromkeys(_beside(row, record) for record in records))
     return (
         f"Seed{'s' * (len(records) > 1)} {seeds}, {episodes} episodes each. {training['updates']:,.0f} updates, "
-        f"{training['env_steps']:,.0f} steps; training {duration(*spread)}{company(records)}, the whole command "
-        f"{whole}. {with_what}" + (f" Run {typed}." if typed else "")
+        f"{training['env_steps']:,.0f} steps; training {duration(*spread)}{company(records, beside=row.beside)}, "
+        f"the whole command {whole}. {with_what}" + (f" Run {typed}." if typed else "")
     )
 
 
@@ -312,34 +308,6 @@ def _beside(row: Row, record: Record) -> str:
     )
     parts = [f"{word} `{' '.join(some)}`" for word, some in (("with", more), ("without", less)) if some]
     return " and ".join(parts)
-
-
-def machine(record: Record) -> str:
-    """The machine of a run."""
-    made = record["machine"]
-    return made["gpu"] or f"{made['processor']}, {made['threads']} thread{'s' * (made['threads'] > 1)}"
-
-
-def grouped(records: Sequence[Record]) -> str:
-    """Each machine once, with how many runs it had at a time; numbers of runs where these are not all the same."""
-    kinds = Counter((machine(record), record["machine"]["jobs"]) for record in records)
-    if len(kinds) == 1:
-        ((kind, jobs),) = kinds
-        return kind + (f", {jobs} runs at a time" if jobs > 1 else "")
-    texts: dict[str, list[str]] = {}
-    for (kind, jobs), runs in sorted(kinds.items()):
-        said = texts.setdefault(kind, [])
-        noun = "" if said else f" run{'s' * (runs > 1)}"
-        said.append(f"{runs}{noun} " + (f"at {jobs} a time" if jobs > 1 else "alone"))
-    return "; ".join(f"{kind}: {', '.join(said)}" for kind, said in texts.items())
-
-
-def cores(row: Row, records: Sequence[Record]) -> str:
-    """The kind of machine: the section's, on a CPU with the cores that the runs used."""
-    if row.section.threads is None:
-        return row.section.title
-    used = sorted({record["machine"]["threads"] for record in records})
-    return " or ".join(COUNTS.get(threads, f"{threads} CPU cores") for threads in used)
 
 
 def table(titles: Sequence[str], cells: Sequence[Sequence[str]]) -> str:
@@ -381,7 +349,8 @@ def readme_tables(rows: Mapping[str, Row], place: Path = PLACE) -> str:
         aged, alike = aged or mark == "¹", alike or mark == "²"
         if isinstance(row.readme, list):
             titles = ["machine", *row.readme]
-            cells = [[machine(records[0]) + mark, *line] for line in _cells(records[0]["rows"], row.readme)]
+            who = machine(records[0]) + company(records, beside=row.beside) + mark
+            cells = [[who, *line] for line in _cells(records[0]["rows"], row.readme)]
             speed += [table(titles, cells), ""]
             continue
         policy = row.acting(records[0]["policies"])
@@ -393,9 +362,10 @@ def readme_tables(rows: Mapping[str, Row], place: Path = PLACE) -> str:
             reached = RETURN.show(_mean(values), min(values), max(values))
             others.append([who, row.model, f"{where}, {runs}", reached, f"{row.wanted.get('return', '–')}"])
             continue
-        times = _mean([seconds(record) for record in timed(records)])
-        command = _mean([record["training"]["command_seconds"] for record in timed(records)])
-        took = [duration(times) + company(records), f"{command / 60:.1f} min"]
+        timing = timed(records, beside=row.beside)
+        times = _mean([seconds(record) for record in timing])
+        command = _mean([record["training"]["command_seconds"] for record in timing])
+        took = [duration(times) + company(records, beside=row.beside), f"{command / 60:.1f} min"]
         if columns(records) == [SUCCESS, RETURN]:
             values = [SUCCESS.of(record, policy) for record in records]
             expert = _mean([SUCCESS.of(record, "expert") for record in records])

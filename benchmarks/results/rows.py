@@ -59,6 +59,7 @@ class Row:
     text: str = ""
     readme: bool | list[str] = False
     plot: Mapping[str, str] | None = None
+    beside: bool = False
 
     @property
     def words(self) -> list[str]:

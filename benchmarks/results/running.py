@@ -120,7 +120,7 @@ def run(
         elif row.script is None:
             line += [(row, seed) for seed in seeds]
         else:
-            failed += _benchmark(row, slots_of[0][0], out / row.name / stamp, place)
+            failed += _benchmark(row, slots_of[0][0], out / row.name / stamp, place, 1 + machine.beside)
     slots: Queue[Slot] = Queue()
     for slot in slots_of[0]:
         slots.put(slot)
@@ -160,13 +160,13 @@ def run(
         return failed + [failure for failure in pool.map(one, line) if failure]
 
 
-def _benchmark(row: Row, slot: Slot, folder: Path, place: Path) -> list[str]:
+def _benchmark(row: Row, slot: Slot, folder: Path, place: Path, jobs: int) -> list[str]:
     before, _, environment = slot
     folder.mkdir(parents=True, exist_ok=True)
     command = [*before, sys.executable, *row.command[1:], "--out", str(folder / "run.json")]
     failure = _call(command, environment, folder / "run.log")
     if failure is None:
-        print(write(record_benchmark(row, folder / "run.json"), place), flush=True)
+        print(write(record_benchmark(row, folder / "run.json", jobs=jobs), place), flush=True)
     return [failure] if failure else []
 
 

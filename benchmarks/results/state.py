@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from functools import cache
 from typing import Any
 
-from benchmarks.results.records import check_arguments
+from benchmarks.results.records import BESIDE, check_arguments, check_seed
 from benchmarks.results.rows import Row
 from franka_wm.errors import FrankaError
 from franka_wm.report.run import SAME_BUT
@@ -41,23 +41,29 @@ def mixed(row: Row, records: Sequence[Record]) -> list[str]:
         try:
             words = shlex.split(record["command"])
             check_arguments(row, words[2:], where)
+            if "seed" in record:
+                check_seed(row, record["seed"], where)
             if words[1] != row.command[1]:
                 reasons.append(f"{where} ran {words[1]}")
         except FrankaError as error:
             reasons.append(str(error))
     first = records[0]
-    for record in records[1:]:
-        files, others = first["code"]["files"], record["code"]["files"]
-        names = [name for name in files if files[name] != others.get(name, files[name])]
+    files: dict[str, str] = {}
+    for record in records:
+        here = record["code"]["files"]
+        names = [name for name in here if files.setdefault(name, here[name]) != here[name]]
+        made = {**dict.fromkeys(first["versions"]), **record["versions"]}
+        names += [f"{name} {value}" for name, value in made.items() if first["versions"].get(name) != value]
         names += [
-            f"{name} {value}"
-            for name, value in record["versions"].items()
-            if first["versions"].get(name) != value
+            change
+            for change in changes(first["code"]["config"], record["code"]["config"])
+            if not change.startswith(tuple(f"{name}{end}" for name in BESIDE for end in (" ", ".")))
         ]
-        names += changes(first["code"]["config"], record["code"]["config"])
         if names:
-            reasons.append(f"seeds {first['seed']} and {record['seed']} differ in {', '.join(names)}")
-    return reasons
+            reasons.append(f"seed {record['seed']} differs from those before it in {', '.join(names)}")
+    seeds = [record["seed"] for record in records if "seed" in record]
+    twice = sorted({seed for seed in seeds if seeds.count(seed) > 1})
+    return reasons + [f"seed {seed} has {seeds.count(seed)} files" for seed in twice]
 
 
 def stale(records: Sequence[Record]) -> list[str]:
@@ -104,6 +110,12 @@ def changes(before: Any, after: Any, name: str = "") -> list[str]:
             for found in changes(before.get(key, "–"), after.get(key, "–"), f"{name}.{key}" if name else key)
         ]
     return [] if before == after else [f"{name} {before} → {after}"]
+
+
+def apart(reasons: Sequence[str]) -> tuple[list[str], list[str]]:
+    """Of what `stale` found: files, and what changed of the configuration or the command."""
+    files = [reason for reason in reasons if " " not in reason]
+    return files, [reason for reason in reasons if " " in reason]
 
 
 def numbers(seeds: Sequence[int]) -> str:

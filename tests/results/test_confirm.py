@@ -73,6 +73,7 @@ def test_equal_runs_are_written_down_and_hold(measured: Path, monkeypatch: pytes
     path = confirm.confirm(ROW, measured)
     same = confirm.confirmed(ROW, found, measured)
     assert same is not None and same["measured"] == "abc1234"
+    assert confirm.confirmed(ROW, [{**found[0], "code": {"files": {}, "config": {}}}], measured) is None
     assert confirm.confirmed(ROW, [{**found[0], "commit": "other12"}], measured) is None
     for change in ({"files": {"train.py": "another hash"}}, {"config": {}}):
         kept = json.loads(path.read_text())
@@ -117,7 +118,16 @@ def test_what_else_was_not_committed_counts_as_far_as_it_is_code(measured: Path,
     path = measured / "reach" / "seed-100.json"
     record = json.loads(path.read_text()) | {"commit": "abc1234+"}
     path.write_text(json.dumps(record))
-    assert json.loads(confirm.confirm(ROW, measured).read_text())["measured"] == "abc1234"
+    file = confirm.confirm(ROW, measured)
+    kept = json.loads(file.read_text())
+    assert kept["measured"] == "abc1234"
+    assert confirm.confirmed(ROW, records.read(ROW, measured), measured)
+    del kept["code"]  # of an earlier version, which says nothing of what "+" stands for
+    file.write_text(json.dumps(kept))
+    assert confirm.confirmed(ROW, records.read(ROW, measured), measured) is None
+    path.write_text(json.dumps(record | {"commit": "abc1234"}))
+    assert confirm.confirmed(ROW, records.read(ROW, measured), measured)
+    path.write_text(json.dumps(record))
     code = {"files": {"train.py": "another"}, "config": {}}
     records.write(record | {"code": code}, measured)
     with pytest.raises(UserError, match=r"measured with another train\.py than that of abc1234"):

@@ -110,7 +110,7 @@ def test_what_runs_beside_is_recorded_with_the_times(tmp_path, monkeypatch) -> N
     monkeypatch.setattr(running, "record_run", recorded)
     name = next(iter(load_rows()))
     for words in (["--beside", "2"], []):
-        seeds = ["--seeds", "1", "--threads", "1", "--out", str(tmp_path / "out")]
+        seeds = ["--seeds", "100", "--threads", "1", "--out", str(tmp_path / "out")]
         assert main(["run", name, *words, *seeds, "--results", str(tmp_path / "place")]) == 0
     assert told == [3, 1]
 

@@ -1,0 +1,168 @@
+"""Which runs a row's numbers are of: its own seeds, alike in all that counts, and what ran beside them."""
+
+from __future__ import annotations
+
+import json
+import shlex
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+
+from benchmarks.results import records, render, running, times
+from benchmarks.results.__main__ import main, overview
+from benchmarks.results.rows import Row, Section, load_rows
+from benchmarks.results.state import composed, state
+from franka_wm import source
+from franka_wm.errors import UserError
+
+CPU = Section(title="Two CPU cores", arguments="scale=smoke device=cpu", threads=2)
+ROW = Row(
+    name="reach",
+    section=CPU,
+    title="One goal",
+    arguments="env=reach_fixed",
+    seeds=(100, 101, 102),
+    wanted={"minutes": 1},
+    readme=True,
+)
+SPEED = Row(name="speed", section=CPU, title="Speed", script="benchmarks/x.py", readme=["batch"])
+INTERVAL = {"mean": 0.01, "low": 0.01, "high": 0.02}
+POLICY = {
+    "final_distance": INTERVAL,
+    "success": dict.fromkeys(("0.05", "0.025", "0.01"), INTERVAL),
+    "return": INTERVAL,
+    "episodes": 128,
+}
+
+
+def record(seed: int, *typed: str, jobs: int = 1, **code: Any) -> dict[str, Any]:
+    """What a run of the row left, 30 s and one for each seed above 100; ``code``: files and values of its own."""
+    words = [*ROW.words, *typed]
+    files = {n: source.code_hash(n, c) for n, c in source.read(["train.py"]).items()}
+    config = composed(tuple(words))
+    assert isinstance(config, dict)
+    return {
+        "row": "reach", "seed": seed, "command": shlex.join(["python", "train.py", *words, f"seed={seed}"]),
+        "commit": "abc", "date": "2026-01-02",
+        "machine": {"processor": "p", "cores": 2, "threads": 2, "gpu": None, "jobs": jobs},
+        "versions": {"torch": "2", "newton": "1"},
+        "training": {"updates": 30, "env_steps": 200, "seconds": seed - 70, "command_seconds": 40},
+        "policies": {"planner": POLICY, "noop": POLICY},
+        "code": {"files": files | code.get("files", {}), "config": config | code.get("config", {})},
+    }  # fmt: skip
+
+
+def place(folder: Path, *found: dict[str, Any]) -> Path:
+    for one in found:
+        records.write(one, folder)
+    return folder
+
+
+# -- what ran beside --------------------------------------------------------------------------------------
+
+
+def test_no_run_was_alone_where_a_row_says_that_other_work_ran(tmp_path: Path) -> None:
+    """Times are of all its runs then, the slowest among them."""
+    row = replace(ROW, beside=True, seeds=(100, 101))
+    found = [record(100), record(101, jobs=2)]
+    place(tmp_path, *found)
+    assert times.company(found) == " alone (1 of 2 runs)" and list(times.timed(found)) == found[:1]
+    said = ", 1 – 2 at a time, beside other work"
+    assert render.verdicts(row, found) == [("≤ 1 min of training", f"31 s{said}", True)]
+    page, readme = render.page({"reach": row}, tmp_path), render.readme_tables({"reach": row}, tmp_path)
+    assert f"training 30 (30 – 31) s{said}, the whole command" in page
+    assert "p, 2 threads: 1 run at 1 a time, 1 at 2 a time, beside other work; torch" in page
+    assert f"| 30 s{said} | 0.7 min |" in readme and "*beside other work*: none had" in readme
+    assert "alone (1" not in page and "alone (1" not in readme
+    assert times.company(found[:1], beside=True) == times.BESIDE_OTHERS
+    assert times.grouped(found[:1], beside=True) == "p, 2 threads, beside other work"
+
+
+def test_rows_whose_text_tells_of_other_work_declare_it() -> None:
+    rows = load_rows()
+    assert rows["push-demos-cpu"].beside and rows["muzero-cpu"].beside and not rows["reach-cpu"].beside
+
+
+def test_what_runs_beside_a_benchmark_is_recorded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    made = {
+        "python": "3", "torch": "2", "newton": "1", "processor": "p", "cores": 2, "threads": 2,
+        "device": "cpu", "started": "2026-01-02T03:04:05+00:00", "source": {},
+    }  # fmt: skip
+
+    def call(command: list[str], environment: Any, log: Path) -> None:
+        Path(command[-1]).write_text(json.dumps({"machine": made, "rows": [{"batch": 32}]}))
+
+    monkeypatch.setattr(running, "_call", call)
+    machine = running.Machine(threads=1, beside=2)
+    assert running.run([(SPEED, [])], machine, out=tmp_path / "out", place=tmp_path / "place") == []
+    (found,) = records.read(SPEED, tmp_path / "place")
+    assert found["machine"]["jobs"] == 3
+    assert "| p, 2 threads, 3 at a time | 32 |" in render.readme_tables({"speed": SPEED}, tmp_path / "place")
+    assert "p, 2 threads, 3 runs at a time; torch" in render.page({"speed": SPEED}, tmp_path / "place")
+    (file,) = (tmp_path / "out").glob("speed/*/run.json")
+    monkeypatch.setattr("benchmarks.results.__main__.load_rows", lambda: {"speed": SPEED})
+    words = ["collect", "speed", str(file), "--jobs", "2", "--results", str(tmp_path / "other")]
+    assert main(words) == 0
+    assert records.read(SPEED, tmp_path / "other")[0]["machine"]["jobs"] == 2
+
+
+# -- which seeds ------------------------------------------------------------------------------------------
+
+
+def test_a_seed_that_is_not_declared_enters_no_mean(tmp_path: Path, capsys, monkeypatch) -> None:
+    monkeypatch.setattr(running, "run", lambda *a, **k: pytest.fail("ran"))
+    place(tmp_path, record(100), record(101), record(300))
+    kind, reasons = state(ROW, records.read(ROW, tmp_path))
+    assert kind == "mixed" and reasons == ["seed 300: seed 300 is none of reach's, 100 – 102"]
+    assert "One goal" not in render.readme_tables({"reach": ROW}, tmp_path)
+    assert " 2/3 " in overview({"reach": ROW}, tmp_path)
+    name = next(iter(load_rows()))
+    assert main(["run", name, "--seeds", "1", "--results", str(tmp_path)]) == 1
+    assert f"--seeds: seed 1 is none of {name}'s, " in capsys.readouterr().err
+
+
+def test_a_run_of_another_seed_is_not_collected(tmp_path: Path) -> None:
+    for name in ("versions", "finished", "evaluation"):
+        (tmp_path / f"{name}.json").write_text('{"a": 1}')
+    (tmp_path / "config.yaml").write_text(yaml.safe_dump({"seed": 300}))
+    with pytest.raises(UserError, match="seed 300 is none of reach's, 100 – 102"):
+        records.record_run(ROW, tmp_path, jobs=1)
+
+
+def test_a_seed_counts_once(tmp_path: Path) -> None:
+    place(tmp_path, record(100), record(101))
+    file = tmp_path / "reach" / "seed-100.json"
+    file.with_name("seed-100 (copy).json").write_text(file.read_text())
+    assert state(ROW, records.read(ROW, tmp_path)) == ("mixed", ["seed 100 has 2 files"])
+
+
+# -- what else may differ ---------------------------------------------------------------------------------
+
+
+def test_files_are_compared_among_all_runs(tmp_path: Path) -> None:
+    """Also one that the first run did not read."""
+    some = [record(100), record(101, files={"x.py": "1"}), record(102, files={"x.py": "2"})]
+    assert state(ROW, records.read(ROW, place(tmp_path, *some))) == (
+        "mixed",
+        ["seed 102 differs from those before it in x.py"],
+    )
+
+
+def test_arguments_that_change_no_number_do_not_make_a_row_mixed(tmp_path: Path) -> None:
+    typed = ["logger=none", "evaluation.video_episodes=0", "trainer.checkpoint_replay=false"]
+    some = [record(100), record(101, *typed), record(102, *typed[1:2])]
+    assert some[0]["code"]["config"]["evaluation"] != some[1]["code"]["config"]["evaluation"]
+    assert state(ROW, records.read(ROW, place(tmp_path, *some))) == ("fresh", [])
+
+
+def test_changed_values_are_no_files_and_stand_unfolded(tmp_path: Path) -> None:
+    old = {"files": {"gone.py": "1"}, "config": {"scale": "other", "old": 1}}
+    text = render.page({"reach": ROW}, place(tmp_path, *(record(seed, **old) for seed in ROW.seeds)))
+    assert "**Measured before changes of one file and 2 values of its configuration.**" in text
+    assert " Of the configuration: `old 1 → –`, `scale other → smoke`. <details>" in text
+    assert "<summary>Files</summary>`gone.py`</details>" in text
+    assert render.changed_told(["a 1 → 2"]) == "one value of its configuration"
+    assert "<details>" not in render._since(["a 1 → 2"], None)
