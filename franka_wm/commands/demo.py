@@ -13,7 +13,7 @@ AGENT = Path(__file__).parents[1] / "demo_agent"
 
 @verb(
     "demo",
-    params=[one for name, one in view.words.items() if name not in ("checkpoint", "plugins")],
+    params=[one for name, one in view.words.items() if name not in ("checkpoint", "env", "plugins")],
     others=view.others,
     shown=view.shown,
 )

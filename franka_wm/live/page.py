@@ -185,7 +185,7 @@ class Page:
             setting.value,
         )
         self._sliders[setting.name] = slider
-        whole = isinstance(setting.value, int)
+        whole = isinstance(setting.step, int)  # a temperature of 1 is no whole number
         self._allow(slider, lambda value: is_number(value, setting.low, setting.high))
 
         def moved(event: Any) -> None:

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 from franka_wm.errors import UserError
 from franka_wm.report import style
-from franka_wm.report.figure import finish_axes, new_figure
+from franka_wm.report.figure import as_label, finish_axes, new_figure
 from franka_wm.report.style import INK, LIGHT, PAPER, Theme
 
 if TYPE_CHECKING:
@@ -61,7 +61,7 @@ def bars_figure(
         means, low, high = zip(
             *(_ends(group[name], scale) for group in values.values() if name in group), strict=True
         )
-        axes.barh(places, means, height=0.9 * thick, color=each, label=name)
+        axes.barh(places, means, height=0.9 * thick, color=each, label=as_label(name))
         whiskers = [
             [mean - a for mean, a in zip(means, low, strict=True)],
             [b - mean for mean, b in zip(means, high, strict=True)],
@@ -78,7 +78,7 @@ def bars_figure(
             )
             for line in (*drawn.lines[1], *drawn.lines[2]):  # caps and bars stay visible on a dark bar
                 line.set_path_effects([withStroke(linewidth=2.8, foreground=theme.colour(PAPER))])
-    axes.set_yticks(range(len(values)), list(values))
+    axes.set_yticks(range(len(values)), [as_label(name) for name in values])
     axes.invert_yaxis()
     if limits is not None:
         axes.set_xlim(*limits)
@@ -94,7 +94,7 @@ def bars_figure(
         )
         axes.set_title("")
         if title:
-            figure.suptitle(title, fontsize=10, color=theme.colour(INK))
+            figure.suptitle(as_label(title), fontsize=10, color=theme.colour(INK))
     axes.spines["left"].set_visible(False)
     axes.tick_params(axis="y", length=0)
     return figure

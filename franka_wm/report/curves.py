@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from franka_wm.errors import UserError
 from franka_wm.report import style
 from franka_wm.report.figure import (
+    as_label,
     check_format,
     finish_axes,
     new_figure,
@@ -187,7 +188,7 @@ def seeds_figure(
             color=colour,
             linestyle=dashes,
             linewidth=1.8,
-            label=text,
+            label=as_label(text),
             marker=marker,
         )
         if having > 1:
@@ -229,7 +230,7 @@ def _draw_values(axes: "Axes", rows: Rows, x: str, keys: Sequence[str], title: s
             color=theme.colour(light),
             linestyle=dashes,
             linewidth=1.2,
-            label=_short(key),
+            label=as_label(_short(key)),
             marker="o" if len(xs) == 1 else None,
             markersize=3.5,
         )
@@ -254,7 +255,7 @@ def _draw_policy(axes: "Axes", rows: Rows, x: str, key: str, scale: float, theme
         zorder=2 if training else 3,
         marker="o" if len(xs) <= 40 else None,
         markersize=3.5,
-        label=style.policy_name(policy),
+        label=as_label(style.policy_name(policy)),
     )
 
 

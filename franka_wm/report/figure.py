@@ -67,7 +67,7 @@ def finish_axes(
     ink = theme.colour(INK)
     axes.set_xlabel(x, color=ink, fontsize=9)
     axes.set_ylabel(y, color=ink, fontsize=9)
-    axes.set_title(title, color=ink, fontsize=10)
+    axes.set_title(as_label(title), color=ink, fontsize=10)
     axes.spines[["top", "right"]].set_visible(False)
     axes.set_axisbelow(True)
     if grid:
@@ -76,6 +76,11 @@ def finish_axes(
         empty(axes, theme=theme)
     elif legend and axes.get_legend_handles_labels()[1]:
         axes.legend(frameon=False, fontsize=8, labelcolor=ink)
+
+
+def as_label(text: str) -> str:
+    """A name that others chose, as matplotlib shows it unchanged: no formula, and not left out of the legend."""
+    return (" " if text.startswith("_") else "") + text.replace("$", r"\$")
 
 
 def empty(axes: "Axes", text: str = "nothing logged", *, theme: Theme = LIGHT) -> None:

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 from franka_wm.errors import UserError
 from franka_wm.report import style
-from franka_wm.report.figure import finish_axes, new_figure
+from franka_wm.report.figure import as_label, finish_axes, new_figure
 from franka_wm.report.style import LIGHT, Theme
 
 if TYPE_CHECKING:
@@ -61,13 +61,13 @@ def horizon_figure(
             linewidth=1.8,
             marker="o" if len(places) <= 20 else None,
             markersize=3.5,
-            label=name.replace("_", " "),
+            label=as_label(name.replace("_", " ")),
         )
         if "low" in curve and "high" in curve:
             axes.fill_between(
                 places, _numbers(curve["low"]), _numbers(curve["high"]), color=drawn, alpha=0.2, linewidth=0
             )
-    finish_axes(axes, x="steps ahead", y=unit, title=title, theme=theme)
+    finish_axes(axes, x="steps ahead", y=as_label(unit), title=title, theme=theme)
     axes.set_ylim(bottom=0)
     return figure
 

@@ -6,8 +6,8 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
+import yaml
 from markupsafe import Markup
-from omegaconf import OmegaConf
 
 from franka_wm.console import named_plugins, quoted
 from franka_wm.evaluation.results import COMMAND, END
@@ -273,10 +273,13 @@ def what(run: RunFiles) -> str:
     used = facts((name.replace("_", " "), plain(value)) for name, value in run.versions.items())
     text = told + headed("Made with", used)
     if config:
-        text += folded(
-            "The whole configuration", commands(OmegaConf.to_yaml(OmegaConf.create(dict(config))).split("\n"))
-        )
+        text += folded("The whole configuration", commands(_as_yaml(config).split("\n")))
     return text
+
+
+def _as_yaml(config: Mapping[str, Any]) -> str:
+    """A configuration that others wrote, as text: OmegaConf would parse what is in it."""
+    return yaml.safe_dump(dict(config), sort_keys=False, allow_unicode=True)
 
 
 def reproduce(run: RunFiles) -> str:

@@ -8,7 +8,7 @@ from numpy.typing import ArrayLike
 
 from franka_wm.errors import UserError
 from franka_wm.report import style
-from franka_wm.report.figure import finish_axes, new_figure
+from franka_wm.report.figure import as_label, finish_axes, new_figure
 from franka_wm.report.style import GREY, INK, LIGHT, Theme
 
 if TYPE_CHECKING:
@@ -53,10 +53,12 @@ def spectrum_figure(
             linewidth=1.8,
             marker="o" if ordered.size <= 64 else None,
             markersize=3,
-            label=name,
+            label=as_label(name),
         )
     for name, rank in (marks or {}).items():
-        axes.axvline(rank, color=theme.colour(GREY), linestyle=":", linewidth=1.2, label=f"{name} {rank:.1f}")
+        axes.axvline(
+            rank, color=theme.colour(GREY), linestyle=":", linewidth=1.2, label=as_label(f"{name} {rank:.1f}")
+        )
     axes.set_yscale("log")
     finish_axes(axes, x="rank", y="relative to the largest", title=title, theme=theme)
     return figure
@@ -92,7 +94,7 @@ def latent_figure(
     # As an image: thousands of vector points would make a page slow.
     drawn: Any = axes.scatter(*places.T, c=colours, cmap=_colour_map(), s=7, linewidths=0, rasterized=True)
     bar = figure.colorbar(drawn, ax=axes)
-    bar.set_label(label, color=theme.colour(INK), fontsize=9)
+    bar.set_label(as_label(label), color=theme.colour(INK), fontsize=9)
     bar.ax.tick_params(colors=theme.colour(INK), labelsize=8)
     bar.outline.set_visible(False)  # pyright: ignore[reportCallIssue]
     shares = ["", ""] if explained is None else [f" ({100 * share:.0f} %)" for share in explained]

@@ -8,7 +8,8 @@ import pytest
 import torch
 
 from franka_wm.commands import main as cli
-from franka_wm.commands.demo import AGENT
+from franka_wm.commands.demo import AGENT, demo
+from franka_wm.commands.view import view
 from franka_wm.training.load import load_agent
 
 STEPS = 30
@@ -49,3 +50,8 @@ def test_demo_refuses_another_checkpoint(capsys: pytest.CaptureFixture[str]) -> 
     assert "demo: checkpoint: no such option" in capsys.readouterr().err
     assert cli.main(["demo", "--help"]) == 0
     assert "franka-wm view" in capsys.readouterr().out
+
+
+def test_no_environment_is_offered_which_the_agent_would_refuse() -> None:
+    assert cli.main(["demo", "env=reach"]) == 1
+    assert "env" not in {one.name for one in demo.params} and "env" in {one.name for one in view.params}

@@ -1,7 +1,37 @@
-"""Planners rebuilt with other settings."""
+"""Sliders of the planner's settings: whole numbers where their steps are."""
 
-from franka_wm.live.sliders import rebuilt
+from __future__ import annotations
+
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+
+from franka_wm.live.page import Page
+from franka_wm.live.sliders import RANGES, Setting, rebuilt
 from franka_wm.planning import MCTS
+
+
+@pytest.mark.parametrize(("name", "moved", "sent"), [("temperature", 0.55, 0.55), ("horizon", 3.0, 3)])
+def test_a_setting_that_is_whole_by_chance_takes_what_its_slider_gives(
+    name: str, moved: float, sent: float
+) -> None:
+    """A temperature of 1 became 0 between 0 and 1, which is refused."""
+    updates: list[Any] = []
+    slider = SimpleNamespace(value=1, on_update=updates.append)
+    planner = SimpleNamespace(**{name: 1})
+    session = SimpleNamespace(planner=planner, set_planner=lambda **new: planner.__dict__.update(new))
+    page: Any = SimpleNamespace(
+        server=SimpleNamespace(gui=SimpleNamespace(add_slider=lambda *_: slider)),
+        session=session,
+        _sliders={},
+        _allow=lambda *_: None,
+        _try=lambda do: do(),
+    )
+    Page._add_slider(page, Setting(name, 1, *RANGES[name]))
+    updates[0](SimpleNamespace(client=1, target=SimpleNamespace(value=moved)))
+    assert getattr(planner, name) == sent and type(getattr(planner, name)) is type(sent)
+    assert slider.value == sent
 
 
 def test_a_longest_path_comes_back_with_more_simulations() -> None:

@@ -1,0 +1,41 @@
+"""Names and values that others chose, in pictures and pages: shown as they are."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+
+from franka_wm.report.bars import bars_figure
+from franka_wm.report.curves import seeds_figure
+from franka_wm.report.figure import inline_svg
+from franka_wm.report.horizon import horizon_figure
+from franka_wm.report.run import RunFiles
+from franka_wm.report.sections import what
+from franka_wm.report.spectra import spectrum_figure
+
+NAMES = ("_omitted", "b$x^{$", r"c\$d$")
+ROWS = [{"env_steps": 1.0, "loss": 1.0}, {"env_steps": 2.0, "loss": 2.0}]
+
+
+@pytest.mark.parametrize(
+    "figure",
+    [
+        lambda: seeds_figure({name: [ROWS] for name in NAMES}, "loss"),
+        lambda: spectrum_figure({name: [1.0, 0.5] for name in NAMES}),
+        lambda: horizon_figure({name: {"mean": [1.0]} for name in NAMES}),
+        lambda: bars_figure({name: dict.fromkeys(NAMES, 1.0) for name in NAMES}),
+    ],
+    ids=["curves", "spectra", "horizon", "bars"],
+)
+def test_names_of_runs_are_no_formulas_and_stay_in_the_legend(figure: Any) -> None:
+    svg = inline_svg(figure(), "names")
+    for name in NAMES:
+        assert name in svg or name.replace("_", " ") in svg, name
+
+
+def test_a_configuration_of_others_is_not_parsed(tmp_path: Any) -> None:
+    """An interpolation that is none ended in a traceback; one that is none of the run's would be looked up."""
+    config = {"x": "${a", "y": "${oc.env:HOME}", "model": {"name": "tdmpc2", "sizes": [1, 2]}}
+    text = what(RunFiles(folder=tmp_path, config=config))
+    assert "${a" in text and "${oc.env:HOME}" in text and "name: tdmpc2" in text
