@@ -113,7 +113,7 @@ def changes(before: Any, after: Any, name: str = "") -> list[str]:
 
 
 def apart(reasons: Sequence[str]) -> tuple[list[str], list[str]]:
-    """Of what `stale` found: files, and what changed of the configuration or the command."""
+    """Files, and what changed of the configuration or the command, of what `stale` found."""
     files = [reason for reason in reasons if " " not in reason]
     return files, [reason for reason in reasons if " " in reason]
 

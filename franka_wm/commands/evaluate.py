@@ -99,7 +99,7 @@ def check_larger(folder: Path, episodes: int, checkpoint: str) -> None:
     if there.updates is not None:
         from franka_wm.training.load import find_checkpoint
 
-        if there.updates != find_checkpoint(checkpoint).counters.get("updates"):
+        if there.updates < find_checkpoint(checkpoint).counters.get("updates", 0):  # of earlier weights
             return
     raise UserError(
         f"evaluate: {folder} holds a result of {there.episodes} episodes, which one of {episodes} would replace; "

@@ -144,5 +144,5 @@ def diagnose_training(model: WorldModel, batch: TensorDictBase) -> tuple[dict[st
     """Whether latents collapse and values drift: numbers to log, and a warning."""
     numbers = training_diagnostics(model, batch)
     if not numbers:
-        return {}, "the model's latents are no longer finite; lower trainer.lr"
+        return {}, "the model's latents are no longer finite; lower the learning rate"
     return numbers, collapse_warning(numbers)

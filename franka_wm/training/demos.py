@@ -116,7 +116,8 @@ def check_demonstrations(run: RunSettings) -> None:
         others = next(s.root for s, one in zip(sources, mappings, strict=True) if not one.ours)
         raise UserError(
             f"replay.demos={others}: was not recorded by this package, so its actions would be scaled to [−1, 1] and "
-            "mean something else; record demonstrations with franka-wm collect"
+            "mean something else; "
+            + ("only the arm has demonstrations" if arm is None else "record them with franka-wm collect")
         )
     if arm is None:
         return

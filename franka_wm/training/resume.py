@@ -93,6 +93,9 @@ def _fitting(trainer: Trainer, experience: TensorDictBase) -> TensorDictBase:
     if CUT_SHORT in trainer.kept and CUT_SHORT not in experience.keys(True):  # of an older run
         experience = experience.clone(recurse=False)
         experience.set(CUT_SHORT, torch.zeros_like(experience.get(("next", "terminated"))))
+        say(
+            "export: of the steps before this resume nothing says which episodes were cut short; those will be missing"
+        )
     for key in trainer.kept:
         if key not in experience.keys(True):
             name = key if isinstance(key, str) else ".".join(map(str, key))

@@ -87,7 +87,7 @@ def map_features(
     feature                             entry
     ==================================  ==============================================================
     ``observation.images.goal``         ``goal_pixels`` (ours: ``….goal_<camera>`` as ``goal_pixels_<camera>``)
-    first other image                 ``pixels``
+    first other image                 ``pixels`` (ours: as the arm named it)
     further ones                        ``pixels_<camera>``
     ``observation.state``               ``state``
     ``observation.environment_state``   ``goal`` in a dataset of ours, else ``environment_state``

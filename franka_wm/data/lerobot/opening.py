@@ -100,7 +100,11 @@ def open_dataset(
     elif not mappings[0].discrete and (np.abs([low, high]) > 1 + 1e-6).any():
         raise UserError(
             f"{roots[0]}: actions reach from {low.min():.3g} to {high.max():.3g}, models take [−1, 1]; "
-            "set dataset.normalize_actions=true"
+            + (
+                "use env=none dataset.normalize_actions=true"
+                if action_dim
+                else "set dataset.normalize_actions=true"
+            )
         )
     arrays, in_memory = _load(caches, device, in_memory)
     recording = Recording(
@@ -178,7 +182,7 @@ def read_datasets(
     if action_dim is not None and _scales(mappings, normalize_actions):
         raise UserError(
             f"{roots[0]}: actions would be scaled to [−1, 1] by what the data spans, and mean something else in the "
-            "environment; use env=none to train alone, or dataset.normalize_actions=false if they are in its units"
+            "environment; use env=none to train alone, or dataset.normalize_actions=false if they are in [−1, 1]"
         )
     return sources, mappings
 
