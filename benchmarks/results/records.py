@@ -26,7 +26,7 @@ from franka_wm.source import ROOT
 from franka_wm.versions import PACKAGES
 
 PLACE = ROOT / "docs" / "results"
-CODE = "code"
+CODE, CONFIRMED = "code", "confirmed"
 BESIDE = ("logger", "evaluation.video_episodes", "trainer.checkpoint_replay")
 """Arguments that a run may have beside its row's, or lack: they change none of its numbers but times."""
 FREE = ("seed", "device", *BESIDE)
@@ -227,10 +227,9 @@ def read_json(file: Path) -> dict[str, Any] | None:
 
 
 def prune(place: Path = PLACE) -> None:
-    """Removes the code that no record names any more."""
-    named = {
-        (read_json(path) or {}).get("code") for path in place.glob("*/*.json") if path.parent.name != CODE
-    }
+    """Removes the code that no record names any more; a confirmation's are those of its records."""
+    kept = [path for path in place.glob("*/*.json") if path.parent.name not in (CODE, CONFIRMED)]
+    named = {(read_json(path) or {}).get("code") for path in kept}
     for path in (place / CODE).glob("*.json"):
         if path.stem not in named:
             path.unlink()
