@@ -73,6 +73,8 @@ def test_equal_runs_are_written_down_and_hold(measured: Path, monkeypatch: pytes
     path = confirm.confirm(ROW, measured)
     same = confirm.confirmed(ROW, found, measured)
     assert same is not None and same["measured"] == "abc1234"
+    records.prune(measured)  # a confirmation names code, but is no record
+    assert {one.stem for one in (measured / "code").iterdir()} == {*same["code"]}
     assert confirm.confirmed(ROW, [{**found[0], "code": {"files": {}, "config": {}}}], measured) is None
     assert confirm.confirmed(ROW, [{**found[0], "commit": "other12"}], measured) is None
     for change in ({"files": {"train.py": "another hash"}}, {"config": {}}):
