@@ -81,10 +81,10 @@ def check_folder(folder: Path) -> None:
 def check_larger(folder: Path, episodes: int, checkpoint: str) -> None:
     """Whether a result of more episodes would be lost there; asked before anything is played.
 
-    A result of a checkpoint of more or fewer updates may go: it says nothing of this one.
+    A result of earlier weights may go: it would not be shown any more.
 
     Raises:
-        UserError: It would, or there is no checkpoint to compare it with.
+        UserError: It would be lost, or there is no checkpoint to compare it with.
     """
     if not (folder / "evaluation.json").is_file():
         return

@@ -124,15 +124,15 @@ def robustness(
         env = build.make_evaluation_env(
             agent.settings, num_envs=episodes, randomization=widened(own, shift.randomization), **shift.env
         )
+        plain = None
+        if shift.env:  # the solver's own effect is none of the shift's
+            plain = build.make_evaluation_env(agent.settings, num_envs=episodes, **shift.env)
         results[case] = {}
         for name in names:
             policy = agent.policies[name]
             played = play(env, policy)
             before.setdefault(name, played)
-            then = before[name]
-            if shift.env:  # the solver's own effect is none of the shift's
-                plain = build.make_evaluation_env(agent.settings, num_envs=episodes, **shift.env)
-                then = play(plain, policy)
+            then = before[name] if plain is None else play(plain, policy)
             results[case][name] = _compared(played, then, success_distance(env))
         if report is not None:
             report(case, results[case])

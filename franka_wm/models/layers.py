@@ -205,7 +205,7 @@ class TwoHotSymlog(nn.Module):
     def decode(self, logits: Tensor) -> Tensor:
         """Logits (..., bins) -> expected value (..., 1), the expectation taken in symlog space.
 
-        In the support's precision, also under autocast: bfloat16's probabilities shift a value of 50 by up to 1.
+        In the support's precision, also under autocast: bfloat16's probabilities are too coarse for values of tens.
         """
         probabilities = logits.softmax(-1, dtype=self.support.dtype)
         return symexp((probabilities * self.support).sum(-1, keepdim=True))

@@ -51,7 +51,10 @@ def made(monkeypatch: pytest.MonkeyPatch) -> list[dict[str, Any]]:
 def agent(**own: float) -> Any:
     settings = SimpleNamespace(values={"env": {"randomization": own}})
     return SimpleNamespace(
-        settings=settings, model=SimpleNamespace(image_sizes={}), policies={"ik": object()}, env=None
+        settings=settings,
+        model=SimpleNamespace(image_sizes={}),
+        policies={"ik": object(), "noop": object()},
+        env=None,
     )
 
 
@@ -71,3 +74,4 @@ def test_another_solver_is_no_part_of_what_friction_does(made: list[dict[str, An
     assert found[UNSHIFTED]["ik"]["change"] is None
     assert found[FRICTION]["ik"]["change"]["mean"] == pytest.approx(0.01)
     assert made[-1]["solver_iterations"] == 30 and "randomization" not in made[-1]
+    assert len(made) == 3  # one for all policies

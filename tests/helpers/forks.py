@@ -42,6 +42,18 @@ def _script(path: Path, arguments: tuple[str, ...]) -> None:
     runpy.run_path(str(path), run_name="__main__")
 
 
+def _status(work: Callable[[], Any]) -> int:
+    """The exit status that Python would end with after `work`."""
+    try:
+        work()
+        return 0
+    except SystemExit as end:
+        return end.code if isinstance(end.code, int) else int(end.code is not None)
+    except BaseException:
+        traceback.print_exc()
+        return 1
+
+
 class Fork:
     """Work in a fork, in a folder of its own, which also holds its output.
 
@@ -64,8 +76,7 @@ class Fork:
             os._exit(self._run(work, cwd))
 
     def _run(self, work: Callable[[], Any], cwd: Path) -> int:
-        status = 1
-        try:
+        def all_of_it() -> None:
             signal.signal(signal.SIGINT, signal.default_int_handler)
             for descriptor, path in zip((1, 2), self._logs, strict=True):
                 os.dup2(os.open(path, os.O_WRONLY), descriptor)
@@ -76,11 +87,9 @@ class Fork:
                 sys.modules["torch"].set_num_threads(1)
             GlobalHydra.instance().clear()
             work()
-            status = 0
-        except SystemExit as end:
-            status = end.code if isinstance(end.code, int) else int(end.code is not None)
-        except BaseException:
-            traceback.print_exc()
+
+        try:
+            return _status(all_of_it)
         finally:
             loky = sys.modules.get("joblib.externals.loky.reusable_executor")
             if loky is not None and loky._executor is not None:  # its processes are waited for below
@@ -89,7 +98,6 @@ class Fork:
                 sys.modules["multiprocessing.util"]._exit_function()
             sys.stdout.flush()
             sys.stderr.flush()
-        return status
 
     def said(self) -> tuple[str, str]:
         """What is on standard output and standard error so far."""
@@ -256,8 +264,7 @@ class _Rank(subprocess.Popen):
 
     @staticmethod
     def _run(words: tuple[str, ...], environment: dict[str, str]) -> int:
-        status = 1
-        try:
+        def all_of_it() -> None:
             os.setsid()
             for one in (signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT):  # torchrun has handlers
                 signal.signal(one, signal.SIG_DFL)
@@ -265,24 +272,19 @@ class _Rank(subprocess.Popen):
             os.environ.clear()
             os.environ.update(environment)
             GlobalHydra.instance().clear()
-            for name, module in list(
-                sys.modules.items()
-            ):  # plugins, which torchrun's process has loaded to look at
-                if str(getattr(module, "__file__", "")).startswith(os.getcwd()):
+            own = f"{os.getcwd()}/"  # plugins, which torchrun's process has loaded to look at
+            for name, module in list(sys.modules.items()):
+                if str(getattr(module, "__file__", "")).startswith(own):
                     del sys.modules[name]
             if words[0] == "-m":
                 sys.argv = list(words[1:])
                 runpy.run_module(words[1], run_name="__main__", alter_sys=True)
             else:
                 _script(Path(words[0]), words[1:])
-            status = 0
-        except SystemExit as end:
-            status = end.code if isinstance(end.code, int) else int(end.code is not None)
-        except BaseException:
-            traceback.print_exc()
-        finally:
-            sys.stdout.flush()
-            sys.stderr.flush()
+
+        status = _status(all_of_it)
+        sys.stdout.flush()
+        sys.stderr.flush()
         return status
 
 

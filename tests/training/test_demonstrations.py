@@ -255,6 +255,9 @@ def test_actions_that_would_be_scaled_are_refused_where_the_model_acts(
                 others.setattr(opening, "map_features", others_features)
                 with pytest.raises(UserError, match=r"replay\.demos=.*was not recorded by this package"):
                     check(settled("scale=smoke", *ARM, f"replay.demos={demos}"))
+                other = ("env=dm_control", "env.name=walker", "env.task=run", f"replay.demos={demos}")
+                with pytest.raises(UserError, match="only the arm has demonstrations"):
+                    check(settled("scale=smoke", "device=cpu", *other))
             run = settled(*words, *ARM, *changes, "dataset.workers=1")
             with pytest.raises(UserError, match=r"would be scaled to \[−1, 1\].*use env=none") as refused:
                 check(run)

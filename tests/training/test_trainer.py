@@ -420,6 +420,11 @@ def test_a_run_that_exports_keeps_what_the_task_says(train, tmp_path: Path, monk
     with monkeypatch.context() as older:
         older.setattr(Trainer, "kept", property(lambda self: [key for key in kept(self) if key != CUT_SHORT]))
         train(*words, "trainer.updates=10", folder=tmp_path / "older")
-    assert "lost an object are missing" in capsys.readouterr().out
+    assert "lost an object are missing" in (said := capsys.readouterr().out)
+    assert "nothing says which episodes" not in said
     more = train(f"resume={tmp_path}/older", "trainer.updates=20", folder=tmp_path / "on").replay()
     assert more is not None and bool(more["next", "truncated"].any())
+    assert (
+        "of the steps before this resume nothing says which episodes were cut short"
+        in capsys.readouterr().out
+    )

@@ -174,8 +174,12 @@ def test_actions_of_others_are_scaled(pictures: Path, foreign, opened: Callable)
         seen.append(batch["action"])
     action = torch.cat(seen)
     assert action.min() >= -1 and action.max() <= 1 and (action[..., 2] == 0).all()
-    with pytest.raises(UserError, match="normalize_actions=true"):
+    with pytest.raises(UserError, match=r"set dataset\.normalize_actions=true"):
         opened(pictures, normalize_actions=False)
+    with pytest.raises(
+        UserError, match=r"use env=none dataset\.normalize_actions=true"
+    ):  # else refused again
+        opened(pictures, normalize_actions=False, action_dim=action.shape[-1])
 
 
 def test_an_action_that_only_trembles_never_changes(
