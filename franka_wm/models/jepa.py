@@ -58,10 +58,10 @@ class JEPA(WorldModel):
         the mean of the large crops' ones; squared error. No predictor, no teacher.
 
     and four guards against the collapse to a constant, free to combine with any recipe: `ema`, the targets
-    come from a slow copy of the encoder, without gradient; `sigreg` and `vicreg`, a regulariser on
-    the pooled embeddings, where targets come from the encoder itself through an MLP with BatchNorm, with
-    gradient; `none`, to see it
-    collapse. In the masked recipes the encoder computes only the tokens that it may see.
+    come from a slow copy of the encoder, without gradient; `sigreg` and `vicreg`, a regulariser over images
+    of the embeddings of each place (of `lejepa`: of each crop), where targets come from the encoder itself
+    through an MLP with BatchNorm, with gradient; `none`, to see it collapse. In the masked recipes the encoder
+    computes only the tokens that it may see.
 
     It pretrains: there is `encode`, but no `next`, so nothing plans with it. Its checkpoint is what
     `encoder_from` of the action world model and of TD-MPC2 read.
@@ -319,9 +319,10 @@ class JEPA(WorldModel):
         predicted = self.predictor(context, masks.context, masks.targets, clips.shape[1]).float()
         distance = F.l1_loss if self.recipe == "vjepa" else F.smooth_l1_loss
         prediction = distance(predicted, target)
-        # On what is predicted: on a projection of it, the guard would not see it collapse.
-        pooled = full.mean(1)
-        return prediction, self.guard(pooled), pooled
+        # On what is predicted: on a projection of it, the guard would not see it collapse. Of every place of every
+        # camera: what differs from place to place only is the same in all images.
+        places = full.unflatten(0, (-1, len(self.image_sizes))).permute(1, 2, 0, 3)  # (cameras, tokens, n, P)
+        return prediction, self.guard(places), full.mean(1)
 
     def _loss_of_views(self, clips: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         assert self.projector is not None

@@ -8,7 +8,7 @@ from tensordict import TensorDict
 from franka_wm.models import make
 from franka_wm.models.images import random_crops
 from franka_wm.models.jepa import JEPA
-from franka_wm.models.regularizers import feature_std
+from franka_wm.models.regularizers import covariance_loss, feature_std, variance_loss
 from franka_wm.models.vision import ViT
 
 SIZE = dict(encoder_width=32, encoder_depth=1, encoder_heads=2, predictor_width=32, predictor_depth=1)
@@ -268,3 +268,22 @@ def test_settings_that_cannot_work_are_refused(dots):
         small().loss(dots.windows(3, 2)[0])
     with pytest.raises(ValueError, match="frames"):
         small(recipe="vjepa").loss(dots.windows(3, 1))
+
+
+@pytest.mark.parametrize("recipe", ["ijepa", "vjepa"])
+def test_the_guard_spreads_every_place_of_every_camera_over_images(recipe, dots):
+    model = small(recipe=recipe, collapse="vicreg", image_sizes=dict.fromkeys(("pixels", "side"), (16, 16, 3)))
+    windows = dots.windows(8, 2)
+    windows["side"] = dots.windows(8, 2)["pixels"]
+    cameras = []
+    with torch.no_grad():
+        seen = torch.stack((windows["pixels"], windows["side"]), 2)  # (8, 2, cameras, …)
+        clips = seen.transpose(1, 2) if recipe == "vjepa" else seen.flatten(0, 1).unsqueeze(2)
+        tokens = model.encoder(clips.flatten(0, 1))
+        tokens = model.projector(tokens, batch_statistics=True)
+        tokens = torch.nn.functional.layer_norm(tokens, tokens.shape[-1:])
+        for camera in range(2):
+            for place in range(tokens.shape[1]):
+                x = tokens[camera::2, place]
+                cameras.append(variance_loss(x) + covariance_loss(x) / 25)
+    assert model.loss(windows)["loss_guard"].item() == pytest.approx(torch.stack(cameras).mean().item(), rel=1e-5)
