@@ -37,8 +37,8 @@ SIZES = (
     "replay.capacity",
     "replay.batch_size",
 )
-SHORT_DEMOS = "replay.demo_updates=10"
-"""Of a row that begins with demonstrations alone; a smoke run makes 30 updates in all."""
+SMALLER = {"replay.demo_updates": 10, "planner.num_policy_samples": 4}
+"""What a row asks for beyond a smoke run's 30 updates and 16 candidates, and what a short run has instead."""
 ONE_CORE = {"OMP_NUM_THREADS": "1", "CUDA_VISIBLE_DEVICES": ""}
 SHORT = ("scale=smoke", "device=cpu", "seed=3", "logger=none", "evaluation.video_episodes=0")
 
@@ -50,11 +50,10 @@ def short(row: Row) -> list[str]:
         "collector.num_envs",
         "collector.seed_steps",
         "evaluation.episodes",
-        "replay.demo_updates",
     )
-    kept = [word for word in row.words if word.split("=", 1)[0] not in sized]
-    shown = [SHORT_DEMOS] if any(word.startswith("replay.demo_updates=") for word in row.words) else []
-    return [*kept, *SHORT, *shown]
+    names = [word.split("=", 1)[0] for word in row.words]
+    kept = [word for word, name in zip(row.words, names, strict=True) if name not in (*sized, *SMALLER)]
+    return [*kept, *SHORT, *(f"{name}={value}" for name, value in SMALLER.items() if name in names)]
 
 
 def confirm(row: Row, place: Path = PLACE) -> Path:

@@ -84,7 +84,7 @@ def check(run: RunSettings) -> None:
     if run.model.family.pretrained and run.pretrain.kind == "none" and not any(given):
         raise UserError(
             f"model={run.model.name} needs a pretrained encoder: model.huggingface=facebook/dinov2-small, "
-            "model.encoder_from=RUN, or pretrain=jepa"
+            "model.encoder_from=RUN, or pretrain=lejepa"
         )
     if run.pretrain.kind != "none":
         _check_first_stage(run)

@@ -272,7 +272,9 @@ def test_settings_that_cannot_work_are_refused(dots):
 
 @pytest.mark.parametrize("recipe", ["ijepa", "vjepa"])
 def test_the_guard_spreads_every_place_of_every_camera_over_images(recipe, dots):
-    model = small(recipe=recipe, collapse="vicreg", image_sizes=dict.fromkeys(("pixels", "side"), (16, 16, 3)))
+    model = small(
+        recipe=recipe, collapse="vicreg", image_sizes=dict.fromkeys(("pixels", "side"), (16, 16, 3))
+    )
     windows = dots.windows(8, 2)
     windows["side"] = dots.windows(8, 2)["pixels"]
     cameras = []
@@ -286,4 +288,6 @@ def test_the_guard_spreads_every_place_of_every_camera_over_images(recipe, dots)
             for place in range(tokens.shape[1]):
                 x = tokens[camera::2, place]
                 cameras.append(variance_loss(x) + covariance_loss(x) / 25)
-    assert model.loss(windows)["loss_guard"].item() == pytest.approx(torch.stack(cameras).mean().item(), rel=1e-5)
+    assert model.loss(windows)["loss_guard"].item() == pytest.approx(
+        torch.stack(cameras).mean().item(), rel=1e-5
+    )

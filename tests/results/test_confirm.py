@@ -63,7 +63,9 @@ def test_a_short_run_has_the_rows_task_and_a_smoke_runs_sizes() -> None:
     assert not {"scale=laptop", "trainer.updates=9", "evaluation.episodes=128"} & set(words)
     shown = replace(row, arguments="env=push replay.demos=set replay.demo_updates=2000 trainer.updates=4000")
     assert "replay.demo_updates=2000" not in (words := confirm.short(shown))
-    assert confirm.SHORT_DEMOS in words and "replay.demos=set" in words
+    assert "replay.demo_updates=10" in words and "replay.demos=set" in words
+    guided = replace(row, arguments="env=reach planner.num_policy_samples=24")
+    assert "planner.num_policy_samples=4" in confirm.short(guided)
 
 
 def test_equal_runs_are_written_down_and_hold(measured: Path, monkeypatch: pytest.MonkeyPatch) -> None:
