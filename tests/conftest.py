@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 import importlib.util
 import itertools
 import logging
@@ -14,10 +13,9 @@ from typing import Any
 
 import pytest
 import torch
-from hydra._internal.core_plugins.file_config_source import FileConfigSource
-from hydra._internal.core_plugins.importlib_resources_config_source import ImportlibResourcesConfigSource
 from omegaconf import DictConfig
 
+from configuration import compose_once
 from forks import spare, train_in_fork
 from franka_wm import conf, models
 from franka_wm.envs import FrankaConfig, FrankaEnv, franka, tasks
@@ -60,6 +58,7 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 def pytest_collection_finish(session: pytest.Session) -> None:
     """All modules are loaded, and no test has run."""
     if session.items:
+        compose_once()
         spare()
 
 
@@ -99,31 +98,6 @@ def process_as_before() -> Iterator[None]:
             del os.environ[name]
         elif os.environ.get(name) != variables[name]:
             os.environ[name] = variables[name]
-
-
-@pytest.fixture(scope="session", autouse=True)
-def configuration_is_read_once() -> Iterator[None]:
-    """The package's YAML files, which Hydra reads anew for each command line: a third of what that costs."""
-    with pytest.MonkeyPatch.context() as patched:
-        for source, folder in (
-            (FileConfigSource, str(conf.FOLDER)),
-            (ImportlibResourcesConfigSource, "franka_wm.conf"),
-        ):
-            patched.setattr(source, "load_config", _read_once(source.load_config, folder))
-        yield
-
-
-def _read_once(load: Callable[..., Any], folder: str) -> Callable[..., Any]:
-    known: dict[str, Any] = {}
-
-    def load_config(self: Any, config_path: str) -> Any:
-        if self.path != folder:
-            return load(self, config_path)
-        if config_path not in known:
-            known[config_path] = load(self, config_path)
-        return copy.deepcopy(known[config_path])
-
-    return load_config
 
 
 SMALL = {"substeps": 2, "gravity_compensation": True, "observations": ("state", "joint_target")}

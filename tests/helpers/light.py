@@ -69,8 +69,10 @@ def _main(cwd: Path) -> None:
 
     import franka_wm.commands.entry
     import franka_wm.commands.main  # noqa: F401
+    from configuration import compose_once
     from forks import run_in_fork
 
+    compose_once()
     results = []
     with tempfile.TemporaryDirectory() as folder:
         modules = Path(folder, "modules")
