@@ -7,12 +7,13 @@ import subprocess
 import sys
 import sysconfig
 import zipfile
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
 
 import franka_wm
+from preloaded import Preloaded
 
 ROOT = Path(__file__).parents[1]
 SOURCES = ("pyproject.toml", "setup.py", "README.md", "LICENSE", "franka_wm")
@@ -36,27 +37,38 @@ def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def franka(wheel: Path, tmp_path_factory: pytest.TempPathFactory) -> Callable[..., str]:
+def franka(wheel: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Callable[..., str]]:
     """Run ``franka-wm`` of a new environment in an empty folder; gives what it printed.
+
+    Where `fork` is, it is a fork of one process of that environment, which has loaded what the verbs need.
 
     The environment sees the packages of the present one, but not the project installed there: files named ``*.pth``
     work in an environment's own folder only.
     """
     place = tmp_path_factory.mktemp("elsewhere")
-    subprocess.run([sys.executable, "-m", "venv", place / "venv"], check=True)
+    subprocess.run([sys.executable, "-m", "venv", "--without-pip", place / "venv"], check=True)
     python = place / "venv/bin/python"
     clean = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}
-    subprocess.run([python, "-m", "pip", "install", "--quiet", "--no-deps", wheel], env=clean, check=True)
+    pip = [sys.executable, "-m", "pip", "--python", python, "install", "--quiet", "--no-deps", wheel]
+    subprocess.run(pip, env=clean, check=True)
     (own,) = (place / "venv").glob("lib/python*/site-packages")
     (own / "packages_of_the_tests.pth").write_text(sysconfig.get_path("purelib") + "\n")
     folder = place / "work"
     folder.mkdir()
 
-    def run(*arguments: str) -> str:
-        done = subprocess.run(
-            [place / "venv/bin/franka-wm", *arguments], cwd=folder, env=clean | {"OMP_NUM_THREADS": "1"},
-            capture_output=True, text=True, check=False,
-        )  # fmt: skip
+    clean["OMP_NUM_THREADS"] = "1"
+    loaded = Preloaded(
+        "franka_wm.commands.train", "franka_wm.training.trainer", "franka_wm.evaluation.protocol",
+        "franka_wm.report.end_of_run", "franka_wm.data.lerobot.writer", "franka_wm.live.page",
+        environment=clean, python=python,
+    )  # fmt: skip
+
+    def run(*arguments: str, fork: bool = True) -> str:
+        if fork:
+            done = loaded.run("franka_wm", *arguments, cwd=folder)
+        else:
+            command = [place / "venv/bin/franka-wm", *arguments]
+            done = subprocess.run(command, cwd=folder, env=clean, capture_output=True, text=True, check=False)
         assert done.returncode == 0, f"{arguments}\n{done.stdout[-1000:]}\n{done.stderr[-3000:]}"
         return done.stdout
 
@@ -65,13 +77,15 @@ def franka(wheel: Path, tmp_path_factory: pytest.TempPathFactory) -> Callable[..
         cwd=folder, env=clean, capture_output=True, text=True, check=True,
     ).stdout  # fmt: skip
     assert where.startswith(str(own)), where
-    return run
+    yield run
+    loaded.close()
 
 
 @pytest.fixture(scope="module")
 def run_folder(franka: Callable[..., str], tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("run") / "smoke"
-    franka("train", "scale=smoke", "device=cpu", f"hydra.run.dir={folder}")
+    few = ("trainer.updates=10", "env.episode_length=12", "evaluation.episodes=2", "evaluation.during=[]")
+    franka("train", "scale=smoke", "device=cpu", *few, f"hydra.run.dir={folder}", fork=False)
     return folder
 
 
@@ -86,7 +100,7 @@ def test_wheel_brings_its_data_and_nothing_else(wheel: Path) -> None:
 
 
 def test_version(franka: Callable[..., str], wheel: Path) -> None:
-    assert franka("--version").split()[-1] == franka_wm.__version__ == wheel.name.split("-")[1]
+    assert franka("--version", fork=False).split()[-1] == franka_wm.__version__ == wheel.name.split("-")[1]
 
 
 def test_train_writes_a_run(run_folder: Path) -> None:
@@ -114,6 +128,6 @@ def test_view(franka: Callable[..., str]) -> None:
 
 
 def test_list_names_what_the_wheel_holds(franka: Callable[..., str]) -> None:
-    listed = franka("list")
+    listed = franka("list", fork=False)
     for name in ("reach_fixed", "tdmpc2", "mppi"):
         assert name in listed

@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 
 import franka_wm
+from forks import module, spare
 from franka_wm.commands import bench, entry, listing
 from franka_wm.commands import main as cli
 from franka_wm.commands.arguments import check_run
@@ -49,16 +50,12 @@ def test_list_shows_what_is_one_s_own(tmp_path: Path) -> None:
     plugins = [f"examples.add_a_{kind}" for kind in ("model", "planner", "task")]
     own = [f"plugins=[{','.join(plugins)}]", "hydra.searchpath=[file://examples/conf]"]
 
-    command = [
-        sys.executable,
-        "-m",
-        "franka_wm",
-        "list",
-    ]  # no fork: other tests may have imported these plugins
-    shown = [
-        subprocess.run([*command, *words], capture_output=True, text=True, check=True, cwd=tmp_path).stdout
-        for words in ([], own)
-    ]
+    # In forks of a process in which no test has imported these plugins.
+    shown = []
+    for words in ([], own):
+        done = spare().fork(module("franka_wm", "list", *words), tmp_path)
+        assert done.returncode == 0, done.stderr
+        shown.append(done.stdout)
     names = [{tuple(line.split()) for line in text.splitlines()} for text in shown]
     more = {line[0] for line in names[1] - names[0] if line[0] not in ("models", "planners", "tasks")}
     assert more == {"linear", "shooting", "raise_tool"}

@@ -42,6 +42,17 @@ def _script(path: Path, arguments: tuple[str, ...]) -> None:
     runpy.run_path(str(path), run_name="__main__")
 
 
+def module(name: str, *arguments: str) -> Callable[[], Any]:
+    """``python -m NAME ARGUMENT …`` with the working directory first in its path, as work for a fork."""
+    return functools.partial(_module, name, arguments)
+
+
+def _module(name: str, arguments: tuple[str, ...]) -> None:
+    sys.argv = [name, *arguments]
+    sys.path.insert(0, os.getcwd())
+    runpy.run_module(name, run_name="__main__", alter_sys=True)
+
+
 def _status(work: Callable[[], Any]) -> int:
     """The exit status that Python would end with after `work`."""
     try:

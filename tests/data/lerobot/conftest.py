@@ -6,9 +6,7 @@ import os
 
 os.environ.setdefault("HF_HUB_OFFLINE", "1")  # before anything imports LeRobot
 
-import subprocess
-import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +19,7 @@ from franka_wm.data.lerobot.provenance import describe
 from franka_wm.data.lerobot.schema import DONE, EPISODE_KEY, SEED, TRUNCATED, Schema, schema_for
 from franka_wm.data.lerobot.writer import DatasetWriter
 from franka_wm.envs import FrankaConfig
+from preloaded import Preloaded
 
 
 @pytest.fixture(scope="session")
@@ -103,31 +102,54 @@ def load(monkeypatch: pytest.MonkeyPatch) -> Callable[..., Any]:
     return run
 
 
-@pytest.fixture
-def hub():
+@pytest.fixture(scope="session")
+def one_hub() -> Iterator[fake_hub.Hub]:
     hub = fake_hub.Hub()
     yield hub
     hub.close()
 
 
 @pytest.fixture
-def publish(hub, tmp_path):
-    """Runs the verb in a process of its own: the Hub's address is read when its client is imported."""
+def hub(one_hub: fake_hub.Hub) -> fake_hub.Hub:
+    """Empty, at the same address in all tests."""
+    one_hub.repos.clear()
+    one_hub.requests.clear()
+    return one_hub
+
+
+@pytest.fixture(scope="session")
+def clients(one_hub: fake_hub.Hub, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Callable[..., Any]]:
+    """Runs the verb where the Hub's client was imported: there it reads the address, and that it is offline."""
+    home = str(tmp_path_factory.mktemp("hub"))
+    known: dict[tuple[str, bool], Preloaded] = {}
+
+    def run(*arguments: str, url: str, offline: bool, cwd: Path, **variables: str) -> Any:
+        if (url, offline) not in known:
+            env = {k: v for k, v in os.environ.items() if not k.startswith(("HF_", "HUGGING"))}
+            env |= {"HF_ENDPOINT": url, "HF_HOME": home, "HF_HUB_DISABLE_XET": "1"}
+            env |= {"HF_HUB_OFFLINE": "1"} if offline else {}
+            modules = (
+                "franka_wm.data.lerobot.publish",
+                "huggingface_hub.hf_api",
+                "pyarrow.compute",
+                "pandas",
+            )
+            known[url, offline] = Preloaded(*modules, environment=env)
+        return known[url, offline].run("franka_wm.commands.main", *arguments, cwd=cwd, **variables)
+
+    yield run
+    for one in known.values():
+        one.close()
+
+
+@pytest.fixture
+def publish(hub, clients, tmp_path):
+    """Runs the verb in a process of its own."""
 
     def run(
         *arguments: str, token: str | None = fake_hub.TOKEN, url: str | None = None, offline: bool = False
     ):
-        env = {k: v for k, v in os.environ.items() if not k.startswith(("HF_", "HUGGING"))}
-        env |= {"HF_ENDPOINT": url or hub.url, "HF_HOME": str(tmp_path / "home"), "HF_HUB_DISABLE_XET": "1"}
-        env |= {"HF_TOKEN": token} if token else {}
-        env |= {"HF_HUB_OFFLINE": "1"} if offline else {}
-        return subprocess.run(
-            [sys.executable, "-m", "franka_wm.commands.main", "publish", *arguments],
-            capture_output=True,
-            text=True,
-            cwd=tmp_path,
-            env=env,
-            check=False,
-        )
+        variables = {"HF_TOKEN": token} if token else {}
+        return clients("publish", *arguments, url=url or hub.url, offline=offline, cwd=tmp_path, **variables)
 
     return run
