@@ -15,7 +15,7 @@ import pytest
 import torch
 from omegaconf import DictConfig
 
-from configuration import compose_once
+from configuration import compose_once, load_what_runs_load
 from forks import spare, train_in_fork
 from franka_wm import conf, models
 from franka_wm.envs import FrankaConfig, FrankaEnv, franka, tasks
@@ -59,6 +59,7 @@ def pytest_collection_finish(session: pytest.Session) -> None:
     """All modules are loaded, and no test has run."""
     if session.items:
         compose_once()
+        load_what_runs_load()
         spare()
 
 

@@ -15,7 +15,7 @@ from typing import Any
 
 import pytest
 
-from rooms.kills import collect, command, in_one_line, load_commands, places, train, verb, whole
+from rooms.kills import collect, command, in_one_line, load_commands, load_worlds, places, train, verb, whole
 
 pytestmark = pytest.mark.slow
 
@@ -24,6 +24,7 @@ pytestmark = pytest.mark.slow
 def loaded() -> None:
     """Once, before the forks."""
     load_commands()
+    load_worlds()
 
 
 @pytest.fixture(scope="module")

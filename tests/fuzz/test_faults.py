@@ -18,6 +18,7 @@ from rooms.kills import (
     command,
     in_one_line,
     load_commands,
+    load_worlds,
     places,
     short_of_memory,
     train,
@@ -47,15 +48,35 @@ WORDS = [
 def loaded() -> None:
     """Once, before the forks."""
     load_commands()
+    load_worlds()
 
 
-def test_a_killed_run_goes_on_from_its_last_checkpoint(tmp_path: Path) -> None:
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, int]:
+    """A run that nothing disturbed, and how many operations it made."""
+    run = tmp_path_factory.mktemp("trained") / "run"
+    return run, whole(command(train(*WORDS, f"hydra.run.dir={run}"), run)).operations
+
+
+@pytest.fixture(scope="module")
+def collected(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, int]:
+    """The same of a dataset."""
+    out = tmp_path_factory.mktemp("collected") / "set"
+    return out, whole(command(collect(out), out)).operations
+
+
+@pytest.fixture
+def run(trained: tuple[Path, int], tmp_path: Path) -> Path:
+    """A copy of that run, of the test's own."""
+    return Path(shutil.copytree(trained[0], tmp_path / "run"))
+
+
+def test_a_killed_run_goes_on_from_its_last_checkpoint(trained: tuple[Path, int], tmp_path: Path) -> None:
     from franka_wm.errors import UserError
     from franka_wm.training.checkpoint import latest_checkpoint, load_checkpoint
 
-    once = whole(command(train(*WORDS, f"hydra.run.dir={tmp_path}/once"), tmp_path / "once"))
     last = 0
-    for at in places("train", once.operations):
+    for at in places("train", trained[1]):
         run = tmp_path / f"killed{at}"
         words = [*WORDS, f"hydra.run.dir={run}"]
         assert command(train(*words), run, kill_at=at).status in (-9, 0), at
@@ -75,11 +96,10 @@ def test_a_killed_run_goes_on_from_its_last_checkpoint(tmp_path: Path) -> None:
     assert last
 
 
-def test_a_killed_collection_goes_on_as_it_says(tmp_path: Path) -> None:
+def test_a_killed_collection_goes_on_as_it_says(collected: tuple[Path, int], tmp_path: Path) -> None:
     from franka_wm.data.lerobot.source import read_source
 
-    once = whole(command(collect(tmp_path / "once"), tmp_path / "once"))
-    for at in places("collect", once.operations):
+    for at in places("collect", collected[1]):
         out = tmp_path / f"killed{at}"
         ended = command(collect(out), out, kill_at=at)
         assert ended.status in (-9, 0), ended
@@ -90,11 +110,8 @@ def test_a_killed_collection_goes_on_as_it_says(tmp_path: Path) -> None:
         assert len(read_source(out).lengths) == 6
 
 
-def test_a_killed_export_and_report_are_repeated_as_they_say(tmp_path: Path) -> None:
+def test_a_killed_export_and_report_are_repeated_as_they_say(run: Path, tmp_path: Path) -> None:
     from franka_wm.data.lerobot.source import read_source
-
-    run = tmp_path / "run"
-    whole(command(train(*WORDS, f"hydra.run.dir={run}"), run))
 
     def words(out: Path) -> list[str]:
         return ["export", f"source={run}", f"out={out}", "workers=1"]
@@ -142,21 +159,20 @@ def test_files_that_cannot_grow_make_no_dataset(tmp_path: Path) -> None:
     assert not out.exists()
 
 
-def test_too_little_memory_is_one_line(tmp_path: Path) -> None:
+def test_too_little_memory_is_one_line(collected: tuple[Path, int], tmp_path: Path) -> None:
     words = "out of memory; allow more (ulimit -v)"
     run, out = tmp_path / "run", tmp_path / "set"
     assert words in in_one_line(short_of_memory(train(*WORDS, f"hydra.run.dir={run}"), run))
     assert words in in_one_line(short_of_memory(collect(out), out))
     assert not out.exists()
-    whole(command(collect(out), out))
+    shutil.copytree(collected[0], out)
     before = {path: path.read_bytes() for path in out.rglob("*") if path.is_file()}
     in_one_line(short_of_memory(collect(out, "resume=true", episodes=8), out))
     assert {path: path.read_bytes() for path in out.rglob("*") if path.is_file()} == before
 
 
-def test_a_read_only_folder_is_one_line(tmp_path: Path) -> None:
-    run, shut = tmp_path / "run", tmp_path / "shut"
-    whole(command(train(*WORDS, f"hydra.run.dir={run}"), run))
+def test_a_read_only_folder_is_one_line(run: Path, tmp_path: Path) -> None:
+    shut = tmp_path / "shut"
     shut.mkdir()
     for folder in (shut, run):
         folder.chmod(0o555)
@@ -173,11 +189,9 @@ def test_a_read_only_folder_is_one_line(tmp_path: Path) -> None:
     assert not list(shut.iterdir())
 
 
-def test_a_disk_that_fills_up_keeps_the_last_checkpoint(tmp_path: Path) -> None:
+def test_a_disk_that_fills_up_keeps_the_last_checkpoint(run: Path) -> None:
     from franka_wm.training.checkpoint import latest_checkpoint, load_checkpoint
 
-    run = tmp_path / "run"
-    whole(command(train(*WORDS, f"hydra.run.dir={run}"), run))
     size = max(path.stat().st_size for path in (run / "checkpoints" / "latest").iterdir())
     more = [f"resume={run}", f"hydra.run.dir={run}", f"trainer.updates={2 * UPDATES}"]
     in_one_line(command(train(*more), run, limits={resource.RLIMIT_FSIZE: size // 2}))

@@ -16,7 +16,7 @@ from hydra.core.global_hydra import GlobalHydra
 from hydra.core.plugins import Plugins
 from omegaconf import DictConfig
 
-from franka_wm import conf
+from franka_wm import conf, source
 
 SOURCES = {
     "file_config_source": "FileConfigSource",
@@ -34,6 +34,15 @@ def compose_once() -> None:
         source.load_config = _read_once(source.load_config)
     conf.compose = _composed_once(conf.compose)
     conf.compose("scale=smoke")
+
+
+def load_what_runs_load() -> None:
+    """What each run imports, and computes of its code, before any forks."""
+    for name in ("torch.utils.tensorboard", "matplotlib.backends.backend_agg", "matplotlib.pyplot"):
+        importlib.import_module(name)
+    names = [file.relative_to(source.ROOT).as_posix() for file in conf.FOLDER.parent.rglob("*.py")]
+    for name, content in source.read([*names, "train.py"]).items():
+        source.code_hash(name, content)
 
 
 def _read_once(load: Callable[..., Any]) -> Callable[..., Any]:

@@ -208,6 +208,13 @@ def load_commands() -> None:
     Plugins.instance()  # it looks into every package once
 
 
+def load_worlds() -> None:
+    """What building worlds loads and computes, once, before the forks of this process."""
+    from franka_wm.envs import FrankaConfig, FrankaEnv
+
+    FrankaEnv(FrankaConfig(substeps=2), num_envs=2, device="cpu", seed=0).close()
+
+
 def places(what: str, operations: int, some: int = 3) -> list[int]:
     """At which operations of `what` to kill: at `some`, or at all of them (`FAULTS=all`), and says how many."""
     chosen = sorted({operations - k * operations // some for k in range(some)})
