@@ -5,9 +5,11 @@ from __future__ import annotations
 import os
 import socket
 import subprocess
-import sys
+import time
+from collections.abc import Callable
 from contextlib import nullcontext
 from datetime import timedelta
+from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -18,15 +20,14 @@ from omegaconf import OmegaConf
 from torch.distributed.elastic.multiprocessing.api import SubprocessContext
 from torch.utils._python_dispatch import TorchDispatchMode
 
+from forks import Fork
 from franka_wm import processes
-from franka_wm.commands import several
+from franka_wm.commands import entry, several
 from franka_wm.commands.overrides import compose, given
 from franka_wm.console import quoted
 from franka_wm.errors import UserError
 from franka_wm.training import run
 from franka_wm.versions import versions
-
-ROOT = Path(__file__).resolve().parents[2]
 
 
 @pytest.fixture
@@ -56,47 +57,46 @@ def test_others_that_cannot_be_met_are_one_line(monkeypatch, port) -> None:
         processes.join(cuda=False)
 
 
-def together(port: int, work: str) -> list[tuple[int, str]]:
-    """Exit status and errors of two processes of two hosts that do the same."""
-    common = {"WORLD_SIZE": "2", "LOCAL_WORLD_SIZE": "1", "LOCAL_RANK": "0", "TORCHELASTIC_RUN_ID": "1"}
-    common |= {"MASTER_ADDR": "localhost", "MASTER_PORT": str(port), "OMP_NUM_THREADS": "1"}
-    code = (
-        "import time\nfrom datetime import timedelta\nimport torch\nfrom franka_wm import processes\n"
-        f"from franka_wm.commands.entry import fail\nfrom franka_wm.errors import UserError\n{work}"
-    )
-    ranks = [
-        subprocess.Popen(
-            [sys.executable, "-c", code],
-            env={**os.environ, **common, "RANK": str(rank), "PYTHONPATH": str(ROOT)},
-            stderr=subprocess.PIPE,
-            text=True,
-        )
-        for rank in range(2)
-    ]
-    said = [one.communicate(timeout=120)[1] for one in ranks]
-    return [(one.returncode, text) for one, text in zip(ranks, said, strict=True)]
+def together(work: Callable[[], None], port: int, place: Path) -> list[subprocess.CompletedProcess[str]]:
+    """How two processes of two hosts end that do the same."""
+
+    def on_a_host(rank: int) -> None:
+        common = {"WORLD_SIZE": "2", "LOCAL_WORLD_SIZE": "1", "LOCAL_RANK": "0", "TORCHELASTIC_RUN_ID": "1"}
+        common |= {"MASTER_ADDR": "localhost", "MASTER_PORT": str(port)}
+        os.environ.update(common, RANK=str(rank))
+        work()
+
+    ranks = [Fork(partial(on_a_host, rank), place, place / str(rank)) for rank in range(2)]
+    return [one.wait(120) for one in ranks]
 
 
-def test_a_host_without_a_gpu_says_so_and_all_end(port) -> None:
+def test_a_host_without_a_gpu_says_so_and_all_end(port, tmp_path) -> None:
     """The second is that host; the first has one."""
-    found = together(
-        port,
-        "import os\nthere = os.environ['RANK'] == '0'\n"
-        "torch.cuda.is_available, torch.cuda.device_count = lambda: there, lambda: int(there)\n"
-        "try:\n    processes.join(cuda=True)\nexcept UserError as error:\n    fail(str(error))\n",
-    )
-    assert [status for status, _ in found] == [1, 1]
-    assert f"host {socket.gethostname()} has 0 usable CUDA devices for 1 processes" in found[1][1]
-    assert not any("Traceback" in text for _, text in found)
+
+    def work() -> None:
+        there = os.environ["RANK"] == "0"
+        torch.cuda.is_available, torch.cuda.device_count = lambda: there, lambda: int(there)
+        try:
+            processes.join(cuda=True)
+        except UserError as error:
+            entry.fail(str(error))
+
+    found = together(work, port, tmp_path)
+    assert [one.returncode for one in found] == [1, 1]
+    assert f"host {socket.gethostname()} has 0 usable CUDA devices for 1 processes" in found[1].stderr
+    assert not any("Traceback" in one.stderr for one in found)
 
 
-def test_who_has_met_is_waited_for_longer(port) -> None:
-    found = together(
-        port,
-        "processes.MEETING = timedelta(seconds=10)\nprocesses.join(cuda=False)\n"
-        "time.sleep(15 * processes.rank())\nprocesses.wait()\nprocesses.leave(7)\n",
-    )
-    assert [status for status, _ in found] == [7, 7], found
+def test_who_has_met_is_waited_for_longer(port, tmp_path) -> None:
+    def work() -> None:
+        processes.MEETING = timedelta(seconds=5)
+        processes.join(cuda=False)
+        time.sleep(7 * processes.rank())
+        processes.wait()
+        processes.leave(7)
+
+    found = together(work, port, tmp_path)
+    assert [one.returncode for one in found] == [7, 7], found
 
 
 @pytest.mark.parametrize(
