@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import importlib.util
 import itertools
 import logging
@@ -9,24 +10,25 @@ import os
 import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import pytest
-import torch
-from omegaconf import DictConfig
 
-from configuration import compose_once, load_what_runs_load
-from forks import spare, train_in_fork
-from franka_wm import conf, models
-from franka_wm.envs import FrankaConfig, FrankaEnv, franka, tasks
-from franka_wm.planning import registry
-from franka_wm.training.load import Agent, load_agent
-from franka_wm.training.settings import RunSettings
+# Torch and the simulator are imported inside: `pytest -n` loads this file in a process that runs no test, too, before
+# it starts those that do.
+if TYPE_CHECKING:
+    import torch
+    from omegaconf import DictConfig
+
+    from franka_wm.envs import FrankaEnv
+    from franka_wm.training.load import Agent
+    from franka_wm.training.settings import RunSettings
 
 ROOT = Path(__file__).resolve().parents[1]
 
 LONG = (
     "tests/processes/test_job.py",
+    "tests/fuzz/test_faults.py",
     "tests/training/test_undisturbed.py",
     "tests/training/test_resume.py",
     "tests/commands/test_train.py",
@@ -38,9 +40,20 @@ LONG = (
 """Files that take longest. They begin: else one process works at them when the other has nothing left."""
 
 
-def pytest_configure() -> None:
+MANY = 200
+"""Tests of a process among which there are many runs."""
+
+
+def pytest_configure(config: pytest.Config) -> None:
     """One thread by plain ``pytest``, too, as by ``make test``: tests compare with processes that have one."""
-    torch.set_num_threads(int(os.environ.setdefault("OMP_NUM_THREADS", "1")))
+    threads = int(os.environ.setdefault("OMP_NUM_THREADS", "1"))
+    if config.getoption("numprocesses", None) and not hasattr(config, "workerinput"):
+        return  # others run the tests
+    # Until all modules are loaded: a sixth of the time goes into looking for garbage among what stays.
+    gc.disable()
+    import torch
+
+    torch.set_num_threads(threads)
     # dm_control brings absl, which takes the stderr that it finds, here pytest's file, and closes it as Hydra sets up
     # logging: in whichever tests a process has come to by then.
     if importlib.util.find_spec("absl"):
@@ -57,20 +70,31 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
 def pytest_collection_finish(session: pytest.Session) -> None:
     """All modules are loaded, and no test has run."""
-    if session.items:
+    gc.enable()
+    if session.items and not session.config.option.collectonly:
+        import franka_wm.training.load  # noqa: F401  with torch and the simulator, for all forks
+        from configuration import compose_once, load_what_runs_load
+        from forks import spare
+
         compose_once()
-        load_what_runs_load()
+        if len(session.items) > MANY:
+            load_what_runs_load()
         spare()
 
 
 def pytest_sessionfinish() -> None:
-    if spare.cache_info().currsize:
-        spare().close()
+    forks = sys.modules.get("forks")
+    if forks is not None and forks.spare.cache_info().currsize:
+        forks.spare().close()
 
 
 @pytest.fixture(autouse=True)
 def registries_as_before() -> Iterator[None]:
     """What a test registers, or removes, is not there for the next one of its process."""
+    from franka_wm import models
+    from franka_wm.envs import tasks
+    from franka_wm.planning import registry
+
     names = tasks._REGISTERED, models._REGISTERED, registry._REGISTERED
     before, known = [dict(one) for one in names], list(tasks.TASKS)
     yield
@@ -86,6 +110,8 @@ def process_as_before() -> Iterator[None]:
 
     Environments without a seed are counted: the same test makes the same ones wherever it runs.
     """
+    from franka_wm.envs import franka
+
     franka._unseeded = itertools.count()
     variables, root = dict(os.environ), logging.getLogger()
     handlers, level = list(root.handlers), root.level
@@ -113,6 +139,7 @@ def root() -> Path:
 @pytest.fixture(scope="session")
 def small_env() -> Callable[..., FrankaEnv]:
     """Makes a cheap environment on the CPU: two substeps, no pictures unless asked for."""
+    from franka_wm.envs import FrankaConfig, FrankaEnv
 
     def make(num_envs: int = 3, *, seed: int = 0, **changes: Any) -> FrankaEnv:
         config = FrankaConfig(**(SMALL | changes))
@@ -124,18 +151,24 @@ def small_env() -> Callable[..., FrankaEnv]:
 @pytest.fixture(scope="session")
 def composed() -> Callable[..., DictConfig]:
     """The configuration that ``python train.py …`` would run with."""
+    from franka_wm import conf
+
     return conf.compose
 
 
 @pytest.fixture(scope="session")
 def settled() -> Callable[..., RunSettings]:
     """Settings of the run that ``python train.py …`` would be."""
+    from franka_wm import conf
+    from franka_wm.training.settings import RunSettings
+
     return lambda *overrides: RunSettings.of(conf.compose(*overrides))
 
 
 @pytest.fixture(scope="session")
 def random_actions() -> Callable[..., torch.Tensor]:
     """Uniform actions (N, T, 7) whose first worlds do not depend on N."""
+    import torch
 
     def make(num_envs: int, steps: int, seed: int = 0) -> torch.Tensor:
         worlds = [
@@ -162,6 +195,8 @@ SMOKE = [
 @pytest.fixture(scope="session")
 def run_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The folder of a finished smoke run."""
+    from forks import train_in_fork
+
     place = tmp_path_factory.mktemp("agent")
     done = train_in_fork(*SMOKE, f"hydra.run.dir={place}/run", cwd=place)
     assert done.returncode == 0, done.stdout + done.stderr
@@ -171,4 +206,6 @@ def run_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="session")
 def agent(run_folder: Path) -> Agent:
     """That run's agent in six worlds."""
+    from franka_wm.training.load import load_agent
+
     return load_agent(run_folder, num_envs=6, device="cpu", seed=0)

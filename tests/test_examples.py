@@ -7,13 +7,12 @@ import os
 import re
 import signal
 import subprocess
-import sys
 import time
 from pathlib import Path
 
 import pytest
 
-from forks import TRAIN, run_in_fork, script
+from forks import TRAIN, module, run_in_fork, script, spare
 
 
 def run(root: Path, *arguments: str) -> str:
@@ -83,9 +82,8 @@ def test_add(arguments: tuple[str, ...], root: Path, tmp_path: Path) -> None:
             "probes=false",
             "device=cpu",
         ]
-        # Not in a fork: other tests of this process may have imported the module.
-        program = [sys.executable, "-m", "franka_wm", *evaluate]
-        done = subprocess.run(program, cwd=root, capture_output=True, text=True, check=False)
+        # In a fork of a process in which no test has imported the module.
+        done = spare().fork(module("franka_wm", *evaluate), root)
         assert done.returncode == 1 and "plugins=[MODULE] imports its module" in done.stderr, done.stderr
         assert "height [m]" in run(root, "franka_wm/__main__.py", *evaluate, arguments[0])
 

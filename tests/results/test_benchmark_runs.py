@@ -3,22 +3,21 @@
 from __future__ import annotations
 
 import json
-import os
-import subprocess
-import sys
 from importlib import import_module
 from pathlib import Path
 from typing import Any
 
 import pytest
 
+from forks import script, spare
+
 TOP = Path(__file__).resolve().parents[2]
 
 
-def rows(out: Path, script: str, *words: str) -> list[dict[str, Any]]:
-    command = [sys.executable, f"benchmarks/{script}.py", "--device", "cpu", "--out", str(out), *words]
-    environment = os.environ | {"PYTHONPATH": str(TOP), "OMP_NUM_THREADS": "1"}
-    done = subprocess.run(command, cwd=TOP, env=environment, capture_output=True, text=True, check=False)
+def rows(out: Path, name: str, *words: str) -> list[dict[str, Any]]:
+    """In a fork; what it starts is a process of its own."""
+    work = script(TOP / "benchmarks" / f"{name}.py", "--device", "cpu", "--out", str(out), *words)
+    done = spare().fork(work, TOP)
     assert done.returncode == 0, done.stderr[-2000:]
     return json.loads(out.read_text())["rows"]
 
