@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import importlib
 import json
+from types import ModuleType
 
 import pytest
 import torch
 
-from examples.add_a_task import HEIGHT, RaiseTool
 from franka_wm.commands.main import main
 from franka_wm.envs import FrankaConfig, FrankaEnv
 from franka_wm.envs.tasks import Reach, Track
@@ -27,11 +28,17 @@ from tests.conftest import SMALL
 LENGTH = 10
 
 
+@pytest.fixture(scope="module", autouse=True)
+def example() -> ModuleType:
+    """Imported here: forks that begin before any test shall not know what it registers."""
+    return importlib.import_module("examples.add_a_task")
+
+
 @pytest.fixture(scope="module")
-def env() -> FrankaEnv:
+def env(example: ModuleType) -> FrankaEnv:
     """Episodes that end at a success go on into others, whose height must not be taken for theirs."""
     config = FrankaConfig(**SMALL, pose_noise=0.6, episode_length=LENGTH, terminate_on_success=True)
-    return FrankaEnv(config, num_envs=6, device="cpu", task=RaiseTool(config))
+    return FrankaEnv(config, num_envs=6, device="cpu", task=example.RaiseTool(config))
 
 
 @pytest.fixture(scope="module")
@@ -41,7 +48,7 @@ def found(env: FrankaEnv) -> Evaluation:
     return evaluate_policies(env, {"planner": random, "ik": oracle, "noop": NoopPolicy()})
 
 
-def test_success_and_measures_at_the_true_end(env: FrankaEnv) -> None:
+def test_success_and_measures_at_the_true_end(env: FrankaEnv, example: ModuleType) -> None:
     """Played by hand: the height of the last observation of each world's first episode."""
     episodes = play_episodes(env, SmoothRandomPolicy(generator=torch.Generator().manual_seed(3)), seed=2)
     policy = SmoothRandomPolicy(generator=torch.Generator().manual_seed(3))
@@ -53,7 +60,7 @@ def test_success_and_measures_at_the_true_end(env: FrankaEnv) -> None:
         success = torch.where(ended, step["next", "success"].squeeze(-1).float(), success)
     assert torch.equal(episodes["measures", "height [m]"], height)
     assert torch.equal(episodes["success"], success) and 0 < success.sum() < 6
-    assert torch.equal(episodes["success"], (height >= HEIGHT).float())
+    assert torch.equal(episodes["success"], (height >= example.HEIGHT).float())
     assert episodes["success_once"].sum() >= success.sum()
     assert not {"final_distance", "closest_distance"} & set(episodes.keys())
 
@@ -69,7 +76,7 @@ def test_reach_is_judged_by_distances_as_ever(small_env) -> None:
     assert told["success"]["0.3"]["mean"] == rows["success"].mean()
 
 
-def test_a_subclass_of_reach_that_judges_otherwise_is_judged_by_itself() -> None:
+def test_a_subclass_of_reach_that_judges_otherwise_is_judged_by_itself(example: ModuleType) -> None:
     class Otherwise(Reach):
         def reward_and_success(self, sim) -> None: ...
 
@@ -78,7 +85,7 @@ def test_a_subclass_of_reach_that_judges_otherwise_is_judged_by_itself() -> None
 
     config = FrankaConfig()
     assert Reach(config).goal_distance and Track(config).goal_distance and Near(config).goal_distance
-    assert not (Otherwise(config).goal_distance or RaiseTool(config).goal_distance)
+    assert not (Otherwise(config).goal_distance or example.RaiseTool(config).goal_distance)
 
 
 def test_no_distance_is_shown_anywhere(env: FrankaEnv, found: Evaluation) -> None:
