@@ -30,15 +30,15 @@ def compose_once() -> None:
     """From now on, in this process and in its forks; what most of them need is composed now."""
     Plugins.instance()  # this executes their modules anew: the classes of before are not those that read
     for module, name in SOURCES.items():
-        source = getattr(importlib.import_module(f"hydra._internal.core_plugins.{module}"), name)
-        source.load_config = _read_once(source.load_config)
+        reader = getattr(importlib.import_module(f"hydra._internal.core_plugins.{module}"), name)
+        reader.load_config = _read_once(reader.load_config)
     conf.compose = _composed_once(conf.compose)
     conf.compose("scale=smoke")
 
 
 def load_what_runs_load() -> None:
     """What each run imports, and computes of its code, before any forks."""
-    for name in ("torch.utils.tensorboard", "matplotlib.backends.backend_agg", "matplotlib.pyplot"):
+    for name in ("torch.utils.tensorboard", "matplotlib.backends.backend_agg", "mpl_toolkits.mplot3d"):
         importlib.import_module(name)
     names = [file.relative_to(source.ROOT).as_posix() for file in conf.FOLDER.parent.rglob("*.py")]
     for name, content in source.read([*names, "train.py"]).items():
