@@ -102,12 +102,11 @@ def _run(main: Callable[[], Any], arguments: list[str]) -> None:
     joins = several.started_by_torchrun() and not only_shows
     if not (elsewhere or asked.hydra_help or asked.shell_completion):
         composed = list(swept(overrides)) if asked.multirun else [overrides]
-        for one in composed:
-            check_overrides(one)
-        for one in [] if only_shows or asked.cfg or joins else composed:
+        checked = [check_overrides(one) for one in composed]
+        for cfg in [] if only_shows or asked.cfg or joins else checked:
             if not any(a.startswith("hydra/launcher=") for a in overrides):  # may take jobs to other machines
-                check_folders(one)
-            check_settings(one)
+                check_folders(cfg)
+            check_settings(cfg)
     if joins:
         if elsewhere or asked.multirun:
             fail("several processes learn one model of this package's configuration: leave out Hydra's flags")
@@ -249,20 +248,21 @@ def _discard() -> bool:
     return discard(_there)
 
 
-def check_overrides(arguments: list[str]) -> None:
+def check_overrides(arguments: list[str]) -> DictConfig:
     """Composes the configuration alone, so that a typo is answered before torch or the simulator are imported."""
     try:
         cfg = compose([a for a in arguments if a != "scale=auto"])
         OmegaConf.to_container(cfg, resolve=True)
         if "trainer=offline" in arguments and cfg.resume is None and cfg.dataset.kind == "none":
             fail("trainer=offline: trains on recorded data; name them, dataset=lerobot dataset.root=FOLDER")
+        return cfg
     except FrankaError as error:
         fail(str(error))
     except OmegaConfBaseException as error:
         fail(explain(str(error)))
 
 
-def check_settings(arguments: list[str]) -> None:
+def check_settings(cfg: DictConfig) -> None:
     """Reads the settings of checked overrides: a value of a wrong type or out of range is answered as early.
 
     At any scale, since the device that decides on it is not known yet: each value's own range is that of all scales.
@@ -271,16 +271,14 @@ def check_settings(arguments: list[str]) -> None:
     from franka_wm.training.settings import RunSettings
 
     try:
-        cfg = compose([a for a in arguments if a != "scale=auto"])
         if not cfg.plugins and cfg.resume is None:
             RunSettings.whole(cfg)
     except FrankaError as error:
         fail(str(error))
 
 
-def check_folders(arguments: list[str]) -> None:
+def check_folders(cfg: DictConfig) -> None:
     """Whether the folders that a run reads are there, which needs no simulator."""
-    cfg = compose([a for a in arguments if a != "scale=auto"])
     for option in ("resume", "dataset.root", "replay.demos"):
         named = OmegaConf.select(cfg, option)
         for folder in named if isinstance(named, ListConfig) else [named]:

@@ -8,6 +8,7 @@ from pathlib import Path
 
 from omegaconf import OmegaConf
 
+from franka_wm.console import say
 from franka_wm.data.lerobot.card import FILM, model_card
 from franka_wm.data.lerobot.hub import check_license, check_repo_id
 from franka_wm.data.lerobot.paths import shortened, without_paths
@@ -75,12 +76,18 @@ def stage_model(checkpoint: Path, place: Path, *, repo_id: str, license: str) ->
         _copy_json(place / "extra.json", place / "extra.json")
     write_manifest(place, manifest.model, written_by=manifest.written_by, saved_at_ns=saved_at(opened.folder))
     # Where the verb evaluate puts them, unless it played fewer episodes; a published model has them at its top.
-    verb = files.path("evaluation/evaluation.md") and _episodes(files, "evaluation/") >= _episodes(files, "")
-    written = "evaluation/" if verb else ""
-    if source := files.path(f"{written}evaluation.json"):
-        _copy_json(source, place / "evaluation.json")
-    if (text := files.text(f"{written}evaluation.md")) is not None:
-        (place / "evaluation.md").write_text(shortened(text), encoding="utf-8")
+    updates = opened.counters.get("updates")
+    places = ("evaluation/", "") if files.path("evaluation/evaluation.md") else ("",)
+    measured = {where: _episodes(files, where, updates) for where in places}
+    usable = {where: episodes for where, episodes in measured.items() if episodes is not None}
+    written = max(usable, key=lambda where: usable[where], default="")
+    if written in usable:
+        if source := files.path(f"{written}evaluation.json"):
+            _copy_json(source, place / "evaluation.json")
+        if (text := files.text(f"{written}evaluation.md")) is not None:
+            (place / "evaluation.md").write_text(shortened(text), encoding="utf-8")
+    if None in measured.values() and not (place / "evaluation.json").is_file():
+        say(f"no evaluation goes along: that of {run} is of other weights; franka-wm evaluate {folder} first")
     if film := files.path(FILM):
         shutil.copyfile(film, place / FILM)
     card = model_card(place, repo_id=repo_id, license=license)
@@ -88,11 +95,16 @@ def stage_model(checkpoint: Path, place: Path, *, repo_id: str, license: str) ->
     return place
 
 
-def _episodes(files: UntrustedFolder, place: str) -> int:
-    """Episodes of each policy in an ``evaluation.json``; 0 without one."""
+def _episodes(files: UntrustedFolder, place: str, updates: float | None) -> int | None:
+    """Episodes of each policy in an ``evaluation.json``, 0 without one; ``None`` if it says it is of other weights."""
     with values_of(str(files.root / place / "evaluation.json"), "measure the run again."):
-        policies = (files.json(f"{place}evaluation.json") or {}).get("policies") or {}
-        return max((int(one.get("episodes", 0)) for one in policies.values()), default=0)
+        found = files.json(f"{place}evaluation.json") or {}
+        of = (found.get("protocol") or {}).get("updates")
+        if of is not None and updates is not None and of != updates:
+            return None
+        return max(
+            (int(one.get("episodes", 0)) for one in (found.get("policies") or {}).values()), default=0
+        )
 
 
 def _copy_json(source: Path, target: Path) -> None:

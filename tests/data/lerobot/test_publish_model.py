@@ -114,6 +114,28 @@ def test_of_two_evaluations_the_one_of_more_episodes_is_published(run_folder, tm
     assert (place / "evaluation.md").read_text() == shown
 
 
+def test_an_evaluation_of_other_weights_is_not_published(run_folder, tmp_path, capsys) -> None:
+    """More episodes do not make up for it; where there is no other, none goes along, and a line says so."""
+    run, place = run_folder[0], tmp_path / "place"
+    counters = json.loads((run / "checkpoints" / "latest" / "counters.json").read_text())
+    (run / "evaluation").mkdir()
+    for folder, name, updates, episodes in (
+        (run, "the last weights", counters["updates"], 4),
+        (run / "evaluation", "half of them", counters["updates"] - 1, 9),
+    ):
+        told = {"protocol": {"updates": updates}, "policies": {"planner": {"episodes": episodes}}}
+        (folder / "evaluation.json").write_text(json.dumps(told))
+        (folder / "evaluation.md").write_text(name)
+    place.mkdir()
+    stage_model(run, place, repo_id="user/model", license="mit")
+    assert (place / "evaluation.md").read_text() == "the last weights"
+    for name in ("evaluation.json", "evaluation.md"):
+        (run / name).unlink()
+    (other := tmp_path / "other").mkdir()
+    stage_model(run, other, repo_id="user/model", license="mit")
+    assert not [*other.glob("evaluation.*")] and "is of other weights" in capsys.readouterr().out
+
+
 def test_a_staged_model_is_damaged_if_changed(run_folder, tmp_path) -> None:
     place = tmp_path / "place"
     place.mkdir()
