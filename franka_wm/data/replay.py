@@ -16,6 +16,9 @@ from franka_wm.data.hindsight import Hindsight
 from franka_wm.data.image_storage import BOUNDARY, ImageStorage
 from franka_wm.errors import UserError
 
+OVERFLOW = ("next", "overflow")
+"""Key of the flag that marks a step in which contacts were lost."""
+
 
 class WindowSampler(Sampler):
     """Windows of consecutive steps of one episode, uniform over all such windows, at a cost of O(batch).
@@ -38,6 +41,7 @@ class WindowSampler(Sampler):
             ``boundary`` themselves. Then every step starts windows, also the last ones of an episode, and
             episodes shorter than a window are seen.
         before: So many steps before each window must be kept as well: for stacked images.
+        marks: Steps under ``("next", "overflow")`` are in no window: contacts were lost in them.
     """
 
     OVERSAMPLE = 4
@@ -51,6 +55,7 @@ class WindowSampler(Sampler):
         oversample: int = OVERSAMPLE,
         cross_episode: bool = False,
         before: int = 0,
+        marks: bool = False,
     ):
         if length < 1 or oversample < 1:
             raise UserError(f"window length={length}, oversample={oversample}: both must be at least 1")
@@ -60,6 +65,7 @@ class WindowSampler(Sampler):
         self.oversample = oversample
         self.cross_episode = cross_episode
         self.before = before
+        self.marks = marks
         self._missing: torch.Tensor | None = None
 
     def sample(self, storage: Any, batch_size: int) -> tuple[Any, dict]:
@@ -89,13 +95,13 @@ class WindowSampler(Sampler):
         return span, oldest + self.before
 
     @property
-    def _checks(self) -> bool:
+    def _whole(self) -> bool:
         """Whether windows across an episode's start are rejected."""
         return self.length > 1 and not self.cross_episode
 
     def candidates(self, batch_size: int) -> int:
         """How many windows are drawn for a batch of so many."""
-        return self.oversample * batch_size + 64 if self._checks else batch_size
+        return self.oversample * batch_size + 64 if self._whole or self.marks else batch_size
 
     def choose(
         self, data: Any, draw: torch.Tensor, oldest: int | torch.Tensor, batch_size: int
@@ -108,17 +114,22 @@ class WindowSampler(Sampler):
             oldest: The first time that a window may start at.
 
         Returns:
-            Time and world of each step, (batch_size, length) both, and which windows cross an episode's start though
-            they should not, (batch_size,) bool: none where there are enough whole ones, ``None`` where all may.
+            Time and world of each step, (batch_size, length) both, and which windows cross an episode's start, or have
+            a marked step, though they should not, (batch_size,) bool: none where there are enough whole ones,
+            ``None`` where all may.
         """
         (capacity, worlds), device = data.shape[:2], draw.device
         world = draw % worlds
         time = (torch.div(draw, worlds, rounding_mode="floor").unsqueeze(1) + oldest
                 + torch.arange(self.length, device=device)) % capacity  # fmt: skip
         crossing = None
-        if self._checks:
+        if self._whole:
             starts = data.get(self.boundary)[time[:, 1:], world.unsqueeze(1)]
             crossing = starts.flatten(1).any(1)
+        if self.marks:
+            lost = data.get(OVERFLOW)[time, world.unsqueeze(1)].flatten(1).any(1)
+            crossing = lost if crossing is None else crossing | lost
+        if crossing is not None:
             # Stable: keeps the order of the draws, so the first batch_size whole windows are a uniform sample.
             order = torch.sort(crossing, stable=True).indices[:batch_size]
             time, world, crossing = time[order], world[order], crossing[order]
@@ -217,6 +228,7 @@ def make_replay(
     future: FutureFrames | None = None,
     demonstrations: Demonstrations | None = None,
     episode_length: int = 0,
+    marks: bool = False,
 ) -> WindowReplay:
     """A buffer of (time, worlds) that is extended with the collector's (worlds, time) batches.
 
@@ -235,6 +247,7 @@ def make_replay(
         demonstrations: Take the place of a share of each batch.
         episode_length: Steps of an episode, where it is known: windows of more than half of it are seldom whole, so
             more of them must be drawn; and how many last images there is room for at first.
+        marks: The data says in which steps contacts were lost, see :class:`WindowSampler`.
 
     Returns:
         A ``ReplayBuffer`` whose samples have batch size (batch_size, window).
@@ -262,7 +275,12 @@ def make_replay(
         demonstrations=demonstrations,
         storage=storage,
         sampler=WindowSampler(
-            writer, length=window, oversample=oversample, cross_episode=cross_episode, before=before
+            writer,
+            length=window,
+            oversample=oversample,
+            cross_episode=cross_episode,
+            before=before,
+            marks=marks,
         ),
         writer=writer,
         batch_size=batch_size,

@@ -24,7 +24,7 @@ from franka_wm.envs.camera import Camera, as_torch, camera_framing
 from franka_wm.envs.config import FrankaConfig
 from franka_wm.envs.frames import FrameStack
 from franka_wm.envs.simulation import Simulation
-from franka_wm.envs.specs import goals_given, observation_spec
+from franka_wm.envs.specs import MARKS, goals_given, observation_spec
 from franka_wm.envs.start import check_robot, check_task
 from franka_wm.envs.tasks import Task, goal_distance
 from franka_wm.errors import UserError
@@ -67,6 +67,7 @@ class FrankaEnv(EnvBase):
     ``action``          (N, 7) float32          in [−1, 1]: change of the joint targets, × ``action_scale``; an eighth
                                                 is the gripper's: −1 closed, 1 open
     ``reward``          (N, 1) float32          the task's: of reach, −tanh(distance) − penalty · mean(action²)
+    ``overflow``        (N, 1) bool             with a scene: contacts were lost in the step; not to be learned from
     ``done``, …         (N, 1) bool             ``terminated`` by success (if asked), ``truncated`` by time
     ==================  ======================  ==================================================================
 
@@ -142,7 +143,8 @@ class FrankaEnv(EnvBase):
         images = self.simulation.renderer.images
         self._stacked = [key for key in images if self._stack and key.startswith("pixels")]
         self.observation_spec = observation_spec(config, list(images), self.kinematics, num_envs, device)
-        self._observed = [key for key in self.observation_spec if key not in ("success", "is_init")]
+        self._observed = [key for key in self.observation_spec if key not in MARKS]
+        self._marks = [key for key in self.observation_spec if key in MARKS]
         self.action_spec = Bounded(-1.0, 1.0, shape=(num_envs, config.action_dim), device=device)
         self.reward_spec = Unbounded(shape=(num_envs, 1), device=device)
         flags = {key: Binary(shape=(num_envs, 1), dtype=torch.bool, device=device) for key in FLAGS}
@@ -161,11 +163,7 @@ class FrankaEnv(EnvBase):
         sim.reset(mask)
         for key in self._stacked:
             self._stack.restart(key, sim.renderer.images[key], sim.tensors.mask)
-        out = self._present()
-        out["is_init"] = sim.tensors.mask.clone().unsqueeze(-1)
-        out["success"] = torch.zeros_like(sim.tensors.success)
-        for key in FLAGS:
-            out[key] = torch.zeros_like(sim.tensors.done)
+        out = self._present() | self._unmarked() | {"is_init": sim.tensors.mask.clone().unsqueeze(-1)}
         return TensorDict(out, batch_size=self.batch_size, device=self.device)
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
@@ -186,6 +184,8 @@ class FrankaEnv(EnvBase):
         for key in ("success", "reward", "done", "terminated", "truncated"):
             out[key] = getattr(sim.tensors, key).clone()
         out["is_init"] = torch.zeros_like(sim.tensors.done)
+        if "overflow" in self._marks:
+            out["overflow"] = (sim.tensors.overflow != 0).unsqueeze(-1)
         return TensorDict(out, batch_size=self.batch_size, device=self.device)
 
     def _step_and_maybe_reset(self, tensordict: TensorDictBase) -> tuple[TensorDictBase, TensorDictBase]:
@@ -205,7 +205,7 @@ class FrankaEnv(EnvBase):
         following.update(self._present())
         following.set("success", following.get("success") & ~done)
         following.set("is_init", done.clone())
-        for key in FLAGS:
+        for key in {*FLAGS, "overflow"} & {*following.keys()}:
             following.set(key, torch.zeros_like(done))
         return tensordict, following
 
@@ -298,12 +298,12 @@ class FrankaEnv(EnvBase):
         sim = self.simulation
         for key in self._stacked:  # a goal marker may have moved in it
             self._stack.replace(key, sim.renderer.images[key])
-        out = self._present()
-        out["is_init"] = sim.tensors.step_count == 0
-        out["success"] = torch.zeros_like(sim.tensors.success)
-        for key in FLAGS:
-            out[key] = torch.zeros_like(sim.tensors.done)
+        out = self._present() | self._unmarked() | {"is_init": sim.tensors.step_count == 0}
         return TensorDict(out, batch_size=self.batch_size, device=self.device)
+
+    def _unmarked(self) -> dict[str, torch.Tensor]:
+        """Flags where no step has led."""
+        return {key: torch.zeros_like(self.simulation.tensors.done) for key in (*self._marks, *FLAGS)}
 
     def _set_seed(self, seed: int | None) -> None:
         self.simulation.set_seed(own_seed() if seed is None else int(seed))

@@ -23,6 +23,7 @@ from tensordict import TensorDictBase
 from franka_wm.envs.camera import whole_arm
 from franka_wm.envs.config import NUM_JOINTS, FrankaConfig
 from franka_wm.envs.franka import FrankaEnv
+from franka_wm.envs.specs import MARKS
 from franka_wm.envs.tasks import TASKS
 from franka_wm.errors import UserError
 
@@ -35,7 +36,7 @@ except ImportError as error:
     raise UserError(f"franka_wm.envs.gym needs pip install 'franka-wm[gym]' ({error})") from error
 
 CAMERA = "front"
-RENAMED = ("pixels", "state", "goal", "success", "is_init")
+RENAMED = ("pixels", "state", "goal", *MARKS)
 """What has another name, or no place, among Gymnasium's observations."""
 
 REACH_V0: dict[str, Any] = {

@@ -18,6 +18,7 @@ from torchrl.envs import EnvBase
 from franka_wm.device import resolve_device
 from franka_wm.envs.franka import FLAGS, FrankaEnv, own_seed
 from franka_wm.envs.multitask_config import MultiTaskConfig
+from franka_wm.envs.specs import MARKS
 from franka_wm.errors import UserError
 from franka_wm.options import check_whole
 from franka_wm.seeding import derive_seed
@@ -72,12 +73,13 @@ class MultiTaskEnv(EnvBase):
             for k, (name, one) in enumerate(config.tasks.items())
         }
         specs = [env.observation_spec for env in self.envs.values()]
-        names = dict.fromkeys(key for spec in specs for key in spec if key not in ("success", "is_init"))
+        names = dict.fromkeys(key for spec in specs for key in spec if key not in MARKS)
         self.sizes = {key: max(spec[key].shape[-1] for spec in specs if key in spec) for key in names}
         self.one_hot = F.one_hot(torch.arange(num_envs, device=device) % count, count).float()
         n = num_envs
         vectors = {key: Unbounded(shape=(n, size), device=device) for key, size in self.sizes.items()}
-        marks = {key: Binary(shape=(n, 1), dtype=torch.bool, device=device) for key in ("success", "is_init")}
+        flagged = [key for key in MARKS if any(key in spec for spec in specs)]
+        marks = {key: Binary(shape=(n, 1), dtype=torch.bool, device=device) for key in flagged}
         task = Unbounded(shape=(n, count), device=device)
         self.observation_spec = Composite(**vectors, task=task, **marks, shape=(n,), device=device)
         self.action_spec = Bounded(-1.0, 1.0, shape=(n, self.action_dim), device=device)

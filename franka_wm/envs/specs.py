@@ -15,6 +15,9 @@ from franka_wm.envs.constants import MOST_OPEN
 from franka_wm.envs.kinematics import Kinematics
 from franka_wm.errors import UserError
 
+MARKS = ("success", "is_init", "overflow")
+"""Flags among what a step gives, none of them an observation; ``overflow`` with a scene alone."""
+
 
 def observation_spec(
     config: FrankaConfig, images: Sequence[str], kinematics: Kinematics, n: int, device: torch.device
@@ -53,6 +56,8 @@ def observation_spec(
     entries["goal"] = Unbounded(shape=(n, 3), device=device)
     entries["success"] = Binary(shape=(n, 1), dtype=torch.bool, device=device)
     entries["is_init"] = Binary(shape=(n, 1), dtype=torch.bool, device=device)
+    if config.resolved_scene:
+        entries["overflow"] = Binary(shape=(n, 1), dtype=torch.bool, device=device)
     return Composite(**entries, shape=(n,), device=device)
 
 

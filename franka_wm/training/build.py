@@ -423,6 +423,7 @@ def make_replay_buffer(
         future=FutureFrames(episode_length=run.env.episode_length) if run.replay.future else None,
         demonstrations=demonstrations,
         episode_length=run.env.shortest_episode,
+        marks=run.env.marks_overflow,
     )
 
 

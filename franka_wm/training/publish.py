@@ -102,9 +102,7 @@ def _episodes(files: UntrustedFolder, place: str, updates: float | None) -> int 
         of = (found.get("protocol") or {}).get("updates")
         if of is not None and updates is not None and of != updates:
             return None
-        return max(
-            (int(one.get("episodes", 0)) for one in (found.get("policies") or {}).values()), default=0
-        )
+        return max((int(one.get("episodes", 0)) for one in (found.get("policies") or {}).values()), default=0)
 
 
 def _copy_json(source: Path, target: Path) -> None:

@@ -228,7 +228,8 @@ class Trainer:
     def kept(self) -> list[NestedKey]:
         """Keys of a step that go into the replay."""
         exported = ["success", "truncated"] if self.settings.export.kind != "none" else []
-        after = [("next", key) for key in (*self._keys, "reward", "terminated", *exported)]
+        marks = ["overflow"] if self.settings.env.marks_overflow else []
+        after = [("next", key) for key in (*self._keys, "reward", "terminated", *exported, *marks)]
         return [*self._keys, "action", "is_init", *self._extra, *after]
 
     def gather(self) -> None:

@@ -12,7 +12,7 @@ from scipy.stats import chisquare
 from tensordict import TensorDict
 from torchrl.data import ReplayBuffer
 
-from franka_wm.data.replay import WindowSampler, make_replay, newest_step
+from franka_wm.data.replay import OVERFLOW, WindowSampler, make_replay, newest_step
 from franka_wm.errors import UserError
 
 WORLDS = 3
@@ -98,6 +98,28 @@ def test_every_last_transition_can_be_sampled() -> None:
         assert not sample["next", "done"][:, :-1].any()
     data = experience(35)
     assert seen == {(w, t) for w, t in data["next", "done"].nonzero().tolist()}
+
+
+@pytest.mark.parametrize("across", [False, True])
+@pytest.mark.parametrize("window", [1, 3])
+def test_no_window_has_a_step_that_lost_contacts(window: int, across: bool) -> None:
+    """All others are drawn, equally often."""
+    torch.manual_seed(0)
+    options = dict(num_envs=WORLDS, batch_size=200, device="cpu", cross_episode=across, marks=True)
+    replay = make_replay(capacity=40 * WORLDS, window=window, **options)
+    data = experience(35)
+    lost = torch.zeros(WORLDS, 35, 1, dtype=torch.bool)
+    lost[0, 4] = lost[1, 20:22] = True
+    replay.extend(data.set(OVERFLOW, lost))
+    every = {(world, t) for world in range(WORLDS) for t in range(35 - window + 1)}
+    expected = every if across else whole_windows(0, 35, window)
+    expected = {(w, t) for w, t in expected if not lost[w, t : t + window].any()}
+    counts: Counter[tuple[int, int]] = Counter()
+    for _ in range(60):
+        sample = replay.sample()
+        counts.update(zip(sample["world"][:, 0].tolist(), sample["time"][:, 0].tolist(), strict=True))
+    assert set(counts) == expected
+    assert chisquare([counts[w] for w in sorted(expected)]).pvalue > 1e-3
 
 
 def test_windows_past_the_end_of_an_episode() -> None:

@@ -296,19 +296,22 @@ def test_an_object_that_is_not_finite_breaks_its_world_alone() -> None:
     assert env.statistics()["nonfinite"] == 1
 
 
-def test_lost_contacts_are_counted_and_end_the_episode(caplog) -> None:
+@pytest.mark.parametrize("reset", ["native", "standard"])
+def test_lost_contacts_are_counted_and_marked_and_end_the_episode(caplog, reset: str) -> None:
     """Five boxes in a heap for which there is not nearly enough room."""
     boxes = tuple(Body(name=f"box{k}", at=(0.45 + 0.05 * (k % 2), -0.2 + 0.1 * k)) for k in range(5))
-    env = make(2, task="reach", gripper=True, scene=Scene(objects=boxes), max_contacts=28)
+    env = make(2, task="reach", gripper=True, scene=Scene(objects=boxes), max_contacts=28, auto_reset=reset)
     observation = env.reset()
     rest_q = env.simulation.tensors.rest_q.view(2, -1)
     for k in range(5):  # thrown into one another
         rest_q[:, 2 + 7 * k : 5 + 7 * k] = torch.tensor([0.5, 0.004 * k, 0.021 + 0.01 * k])
-    ended = torch.zeros(2, 1, dtype=torch.bool)
+    marked = 0
     for _ in range(3):
-        observation = env.step(observation.set("action", grips(env, 1.0)))["next"]
-        ended |= observation["truncated"]
-    assert ended.any()
+        assert not observation["overflow"].any()  # what begins is not marked
+        step, observation = env.step_and_maybe_reset(observation.set("action", grips(env, 1.0)))
+        assert torch.equal(step["next", "overflow"], step["next", "truncated"])
+        marked += int(step["next", "overflow"].sum())
+    assert marked == env.statistics(clear=False)["overflow"]
     with caplog.at_level("WARNING"):
         assert env.statistics(clear=False)["overflow"] == env.statistics()["overflow"] > 0
     assert [record.message for record in caplog.records].count(caplog.messages[0]) == 1

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from franka_wm.console import count, duration, say
-from franka_wm.data.lerobot.episodes import Episode, EpisodeCutter
+from franka_wm.data.lerobot.episodes import Episode, EpisodeCutter, tell_lost
 from franka_wm.data.lerobot.provenance import describe
 from franka_wm.data.lerobot.schema import SEED, SUCCESS, schema_for
 from franka_wm.data.lerobot.writer import DatasetWriter, default_shard_frames
@@ -124,15 +124,21 @@ def gather(
                 trust_policy=True,
             )
             started = said = time.perf_counter()
-            done, steps, stopped = 0, 0, False
+            done, steps, lost, stopped = 0, 0, 0, False
             batches = iter(collector)
             while done < left and not stopped:
                 if chosen.taken < wanted:
                     batch = next(batches)
                     steps += batch.numel()
                     writer.add(episode for episode in cutter.push(batch) if chosen.takes(episode))
-                told = processes.objects((chosen.taken, chosen.seen, chosen.steps, steps, stop()))
-                done, seen, kept, played, stopped = (sum(one) for one in zip(*told, strict=True))
+                told = processes.objects(
+                    (chosen.taken, chosen.seen, chosen.steps, steps, cutter.lost, stop())
+                )
+                done, seen, kept, played, lost, stopped = (sum(one) for one in zip(*told, strict=True))
+                if lost >= HOPELESS and not done:
+                    raise UserError(
+                        f"collect: {lost} episodes lost contacts for want of room, and none did not; raise env.max_contacts"
+                    )
                 if success_only and seen >= HOPELESS and not done:
                     raise UserError(
                         f"collect: none of {seen} episodes succeeded; success_only=true would never end: "
@@ -148,6 +154,7 @@ def gather(
                     )
                     said = now
         collector.shutdown()
+        tell_lost("collect", lost)
         return writer.finish(), done >= left
 
 

@@ -25,6 +25,8 @@ if TYPE_CHECKING:  # writing processes unpickle episodes, and need no torch
     import torch
     from tensordict import TensorDictBase
 
+LOST = "overflow"
+"""Key, under ``next``, of the flag of a step in which contacts were lost."""
 UNKNOWN_EPISODE = -1
 """Number of an episode whose place in its world's history is not known (from a replay)."""
 
@@ -65,6 +67,9 @@ class EpisodeCutter:
         first_world: Number of the first world of the batches.
         first_episode: (worlds,) numbers of the episodes that the first batch starts with; 0 if not given.
         discrete: Table (number of actions, A) that an integer action is a row of; for continuous actions ``None``.
+
+    Attributes:
+        lost: How many episodes were left out since contacts were lost in them: where ``("next", "overflow")`` is set.
     """
 
     def __init__(
@@ -82,6 +87,7 @@ class EpisodeCutter:
         self._table = None if discrete is None else discrete.cpu().numpy()
         self._numbers = first_episode
         self._open: dict[str, np.ndarray] | None = None
+        self.lost = 0
 
     @property
     def waiting(self) -> int:
@@ -111,7 +117,9 @@ class EpisodeCutter:
         out = []
         for time, world in zip(*np.nonzero(done.T), strict=True):
             begin = start[world, time]
-            if begin >= 0:
+            if begin >= 0 and LOST in arrays and arrays[LOST][world, begin : time + 1].any():
+                self.lost += 1
+            elif begin >= 0:
                 out.append(
                     self._episode(arrays, int(world), int(begin), int(time) + 1, int(number[world, time]))
                 )
@@ -146,6 +154,8 @@ class EpisodeCutter:
             action = self._table[action]
         out[ACTION] = action
         out["is_init"] = host(batch.get("is_init"))
+        if (lost := batch.get(("next", LOST), None)) is not None:
+            out[LOST] = host(lost)
         for name in (REWARD, DONE, TERMINATED, TRUNCATED, SUCCESS):
             if name in self.schema.features:
                 out[name] = host(batch.get(("next", name.removeprefix("next."))))
@@ -191,7 +201,7 @@ def cut_replay(
     episode_length: int,
     first_world: int = 0,
     discrete: torch.Tensor | None = None,
-) -> tuple[list[Episode], int]:
+) -> tuple[list[Episode], int, int]:
     """Whole episodes of a replay buffer, which may keep no flag for the end by time.
 
     An episode is whole if its first step is there and it terminated, was truncated or has ``episode_length`` steps.
@@ -208,7 +218,7 @@ def cut_replay(
         discrete: As for :class:`EpisodeCutter`.
 
     Returns:
-        The episodes, and how many partial ones were left out.
+        The episodes, how many partial ones were left out, and how many in which contacts were lost.
     """
     import torch
 
@@ -244,4 +254,12 @@ def cut_replay(
         world = int(episode.rows[SEED][0, 1])
         del episode.rows[SEED], episode.rows[EPISODE_KEY]
         episodes.append(complete(episode.rows, episode.terminal, seed=(seed, world, UNKNOWN_EPISODE)))
-    return episodes, partial
+    return episodes, partial, cutter.lost
+
+
+def tell_lost(verb: str, episodes: int) -> None:
+    """Says that episodes were left out for want of room for contacts."""
+    from franka_wm.console import say
+
+    if episodes:
+        say(f"warning: {verb}: {episodes} episodes lost contacts and were left out; raise env.max_contacts")

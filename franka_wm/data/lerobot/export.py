@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from franka_wm.data.image_storage import newest
-from franka_wm.data.lerobot.episodes import cut_replay
+from franka_wm.data.lerobot.episodes import cut_replay, tell_lost
 from franka_wm.data.lerobot.hub import check_repo_id
 from franka_wm.data.lerobot.provenance import describe, read_provenance
 from franka_wm.data.lerobot.schema import schema_for
@@ -125,7 +125,7 @@ def export_replay(
     discrete = None
     if not data.get("action").is_floating_point():
         discrete = discrete_action_table(config.action_dim)
-    episodes, partial = cut_replay(
+    episodes, partial, lost = cut_replay(
         data,
         schema,
         seed=seed,
@@ -133,8 +133,9 @@ def export_replay(
         first_world=processes.rank() * len(data),
         discrete=discrete,
     )
-    counts = processes.objects((len(episodes), sum(e.length for e in episodes), partial))
-    whole, frames, partial = (sum(one) for one in zip(*counts, strict=True))
+    counts = processes.objects((len(episodes), sum(e.length for e in episodes), partial, lost))
+    whole, frames, partial, lost = (sum(one) for one in zip(*counts, strict=True))
+    tell_lost("export", lost)
     if not whole:
         raise UserError(
             f"export: the buffer holds no whole episode of {config.episode_length} steps, only {partial} partial "

@@ -304,6 +304,12 @@ class EnvSettings:
         return self.episode_length
 
     @property
+    def marks_overflow(self) -> bool:
+        """Whether a step says that contacts were lost in it: some task has a scene."""
+        tasks = self.config.tasks.values() if isinstance(self.config, MultiTaskConfig) else [self.config]
+        return any(isinstance(one, FrankaConfig) and one.resolved_scene is not None for one in tasks)
+
+    @property
     def label(self) -> str:
         """The arm's task, or the name of another library's environment."""
         if isinstance(self.config, FrankaConfig):

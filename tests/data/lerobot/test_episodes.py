@@ -135,7 +135,7 @@ def test_a_replay_gives_whole_episodes_only(make_schema, keeps: bool) -> None:
     kept = data.clone()
     for key in ("done", *(() if keeps else ("truncated",))):
         del data["next", key]
-    episodes, partial = cut_replay(data, make_schema(), seed=4, episode_length=LENGTH)
+    episodes, partial, _ = cut_replay(data, make_schema(), seed=4, episode_length=LENGTH)
     lengths = {world: [e.length for e in episodes if e.rows[SEED][0, 1] == world] for world in (0, 1)}
     assert lengths == {0: [8] * 6, 1: [3] * keeps + [8, 4, 8, 8, 8, 8, 8]}
     assert partial == 4 - keeps  # the first of each world, and the steps after the last end of each
@@ -155,3 +155,21 @@ def test_a_replay_gives_whole_episodes_only(make_schema, keeps: bool) -> None:
     assert by_time.rows[TRUNCATED][-1, 0]
     assert not by_time.rows[TRUNCATED][:-1].any()
     assert list(by_time.rows[SEED][0, [0, 2]]) == [4, -1]
+
+
+@pytest.mark.parametrize("steps", [STEPS, 7], ids=["one batch", "several"])
+def test_episodes_that_lost_contacts_are_left_out_and_counted(make_schema, steps: int) -> None:
+    ends = np.zeros((2, STEPS), bool)
+    ends[:, LENGTH - 1 :: LENGTH] = True
+    data = stream(ends)
+    lost = torch.zeros_like(data["is_init"])
+    lost[0, 10] = lost[1, 0] = lost[1, 58] = (
+        True  # of its second episode; of its first; of one that has not ended
+    )
+    data["next", "overflow"] = lost
+    cutter = EpisodeCutter(make_schema(), seed=4)
+    found = [episode for part in data.split(steps, dim=1) for episode in cutter.push(part)]
+    kept = {(world, number) for world in (0, 1) for number in range(STEPS // LENGTH)} - {(0, 1), (1, 0)}
+    assert {tuple(episode.rows[SEED][0, 1:].tolist()) for episode in found} == kept and cutter.lost == 2
+    if steps == STEPS:
+        assert cut_replay(data, make_schema(), seed=4, episode_length=LENGTH)[2] == 2
