@@ -137,7 +137,7 @@ def gather(
                 done, seen, kept, played, lost, stopped = (sum(one) for one in zip(*told, strict=True))
                 if lost >= HOPELESS and not done:
                     raise UserError(
-                        f"collect: {lost} episodes lost contacts for want of room, and none did not; raise env.max_contacts"
+                        f"collect: all of {lost} episodes lost contacts, for want of room; raise env.max_contacts"
                     )
                 if success_only and seen >= HOPELESS and not done:
                     raise UserError(

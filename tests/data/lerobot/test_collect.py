@@ -153,6 +153,29 @@ def test_steps_of_discarded_episodes_are_counted_apart(tmp_path, load, capsys) -
     assert told is not None and int(told[1]) == load(tmp_path / "set").num_frames == 48 < int(told[2])
 
 
+def test_episodes_that_lost_contacts_are_left_out_and_told(tmp_path, load, capsys, monkeypatch) -> None:
+    """Others are gathered instead; where there are none, it says so instead of going on for ever."""
+    steps, always, step = 0, False, FrankaEnv._step
+
+    def losing(env, tensordict):
+        nonlocal steps
+        steps += 1
+        after = step(env, tensordict)
+        after["overflow"][0] = always or steps == 3
+        return after
+
+    monkeypatch.setattr(FrankaEnv, "_step", losing)
+    arguments = ["collect", "workers=1", "env=lift", "env.substeps=2", "env.episode_length=6", "device=cpu"]
+    arguments += ["num_envs=1", "episodes=2", "env.observations=[state,objects]", "policy=random"]
+    assert main([*arguments, f"out={tmp_path / 'set'}"]) == 0
+    assert "1 episodes lost contacts and were left out" in capsys.readouterr().out
+    assert sorted(set(column(load(tmp_path / "set"), SEED)[:, 2])) == [1, 2]
+    always = True
+    monkeypatch.setattr("franka_wm.data.lerobot.collect.HOPELESS", 3)
+    assert main([*arguments, f"out={tmp_path / 'none'}"]) == 1
+    assert "all of 3 episodes lost contacts" in capsys.readouterr().err
+
+
 def test_ctrl_c_leaves_a_dataset(tmp_path, load) -> None:
     source = open_source("random", overrides=SMALL, num_envs=4, episodes=100_000)
 
