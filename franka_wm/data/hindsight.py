@@ -8,7 +8,7 @@ from typing import Any
 import torch
 from tensordict import TensorDictBase
 
-from franka_wm.data.image_storage import BOUNDARY
+from franka_wm.data.image_storage import BOUNDARY, OVERFLOW
 
 Relabel = Callable[[TensorDictBase, torch.Tensor], TensorDictBase]
 """(windows (B, H), goals (B, 3) [m]) -> the entries that another goal changes, of the same shapes."""
@@ -92,5 +92,9 @@ def reached_later(
     begins = data.get(BOUNDARY)[later, world.unsqueeze(1)].squeeze(-1)
     begins[:, 0] = False
     same = (begins.cumsum(1) == 0) & (ahead <= ((newest - last) % capacity).unsqueeze(1))
+    if (
+        lost := data.get(OVERFLOW, None)
+    ) is not None:  # the last step of its episode: what it led to is no goal
+        same &= ~lost[later, world.unsqueeze(1)].squeeze(-1)
     chosen = (torch.rand(last.shape, device=device) * same.sum(1)).long()
     return later.gather(1, chosen.unsqueeze(1)).squeeze(1), chosen

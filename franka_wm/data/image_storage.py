@@ -22,6 +22,8 @@ CHANNELS = 3
 
 BOUNDARY = "is_init"
 """Key of the flag that marks the first step of an episode."""
+OVERFLOW = ("next", "overflow")
+"""Key of the flag that marks a step in which contacts were lost, where there is a scene."""
 
 
 class ImageStorage(LazyTensorStorage):

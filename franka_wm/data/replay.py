@@ -13,11 +13,8 @@ from torchrl.data.replay_buffers import RoundRobinWriter, Sampler
 from franka_wm.data.demonstrations import Demonstrations
 from franka_wm.data.future import FutureFrames
 from franka_wm.data.hindsight import Hindsight
-from franka_wm.data.image_storage import BOUNDARY, ImageStorage
+from franka_wm.data.image_storage import BOUNDARY, OVERFLOW, ImageStorage
 from franka_wm.errors import UserError
-
-OVERFLOW = ("next", "overflow")
-"""Key of the flag that marks a step in which contacts were lost."""
 
 
 class WindowSampler(Sampler):
@@ -149,6 +146,7 @@ class WindowSampler(Sampler):
             raise UserError(
                 f"too few episodes of at least {self.length} steps in the replay buffer; "
                 "shorten the model's horizon, lengthen episodes, or collect more"
+                + ("; where contacts are lost too often, raise env.max_contacts" if self.marks else "")
             )
         self._missing = None
 

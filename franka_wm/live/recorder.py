@@ -120,8 +120,8 @@ class DatasetRecorder(Recorder):
 
     def _take(self, step: TensorDictBase) -> None:
         keys = {*self.schema.sources.values(), *(key for key, _, _ in self.schema.derived.values())}
-        flags = ("reward", "done", "terminated", "truncated", "success")
-        after = step.get("next").select(*keys, *flags)
+        flags = ("reward", "done", "terminated", "truncated", "success", "overflow")
+        after = step.get("next").select(*keys, *(flag for flag in flags if flag in step["next"]))
         self.steps.append(step.select(*keys, "action", "is_init").set("next", after).cpu().clone())
 
     def write(self, path: str | Path) -> Path:
@@ -130,7 +130,7 @@ class DatasetRecorder(Recorder):
         Raises:
             UserError: No step was taken, or the folder cannot be written.
         """
-        from franka_wm.data.lerobot.episodes import UNKNOWN_EPISODE, EpisodeCutter, complete
+        from franka_wm.data.lerobot.episodes import UNKNOWN_EPISODE, EpisodeCutter, complete, tell_lost
         from franka_wm.data.lerobot.provenance import describe
         from franka_wm.data.lerobot.schema import EPISODE_KEY, SEED
         from franka_wm.data.lerobot.writer import DatasetWriter
@@ -160,6 +160,7 @@ class DatasetRecorder(Recorder):
                 # Which of its world's episodes it was is not said: it was played by hand and cannot be repeated.
                 seed = (self.seed, world, UNKNOWN_EPISODE)
                 writer.add([complete(episode.rows, episode.terminal, seed=seed)])
+            tell_lost("recording", cutter.lost)
             return writer.finish()
 
 

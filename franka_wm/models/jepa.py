@@ -46,6 +46,9 @@ RECIPES: dict[str, tuple[CollapseName, str | None, bool, int]] = {
     "lejepa": ("sigreg", None, False, 1),
 }
 
+SIGREG_PLACES = 8
+"""Places of an image that SIGReg looks at in an update of a masked recipe, drawn anew each time."""
+
 
 class JEPA(WorldModel):
     """An encoder of images or clips, trained to predict embeddings instead of pixels. No actions.
@@ -322,6 +325,10 @@ class JEPA(WorldModel):
         # On what is predicted: on a projection of it, the guard would not see it collapse. Of every place of every
         # camera: what differs from place to place only is the same in all images.
         places = full.unflatten(0, (-1, len(self.image_sizes))).permute(1, 2, 0, 3)  # (cameras, tokens, n, P)
+        if (
+            self.collapse == "sigreg"
+        ):  # its directions are many numbers for each place: some of these in each update
+            places = places[:, torch.randint(places.shape[1], (SIGREG_PLACES,), device=places.device)]
         return prediction, self.guard(places), full.mean(1)
 
     def _loss_of_views(self, clips: Tensor) -> tuple[Tensor, Tensor, Tensor]:

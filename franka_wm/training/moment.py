@@ -11,6 +11,7 @@ from tensordict.nn import TensorDictModuleBase
 from torchrl.collectors import Collector
 
 from franka_wm.envs import Environment, FrankaEnv, MultiTaskEnv
+from franka_wm.envs.specs import MARKS
 from franka_wm.seeding import derive_seed
 from franka_wm.training.build import arm_of
 
@@ -46,6 +47,8 @@ def put_back(env: Environment, collector: Collector, worlds: Mapping[str, Any]) 
     size = [] if isinstance(there, MultiTaskEnv) else there.batch_size
     there.set_state(TensorDict(worlds["state"], batch_size=size, device=there.device))
     carry = TensorDict(worlds["carry"], batch_size=there.batch_size, device=there.device)
+    for key in {*there.observation_spec.keys()} & {*MARKS} - {*carry.keys()}:  # of an earlier version
+        carry[key] = there.observation_spec[key].zero()
     collector._carrier = carry.clear_device_() if collector._carrier.device is None else carry
 
 

@@ -79,7 +79,7 @@ def stage_model(checkpoint: Path, place: Path, *, repo_id: str, license: str) ->
     updates = opened.counters.get("updates")
     places = ("evaluation/", "") if files.path("evaluation/evaluation.md") else ("",)
     measured = {where: _episodes(files, where, updates) for where in places}
-    usable = {where: episodes for where, episodes in measured.items() if episodes is not None}
+    usable = {where: worth for where, worth in measured.items() if worth is not None}
     written = max(usable, key=lambda where: usable[where], default="")
     if written in usable:
         if source := files.path(f"{written}evaluation.json"):
@@ -88,21 +88,25 @@ def stage_model(checkpoint: Path, place: Path, *, repo_id: str, license: str) ->
             (place / "evaluation.md").write_text(shortened(text), encoding="utf-8")
     if None in measured.values() and not (place / "evaluation.json").is_file():
         say(f"no evaluation goes along: that of {run} is of other weights; franka-wm evaluate {folder} first")
-    if film := files.path(FILM):
+    if (film := files.path(FILM)) and measured[""] is not None:
         shutil.copyfile(film, place / FILM)
     card = model_card(place, repo_id=repo_id, license=license)
     (place / README).write_text(card, encoding="utf-8")
     return place
 
 
-def _episodes(files: UntrustedFolder, place: str, updates: float | None) -> int | None:
-    """Episodes of each policy in an ``evaluation.json``, 0 without one; ``None`` if it says it is of other weights."""
+def _episodes(files: UntrustedFolder, place: str, updates: float | None) -> tuple[bool, int] | None:
+    """Whether an ``evaluation.json`` says that it is of these weights; episodes of each policy, 0 without one.
+
+    ``None`` if it says that it is of others.
+    """
     with values_of(str(files.root / place / "evaluation.json"), "measure the run again."):
         found = files.json(f"{place}evaluation.json") or {}
         of = (found.get("protocol") or {}).get("updates")
         if of is not None and updates is not None and of != updates:
             return None
-        return max((int(one.get("episodes", 0)) for one in (found.get("policies") or {}).values()), default=0)
+        episodes = (int(one.get("episodes", 0)) for one in (found.get("policies") or {}).values())
+        return of is not None, max(episodes, default=0)
 
 
 def _copy_json(source: Path, target: Path) -> None:

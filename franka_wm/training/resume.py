@@ -11,7 +11,7 @@ from torch import Tensor
 
 from franka_wm import processes
 from franka_wm.console import say
-from franka_wm.data.image_storage import CHANNELS
+from franka_wm.data.image_storage import CHANNELS, OVERFLOW
 from franka_wm.errors import UserError
 from franka_wm.seeding import derive_seed
 from franka_wm.training.checkpoint import Checkpoint
@@ -96,6 +96,9 @@ def _fitting(trainer: Trainer, experience: TensorDictBase) -> TensorDictBase:
         say(
             "export: of the steps before this resume nothing says which episodes were cut short; those will be missing"
         )
+    if OVERFLOW in trainer.kept and OVERFLOW not in experience.keys(True):  # of an earlier version
+        experience = experience.clone(recurse=False)
+        experience.set(OVERFLOW, torch.zeros_like(experience.get(("next", "terminated"))))
     for key in trainer.kept:
         if key not in experience.keys(True):
             name = key if isinstance(key, str) else ".".join(map(str, key))

@@ -11,9 +11,7 @@ import torch
 from tensordict import TensorDictBase
 from torchrl.data import ReplayBuffer
 
-from franka_wm.data.image_storage import BOUNDARY
 from franka_wm.data.memory import free_memory
-from franka_wm.data.replay import OVERFLOW
 from franka_wm.device import resolve_device
 from franka_wm.errors import UserError
 from franka_wm.models import WorldModel
@@ -119,8 +117,6 @@ def fill(
     """
     storage: Any = replay.storage
     device = torch.device(storage.device)
-    if restored and run.env.marks_overflow and OVERFLOW not in batch.keys(include_nested=True):
-        batch = batch.clone().set(OVERFLOW, torch.zeros_like(batch.get(BOUNDARY)))  # of an earlier version
     per_step = storage.bytes_per_step(batch)
     steps = run.replay.capacity
     if device.type != "cuda":

@@ -4,7 +4,8 @@ import pytest
 import torch
 from tensordict import TensorDict
 
-from franka_wm.data.hindsight import Hindsight
+from franka_wm.data.hindsight import Hindsight, reached_later
+from franka_wm.data.image_storage import OVERFLOW
 from franka_wm.data.replay import make_replay
 from franka_wm.envs import FrankaConfig, FrankaEnv
 from franka_wm.policies.expert import ExpertPolicy
@@ -183,3 +184,16 @@ def test_a_goal_of_the_newest_step_is_found_and_none_past_it() -> None:
     for _ in range(10):
         replay.sample()
     assert torch.cat(goals)[:, 0].max() == 4
+
+
+def test_what_a_step_with_lost_contacts_led_to_is_no_goal() -> None:
+    """It is the last of its episode."""
+    data = numbered(2, 12, 0, 6)
+    lost = torch.zeros(2, 12, 1, dtype=torch.bool)
+    lost[0, 5] = lost[1, 11] = True
+    data.set(OVERFLOW, lost)
+    starts, worlds = torch.tensor([[0], [6], [0], [6]]), torch.tensor([[0], [0], [1], [1]])
+    found = [reached_later(data.transpose(0, 1), starts, worlds, 11, most=6)[0] for _ in range(200)]
+    assert [one.unique().tolist() for one in torch.stack(found, 1)] == [
+        [0, 1, 2, 3, 4], [6, 7, 8, 9, 10, 11], [0, 1, 2, 3, 4, 5], [6, 7, 8, 9, 10],
+    ]  # fmt: skip

@@ -21,9 +21,11 @@ from franka_wm.errors import UserError
 from franka_wm.training import build, storage_budget
 from franka_wm.training.checkpoint import latest_checkpoint, load_checkpoint
 from franka_wm.training.learner import Learner
+from franka_wm.training.moment import worlds_now
 from franka_wm.training.resume import CUT_SHORT, restore
 from franka_wm.training.run import Run
 from franka_wm.training.settings import RunSettings
+from franka_wm.training.settings.groups import EnvSettings
 from franka_wm.training.trainer import Trainer, _of_all
 
 N, CAPACITY = 4, 50
@@ -417,13 +419,21 @@ def test_a_run_that_exports_keeps_what_the_task_says(train, tmp_path: Path, monk
     assert (replay := run.replay()) is not None and bool(replay["next", "truncated"].any())
     kept = Trainer.kept.fget
     assert kept is not None
+
+    def carried(*arguments):
+        (worlds := worlds_now(*arguments))["carry"].pop("overflow")
+        return worlds
+
     with monkeypatch.context() as older:
         older.setattr(Trainer, "kept", property(lambda self: [key for key in kept(self) if key != CUT_SHORT]))
+        older.setattr(EnvSettings, "marks_overflow", False)
+        older.setattr("franka_wm.training.trainer.worlds_now", carried)
         train(*words, "trainer.updates=10", folder=tmp_path / "older")
     assert "lost an object are missing" in (said := capsys.readouterr().out)
     assert "nothing says which episodes" not in said
     more = train(f"resume={tmp_path}/older", "trainer.updates=20", folder=tmp_path / "on").replay()
     assert more is not None and bool(more["next", "truncated"].any())
+    assert not more["next", "overflow"].any()
     assert (
         "of the steps before this resume nothing says which episodes were cut short"
         in capsys.readouterr().out

@@ -135,7 +135,7 @@ def gather(
                     (chosen.taken, chosen.seen, chosen.steps, steps, cutter.lost, stop())
                 )
                 done, seen, kept, played, lost, stopped = (sum(one) for one in zip(*told, strict=True))
-                if lost >= HOPELESS and not done:
+                if lost >= HOPELESS and not seen:
                     raise UserError(
                         f"collect: all of {lost} episodes lost contacts, for want of room; raise env.max_contacts"
                     )
@@ -143,6 +143,7 @@ def gather(
                     raise UserError(
                         f"collect: none of {seen} episodes succeeded; success_only=true would never end: "
                         "take another policy, or success_only=false"
+                        + (f"; {lost} others lost contacts, env.max_contacts" if lost else "")
                     )
                 now = time.perf_counter()
                 if now - said >= every or done >= left:

@@ -230,6 +230,8 @@ def cut_replay(
     over = terminated | (age == episode_length)
     if (truncated := data.get(("next", "truncated"), None)) is not None:
         over = over | truncated[..., 0]
+    if (lost := data.get(("next", LOST), None)) is not None:
+        over = over | lost[..., 0]
     whole = (start >= 0) & over
     data = data.clone(recurse=False)
     after = data.get("next").clone(recurse=False)

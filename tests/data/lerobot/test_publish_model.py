@@ -134,6 +134,12 @@ def test_an_evaluation_of_other_weights_is_not_published(run_folder, tmp_path, c
     (other := tmp_path / "other").mkdir()
     stage_model(run, other, repo_id="user/model", license="mit")
     assert not [*other.glob("evaluation.*")] and "is of other weights" in capsys.readouterr().out
+    assert (place / "video.mp4").is_file()  # that of the run's own evaluation
+    told = {"protocol": {"updates": counters["updates"] - 1}, "policies": {}}
+    (run / "evaluation.json").write_text(json.dumps(told))
+    (film := tmp_path / "film").mkdir()
+    stage_model(run, film, repo_id="user/model", license="mit")
+    assert not (film / "video.mp4").exists()
 
 
 def test_a_staged_model_is_damaged_if_changed(run_folder, tmp_path) -> None:
