@@ -10,6 +10,7 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor, nn
 from torch.nn import functional as F
 
+from franka_wm import processes
 from franka_wm.models.base import WorldModel, summed
 from franka_wm.models.ema import ema_update, frozen_copy
 from franka_wm.models.groups import ParameterGroup, decay_groups
@@ -325,10 +326,9 @@ class JEPA(WorldModel):
         # On what is predicted: on a projection of it, the guard would not see it collapse. Of every place of every
         # camera: what differs from place to place only is the same in all images.
         places = full.unflatten(0, (-1, len(self.image_sizes))).permute(1, 2, 0, 3)  # (cameras, tokens, n, P)
-        if (
-            self.collapse == "sigreg"
-        ):  # its directions are many numbers for each place: some of these in each update
-            places = places[:, torch.randint(places.shape[1], (SIGREG_PLACES,), device=places.device)]
+        if self.guard.kind == "sigreg":  # costly: some places in each update, the same ones in all processes
+            drawn = torch.randint(places.shape[1], (SIGREG_PLACES,), device=places.device)
+            places = places[:, processes.broadcast(drawn)]
         return prediction, self.guard(places), full.mean(1)
 
     def _loss_of_views(self, clips: Tensor) -> tuple[Tensor, Tensor, Tensor]:

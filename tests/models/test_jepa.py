@@ -7,7 +7,7 @@ from tensordict import TensorDict
 
 from franka_wm.models import make
 from franka_wm.models.images import random_crops
-from franka_wm.models.jepa import JEPA
+from franka_wm.models.jepa import JEPA, SIGREG_PLACES
 from franka_wm.models.regularizers import covariance_loss, feature_std, variance_loss
 from franka_wm.models.vision import ViT
 
@@ -291,3 +291,14 @@ def test_the_guard_spreads_every_place_of_every_camera_over_images(recipe, dots)
     assert model.loss(windows)["loss_guard"].item() == pytest.approx(
         torch.stack(cameras).mean().item(), rel=1e-5
     )
+
+
+def test_sigreg_looks_at_some_places_the_same_ones_in_all_processes(dots, monkeypatch) -> None:
+    """Means over processes of unlike places would be of none; all places at once are too many numbers."""
+    model, seen, said = small(collapse="sigreg"), [], []
+    guard = model.guard.forward
+    monkeypatch.setattr(model.guard, "forward", lambda x: seen.append(x) or guard(x))
+    monkeypatch.setattr("franka_wm.processes.broadcast", lambda x: said.append(x) or torch.zeros_like(x))
+    model.loss(dots.windows(6, 2))
+    assert seen[0].shape == (1, SIGREG_PLACES, 12, 64)
+    assert said[0].shape == (SIGREG_PLACES,) and (seen[0] == seen[0][:, :1]).all()  # the first process's draw
