@@ -92,8 +92,8 @@ def reached_later(
     begins = data.get(BOUNDARY)[later, world.unsqueeze(1)].squeeze(-1)
     begins[:, 0] = False
     same = (begins.cumsum(1) == 0) & (ahead <= ((newest - last) % capacity).unsqueeze(1))
-    lost = data.get(OVERFLOW, None)
-    if lost is not None:  # the last step of its episode: what it led to is no goal
+    # A marked step is the last of its episode: what it led to is no goal.
+    if (lost := data.get(OVERFLOW, None)) is not None:
         same &= ~lost[later, world.unsqueeze(1)].squeeze(-1)
     chosen = (torch.rand(last.shape, device=device) * same.sum(1)).long()
     return later.gather(1, chosen.unsqueeze(1)).squeeze(1), chosen
