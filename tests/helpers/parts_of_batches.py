@@ -153,6 +153,7 @@ def learn(name: str) -> dict[str, Tensor]:
 def together(folder: Path) -> None:
     """What one process of the job does: the first writes the weights of all families into a folder."""
     distributed.init_process_group("gloo")
+    processes.GradientAverage.MESSAGE = 2_000  # of these small models several messages, too
     found = {name: learn(name) for name in FAMILIES}
     processes.wait()
     for tensors in found.values():
