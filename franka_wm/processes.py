@@ -188,6 +188,11 @@ def mean(x: Tensor) -> Tensor:
     return x if count() == 1 else _applied(_Mean, x)  # pyright: ignore[reportCallIssue]
 
 
+def means(*tensors: Tensor) -> tuple[Tensor, ...]:
+    """:func:`mean` of tensors of one shape in one message: what a small one costs is the waiting."""
+    return tensors if count() == 1 else mean(torch.stack(tensors)).unbind()
+
+
 @torch.compiler.disable
 def _applied(function: type[torch.autograd.Function], x: Tensor) -> Tensor:
     """Outside of what ``torch.compile`` makes of a loss."""
@@ -213,9 +218,9 @@ class _Gather(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, x: Tensor) -> Tensor:
         x = x.detach().contiguous()
-        parts = [torch.empty_like(x) for _ in range(count())]
-        _together(lambda: distributed.all_gather(parts, x))
-        return torch.cat(parts)
+        whole = x.new_empty(count() * len(x), *x.shape[1:])
+        _together(lambda: distributed.all_gather_into_tensor(whole, x))
+        return whole
 
     @staticmethod
     def backward(ctx: Any, *grads: Tensor) -> Tensor:
@@ -231,84 +236,15 @@ def broadcast(x: Tensor) -> Tensor:
     return x
 
 
-class GradientAverage:
-    """Averages gradients over all processes while the backward pass still goes on.
-
-    They travel in messages of some megabytes, the last parameters' first: the backward pass reaches those first (Li et
-    al. 2020, arXiv:2006.15704). Every process sends the same messages in the same order.
-
-    Args:
-        parameters: More or less in the order in which the model uses them.
-    """
-
-    MESSAGE = 4_000_000
-    """So many bytes of gradients do not wait for more."""
-
-    def __init__(self, parameters: Iterable[Tensor]):
-        self._parameters = list(parameters)[::-1]
-        self._plan: list[list[Tensor]] = []
-        self._arrived: set[int] | None = None
-        self._sent: list[tuple[list[Tensor], Tensor, Any]] = []
-        for parameter in self._parameters:
-            parameter.register_post_accumulate_grad_hook(self._arrives)
-
-    @property
-    def started(self) -> int:
-        """How many messages of this backward pass are on their way."""
-        return len(self._sent)
-
-    def begin(self) -> None:
-        """Before a backward pass. The first one only shows which parameters have gradients."""
-        self._arrived = set()
-
-    @torch.no_grad()
-    def finish(self) -> None:
-        """After it: every gradient is the mean of all processes' gradients."""
-        self._arrived = None
-        known = {id(p) for group in self._plan for p in group}
-        rest = [p for group in self._plan[len(self._sent) :] for p in group]
-        rest += [p for p in self._parameters if id(p) not in known]
-        for group in self._messages(rest):
-            self._send(group)
-        self._plan = self._messages(self._parameters)
-        for group, flat, work in self._sent:
-            _together(work.wait)
-            if flat.device.type == "cpu":  # gloo knows no mean
-                flat /= count()
-            parts = flat.split([p.numel() for p in group])
-            means = [part.view_as(p) for part, p in zip(parts, group, strict=True)]
-            torch._foreach_copy_([p.grad for p in group], means)  # pyright: ignore[reportPrivateImportUsage]
-        self._sent.clear()
-
-    def _messages(self, parameters: Iterable[Tensor]) -> list[list[Tensor]]:
-        """Those that have gradients, divided into messages."""
-        groups, size = [[]], 0
-        for parameter in parameters:
-            if parameter.grad is None:
-                continue
-            if size >= self.MESSAGE:
-                groups, size = [*groups, []], 0
-            groups[-1].append(parameter)
-            size += parameter.grad.nbytes
-        return [group for group in groups if group]
-
-    @torch.no_grad()
-    def _arrives(self, parameter: Tensor) -> None:
-        """A gradient is whole. Sends what is next, if nothing of it is missing."""
-        if self._arrived is None:  # a backward pass of something else
-            return
-        self._arrived.add(id(parameter))
-        for group in self._plan[len(self._sent) :]:
-            if not all(id(p) in self._arrived for p in group):
-                break
-            self._send(group)
-
-    def _send(self, group: list[Tensor]) -> None:
-        flat = torch.cat([p.grad.flatten() for p in group if p.grad is not None])
-        kind = distributed.ReduceOp.SUM if flat.device.type == "cpu" else distributed.ReduceOp.AVG
-        works = []
-        _together(lambda: works.append(distributed.all_reduce(flat, kind, async_op=True)))
-        self._sent.append((group, flat, works[0]))
+@torch.no_grad()
+def average_gradients(parameters: Iterable[Tensor]) -> None:
+    """Averages the gradients of all processes, in one large message."""
+    if count() == 1:
+        return
+    grads = [p.grad for p in parameters if p.grad is not None]
+    flat = _average(torch.cat([g.flatten() for g in grads]))
+    parts = [part.view_as(g) for part, g in zip(flat.split([g.numel() for g in grads]), grads, strict=True)]
+    torch._foreach_copy_(grads, parts)  # pyright: ignore[reportPrivateImportUsage]
 
 
 def pooled(mean: Tensor, std: Tensor, samples: int) -> tuple[Tensor, Tensor]:
@@ -417,9 +353,14 @@ def _joined() -> bool:
 
 
 def _averaged(x: Tensor) -> Tensor:
-    total = x.detach().clone(memory_format=torch.contiguous_format)
-    _together(lambda: distributed.all_reduce(total))
-    return total / count()
+    return _average(x.detach().clone(memory_format=torch.contiguous_format))
+
+
+def _average(x: Tensor) -> Tensor:
+    """The mean over all processes, in place."""
+    kind = distributed.ReduceOp.AVG if x.is_cuda else distributed.ReduceOp.SUM  # gloo knows no mean
+    _together(lambda: distributed.all_reduce(x, kind))
+    return x if x.is_cuda else x.div_(count())
 
 
 def _together(what: Any) -> None:

@@ -65,8 +65,7 @@ class SIGReg(nn.Module):
             directions = torch.randn(x.shape[-1], self.directions, device=x.device)
             directions = processes.broadcast(directions)
             angle = (x @ F.normalize(directions, dim=0)).unsqueeze(-1) * self.knot  # (..., n, M, knots)
-            cos = processes.mean(angle.cos().mean(-3))
-            sin = processes.mean(angle.sin().mean(-3))
+            cos, sin = processes.means(angle.cos().mean(-3), angle.sin().mean(-3))
             error = (cos - self.gaussian).square() + sin.square()
             return (error @ self.weight).mean() * (x.shape[-2] * processes.count())
 
@@ -224,8 +223,10 @@ class BatchNorm(nn.Module):
     def _of_all(self, flat: Tensor) -> Tensor:
         """The same over the batches (n, D) of all processes."""
         wide = flat.float()
-        mean = processes.mean(wide.mean(0))
-        var = processes.mean((wide - mean).square().mean(0))
+        own = torch.stack([wide.mean(0), wide.var(0, correction=0)])
+        means, variances = processes.gather(own.unsqueeze(0)).unbind(1)  # (processes, D)
+        mean = means.mean(0)
+        var = variances.mean(0) + (means - mean).square().mean(0)
         with torch.no_grad():
             samples = len(flat) * processes.count()
             self.running_mean.lerp_(mean, self.momentum)

@@ -90,8 +90,6 @@ class Learner:
                 group["lr"] = torch.tensor(float(group.get("lr", lr)), device=self.device)
         # Without weight decay, the default of every group, AdamW is Adam.
         self.optimizer = torch.optim.AdamW(groups, lr=lr, weight_decay=0.0, fused=True, capturable=on_cuda)
-        shared = [p for group in self._clip_groups.values() for p in group]
-        self._average = processes.GradientAverage(shared) if processes.count() > 1 else None
         self.rates = [float(group["lr"]) for group in self.optimizer.param_groups]
         self.precision = precision
         self._loss = model.compiled_loss() if compile else model.loss
@@ -183,11 +181,8 @@ class Learner:
         # No cache of cast weights: it would hold tensors of one captured update into the next.
         with torch.autocast(self.device.type, torch.bfloat16, enabled=low, cache_enabled=False):
             losses = self._loss(batch)
-        if self._average is not None:
-            self._average.begin()
         losses.get("loss").backward()
-        if self._average is not None:
-            self._average.finish()
+        processes.average_gradients(p for group in self._clip_groups.values() for p in group)
         values = {name: value for name, value in losses.items()}
         for name, parameters in self._clip_groups.items():
             values[f"grad_norm_{name}"] = nn.utils.clip_grad_norm_(parameters, self.grad_clip, foreach=True)

@@ -81,7 +81,7 @@ def _regular(like: Tensor) -> Tensor:
     """In (0, 1), different along the last dimension where that is not one of samples."""
     if like.ndim == 2 and like.shape[0] == 4:  # places of crops
         return torch.full_like(like, 0.4)
-    return (0.37 + 0.618 * torch.arange(like.shape[-1])) % 1.0 * 0.98 + 0.01
+    return (0.37 + 0.618 * torch.arange(like.shape[-1], device=like.device)) % 1.0 * 0.98 + 0.01
 
 
 def windows(name: str, length: int) -> TensorDict:
@@ -125,9 +125,38 @@ def exact() -> Iterator[None]:
         torch.set_default_dtype(torch.float32)
 
 
+MESSAGES = ("all_reduce", "all_gather_into_tensor", "broadcast")
+"""What a process sends: functions of `torch.distributed`."""
+
+
+@contextmanager
+def counted() -> Iterator[list[int]]:
+    """How many messages a process sends; each waits for the others."""
+    found = [0]
+    real = {name: getattr(distributed, name) for name in MESSAGES}
+
+    def counting(name: str) -> Callable[..., Any]:
+        def send(*args: Any, **kwargs: Any) -> Any:
+            found[0] += 1
+            return real[name](*args, **kwargs)
+
+        return send
+
+    for name in MESSAGES:
+        setattr(distributed, name, counting(name))
+    try:
+        yield found
+    finally:
+        for name, function in real.items():
+            setattr(distributed, name, function)
+
+
 @exact()
-def learn(name: str) -> dict[str, Tensor]:
-    """The weights of a family after some updates, each from this process's part of a batch."""
+def learn(name: str, device: str = "cpu") -> tuple[dict[str, Tensor], int]:
+    """A family's weights after some updates from this process's part of a batch, and the messages of an eager one.
+
+    On a GPU the last updates are captured ones.
+    """
     torch.manual_seed(0)
     family, options, length = FAMILIES[name]
     model = models.make(family, **options)
@@ -135,29 +164,30 @@ def learn(name: str) -> dict[str, Tensor]:
         for one in model.parameters():  # heads that begin at zero, behind which gradients vanish
             if one.ndim > 1 and not one.any():
                 one.normal_(std=0.5)
-    learner = Learner(model, lr=1e-2)
+    learner = Learner(model.to(device), lr=1e-2)
     for group in learner.optimizer.param_groups:
         group["eps"] = 1e-6  # else Adam makes whole steps of the rounding of gradients that should be zero
-    generator = torch.get_rng_state()
-    for _ in range(UPDATES):
+    messages, generator = 0, torch.get_rng_state()
+    for update in range(UPDATES):
         torch.set_rng_state(generator)
         batch = windows(name, length)
         generator = torch.get_rng_state()
-        own: Any = batch.chunk(processes.count())[processes.rank()]
-        with Regular():
+        own: Any = batch.chunk(processes.count())[processes.rank()].to(device)
+        with Regular(), counted() as sent:
             learner.update(own)
+        messages = sent[0] if update == 0 else messages
     learner.metrics()
-    return {key: value for key, value in model.state_dict().items() if isinstance(value, Tensor)}
+    return {k: x.cpu() for k, x in model.state_dict().items() if isinstance(x, Tensor)}, messages
 
 
-def together(folder: Path) -> None:
-    """What one process of the job does: the first writes the weights of all families into a folder."""
-    distributed.init_process_group("gloo")
-    processes.GradientAverage.MESSAGE = 2_000  # of these small models several messages, too
-    found = {name: learn(name) for name in FAMILIES}
+def together(folder: Path, *, cuda: bool = False) -> None:
+    """What one process of the job does: the first writes what all families have learned into a folder."""
+    processes.join(cuda=cuda)
+    device = str(processes.own_gpu()) if cuda else "cpu"
+    found = {name: learn(name, device) for name in FAMILIES}
     processes.wait()
-    for tensors in found.values():
-        processes.require_same(tensors)
+    for weights, _ in found.values():
+        processes.require_same(weights)
     if processes.rank() == 0:
         torch.save(found, folder / "learned.pt")
     processes.leave()

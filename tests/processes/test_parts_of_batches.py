@@ -8,14 +8,47 @@ import torch
 from forks import ranks_in_forks
 from parts_of_batches import FAMILIES, learn, together
 
+MESSAGES = {
+    "tdmpc2": 2,
+    "tdmpc2, demonstrations": 3,
+    "muzero": 1,
+    "dreamer": 2,
+    "lewm": 12,
+    "action_world_model": 6,
+    "jepa": 1,
+    "lejepa": 6,
+    "vicreg": 11,
+    "dino_wm": 1,
+}
+"""Family -> how many an update sends: that of the gradients, and statistics, which wait for each other."""
 
-@pytest.fixture(scope="module")
-def learned(tmp_path_factory) -> dict[str, dict[str, torch.Tensor]]:
-    """Family -> weights that two processes have learned together."""
-    folder = tmp_path_factory.mktemp("processes")
-    done = ranks_in_forks([partial(together, folder)] * 2, folder)
+
+def _learned(folder, *, cuda: bool):
+    done = ranks_in_forks([partial(together, folder, cuda=cuda)] * 2, folder)
     assert done.returncode == 0, done.stdout + done.stderr
     return torch.load(folder / "learned.pt", weights_only=True)
+
+
+@pytest.fixture(scope="module")
+def learned(tmp_path_factory) -> dict[str, tuple[dict[str, torch.Tensor], int]]:
+    """Family -> weights that two processes have learned together, and the messages of one update."""
+    return _learned(tmp_path_factory.mktemp("processes"), cuda=False)
+
+
+@pytest.fixture(scope="module")
+def learned_on_gpus(tmp_path_factory) -> dict[str, tuple[dict[str, torch.Tensor], int]]:
+    """The same of two GPUs."""
+    if torch.cuda.device_count() < 2:
+        pytest.skip("needs two GPUs")
+    return _learned(tmp_path_factory.mktemp("gpus"), cuda=True)
+
+
+def _compare(alone: dict[str, torch.Tensor], together: dict[str, torch.Tensor]) -> None:
+    assert alone.keys() == together.keys()
+    for key, value in alone.items():
+        torch.testing.assert_close(
+            together[key], value, rtol=1e-7, atol=1e-8, msg=lambda m, k=key: f"{k}: {m}"
+        )
 
 
 @pytest.mark.slow
@@ -23,9 +56,18 @@ def learned(tmp_path_factory) -> dict[str, dict[str, torch.Tensor]]:
 def test_parts_of_a_batch_teach_what_the_whole_does(learned, name):
     if "dino" in name:
         pytest.importorskip("transformers")
-    alone = learn(name)
-    assert alone.keys() == learned[name].keys()
-    for key, value in alone.items():
-        torch.testing.assert_close(
-            learned[name][key], value, rtol=1e-7, atol=1e-8, msg=lambda m, k=key: f"{k}: {m}"
-        )
+    _compare(learn(name)[0], learned[name][0])
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", FAMILIES)
+def test_gpus_learn_what_one_does(learned_on_gpus, name):
+    """Also inside a captured update."""
+    if "dino" in name:
+        pytest.importorskip("transformers")
+    _compare(learn(name, "cuda")[0], learned_on_gpus[name][0])
+
+
+@pytest.mark.slow
+def test_an_update_sends_few_messages(learned):
+    assert {name: messages for name, (_, messages) in learned.items()} == MESSAGES
