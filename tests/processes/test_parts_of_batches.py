@@ -59,7 +59,7 @@ def test_parts_of_a_batch_teach_what_the_whole_does(learned, name):
     _compare(learn(name)[0], learned[name][0])
 
 
-@pytest.mark.slow
+@pytest.mark.gpu
 @pytest.mark.parametrize("name", FAMILIES)
 def test_gpus_learn_what_one_does(learned_on_gpus, name):
     """Also inside a captured update."""
