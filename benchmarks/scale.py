@@ -6,8 +6,9 @@
 
 *environment* is the simulator alone, one process for each GPU. The others are whole training by ``train.py gpus=N``:
 gathering, resets, sampling, updates and the averaging of gradients; the first third of the updates is warm-up.
-*predicted* is the cost model of `docs/scale.md`, from one GPU's time of an update and that of adding up its gradients
-(`benchmarks/all_reduce.py`).
+*predicted* is the cost model of `docs/scale.md`, from one GPU's time of an update and those of its messages
+(`benchmarks/all_reduce.py`): the gradients', and small ones of statistics that wait for each other. The last rows are
+that model's for more GPUs than there are, in hosts of eight.
 """
 
 from __future__ import annotations
@@ -23,6 +24,7 @@ from typing import Any
 
 import torch
 from common import compose, publish
+from cost_model import HOST, NETWORKS, Link, all_reduce, link, speed_up
 
 from franka_wm.training.checkpoint import latest_checkpoint, load_checkpoint
 from franka_wm.training.history import read_rows
@@ -41,6 +43,16 @@ TRAINING = {
     "LeWorldModel": ["env=reach_goal_image", "model=lewm"],
 }
 """Case -> arguments of train.py."""
+
+MESSAGES = {"TD-MPC2": 2, "TD-MPC2, images": 2, "LeWorldModel": 8}
+"""Case -> how many an update sends, as counted by `tests/processes/test_parts_of_batches.py`; there LeWorldModel has a
+loss more, of four messages."""
+
+COLUMNS = (
+    "case", "GPUs", "network", "updates/s", "windows/s", "env steps/s", "gradients [MB]", "gradients [ms]",
+    "messages [ms]", "predicted", "times one GPU",
+)  # fmt: skip
+"""Of a row. *gradients [ms]* is the time of their message, *messages [ms]* that of all messages of an update."""
 
 QUIET = [
     "evaluation.during=[]",
@@ -99,15 +111,17 @@ def worker(device: str, worlds: int, seconds: float) -> None:
     print(steps(seconds), flush=True)
 
 
-def all_reduce(gpus: int, device: str, megabytes: float) -> float:
-    """Seconds that so many GPUs take to add up gradients of this size."""
+def messages(gpus: int, device: str, megabytes: float) -> tuple[float, float]:
+    """Seconds that so many GPUs take to add up gradients of this size, and numbers of next to no size."""
     if gpus == 1:
-        return 0.0
+        return 0.0, 0.0
     with tempfile.NamedTemporaryFile(suffix=".json") as file:
         command = [sys.executable, "-m", "torch.distributed.run", "--standalone", f"--nproc-per-node={gpus}"]
         command += [str(ROOT / "benchmarks" / "all_reduce.py"), f"--device={device}", f"--out={file.name}"]
-        subprocess.run([*command, "--megabytes", str(megabytes)], check=True, capture_output=True, cwd=ROOT)
-        return json.loads(Path(file.name).read_text())["rows"][0]["ms"] / 1e3
+        sizes = ["--megabytes", str(megabytes), "0.01"]
+        subprocess.run([*command, *sizes], check=True, capture_output=True, cwd=ROOT)
+        large, small = json.loads(Path(file.name).read_text())["rows"]
+        return large["ms"] / 1e3, small["ms"] / 1e3
 
 
 def training(arguments: list[str], gpus: int, updates: int) -> tuple[float, int, float]:
@@ -143,6 +157,26 @@ def training(arguments: list[str], gpus: int, updates: int) -> tuple[float, int,
     return rate, grown["replay.batch_size"] * gpus, gradients
 
 
+def beyond(case: str, update: float, gradients: float, inside: Link) -> list[dict[str, Any]]:
+    """The cost model for more GPUs than there are, whose hosts are as the one measured.
+
+    Args:
+        update: Of one GPU [s].
+        gradients: Of an update [MB].
+    """
+    rows = []
+    hosts = [(gpus, network) for network in NETWORKS for gpus in (16, 64, 512)]
+    for gpus, network in [(HOST, "one host"), *hosts]:
+        large, small = (
+            all_reduce(size, gpus, inside, NETWORKS.get(network)) for size in (1e6 * gradients, 0.0)
+        )
+        waited = large + (MESSAGES[case] - 1) * small
+        row = dict.fromkeys(COLUMNS, float("nan")) | {"case": case, "GPUs": gpus, "network": network}
+        row |= {"gradients [MB]": gradients, "gradients [ms]": 1e3 * large, "messages [ms]": 1e3 * waited}
+        rows.append(row | {"predicted": speed_up(gpus, update, waited)})
+    return rows
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
@@ -164,28 +198,31 @@ def main() -> None:
     there = torch.cuda.device_count() if args.device == "cuda" else 2
     numbers = args.gpus or [n for n in (1, 2, 4, 8) if n <= there]
     rows: list[dict[str, Any]] = []
+    further: list[dict[str, Any]] = []
     for case in args.cases:
         alone, update = 0.0, 0.0
         for gpus in numbers:
-            row: dict[str, Any] = {"case": case, "GPUs": gpus}
+            row: dict[str, Any] = dict.fromkeys(COLUMNS, float("nan")) | {"case": case, "GPUs": gpus}
             if case == "environment":
                 done = environment(gpus, args.device, args.worlds, args.seconds)
-                unknown = ("updates/s", "windows/s", "gradients [MB]", "all-reduce [ms]")
-                row |= dict.fromkeys(unknown, float("nan")) | {"env steps/s": done, "predicted": float(gpus)}
+                row |= {"env steps/s": done, "predicted": float(gpus)}
             else:
                 arguments = [*TRAINING[case], f"scale={args.scale}", f"device={args.device}"]
                 updates, batch, gradients = training(arguments, gpus, args.updates)
-                done, message = updates * batch, all_reduce(gpus, args.device, gradients)
+                done, (large, small) = updates * batch, messages(gpus, args.device, gradients)
+                waited = large + (MESSAGES[case] - 1) * small
                 update = update or 1 / updates  # of the fewest GPUs, which should be one
                 row |= {"updates/s": updates, "windows/s": done, "gradients [MB]": gradients}
-                row |= {"all-reduce [ms]": 1e3 * message, "env steps/s": float("nan")}
-                row["predicted"] = gpus * update / (update + message)
+                row |= {"gradients [ms]": 1e3 * large, "messages [ms]": 1e3 * waited}
+                row["predicted"] = speed_up(gpus, update, waited)
+                if gpus > 1 and gpus == numbers[-1]:
+                    further += beyond(case, update, gradients, link(gpus, 1e6 * gradients, large, small))
             alone = alone or done / gpus
             row["times one GPU"] = done / alone
             rows.append(row)
             print(row, flush=True)
     processes = "franka_wm/", "train.py", "benchmarks/all_reduce.py"
-    publish("scale", rows, args.out, device=args.device, ran=processes)
+    publish("scale", rows + further, args.out, device=args.device, ran=processes)
 
 
 if __name__ == "__main__":
