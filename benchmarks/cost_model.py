@@ -39,7 +39,8 @@ def all_reduce(size: float, gpus: int, inside: Link, between: Link | None = None
         return 0.0
     local = gpus if between is None else min(gpus, HOST)
     took = inside.latency + 2 * (local - 1) / local * size / inside.bandwidth
-    hosts = gpus // local
+    hosts, left = divmod(gpus, local)
+    assert not left, f"{gpus} GPUs are no hosts of {HOST}"
     if between is not None and hosts > 1:
         took += 2 * math.log2(hosts) * between.latency
         took += 2 * (hosts - 1) / hosts * size / between.bandwidth

@@ -45,8 +45,7 @@ TRAINING = {
 """Case -> arguments of train.py."""
 
 MESSAGES = {"TD-MPC2": 2, "TD-MPC2, images": 2, "LeWorldModel": 8}
-"""Case -> how many an update sends, as counted by `tests/processes/test_parts_of_batches.py`; there LeWorldModel has a
-loss more, of four messages."""
+"""Case -> how many an update sends, as counted by `tests/processes/test_parts_of_batches.py`."""
 
 COLUMNS = (
     "case", "GPUs", "network", "updates/s", "windows/s", "env steps/s", "gradients [MB]", "gradients [ms]",
@@ -196,7 +195,9 @@ def main() -> None:
     if args.worker:
         return worker(args.worker, args.worlds, args.seconds)
     there = torch.cuda.device_count() if args.device == "cuda" else 2
-    numbers = args.gpus or [n for n in (1, 2, 4, 8) if n <= there]
+    numbers = sorted(args.gpus or [n for n in (1, 2, 4, 8) if n <= there])
+    if numbers[0] != 1:
+        parser.error("--gpus: needs 1, with which the others are compared")
     rows: list[dict[str, Any]] = []
     further: list[dict[str, Any]] = []
     for case in args.cases:

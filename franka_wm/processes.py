@@ -242,7 +242,7 @@ def average_gradients(parameters: Iterable[Tensor]) -> None:
     if count() == 1:
         return
     grads = [p.grad for p in parameters if p.grad is not None]
-    flat = _average(torch.cat([g.flatten() for g in grads]))
+    flat = _mean_of(torch.cat([g.flatten() for g in grads]))
     parts = [part.view_as(g) for part, g in zip(flat.split([g.numel() for g in grads]), grads, strict=True)]
     torch._foreach_copy_(grads, parts)  # pyright: ignore[reportPrivateImportUsage]
 
@@ -353,14 +353,16 @@ def _joined() -> bool:
 
 
 def _averaged(x: Tensor) -> Tensor:
-    return _average(x.detach().clone(memory_format=torch.contiguous_format))
+    return _mean_of(x.detach().clone(memory_format=torch.contiguous_format))
 
 
-def _average(x: Tensor) -> Tensor:
-    """The mean over all processes, in place."""
-    kind = distributed.ReduceOp.AVG if x.is_cuda else distributed.ReduceOp.SUM  # gloo knows no mean
-    _together(lambda: distributed.all_reduce(x, kind))
-    return x if x.is_cuda else x.div_(count())
+def _mean_of(total: Tensor) -> Tensor:
+    """The mean over all processes; adds them up in place.
+
+    Not by NCCL's own mean, which multiplies by 1 / n: for twelve ones that is not one.
+    """
+    _together(lambda: distributed.all_reduce(total))
+    return total / count()
 
 
 def _together(what: Any) -> None:

@@ -223,10 +223,13 @@ class BatchNorm(nn.Module):
     def _of_all(self, flat: Tensor) -> Tensor:
         """The same over the batches (n, D) of all processes."""
         wide = flat.float()
-        own = torch.stack([wide.mean(0), wide.var(0, correction=0)])
-        means, variances = processes.gather(own.unsqueeze(0)).unbind(1)  # (processes, D)
-        mean = means.mean(0)
-        var = variances.mean(0) + (means - mean).square().mean(0)
+        near = (
+            self.running_mean.clone()
+        )  # all processes' own: squares of what is far from zero would lose digits
+        off = wide.mean(0) - near
+        mean, square = processes.means(off, wide.var(0, correction=0) + off.square())
+        var = (square - mean.square()).clamp_min(0.0)
+        mean = mean + near
         with torch.no_grad():
             samples = len(flat) * processes.count()
             self.running_mean.lerp_(mean, self.momentum)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.util
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -49,7 +50,8 @@ FAMILIES: dict[str, tuple[str, dict[str, Any], int]] = {
     "dreamer": ("dreamer", dict(observation_sizes=VECTORS, action_dim=ACTIONS, discount=0.9, deter_dim=16,
                                 hidden_dim=16, codes=3, classes=4, blocks=2, encoder_layers=2, bins=41,
                                 imagination=4), 6),
-    "lewm": ("lewm", dict(**LEWM, infonce_coef=0.1), 3),
+    "lewm": ("lewm", dict(**LEWM), 3),
+    "lewm, contrastive": ("lewm", dict(**LEWM, infonce_coef=0.1), 3),
     "action_world_model": ("action_world_model", dict(image_sizes=IMAGE, action_dim=ACTIONS, **VISION,
                                                       state_embed_dim=16, state_hidden_dim=32, grid=2,
                                                       predictor_width=32, predictor_depth=1, predictor_heads=2,
@@ -60,6 +62,10 @@ FAMILIES: dict[str, tuple[str, dict[str, Any], int]] = {
     "dino_wm": ("dino_wm", dict(image_sizes=IMAGE, action_dim=ACTIONS, huggingface_config=DINO, grid=2,
                                 **{**TRANSFORMER, "predictor_head_dim": 8}), 3),
 }  # fmt: skip
+
+
+if importlib.util.find_spec("transformers") is None:  # an extra
+    del FAMILIES["dino_wm"]
 
 
 class Regular(TorchFunctionMode):
@@ -177,6 +183,7 @@ def learn(name: str, device: str = "cpu") -> tuple[dict[str, Tensor], int]:
             learner.update(own)
         messages = sent[0] if update == 0 else messages
     learner.metrics()
+    assert device == "cpu" or learner._graph is not None, "nothing was captured"
     return {k: x.cpu() for k, x in model.state_dict().items() if isinstance(x, Tensor)}, messages
 
 
