@@ -15,7 +15,7 @@ from typing import Any, NoReturn, TextIO
 
 from hydra.core.hydra_config import HydraConfig
 from hydra.core.override_parser.overrides_parser import OverridesParser
-from hydra.errors import OverrideParseException
+from hydra.errors import HydraException, OverrideParseException
 from hydra.types import RunMode
 from omegaconf import DictConfig, ListConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
@@ -299,20 +299,33 @@ def fail(message: str) -> NoReturn:
 
 
 def with_scale(arguments: list[str], stream: TextIO | None = None, *, quiet: bool = False) -> list[str]:
-    """Adds ``scale=gpu`` or ``scale=laptop`` where none, or ``scale=auto``, is given; a run that resumes keeps its own.
+    """Adds ``scale=gpu`` or ``scale=laptop`` where none is given, and no experiment chooses one, or for ``scale=auto``.
+
+    A run that resumes keeps its own.
 
     Args:
         stream: Where that is said.
         quiet: Say nothing, since nothing is trained.
 
     Raises:
-        SystemExit: The device of other machines decides; one line says so.
+        SystemExit: The device of other machines decides, or experiments of a sweep that are alike in that; one line.
     """
     chosen = next((a for a in arguments if a.startswith("scale=")), None)
     if chosen not in (None, "scale=auto"):
         return arguments
     if any(a.startswith("resume=") for a in arguments):
         return [a for a in arguments if a != chosen]
+    if chosen is None and (own := _scales_of_files(arguments)) != {None}:
+        if None in own:
+            fail(
+                "some experiments of this sweep choose a scale, others do not; add scale=, or make several sweeps"
+            )
+        if not quiet:
+            say(
+                f"scale={', '.join(sorted(map(str, own)))}, by the experiment; choose with scale=laptop, gpu or smoke",
+                stream,
+            )
+        return arguments
     device = next((a.split("=", 1)[1] for a in arguments if a.startswith("device=")), "auto")
     launcher = given(arguments, "hydra/launcher")
     here = (
@@ -330,6 +343,16 @@ def with_scale(arguments: list[str], stream: TextIO | None = None, *, quiet: boo
     if not quiet:
         say(f"scale={scale}, by the device; choose with scale=laptop, gpu or smoke", stream)
     return [a for a in arguments if a != chosen] + [f"scale={scale}"]
+
+
+def _scales_of_files(arguments: list[str]) -> set[str | None]:
+    """What experiments on the command line choose, of a sweep all of them; ``None`` of one that chooses nothing."""
+    if not any(a.startswith(("experiment=", "hydra.searchpath=")) for a in arguments):
+        return {None}  # no file of this package chooses one unasked
+    try:
+        return {conf.scale_of_files(*one) for one in swept(arguments)}
+    except HydraException:  # said before, where it is composed
+        return {None}
 
 
 def check_sweep(overrides: list[str]) -> Sweep:

@@ -7,10 +7,12 @@ the top of a checkout is this one.
 from __future__ import annotations
 
 import re
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig, OmegaConf, open_dict
 
 from franka_wm.errors import UserError
 
@@ -40,20 +42,54 @@ def compose(*overrides: str) -> DictConfig:
     """The configuration that ``python train.py OVERRIDE …`` runs with.
 
     Raises:
-        UserError: An option by a former name.
+        UserError: An option by a former name, or a scale that a file sets as a value.
         HydraException, OmegaConfBaseException: An override that cannot be.
     """
     import hydra
-    from hydra.core.global_hydra import GlobalHydra
 
     for override in overrides:
         name = override.split("=", 1)[0].lstrip("+~")
         if name in RENAMED:
             raise UserError(f"{override}: this option is now called {RENAMED[name]}")
+    with _hydra():
+        cfg = hydra.compose("config", overrides=list(overrides), return_hydra_config=True)
+    chosen = cfg.hydra.runtime.choices.get("scale")
+    with open_dict(cfg):
+        del cfg["hydra"]
+    if chosen in SCALES and (value := cfg.get("scale")) != chosen:
+        raise UserError(
+            f"scale: is the value {value} beside the numbers of scale={chosen}; in a file, choose it among the "
+            f"defaults, `override /scale: {value}`"
+        )
+    return cfg
+
+
+def scale_of_files(*overrides: str) -> str | None:
+    """The scale that a file chooses by ``override /scale: …``, as an experiment may; ``None``: no file does.
+
+    Raises:
+        HydraException: An override that cannot be.
+    """
+    from hydra.core.global_hydra import GlobalHydra
+    from hydra.types import RunMode
+
+    others = [one for one in overrides if not one.startswith("scale=")]  # Hydra lets the command line win
+    with _hydra():
+        found = GlobalHydra.instance().config_loader().compute_defaults_list("config", others, RunMode.RUN)
+    chosen = found.overrides.override_choices.get("scale")
+    return None if chosen is None else str(chosen)
+
+
+@contextmanager
+def _hydra() -> Iterator[None]:
+    """Hydra at these files."""
+    import hydra
+    from hydra.core.global_hydra import GlobalHydra
+
     GlobalHydra.instance().clear()
     try:
         with hydra.initialize_config_dir(str(FOLDER), version_base="1.3"):
-            return hydra.compose("config", overrides=list(overrides))
+            yield
     finally:
         GlobalHydra.instance().clear()
 

@@ -261,6 +261,7 @@ class FrankaConfig:
                 "limit_velocity needs target_ke above 0: it limits how far the servo's set point may lead"
             )
         self._check_scene()
+        self._check_own_options()
         if self.solver == "featherstone" and self.substeps % 2:
             raise UserError(
                 f"substeps={self.substeps} with solver=featherstone: must be even (it swaps two state buffers); "
@@ -347,6 +348,27 @@ class FrankaConfig:
     def contact_dim(self) -> int:
         """Size of ``contacts``: a force of each finger; 0 where it is not asked for."""
         return NUM_FINGERS * ("contacts" in self.observations)
+
+    def _check_own_options(self) -> None:
+        """Refuses options of other tasks, and those of a gripper or a scene without one: they would do nothing."""
+        from franka_wm.envs.tasks import own_options
+
+        for name, tasks in own_options().items():
+            value, default = getattr(self, name), getattr(type(self), name)
+            if value != default and name not in self.task_class.own_options:
+                raise UserError(
+                    f"{name}={value}: task={self.task} does not read it, {', '.join(tasks)} "
+                    f"do{'es' * (len(tasks) == 1)}; leave it at {'null' if default is None else default}"
+                )
+        for name, there, what in (
+            ("gripper_force", self.has_gripper, "the gripper"),
+            ("max_contacts", self.resolved_scene, "a scene"),
+            ("end_when_lost", self.num_objects, "objects"),
+        ):
+            if getattr(self, name) != getattr(type(self), name) and not there:
+                raise UserError(
+                    f"{name}={getattr(self, name)}: needs {what}; task={self.task} has none; leave it out"
+                )
 
     def _check_scene(self) -> None:
         """Scene, gripper and what they need of the rest."""

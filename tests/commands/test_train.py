@@ -18,7 +18,7 @@ from hydra.core.global_hydra import GlobalHydra
 from omegaconf import OmegaConf
 
 from forks import TRAIN, Fork, run_in_fork, script, train_in_fork
-from franka_wm.commands.entry import check_command, with_scale
+from franka_wm.commands.entry import check_command
 from franka_wm.conf import run_name
 from franka_wm.errors import FrankaError
 from franka_wm.report.run import read_run
@@ -347,14 +347,6 @@ def test_help_explains_the_groups(tmp_path: Path) -> None:
 
 
 # -- the command line, without a run ---------------------------------------------------------------------
-
-
-def test_scale_is_chosen_by_the_device(capsys) -> None:
-    assert with_scale(["scale=smoke", "seed=1"]) == ["scale=smoke", "seed=1"]
-    assert capsys.readouterr().out == ""
-    assert with_scale(["device=cpu"]) == ["device=cpu", "scale=laptop"]
-    assert "scale=laptop" in capsys.readouterr().out
-    assert with_scale(["device=cuda", "scale=auto"]) == ["device=cuda", "scale=gpu"]
 
 
 def test_check_command(monkeypatch, tmp_path: Path) -> None:

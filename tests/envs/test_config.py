@@ -11,8 +11,8 @@ import torch
 from omegaconf import OmegaConf
 
 from franka_wm.device import resolve_device
-from franka_wm.envs import FrankaConfig, FrankaEnv
-from franka_wm.envs.tasks import Reach
+from franka_wm.envs import FrankaConfig, FrankaEnv, tasks
+from franka_wm.envs.tasks import Drawer, Reach, TorchTask
 from franka_wm.errors import UserError
 
 STATE = {"observations": ("state",)}
@@ -82,6 +82,57 @@ def test_impossible_combinations() -> None:
         FrankaConfig(camera_distance=0.0, camera_height=0.5, camera_target_height=0.5)
     with pytest.raises(UserError):
         FrankaConfig(solver="featherstone", substeps=3)
+
+
+@pytest.mark.parametrize(
+    ("changes", "said"),
+    [
+        (
+            {"task": "lift", "drawer_opening": 0.3},
+            "drawer_opening=0.3: task=lift does not read it, drawer does; leave",
+        ),
+        ({"track_radius": 0.2}, "track_radius=0.2: task=reach does not read it, track does; leave it at 0.1"),
+        ({"task": "peg", "track_period": 2.0}, "track_period=2.0: task=peg does not read it, track does"),
+        (
+            {"task": "drawer", "success_distance": 0.02},
+            "task=drawer does not read it, reach, track do; leave",
+        ),
+        ({"goal_noise": 0.3}, "goal_noise=0.3: is for goals that are drawn"),
+        ({"gripper_force": 30.0}, "gripper_force=30.0: needs the gripper; task=reach has none"),
+        ({"max_contacts": 30}, "max_contacts=30: needs a scene; task=reach has none"),
+        (
+            {"task": "drawer", "end_when_lost": False},
+            "end_when_lost=False: needs objects; task=drawer has none",
+        ),
+    ],
+)
+def test_an_option_that_the_task_does_not_read_is_refused(changes: dict[str, Any], said: str) -> None:
+    with pytest.raises(UserError) as caught:
+        FrankaConfig(**STATE, **changes)
+    assert said in one_line(caught.value)
+
+
+def test_options_of_a_task_are_for_it_and_those_that_build_on_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    class Further(Drawer):
+        pass
+
+    class Other(TorchTask):
+        own_options = ("track_radius",)
+
+    monkeypatch.setattr(tasks, "TASKS", [*tasks.TASKS])
+    monkeypatch.setattr(tasks, "_REGISTERED", {})
+    tasks.register("further", Further)
+    tasks.register("other", Other)
+    for task, name, value in (
+        ("track", "track_radius", 0.2),
+        ("track", "success_distance", 0.02),
+        ("drawer", "drawer_opening", 0.3),
+        ("further", "drawer_opening", 0.3),
+        ("other", "track_radius", 0.2),
+    ):
+        assert getattr(FrankaConfig(**STATE, task=task, **{name: value}), name) == value
+    with pytest.raises(UserError, match="task=other does not read it, drawer does"):
+        FrankaConfig(**STATE, task="other", drawer_opening=0.3)
 
 
 def test_config_is_frozen_and_takes_names_only() -> None:

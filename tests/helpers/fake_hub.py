@@ -1,13 +1,16 @@
-"""A Hugging Face Hub in memory, on loopback: enough of its interface for uploads, tags and listings."""
+"""A Hugging Face Hub in memory, on loopback: enough of its interface for uploads, tags, listings and
+downloads."""
 
 from __future__ import annotations
 
 import base64
+import hashlib
 import json
 import re
 import threading
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from typing import Any
+from urllib.parse import unquote
 
 TOKEN = "hf_only_this_one_may_write"
 
@@ -68,7 +71,7 @@ class _Handler(BaseHTTPRequestHandler):
         path = self.path.split("?")[0]
         self.hub.requests.append((self.command, path))
         data = self.body()
-        writes = self.command != "GET" and not path.endswith("validate-yaml")
+        writes = self.command not in ("GET", "HEAD") and not path.endswith("validate-yaml")
         if writes and self.headers.get("Authorization") != f"Bearer {TOKEN}":
             return self.answer(401, {"error": "Invalid username or password."})
         if path == "/api/validate-yaml":
@@ -86,6 +89,9 @@ class _Handler(BaseHTTPRequestHandler):
                 "commits": 1,
             }
             return self.answer(200, {"url": f"{self.hub.url}/{key.removeprefix('models/')}"})
+        match = re.fullmatch(r"/(datasets/[^/]+/[^/]+)/resolve/([^/]+)/(.+)", path)
+        if match is not None:
+            return self.download(match[1], unquote(match[3]))
         match = re.fullmatch(r"/api/((?:datasets|models)/[^/]+/[^/]+)(/.*)?", path)
         if match is None:
             return self.answer(404, {"error": path})
@@ -139,6 +145,23 @@ class _Handler(BaseHTTPRequestHandler):
                 repo["tags"][json.loads(data)["tag"]] = commit
             return self.answer(200, {})
         return self.answer(404, {"error": path})
+
+    def download(self, key: str, name: str) -> None:
+        """Every revision is the newest."""
+        repo = self.hub.repos.get(key)
+        if repo is None:
+            return self.answer(404, {"error": "Repository not found"}, X_Error_Code="RepoNotFound")
+        content = repo["files"].get(name)
+        if content is None:
+            return self.answer(404, {"error": "Entry not found"}, X_Error_Code="EntryNotFound")
+        self.send_response(200)
+        self.send_header("Content-Length", str(len(content)))
+        self.send_header("ETag", f'"{hashlib.sha1(content).hexdigest()}"')
+        self.send_header("X-Repo-Commit", f"{repo['commits']:040x}")
+        self.end_headers()
+        if self.command != "HEAD":
+            self.wfile.write(content)
+        return None
 
     def info(self, key: str, repo: dict[str, Any], commit: str) -> dict[str, Any]:
         return {

@@ -5,12 +5,14 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from franka_wm.data.image_storage import newest
 from franka_wm.data.lerobot.episodes import cut_replay, tell_lost
 from franka_wm.data.lerobot.hub import check_repo_id
+from franka_wm.data.lerobot.paths import without_paths
 from franka_wm.data.lerobot.provenance import describe, read_provenance
 from franka_wm.data.lerobot.schema import schema_for
 from franka_wm.data.lerobot.writer import DatasetWriter
@@ -150,7 +152,7 @@ def export_replay(
 def export_run(settings: Mapping[str, Any], data: TensorDictBase | None, *, folder: Path) -> Exported | None:
     """The end of a training run: what ``export`` in its configuration asks for. Each process of a job calls this.
 
-    A run that goes on, and had written its dataset before, does not write it again.
+    A run that goes on, and had written its dataset before, does not write it again, nor publish it again.
 
     Args:
         settings: The run's resolved configuration, plain; ``export`` has ``kind`` (none, lerobot), ``out`` (``None``:
@@ -188,9 +190,15 @@ def export_run(settings: Mapping[str, Any], data: TensorDictBase | None, *, fold
         )
         tell(done)
     if wanted["repo_id"] and processes.is_first():
-        from franka_wm.data.lerobot.publish import publish_dataset
+        from franka_wm.data.lerobot.publish import publish_dataset, published_before
 
-        publish_dataset(out, wanted["repo_id"])
+        repo_id = wanted["repo_id"]
+        if settings.get("resume") is not None and published_before(
+            repo_id, partial(_is_published_of, settings, repo_id)
+        ):
+            say(f"dataset: {repo_id} was published before")
+        else:
+            publish_dataset(out, repo_id)
     return done
 
 
@@ -210,9 +218,19 @@ def written_before(settings: Mapping[str, Any], out: Path) -> bool:
         return False
     with values_of(str(out), "choose another export.out"):
         found = read_provenance(out)
-        here = json.loads(json.dumps(dict(settings)))
-        there = [] if found is None else [session["config"] for session in found["sessions"]]
-        return [_alike(one) for one in there] == [_alike(here)]
+        return found is not None and _is_of(settings, found)
+
+
+def _is_of(settings: Mapping[str, Any], provenance: Mapping[str, Any]) -> bool:
+    """Whether the run of these settings has made the dataset of this provenance."""
+    here = json.loads(json.dumps(dict(settings)))
+    return [_alike(session["config"]) for session in provenance["sessions"]] == [_alike(here)]
+
+
+def _is_published_of(settings: Mapping[str, Any], repo_id: str, provenance: Mapping[str, Any]) -> bool:
+    """The same of a published provenance, of whose paths only the last parts are left."""
+    with values_of(repo_id, "choose another export.repo_id"):
+        return _is_of(without_paths(dict(settings)), without_paths(provenance))
 
 
 def _alike(config: Mapping[str, Any]) -> dict[str, Any]:

@@ -65,6 +65,34 @@ def publish_dataset(
     publish_staged(stage, repo_id, "dataset", private=private, update=update, dry_run=dry_run, note=note)
 
 
+def published_before(repo_id: str, is_ours: Callable[[dict[str, Any]], bool]) -> bool:
+    """Whether the Hub holds a dataset already that is ours; sets the tag that LeRobot loads where it is not there.
+
+    What is sent arrives whole or not at all; a kill may only leave it without its tag.
+
+    Args:
+        repo_id: ``user/name``.
+        is_ours: Judges the provenance that was published, which has no absolute paths.
+
+    Raises:
+        UserError: No token, no network.
+    """
+    from huggingface_hub.errors import RemoteEntryNotFoundError, RepositoryNotFoundError
+
+    api = hub_client(repo_id)
+    with explained(repo_id):
+        try:
+            path = Path(api.hf_hub_download(repo_id=repo_id, filename=PROVENANCE, repo_type="dataset"))
+        except (RepositoryNotFoundError, RemoteEntryNotFoundError):
+            return False
+        if not is_ours(linked_json(path)):
+            return False
+        refs = api.list_repo_refs(repo_id=repo_id, repo_type="dataset")
+        if VERSION_TAG not in {ref.name for ref in refs.tags}:
+            _tag(api, repo_id)
+    return True
+
+
 def publish_staged(
     stage: Callable[[Path], Path],
     repo_id: str,

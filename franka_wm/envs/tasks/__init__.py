@@ -63,6 +63,12 @@ def task_class(name: str) -> type[Task]:
     return _REGISTERED[name] if name in _REGISTERED else _BUILT_IN[name]
 
 
+def own_options() -> dict[str, list[str]]:
+    """Options of the config that not every task reads, and the tasks that do, of those that ship with the package."""
+    names = dict.fromkeys(name for task in _BUILT_IN.values() for name in task.own_options)
+    return {name: [one for one, task in _BUILT_IN.items() if name in task.own_options] for name in names}
+
+
 def make_task(config: FrankaConfig) -> Task:
     """The task that ``config.task`` names."""
     return task_class(config.task)(config)

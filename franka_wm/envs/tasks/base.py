@@ -38,6 +38,7 @@ class Task:
         marker: What ``show_goal`` draws: a disc of this radius on the table [m]; ``None``: a ball at the goal.
         lowest_goal: Where the task keeps its goals at or above this height [m]: so do those set by hand.
         rewards: What ``reward`` may be.
+        own_options: Options of the config that the task reads and not every task does; others are refused.
         words: The task in words, for datasets.
     """
 
@@ -49,6 +50,7 @@ class Task:
     marker: float | None = None
     lowest_goal = -math.inf
     rewards: tuple[str, ...] = ("dense", "sparse", "normalized")
+    own_options: tuple[str, ...] = ("success_distance",)
     words = "Do what the reward asks for."
 
     def __init__(self, config: FrankaConfig):

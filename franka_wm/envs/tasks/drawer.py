@@ -3,7 +3,6 @@
 """Drawer: pull a drawer open by its handle."""
 
 # Warp reads annotations as types: no `from __future__ import annotations` here.
-import math
 from typing import TYPE_CHECKING
 
 import torch
@@ -100,6 +99,7 @@ class Drawer(GripperTask):
         table=Table(size=(1.5, 1.4, 0.05), at=(0.55, 0.0, 0.0)),
     )
     least_objects = 0
+    own_options = ("drawer_opening",)
     words = "Open the drawer."
 
     @classmethod
@@ -147,4 +147,4 @@ class Drawer(GripperTask):
     def expert(self, sight: Sight) -> Aim:
         """Grasp the handle from above and pull it to where it is when the drawer is open."""
         handle = self.config.num_objects
-        return fetch(sight, handle, moved(sight.goal), step=math.pi, turn=self.drawer.bar[1])[0]
+        return fetch(sight, handle, moved(sight.goal), step=wp.pi, turn=self.drawer.bar[1])[0]

@@ -163,6 +163,7 @@ class GripperTask(Task):
     gripper = True
     home = READY
     rewards = ("dense", "sparse")
+    own_options = ()
     least_objects = 1
     """How many objects the scene must have."""
     grasps = True

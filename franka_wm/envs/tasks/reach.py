@@ -171,6 +171,11 @@ class Reach(Task):
                 f"goal={config.goal}: with goal_sampling={config.goal_sampling} each episode draws another; leave it "
                 "out, or give goal_sampling=fixed"
             )
+        if config.fixed_goal and config.goal_noise != type(config).goal_noise:
+            raise UserError(
+                f"goal_noise={config.goal_noise}: is for goals that are drawn; leave it out, or give "
+                "goal_sampling=reachable"
+            )
 
     @property
     def reward_bounds(self) -> tuple[float, float] | None:

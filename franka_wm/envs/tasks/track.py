@@ -55,6 +55,7 @@ class Track(Reach):
     """
 
     lowest_goal = 0.05
+    own_options = (*Reach.own_options, "track_radius", "track_period")
     words = "Follow the moving goal with the tool."
 
     def __init__(self, config: "FrankaConfig"):

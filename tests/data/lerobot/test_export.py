@@ -9,6 +9,8 @@ import huggingface_hub
 import pytest
 from huggingface_hub import constants
 
+from fake_hub import TOKEN, Hub
+from franka_wm.data.lerobot import export, publish
 from franka_wm.data.lerobot.export import check_export, export_run, written_before
 from franka_wm.data.lerobot.provenance import describe
 from franka_wm.data.lerobot.schema import PROVENANCE
@@ -48,6 +50,47 @@ def test_a_dataset_is_that_of_the_run_which_goes_on(tmp_path: Path, make_schema,
         (out / PROVENANCE).write_text(damaged)
         with pytest.raises(UserError, match=r"another form than was written.*choose another export\.out"):
             written_before(again, out)
+
+
+def test_a_dataset_that_was_published_is_not_published_again(
+    hub: Hub, monkeypatch, tmp_path: Path, make_schema, make_episode, write, capsys
+) -> None:
+    """A run that dies after it has published, and goes on, is neither refused by its own repository nor sent twice."""
+    monkeypatch.setattr(constants, "HF_HUB_OFFLINE", False)
+    monkeypatch.setattr(constants, "HF_HUB_CACHE", str(tmp_path / "cache"))
+    api = huggingface_hub.HfApi(endpoint=hub.url, token=TOKEN)
+    monkeypatch.setattr(publish, "hub_client", lambda repo_id: api)
+    demos = {"replay": {"demos": str(tmp_path / "shown")}}  # a path, which is not published whole
+    run = RUN | demos | {"export": RUN["export"] | {"repo_id": "user/set"}}
+    schema = make_schema()
+    write(
+        tmp_path / "dataset",
+        schema,
+        [make_episode(schema, 0)],
+        provenance=describe(policy="p", seed=0, config=run),
+    )
+    again = run | {"resume": str(tmp_path)}
+    assert export_run(again, None, folder=tmp_path) is None  # it had died before it published
+    repo = hub.repos["datasets/user/set"]
+    sent, tag = repo["commits"], dict(repo["tags"])
+    assert tag and "published:" in capsys.readouterr().out
+    for tags in (dict(tag), {}):  # killed after all, and before the tag
+        repo["tags"] = tags
+        export_run(again, None, folder=tmp_path)
+        assert "user/set was published before" in capsys.readouterr().out
+        assert repo["commits"] == sent and repo["tags"] == tag
+    monkeypatch.setattr(export, "written_before", lambda *_: True)
+    for other in (
+        run,
+        again | {"trainer": {"updates": 8}},
+    ):  # from the beginning, and farther: another dataset
+        with pytest.raises(UserError, match="user/set exists already"):
+            export_run(other, None, folder=tmp_path)
+    assert repo["commits"] == sent
+    repo["files"][PROVENANCE] = b'{"sessions": [{}]}'
+    repo["commits"] += 1
+    with pytest.raises(UserError, match=r"user/set.*choose another export\.repo_id"):
+        export_run(again, None, folder=tmp_path)
 
 
 def test_a_run_without_experience_says_why(tmp_path: Path) -> None:
