@@ -178,3 +178,25 @@ def test_changed_values_are_no_files_and_stand_unfolded(tmp_path: Path) -> None:
     assert "<summary>Files</summary>`gone.py`</details>" in text
     assert render.changed_told(["a 1 → 2"]) == "one value of its configuration"
     assert "<details>" not in render._since(["a 1 → 2"], None)
+
+
+# -- what README says of returns ---------------------------------------------------------------------------
+
+PLAIN = {"mean": 0.0, "low": 0.0, "high": 0.0}
+
+
+@pytest.mark.parametrize(
+    ("reached", "said"), [(500.0, "| 500 (500 – 500) | 475 |"), (400.0, "| 475, **missed** |")]
+)
+def test_a_return_below_what_was_wanted_is_marked(tmp_path: Path, reached: float, said: str) -> None:
+    row = replace(ROW, seeds=(100, 101), wanted={"return": 475})
+    for seed in row.seeds:
+        found = record(seed)
+        of = {"mean": reached, "low": reached, "high": reached}
+        found["policies"] = {
+            "planner": {"return": of, "episodes": 10},
+            "noop": {"return": PLAIN, "episodes": 10},
+        }
+        records.write(found, tmp_path)
+    readme = render.readme_tables({"reach": row}, tmp_path)
+    assert said in readme and ("missed" in readme) == (reached < 475)

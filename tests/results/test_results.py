@@ -183,7 +183,7 @@ def test_the_page_tells_mean_worst_and_what_was_wanted(measured) -> None:
     )
     assert line in readme
     assert "| training | whole command |" in readme and readme.startswith(render.LEGEND)
-    assert "*Whole command*: start, training, and the evaluation of each policy on 128 episodes." in readme
+    assert "and the evaluation of each policy on 128 episodes, without a film." in readme
     assert "missed: ≤ 1.5 cm" in overview({"reach": ROW}, place)
 
 
