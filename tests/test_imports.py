@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import ast
 import re
+import subprocess
+import sys
 from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
 
@@ -101,6 +103,34 @@ def test_the_exit_status_after_ctrl_c_is_written_once() -> None:
         if isinstance(node, ast.Constant) and node.value == 130
     }
     assert told == {"franka_wm.interrupt"}
+
+
+def test_the_key_of_lost_contacts_is_written_once() -> None:
+    """Elsewhere the word counts them: in statistics and what is printed of these."""
+    keys = (
+        "specs.py",
+        "image_storage.py",
+        "replay.py",
+        "hindsight.py",
+        "episodes.py",
+        "recorder.py",
+        "resume.py",
+        "moment.py",
+    )
+    for module, file in FILES.items():
+        if file.name in keys:
+            texts = {
+                n.value
+                for n in ast.walk(ast.parse(file.read_text(encoding="utf-8")))
+                if isinstance(n, ast.Constant)
+            }
+            assert "overflow" not in texts, module
+
+
+def test_what_writes_datasets_loads_no_torch() -> None:
+    """Each writing process would take seconds, and its memory, for it."""
+    said = "import sys, franka_wm.data.lerobot.shard_workers as w; sys.exit('torch' in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", said], check=False).returncode == 0
 
 
 def test_a_task_with_a_gripper_is_one_short_file() -> None:

@@ -15,6 +15,7 @@ import torch
 from tensordict import TensorDictBase
 from torchrl.data import LazyTensorStorage
 
+from franka_wm.envs.constants import LOST
 from franka_wm.errors import UserError
 
 CHANNELS = 3
@@ -22,7 +23,7 @@ CHANNELS = 3
 
 BOUNDARY = "is_init"
 """Key of the flag that marks the first step of an episode."""
-OVERFLOW = ("next", "overflow")
+OVERFLOW = ("next", LOST)
 """Key of the flag that marks a step in which contacts were lost, where there is a scene."""
 
 

@@ -24,7 +24,7 @@ from franka_wm.envs.camera import Camera, as_torch, camera_framing
 from franka_wm.envs.config import FrankaConfig
 from franka_wm.envs.frames import FrameStack
 from franka_wm.envs.simulation import Simulation
-from franka_wm.envs.specs import MARKS, goals_given, observation_spec
+from franka_wm.envs.specs import LOST, MARKS, goals_given, observation_spec
 from franka_wm.envs.start import check_robot, check_task
 from franka_wm.envs.tasks import Task, goal_distance
 from franka_wm.errors import UserError
@@ -184,8 +184,8 @@ class FrankaEnv(EnvBase):
         for key in ("success", "reward", "done", "terminated", "truncated"):
             out[key] = getattr(sim.tensors, key).clone()
         out["is_init"] = torch.zeros_like(sim.tensors.done)
-        if "overflow" in self._marks:
-            out["overflow"] = (sim.tensors.overflow != 0).unsqueeze(-1)
+        if LOST in self._marks:
+            out[LOST] = (sim.tensors.overflow != 0).unsqueeze(-1)
         return TensorDict(out, batch_size=self.batch_size, device=self.device)
 
     def _step_and_maybe_reset(self, tensordict: TensorDictBase) -> tuple[TensorDictBase, TensorDictBase]:
@@ -205,7 +205,7 @@ class FrankaEnv(EnvBase):
         following.update(self._present())
         following.set("success", following.get("success") & ~done)
         following.set("is_init", done.clone())
-        for key in {*FLAGS, "overflow"} & {*following.keys()}:
+        for key in {*FLAGS, LOST} & {*following.keys()}:
             following.set(key, torch.zeros_like(done))
         return tensordict, following
 

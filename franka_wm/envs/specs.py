@@ -11,12 +11,12 @@ import torch
 from torchrl.data import Binary, Bounded, Composite, Unbounded
 
 from franka_wm.envs.config import FrankaConfig
-from franka_wm.envs.constants import MOST_OPEN
+from franka_wm.envs.constants import LOST, MOST_OPEN
 from franka_wm.envs.kinematics import Kinematics
 from franka_wm.errors import UserError
 
-MARKS = ("success", "is_init", "overflow")
-"""Flags among what a step gives, none of them an observation; ``overflow`` with a scene alone."""
+MARKS = ("success", "is_init", LOST)
+"""Flags among what a step gives, none of them an observation; the last one with a scene alone."""
 
 
 def observation_spec(
@@ -57,7 +57,7 @@ def observation_spec(
     entries["success"] = Binary(shape=(n, 1), dtype=torch.bool, device=device)
     entries["is_init"] = Binary(shape=(n, 1), dtype=torch.bool, device=device)
     if config.resolved_scene:
-        entries["overflow"] = Binary(shape=(n, 1), dtype=torch.bool, device=device)
+        entries[LOST] = Binary(shape=(n, 1), dtype=torch.bool, device=device)
     return Composite(**entries, shape=(n,), device=device)
 
 

@@ -13,6 +13,7 @@ from tensordict import TensorDictBase
 from franka_wm.console import say
 from franka_wm.envs import FrankaEnv
 from franka_wm.envs.camera import project, whole_arm
+from franka_wm.envs.constants import LOST
 from franka_wm.errors import UserError
 from franka_wm.video import draw_marker, write_video
 
@@ -120,7 +121,7 @@ class DatasetRecorder(Recorder):
 
     def _take(self, step: TensorDictBase) -> None:
         keys = {*self.schema.sources.values(), *(key for key, _, _ in self.schema.derived.values())}
-        flags = ("reward", "done", "terminated", "truncated", "success", "overflow")
+        flags = ("reward", "done", "terminated", "truncated", "success", LOST)
         after = step.get("next").select(*keys, *(flag for flag in flags if flag in step["next"]))
         self.steps.append(step.select(*keys, "action", "is_init").set("next", after).cpu().clone())
 

@@ -36,6 +36,8 @@ if TYPE_CHECKING:
     from franka_wm.data.lerobot.mapping import FeatureMap
     from franka_wm.data.lerobot.source import Source
 
+    type Named = Sequence[tuple[str, Source]]  # each with the option that names it
+
 
 def check(run: RunSettings) -> None:
     """What the settings ask for together, and what this machine has.
@@ -350,12 +352,13 @@ def _check_dataset(run: RunSettings) -> None:
     root, repo_id = run.dataset.root, run.dataset.repo_id
     if (root is None) == (repo_id is None):
         raise UserError("dataset=lerobot: give dataset.root=FOLDER or dataset.repo_id=USER/NAME, one of them")
-    if root is not None:
-        from franka_wm.data.lerobot.opening import read_datasets
+    arm = run.env.arm if run.is_arm else None
+    if root is not None or arm is not None:  # without an arm nothing is compared: a dataset by name can wait
+        from franka_wm.data.lerobot.opening import find_datasets, read_datasets
 
-        arm = run.env.arm if run.is_arm else None
+        found = find_datasets(root, repo_id, meta=True)
         sources, mappings = read_datasets(
-            root,
+            [folder for _, folder in found],
             features=run.dataset.features,
             keys=run.model.observations,
             image_size=run.dataset.image_size,
@@ -365,8 +368,9 @@ def _check_dataset(run: RunSettings) -> None:
         )
         if arm is not None:
             _check_same_observations(run, mappings[0])
-            _check_same_actions(arm, sources)
-            _check_same_views(run, sources)
+            named = [(option, source) for (option, _), source in zip(found, sources, strict=True)]
+            _check_same_actions(arm, named)
+            _check_same_views(run, named)
 
 
 def _check_same_observations(run: RunSettings, recorded: FeatureMap) -> None:
@@ -390,27 +394,27 @@ def _check_same_observations(run: RunSettings, recorded: FeatureMap) -> None:
             )
 
 
-def _check_same_actions(arm: FrankaConfig, sources: Sequence[Source]) -> None:
+def _check_same_actions(arm: FrankaConfig, sources: Named) -> None:
     """Actions must mean the same; rewards of another task are said."""
     from franka_wm.data.lerobot.provenance import ACTIONS, other_option, read_provenance
 
-    for source in sources:
+    for option, source in sources:
         sessions = (read_provenance(source.root) or {}).get("sessions", ())
         if (changed := other_option(sessions, vars(arm), ACTIONS)) is not None:
             name, there = changed
             raise UserError(
-                f"dataset.root={source.root}: recorded with env.{name}={there}, this run has {getattr(arm, name)}, so "
+                f"{option}: recorded with env.{name}={there}, this run has {getattr(arm, name)}, so "
                 f"actions mean something else; use env.{name}={there}"
             )
         if (changed := other_option(sessions, vars(arm))) is not None:
             name, there = changed
             say(
-                f"dataset {source.root}: recorded with env.{name}={there}, this run has {getattr(arm, name)}; "
+                f"{option}: recorded with env.{name}={there}, this run has {getattr(arm, name)}; "
                 "its rewards and ends are those of then"
             )
 
 
-def _check_same_views(run: RunSettings, sources: Sequence[Source]) -> None:
+def _check_same_views(run: RunSettings, sources: Named) -> None:
     """What a model that acts has learned to see, the arm's cameras must show; sizes are compared elsewhere."""
     from franka_wm.data.lerobot.provenance import VIEWS, other_option, read_provenance
 
@@ -422,12 +426,12 @@ def _check_same_views(run: RunSettings, sources: Sequence[Source]) -> None:
         "image_size",
         *(("cameras",) if run.dataset.features else ()),
     )  # those may be chosen for the dataset
-    for source in sources:
+    for option, source in sources:
         sessions = (read_provenance(source.root) or {}).get("sessions", ())
         changed = other_option(sessions, vars(arm), [name for name in VIEWS if name not in named])
         if changed is not None:
             name, there = changed
             raise UserError(
-                f"dataset.root={source.root}: recorded with env.{name}={there}, this run has {getattr(arm, name)}, so "
+                f"{option}: recorded with env.{name}={there}, this run has {getattr(arm, name)}, so "
                 f"images show something else; use env.{name}={there}, or env=none to train alone"
             )

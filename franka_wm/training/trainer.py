@@ -19,7 +19,7 @@ from franka_wm.console import Progress, say
 from franka_wm.data.captured import CapturedSampling
 from franka_wm.data.lerobot.windows import RecordedWindows
 from franka_wm.data.moments import moments
-from franka_wm.data.replay import WindowReplay
+from franka_wm.data.replay import OVERFLOW, WindowReplay
 from franka_wm.envs import Environment
 from franka_wm.errors import UserError
 from franka_wm.interrupt import interruptible
@@ -228,9 +228,9 @@ class Trainer:
     def kept(self) -> list[NestedKey]:
         """Keys of a step that go into the replay."""
         exported = ["success", "truncated"] if self.settings.export.kind != "none" else []
-        marks = ["overflow"] if self.settings.env.marks_overflow else []
-        after = [("next", key) for key in (*self._keys, "reward", "terminated", *exported, *marks)]
-        return [*self._keys, "action", "is_init", *self._extra, *after]
+        marks = [OVERFLOW] if self.settings.env.marks_overflow else []
+        after = [("next", key) for key in (*self._keys, "reward", "terminated", *exported)]
+        return [*self._keys, "action", "is_init", *self._extra, *after, *marks]
 
     def gather(self) -> None:
         """One batch of the collector into the replay."""

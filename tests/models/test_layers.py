@@ -91,6 +91,8 @@ def test_the_derived_range_holds_every_reward_return_and_bootstrapped_target(lea
     assert code.outside(rewards, returns, torch.zeros(1), rewards + discount * ends) == 0.0
     size = returns.abs().max().log1p().item()
     assert high == -low and size < high < 1.1 * size  # and no further than a few points
+    # Recorded bounds hold 0 besides, of rows without a reward.
+    assert (low, high) == value_range(None, None, (min(least, 0.0), max(largest, 0.0)), discount)
 
 
 def test_the_range_of_rewards_without_bounds_is_the_published_one_and_numbers_win():

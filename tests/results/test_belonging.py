@@ -14,21 +14,14 @@ import yaml
 
 from benchmarks.results import records, render, running, times
 from benchmarks.results.__main__ import main, overview
-from benchmarks.results.rows import Row, Section, load_rows
+from benchmarks.results.rows import Row, load_rows
 from benchmarks.results.state import composed, mixed, state
 from franka_wm import source
 from franka_wm.errors import UserError
+from result_rows import CPU
+from result_rows import ROW as TWO_SEEDS
 
-CPU = Section(title="Two CPU cores", arguments="scale=smoke device=cpu", threads=2)
-ROW = Row(
-    name="reach",
-    section=CPU,
-    title="One goal",
-    arguments="env=reach_fixed",
-    seeds=(100, 101, 102),
-    wanted={"minutes": 1},
-    readme=True,
-)
+ROW = replace(TWO_SEEDS, seeds=(100, 101, 102), wanted={"minutes": 1})
 SPEED = Row(name="speed", section=CPU, title="Speed", script="benchmarks/x.py", readme=["batch"])
 INTERVAL = {"mean": 0.01, "low": 0.01, "high": 0.02}
 POLICY = {
@@ -119,7 +112,7 @@ def test_a_seed_that_is_not_declared_enters_no_mean(tmp_path: Path, capsys, monk
     place(tmp_path, record(100), record(101), record(300))
     kind, reasons = state(ROW, records.read(ROW, tmp_path))
     assert kind == "mixed" and reasons == ["seed 300: seed 300 is none of reach's, 100 – 102"]
-    assert "One goal" not in render.readme_tables({"reach": ROW}, tmp_path)
+    assert "One fixed goal" not in render.readme_tables({"reach": ROW}, tmp_path)
     assert " 2/3 " in overview({"reach": ROW}, tmp_path)
     name = next(iter(load_rows()))
     assert main(["run", name, "--seeds", "1", "--results", str(tmp_path)]) == 1

@@ -18,18 +18,8 @@ from benchmarks.results.rows import Row, Section, load_rows
 from benchmarks.results.state import composed, state
 from franka_wm import source
 from franka_wm.errors import UserError
+from result_rows import ROW
 
-CPU = Section(title="Two CPU cores", arguments="scale=smoke device=cpu", threads=2)
-ROW = Row(
-    name="reach",
-    section=CPU,
-    title="One fixed goal",
-    model="TD-MPC2, MPPI",
-    arguments="env=reach_fixed",
-    seeds=(100, 101),
-    wanted={"minutes": 1, "distance_cm": 1.5, "within_5cm": 90},
-    readme=True,
-)
 TYPED = ["scale=smoke", "device=cpu", "env=reach_fixed"]
 
 

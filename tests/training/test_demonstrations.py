@@ -262,9 +262,7 @@ def test_actions_that_would_be_scaled_are_refused_where_the_model_acts(
             with pytest.raises(UserError, match=r"would be scaled to \[−1, 1\].*use env=none") as refused:
                 check(run)
             assert "\n" not in str(refused.value)
-            with pytest.raises(
-                UserError, match=r"would be scaled to"
-            ):  # also of the Hub's, which no check sees
+            with pytest.raises(UserError, match=r"would be scaled to"):  # also where no check was made
                 build.open_recorded(run, torch.device("cpu"))
             check(settled(*words, "env=none", *changes))
             check(settled(*words, *ARM, "dataset.normalize_actions=false"))
@@ -292,18 +290,18 @@ def test_a_model_that_sees_acts_where_it_sees_the_same(
         (tmp_path / PROVENANCE).write_text(json.dumps(written))
 
     recorded()
-    _check_same_views(run, [source])
+    _check_same_views(run, [("dataset.root=there", source)])
     recorded(**there)
-    _check_same_views(run.changed(model={"observations": ["state"]}), [source])
+    _check_same_views(run.changed(model={"observations": ["state"]}), [("dataset.root=there", source)])
     if "image_size" in there:  # as dataset.image_size makes it
-        return _check_same_views(run, [source])
+        return _check_same_views(run, [("dataset.root=there", source)])
     with pytest.raises(
         UserError, match=rf"recorded with env\.{next(iter(there))}=.*images show something else"
     ):
-        _check_same_views(run, [source])
+        _check_same_views(run, [("dataset.root=there", source)])
     chosen = settled(*words, "dataset.features={pixels: observation.images.front}")
     if "cameras" in there:
-        _check_same_views(chosen, [source])
+        _check_same_views(chosen, [("dataset.root=there", source)])
     return None
 
 

@@ -19,14 +19,13 @@ from franka_wm.data.lerobot.schema import (
     Schema,
     episode_key,
 )
+from franka_wm.envs.constants import LOST
 from franka_wm.errors import UserError
 
 if TYPE_CHECKING:  # writing processes unpickle episodes, and need no torch
     import torch
     from tensordict import TensorDictBase
 
-LOST = "overflow"
-"""Key, under ``next``, of the flag of a step in which contacts were lost."""
 UNKNOWN_EPISODE = -1
 """Number of an episode whose place in its world's history is not known (from a replay)."""
 

@@ -74,7 +74,7 @@ def open_dataset(
     Raises:
         UserError: One line, for a dataset that cannot be used as asked.
     """
-    roots = [Path(r) for r in _as_list(root)] + [find_dataset(name) for name in _as_list(repo_id)]
+    roots = [folder for _, folder in find_datasets(root, repo_id)]
     device = torch.empty(0, device=device).device  # with its index
     sources, mappings = read_datasets(
         roots,
@@ -137,6 +137,22 @@ def open_dataset(
     for note in recording.notes:
         say(f"  {note}")
     return windows
+
+
+def find_datasets(
+    root: str | Path | Sequence[str | Path] | None, repo_id: str | Sequence[str] | None, *, meta: bool = False
+) -> list[tuple[str, Path]]:
+    """Folders of datasets that are given by folder and by name, each behind the option that names it.
+
+    Args:
+        root, repo_id: As those of :func:`open_dataset`.
+        meta: Only what datasets say of themselves is needed: of those on the Hub nothing else is fetched.
+
+    Raises:
+        UserError: One cannot be fetched.
+    """
+    here = [(f"dataset.root={one}", Path(one)) for one in _as_list(root)]
+    return here + [(f"dataset.repo_id={one}", find_dataset(one, meta=meta)) for one in _as_list(repo_id)]
 
 
 def read_datasets(

@@ -260,8 +260,13 @@ def check_finite(root: Path) -> None:
             raise UserError(f"{path} cannot be read: {error}") from error
 
 
-def find_dataset(repo_id: str, revision: str | None = None) -> Path:
+def find_dataset(repo_id: str, revision: str | None = None, *, meta: bool = False) -> Path:
     """The folder of a dataset on the Hub: LeRobot's own copy if there is one, otherwise downloaded.
+
+    Args:
+        repo_id: ``user/name``.
+        revision: A tag, branch or commit; the one that LeRobot loads if not given.
+        meta: Download what it says of itself alone, no rows.
 
     Raises:
         UserError: If it is neither here nor can be fetched.
@@ -281,7 +286,11 @@ def find_dataset(repo_id: str, revision: str | None = None) -> Path:
 
     try:
         folder = snapshot_download(
-            repo_id, repo_type="dataset", revision=revision or "v3.0", cache_dir=HF_LEROBOT_HUB_CACHE
+            repo_id,
+            repo_type="dataset",
+            revision=revision or "v3.0",
+            cache_dir=HF_LEROBOT_HUB_CACHE,
+            allow_patterns=["meta/*"] if meta else None,
         )
     except HFValidationError as error:
         raise UserError(f"dataset.repo_id={repo_id!r}: must look like user/name") from error

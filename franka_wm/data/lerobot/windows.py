@@ -296,7 +296,11 @@ class RecordedWindows:
 
     @property
     def reward_bounds(self) -> tuple[float, float] | None:
-        """The least and the largest reward in all of the data; ``None`` where there are none, or not all are finite."""
+        """The least and the largest reward in all of the data; ``None`` where there are none, or not all are finite.
+
+        The row behind an episode of this package holds 0, which counts: it widens no range of values, since that goes
+        as far to both sides as the bound that is farther from 0.
+        """
         rewards = self.recording.arrays.get("next.reward")
         if rewards is None:
             return None
