@@ -32,11 +32,11 @@ def steps(first: int, lengths: tuple[int, ...]) -> TensorDict:
     return TensorDict({"x": number, "action": number, "is_init": begins, "next": after}, [total, 1])
 
 
-def mixed(device: str, demonstrations: Demonstrations | None) -> Any:
+def mixed(device: str, demonstrations: Demonstrations | None, window: int = WINDOW) -> Any:
     replay = make_replay(
         capacity=200,
         num_envs=2,
-        window=WINDOW,
+        window=window,
         batch_size=BATCH,
         device=device,
         demonstrations=demonstrations,
@@ -59,7 +59,7 @@ def test_so_many_windows_are_demonstrations_and_they_are_marked(device: str) -> 
             batch = draw(replay)
             theirs = batch["x"][:, 0, 0] < 1000
             assert theirs.sum() == count
-            assert torch.equal(batch["demonstrated"][..., 0], theirs.unsqueeze(1).expand(-1, WINDOW))
+            assert torch.equal(batch["demonstrated"], theirs.view(-1, 1, 1).expand(-1, WINDOW, 1))
             assert torch.equal(batch["next", "x"], batch["x"] + 0.5)
             assert torch.equal(batch["action"], batch["x"]) and torch.equal(
                 batch["next", "reward"], -batch["x"]
@@ -93,16 +93,22 @@ def test_without_demonstrations_batches_are_as_before() -> None:
         assert torch.equal(plain[key], batch[key]), key
 
 
-def test_their_goals_in_hindsight_are_places_of_their_own_episode() -> None:
+@pytest.mark.parametrize("window", [1, 2, 3])
+def test_their_goals_in_hindsight_are_places_of_their_own_episode(window: int) -> None:
+    """Also after windows so short that they end with the first steps of all."""
+
     def relabel(batch: TensorDictBase, goal: torch.Tensor) -> TensorDict:
         return TensorDict({"action": goal.unsqueeze(1).expand_as(batch["action"])}, batch.batch_size)
 
     hindsight = Hindsight(relabel, achieved=("x", slice(0, 1)), reads=["x"], share=1.0, episode_length=5)
-    shown = Demonstrations(steps(0, LENGTHS), window=WINDOW, most=BATCH, hindsight=hindsight)
-    seen = set()
-    for _ in range(20):
-        batch = draw(mixed("cpu", shown))
-        for first, goal in zip(batch["x"][:, 0, 0].tolist(), batch["action"][:, 0, 0].tolist(), strict=True):
-            seen.add((int(first), goal))
-    ends = {0: 5, 1: 5, 2: 5, 5: 8, 8: 12, 9: 12}
-    assert seen == {(first, step + 0.5) for first, end in ends.items() for step in range(first + 2, end)}
+    shown = Demonstrations(steps(0, LENGTHS), window=window, most=BATCH, hindsight=hindsight)
+    replay, seen = mixed("cpu", shown, window), set()
+    for _ in range(40):
+        batch = draw(replay)
+        seen |= {*zip(batch["x"][:, 0, 0].tolist(), batch["action"][:, 0, 0].tolist(), strict=True)}
+    ends = {
+        first: end for begin, end in ((0, 5), (5, 8), (8, 12)) for first in range(begin, end - window + 1)
+    }
+    assert seen == {
+        (first, step + 0.5) for first, end in ends.items() for step in range(first + window - 1, end)
+    }

@@ -8,12 +8,14 @@ import threading
 from collections.abc import Callable
 from dataclasses import FrozenInstanceError
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
 import torch
 from safetensors.torch import load_file
+from tensordict import TensorDict
 from torch import Tensor, nn
 
 from franka_wm import processes
@@ -322,6 +324,50 @@ def test_parts_of_several_processes_are_one_checkpoint(
     monkeypatch.setattr("franka_wm.processes.rank", lambda: 2)
     own = own_experience(found, torch.device("cpu"))
     assert own is not None and torch.equal(own["state"], whole["state"][8:])
+
+
+@pytest.mark.parametrize("count", [1, 2, 3, 4])
+@pytest.mark.parametrize("saved", [1, 2, 3, 4])
+def test_any_number_of_processes_goes_on_with_the_worlds_of_any_other(
+    saved: int, count: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """All in their order, none twice; and nobody reads a part that only others need, which may be large."""
+    worlds, read = torch.arange(12), []
+    parts = [TensorDict({"x": x}, x.shape) for x in worlds.chunk(saved)]
+
+    def replay(device: torch.device, which: int | range) -> TensorDict:
+        read.append([which] if isinstance(which, int) else [*which])
+        return TensorDict.cat([parts[k] for k in read[-1]])
+
+    def moment(k: int) -> dict[str, Any]:
+        return {"worlds": {"state": {"x": parts[k]["x"]}, "carry": parts[k]["x"]}, "policies": k}
+
+    checkpoint: Any = SimpleNamespace(processes=saved, replay=replay, moment=moment)
+    monkeypatch.setattr(processes, "count", lambda: count)
+    for rank, mine in enumerate(worlds.chunk(count)):
+        monkeypatch.setattr(processes, "rank", lambda rank=rank: rank)
+        experience, stood = own_experience(checkpoint, torch.device("cpu")), own_moment(checkpoint)
+        assert experience is not None and torch.equal(experience["x"], mine)
+        assert read[-1] == sorted({int(x) // (12 // saved) for x in mine})
+        assert torch.equal(stood["worlds"]["state"]["x"], mine) and torch.equal(
+            stood["worlds"]["carry"], mine
+        )
+        assert stood.get("policies") == (rank if saved == count else None)  # drew for other worlds
+
+
+def test_another_number_of_processes_goes_on_with_the_first_ones_windows(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Recorded data have no worlds, and no experience of a run."""
+    checkpoint: Any = SimpleNamespace(
+        processes=3,
+        replay=lambda *_: None,
+        moment=lambda k: {"windows": f"a{k}", "validation": f"b{k}", "other": k},
+    )
+    monkeypatch.setattr(processes, "count", lambda: 2)
+    monkeypatch.setattr(processes, "rank", lambda: 1)
+    assert own_experience(checkpoint, torch.device("cpu")) is None
+    assert own_moment(checkpoint) == {"windows": "a0", "validation": "b0"}
 
 
 @pytest.mark.parametrize("lost", ["rng1.json", "moment1.safetensors", "replay1.safetensors", None])

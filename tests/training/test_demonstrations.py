@@ -183,6 +183,24 @@ def test_short_ones_are_refused_in_a_line(demos: Path, settled) -> None:
     assert "\n" not in str(refused.value)
 
 
+@pytest.mark.parametrize("shares", [(0.5, 0.0, 0), (0.25, 0.75, 0), (0.25, 0.5, 1)])
+def test_as_many_as_the_batch_that_asks_for_most_are_drawn(demos: Path, settled, shares) -> None:
+    """A replacement that is too small would leave windows out without a word."""
+    share, end, alone = shares
+    options = (f"replay.demo_share={share}", f"replay.demo_share_end={end}", f"replay.demo_updates={alone}")
+    run = settled("scale=smoke", *ARM, f"replay.demos={demos}", "trainer.updates=4", *options)
+    shown = open_demonstrations(run, Spaces.of_config(run.env.arm), None)
+    assert shown is not None and shown.most == max(run.demo_windows(update) for update in range(5))
+
+
+def test_observations_of_another_size_are_refused(demos: Path, settled) -> None:
+    run = settled("scale=smoke", *ARM, f"replay.demos={demos}")
+    spaces = Spaces.of_config(run.env.arm)
+    larger = {key: size + (key == "state") for key, size in spaces.observation_sizes.items()}
+    with pytest.raises(UserError, match="state has size 20 there, 21 in this environment"):
+        open_demonstrations(run, replace(spaces, observation_sizes=larger), None)
+
+
 def test_episodes_without_rewards_are_refused(demos: Path, settled, monkeypatch) -> None:
     from franka_wm.data.lerobot.windows import RecordedWindows
 

@@ -12,7 +12,7 @@ import torch
 from tensordict import TensorDict
 
 from franka_wm import processes
-from franka_wm.envs import FrankaEnv
+from franka_wm.envs import FrankaEnv, MultiTaskEnv
 from franka_wm.errors import UserError
 from franka_wm.seeding import derive_seed
 from franka_wm.training import build, moment, resume, storage_budget
@@ -214,6 +214,35 @@ def test_policies_that_drew_on_another_kind_of_device(make: Make, checkpoint, mo
     monkeypatch.setattr(resume, "go_on_drawing", lambda *_: False)
     restore(make(), checkpoint)
     assert said(capsys) == [OTHER_DEVICE]
+
+
+@pytest.mark.parametrize("device", [None, "cpu"])
+def test_worlds_of_several_tasks_go_on_where_they_stood(settled, tiny: list[str], device: str | None) -> None:
+    """Also of a checkpoint of an earlier version, which lacks a mark; the collector's root stays as it has it."""
+    dropped = [f"~env.tasks.{name}" for name in ("track", "lift", "pick", "stack", "drawer", "peg")]
+    arm = [one for one in tiny if not one.startswith(("env.", "collector."))]
+    run = settled(*arm, "env=multitask", *dropped, "collector.num_envs=4")
+    env = build.make_env(run)
+    assert isinstance(env, MultiTaskEnv)
+    action = torch.rand(3, 4, env.action_dim, generator=torch.Generator().manual_seed(0)) * 2 - 1
+
+    def go_on(root: Any) -> torch.Tensor:
+        steps = []
+        for one in action:
+            step, root = env.step_and_maybe_reset(root.clone().set("action", one))
+            steps.append(torch.cat((step["state"], step["next", "state"]), -1))
+        return torch.stack(steps)
+
+    carrier = env.rollout(2)[:, -1]["next"].exclude("reward")
+    collector: Any = SimpleNamespace(_carrier=carrier if device else carrier.clear_device_())
+    saved: Any = moment.worlds_now(env, collector)
+    assert saved["carry"].pop("overflow").shape == (4, 1)
+    before = go_on(collector._carrier)
+    collector._carrier = collector._carrier.clone().zero_()
+    moment.put_back(env, collector, saved)
+    assert collector._carrier.device == (torch.device(device) if device else None)
+    assert not collector._carrier["overflow"].any() and collector._carrier["task"].any()
+    assert torch.equal(go_on(collector._carrier), before)
 
 
 @pytest.mark.parametrize("held_out", [True, False])

@@ -21,6 +21,7 @@ from franka_wm.data.lerobot.schema import (
     TRUNCATED,
     episode_key,
 )
+from franka_wm.data.lerobot.stats import aggregate, episode_stats
 from franka_wm.errors import UserError
 
 WORLDS, STEPS, LENGTH = 5, 60, 8
@@ -177,3 +178,61 @@ def test_episodes_that_lost_contacts_are_left_out_and_counted(make_schema, steps
     del early["next", "done"], early["next", "truncated"]
     early["next", "terminated"] = torch.zeros_like(early["next", "terminated"])
     assert cut_replay(early, make_schema(), seed=4, episode_length=LENGTH)[2] == 2
+
+
+def plain_stats(values: np.ndarray) -> dict[str, np.ndarray]:
+    """Of (N, D), by numpy alone."""
+    quantiles = {"q01": 0.01, "q10": 0.1, "q50": 0.5, "q90": 0.9, "q99": 0.99}
+    found = {"min": values.min(0), "max": values.max(0), "mean": values.mean(0), "std": values.std(0)}
+    for name, q in quantiles.items():
+        found[name] = np.quantile(values, q, axis=0, method="inverted_cdf")
+    return found
+
+
+@pytest.mark.parametrize("length", [1, 2, 10, 37, 200])
+def test_statistics_of_an_episode_are_those_of_its_values(length: int) -> None:
+    """Without LeRobot's histograms; of images so few frames that all are looked at are compared."""
+    rng = np.random.default_rng(length)
+    columns = {
+        "vector": rng.normal(size=(length, 3)).astype(np.float32),
+        "number": rng.integers(-5, 5, (length,)),
+        "flag": rng.integers(0, 2, (length, 1)).astype(bool),
+        "bytes": rng.integers(0, 255, (length, 4)).astype(np.uint8),
+    }
+    stats = episode_stats(columns)
+    for name, array in columns.items():
+        wide = array.reshape(length, -1).astype(np.float64)
+        assert stats[name].pop("count").tolist() == [length]
+        for stat, value in plain_stats(wide).items():
+            np.testing.assert_allclose(
+                stats[name][stat], value, rtol=1e-5, atol=1e-6, err_msg=f"{name} {stat}"
+            )
+
+
+@pytest.mark.parametrize(("length", "frames"), [(1, 1), (3, 3), (100, 100), (900, 164)])
+def test_statistics_of_images_are_those_of_the_frames_that_are_looked_at(length: int, frames: int) -> None:
+    images = np.random.default_rng(0).integers(3, 251, (length, 4, 5, 3)).astype(np.uint8)
+    images[..., 1] //= 2
+    stats = episode_stats({"pixels": images})["pixels"]
+    chosen = images[np.round(np.linspace(0, length - 1, frames)).astype(int)]
+    assert stats.pop("count").tolist() == [frames]
+    for stat, value in plain_stats(chosen.reshape(-1, 3) / 255.0).items():
+        assert stats[stat].shape == (3, 1, 1)
+        np.testing.assert_allclose(stats[stat].ravel(), value, atol=1e-9, err_msg=stat)
+
+
+def test_statistics_of_episodes_together_are_those_of_all_values() -> None:
+    """But for quantiles, which are means of the episodes', weighted by their lengths."""
+    rng = np.random.default_rng(0)
+    episodes = [rng.normal(k, 1 + k, (n, 2)) for k, n in enumerate((5, 30, 12))]
+    pictures = [rng.integers(10 * k, 90 + k, (n, 2, 2, 3)).astype(np.uint8) for k, n in enumerate((2, 3, 4))]
+    stats = [episode_stats({"x": x, "pixels": y}) for x, y in zip(episodes, pictures, strict=True)]
+    for name, parts in (("x", episodes), ("pixels", [one.reshape(-1, 3) / 255.0 for one in pictures])):
+        found = aggregate(stats)[name]
+        counts = [int(one[name]["count"][0]) for one in stats]
+        assert found["count"].tolist() == [sum(counts)]
+        for stat, value in plain_stats(np.concatenate(parts)).items():
+            if stat.startswith("q"):
+                value = np.average([plain_stats(part)[stat] for part in parts], axis=0, weights=counts)
+            assert found[stat].shape == ((3, 1, 1) if name == "pixels" else (2,))
+            np.testing.assert_allclose(found[stat].ravel(), value, atol=1e-9, err_msg=f"{name} {stat}")
