@@ -15,8 +15,8 @@ import torch
 from tensordict import TensorDictBase
 from torchrl.data import LazyTensorStorage
 
-from franka_wm.envs.constants import LOST
 from franka_wm.errors import UserError
+from franka_wm.keys import LOST
 
 CHANNELS = 3
 """Channels of one image; stacks are of colours alone."""

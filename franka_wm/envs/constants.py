@@ -18,6 +18,3 @@ OBJECT_DIM = 13
 
 JOINT_DIM = 2
 """Numbers of each articulated body's joint: how far it is open [m or rad], and its speed [m/s or rad/s]."""
-
-LOST = "overflow"
-"""Key of the flag of a step in which contacts were lost, where there is a scene."""

@@ -11,9 +11,10 @@ import torch
 from torchrl.data import Binary, Bounded, Composite, Unbounded
 
 from franka_wm.envs.config import FrankaConfig
-from franka_wm.envs.constants import LOST, MOST_OPEN
+from franka_wm.envs.constants import MOST_OPEN
 from franka_wm.envs.kinematics import Kinematics
 from franka_wm.errors import UserError
+from franka_wm.keys import LOST
 
 MARKS = ("success", "is_init", LOST)
 """Flags among what a step gives, none of them an observation; the last one with a scene alone."""

@@ -13,8 +13,8 @@ from tensordict import TensorDictBase
 from franka_wm.console import say
 from franka_wm.envs import FrankaEnv
 from franka_wm.envs.camera import project, whole_arm
-from franka_wm.envs.constants import LOST
 from franka_wm.errors import UserError
+from franka_wm.keys import LOST
 from franka_wm.video import draw_marker, write_video
 
 

@@ -19,8 +19,8 @@ from franka_wm.data.lerobot.schema import (
     Schema,
     episode_key,
 )
-from franka_wm.envs.constants import LOST
 from franka_wm.errors import UserError
+from franka_wm.keys import LOST
 
 if TYPE_CHECKING:  # writing processes unpickle episodes, and need no torch
     import torch

@@ -1,0 +1,4 @@
+"""Keys of what steps hold, where several rooms read them and some of these may import nothing heavy."""
+
+LOST = "overflow"
+"""The flag of a step in which contacts were lost, where there is a scene."""
