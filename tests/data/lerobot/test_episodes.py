@@ -227,6 +227,8 @@ def test_statistics_of_episodes_together_are_those_of_all_values() -> None:
     episodes = [rng.normal(k, 1 + k, (n, 2)) for k, n in enumerate((5, 30, 12))]
     pictures = [rng.integers(10 * k, 90 + k, (n, 2, 2, 3)).astype(np.uint8) for k, n in enumerate((2, 3, 4))]
     stats = [episode_stats({"x": x, "pixels": y}) for x, y in zip(episodes, pictures, strict=True)]
+    alone = aggregate(stats[:1])["x"]
+    assert all(np.allclose(alone[stat], value) for stat, value in stats[0]["x"].items())
     for name, parts in (("x", episodes), ("pixels", [one.reshape(-1, 3) / 255.0 for one in pictures])):
         found = aggregate(stats)[name]
         counts = [int(one[name]["count"][0]) for one in stats]
