@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import io
+import os
 import shutil
 import time
+import warnings
 from collections.abc import Callable, Iterator
 
 import numpy as np
@@ -14,6 +16,7 @@ from PIL import Image
 pytest.importorskip("viser", reason="needs the extra view")
 webdriver = pytest.importorskip("selenium.webdriver", reason="needs selenium")
 
+from selenium.common.exceptions import TimeoutException  # noqa: E402
 from selenium.webdriver.chrome.service import Service  # noqa: E402
 from selenium.webdriver.common.action_chains import ActionChains  # noqa: E402
 from selenium.webdriver.common.actions.action_builder import ActionBuilder  # noqa: E402
@@ -50,25 +53,33 @@ def page(make_session) -> Iterator[Page]:
     page.close()
 
 
-def opened(page: Page, phone: tuple[int, int] | None = None):
-    """A browser that shows the page; of a phone's width and height [px] if given."""
+def started(address: str):
+    """A browser that has loaded the page."""
+    # Threads that wait for each other by turns never let go of a core under a realtime class, which some machines give.
+    os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
     options = webdriver.ChromeOptions()
     options.binary_location = CHROMIUM
     for flag in FLAGS:
         options.add_argument(f"--{flag}")
     options.set_capability("goog:loggingPrefs", {"browser": "ALL"})
-    if phone is not None:
-        metrics = {"width": phone[0], "height": phone[1], "pixelRatio": 2.0, "touch": True}
-        options.add_experimental_option("mobileEmulation", {"deviceMetrics": metrics})
     browser = webdriver.Chrome(options=options, service=Service(DRIVER))
     browser.set_page_load_timeout(60)
-    browser.get(page.address)
+    try:
+        browser.get(address)
+    except BaseException:
+        browser.quit()
+        raise
     return browser
 
 
 @pytest.fixture(scope="module")
 def browser(page: Page) -> Iterator:
-    browser = opened(page)
+    """The one browser of these tests: a second one that draws in software can starve two cores."""
+    try:
+        browser = started(page.address)
+    except TimeoutException as error:
+        warnings.warn(f"Chromium did not load the page and is started again: {error.msg}", stacklevel=1)
+        browser = started(page.address)
     wait(lambda: browser.find_elements(By.TAG_NAME, "canvas"), "no canvas")
     wait(lambda: page.server.get_clients(), "the page has not connected")
     wait(lambda: drawn(picture(browser)), "the arm was not drawn")
@@ -96,9 +107,9 @@ def drawn(shot: np.ndarray) -> bool:
     return bool(dark > 0.003 and spread > 10)
 
 
-def on_screen(page: Page, point: np.ndarray, client: int = 0) -> tuple[int, int]:
-    """Where a world point is in the window [px] of one of the page's clients, the oldest first."""
-    camera = page.server.get_clients()[sorted(page.server.get_clients())[client]].camera
+def on_screen(page: Page, point: np.ndarray) -> tuple[int, int]:
+    """Where a world point is in the window [px] of the page's newest client."""
+    camera = page.server.get_clients()[max(page.server.get_clients())].camera
     w, x, y, z = camera.wxyz
     rotation = np.array(
         [
@@ -201,32 +212,33 @@ def test_the_goal_has_its_colour_until_it_is_reached(page: Page, browser) -> Non
     wait(lambda: hue()[0] > hue()[2] + 40, f"the ball at {x}, {y} is not orange: {hue()}")
 
 
-@pytest.mark.parametrize("size", [(360, 640), (400, 860)])
+@pytest.fixture(params=[(360, 640), (400, 860)])
+def size(request, browser) -> Iterator[tuple[int, int]]:
+    """A phone's width and height [px], which the browser has meanwhile."""
+    width, height = request.param
+    metrics = {"width": width, "height": height, "deviceScaleFactor": 2.0, "mobile": True}
+    browser.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", metrics)
+    browser.execute_cdp_cmd("Emulation.setTouchEmulationEnabled", {"enabled": True})
+    yield width, height
+    browser.execute_cdp_cmd("Emulation.clearDeviceMetricsOverride", {})
+    browser.execute_cdp_cmd("Emulation.setTouchEmulationEnabled", {"enabled": False})
+
+
 def test_on_a_phone_the_arm_is_above_the_controls(page: Page, browser, size) -> None:
     """Links and goal of every pose within reach: stretched out to each side, up, and folded."""
     page.session.pause()
-    before = len(page.server.get_clients())
-    phone = opened(page, size)
-    try:
-        wait(lambda: len(page.server.get_clients()) > before, "the phone has not connected")
-        handle = "//*[text()='franka_wm']"
-        wait(lambda: phone.find_elements(By.XPATH, handle), "no controls")
-        top = phone.find_element(By.XPATH, handle).rect["y"]
-        assert 0.35 * size[1] < top < 0.6 * size[1], "the controls open over the lower part"
-        client = page.server.get_clients()[max(page.server.get_clients())]
-        wait(lambda: client.camera.look_at[2] < 0, "the camera was not moved")
-        ratio = client.camera.image_width / size[0]
-        for point in [
-            (0.75, 0, 0.3),
-            (0, 0.75, 0.3),
-            (0, -0.75, 0.3),
-            (0, 0, 1.15),
-            (0, 0, 0),
-            (-0.15, 0, 0),
-        ]:
-            x, y = (value / ratio for value in on_screen(page, np.array(point), -1))
-            assert 0 < x < size[0] and 0 < y < top, (
-                f"{point} m is at {x:.0f}, {y:.0f} px; controls from {top:.0f}"
-            )
-    finally:
-        phone.quit()
+    before = max(page.server.get_clients())
+    browser.refresh()
+    wait(lambda: max(page.server.get_clients(), default=before) > before, "the phone has not connected")
+    handle = "//*[text()='franka_wm']"
+    wait(lambda: browser.find_elements(By.XPATH, handle), "no controls")
+    top = browser.find_element(By.XPATH, handle).rect["y"]
+    assert 0.35 * size[1] < top < 0.6 * size[1], "the controls open over the lower part"
+    client = page.server.get_clients()[max(page.server.get_clients())]
+    wait(lambda: client.camera.look_at[2] < 0, "the camera was not moved")
+    ratio = client.camera.image_width / size[0]
+    for point in [(0.75, 0, 0.3), (0, 0.75, 0.3), (0, -0.75, 0.3), (0, 0, 1.15), (0, 0, 0), (-0.15, 0, 0)]:
+        x, y = (value / ratio for value in on_screen(page, np.array(point)))
+        assert 0 < x < size[0] and 0 < y < top, (
+            f"{point} m is at {x:.0f}, {y:.0f} px; controls from {top:.0f}"
+        )
