@@ -37,6 +37,18 @@ def compose(*arguments: str) -> DictConfig:
     return config
 
 
+def grown(gpus: int, *arguments: str) -> list[str]:
+    """Further arguments, by which each of so many GPUs has the worlds, batch and replay that one has with these."""
+    alone = compose(*arguments)
+    numbers = {
+        "collector.num_envs": alone.collector.num_envs,
+        "collector.planner_worlds": alone.collector.planner_worlds,
+        "replay.batch_size": alone.replay.batch_size,
+        "replay.capacity": alone.replay.capacity,
+    }
+    return [f"gpus={gpus}", *(f"{name}={value * gpus}" for name, value in numbers.items())]
+
+
 def synchronize() -> None:
     """Waits for the device, if there is one to wait for."""
     if torch.cuda.is_available():

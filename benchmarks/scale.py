@@ -23,7 +23,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from common import compose, publish
+from common import compose, grown, publish
 from cost_model import HOST, NETWORKS, Link, all_reduce, link, speed_up
 
 from franka_wm.training.checkpoint import latest_checkpoint, load_checkpoint
@@ -129,17 +129,9 @@ def training(arguments: list[str], gpus: int, updates: int) -> tuple[float, int,
     Returns:
         Updates per second, its batch, and the gradients of an update [MB].
     """
-    alone = compose(*arguments)
-    grown = {
-        "collector.num_envs": alone.collector.num_envs,
-        "collector.planner_worlds": alone.collector.planner_worlds,
-        "replay.batch_size": alone.replay.batch_size,
-        "replay.capacity": alone.replay.capacity,
-    }
     with tempfile.TemporaryDirectory() as folder:
         command = [sys.executable, str(ROOT / "train.py"), *arguments, *QUIET]
-        command += [f"{name}={value * gpus}" for name, value in grown.items()]
-        command += [f"gpus={gpus}", f"trainer.updates={updates}", f"hydra.run.dir={folder}/run"]
+        command += [*grown(gpus, *arguments), f"trainer.updates={updates}", f"hydra.run.dir={folder}/run"]
         done = subprocess.run(command, capture_output=True, text=True, cwd=ROOT)
         if done.returncode:
             raise SystemExit(f"{' '.join(command)}\n{done.stdout[-2000:]}\n{done.stderr[-4000:]}")
@@ -153,7 +145,7 @@ def training(arguments: list[str], gpus: int, updates: int) -> tuple[float, int,
         raise SystemExit(f"--updates {updates}: over before two rows were logged; make more")
     first, last = later[0], later[-1]
     rate = (last["updates"] - first["updates"]) / (last["time_s"] - first["time_s"])
-    return rate, grown["replay.batch_size"] * gpus, gradients
+    return rate, compose(*arguments).replay.batch_size * gpus, gradients
 
 
 def beyond(case: str, update: float, gradients: float, inside: Link) -> list[dict[str, Any]]:

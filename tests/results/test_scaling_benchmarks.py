@@ -1,0 +1,109 @@
+"""What the benchmarks of several GPUs ask for, and what they make of the answers; nothing is trained."""
+
+from __future__ import annotations
+
+import math
+import sys
+from importlib import import_module
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import pytest
+import torch
+
+from benchmarks.cost_model import HOST, NETWORKS, Link, all_reduce, speed_up
+
+TOP = Path(__file__).resolve().parents[2]
+
+
+@pytest.fixture
+def benchmark(monkeypatch: pytest.MonkeyPatch):
+    """A benchmark by name, whose table is kept in ``rows`` in the place of being printed."""
+
+    def load(name: str) -> tuple[ModuleType, list[dict[str, Any]]]:
+        monkeypatch.syspath_prepend(str(TOP / "benchmarks"))
+        module, rows = import_module(name), []
+        monkeypatch.setattr(module, "publish", lambda title, found, out, **kwargs: rows.extend(found))
+        return module, rows
+
+    return load
+
+
+def test_beyond_what_there_is_speaks_the_cost_model(benchmark) -> None:
+    scale, _ = benchmark("scale")
+    inside = Link(latency=1e-4, bandwidth=1e11)
+    rows = scale.beyond("LeWorldModel", 0.01, 20.0, inside)
+    assert [(row["GPUs"], row["network"]) for row in rows] == [
+        (HOST, "one host"),
+        *((gpus, network) for network in ("InfiniBand", "Ethernet") for gpus in (16, 64, 512)),
+    ]
+    for row in rows:
+        between = NETWORKS.get(row["network"])
+        large, small = (all_reduce(size, row["GPUs"], inside, between) for size in (20e6, 0.0))
+        assert row["gradients [ms]"] == pytest.approx(1e3 * large)
+        assert row["messages [ms]"] == pytest.approx(1e3 * (large + 7 * small))  # eight messages
+        assert row["predicted"] == pytest.approx(speed_up(row["GPUs"], 0.01, large + 7 * small))
+        assert tuple(row) == scale.COLUMNS
+
+
+def test_the_first_evaluation_that_is_good_enough_counts(benchmark) -> None:
+    sooner, _ = benchmark("sooner")
+    shares = [0.2, 0.96, 0.9, 1.0]
+    rows = [{"loss": 1.0, "time_s": 0.5, "updates": 1.0, "env_steps": 1.0}]
+    rows += [{sooner.SUCCESS: x, "time_s": 10.0 * k, "updates": 1.0} for k, x in enumerate(shares, 1)]
+    assert sooner.first(rows, 0.95)["time_s"] == 20.0
+    never = sooner.first(rows[:2], 0.95)
+    assert math.isnan(never["time_s"]) and never[sooner.SUCCESS] == 0.2
+    with pytest.raises(SystemExit, match="needs a planner"):
+        sooner.first(rows[:1], 0.95)
+
+
+def test_each_gpu_has_the_work_of_one_and_the_learning_rate_grows(benchmark, monkeypatch) -> None:
+    sooner, rows = benchmark("sooner")
+    asked = []
+
+    def learned(arguments: list[str], folder: Path) -> list[dict[str, float]]:
+        said = dict(word.split("=", 1) for word in arguments)  # of several the last counts
+        asked.append(said)
+        seconds = 60.0 / int(said["gpus"])
+        return [{sooner.SUCCESS: 1.0, "time_s": seconds, "updates": 10.0, "env_steps": 20.0}]
+
+    monkeypatch.setattr(sooner, "learned", learned)
+    words = ["env=lift", "replay.batch_size=100", "trainer.lr=1e-3", "--gpus", "1", "4", "--device", "cpu"]
+    monkeypatch.setattr(sys, "argv", ["sooner.py", *words, "--scale", "laptop"])
+    sooner.main()
+    one, four = asked
+    assert (one["gpus"], four["gpus"]) == ("1", "4")
+    for name in ("replay.batch_size", "collector.num_envs", "replay.capacity"):
+        assert int(four[name]) == 4 * int(one[name])
+    assert float(one["trainer.lr"]) == pytest.approx(1e-3)
+    assert float(four["trainer.lr"]) == pytest.approx(2e-3)
+    assert [row["times sooner"] for row in rows] == [1.0, 4.0]
+    assert [row["batch"] for row in rows] == [100, 400]
+
+
+@pytest.mark.parametrize("mps", [False, True])
+def test_a_sweep_is_timed_alone_at_once_and_on_every_gpu(benchmark, monkeypatch, mps: bool) -> None:
+    sweep, rows = benchmark("sweep")
+    asked, calls = [], []
+
+    def timed(arguments: list[str], runs: int, at_once: int, environment: dict[str, str]) -> float:
+        asked.append(
+            (runs, at_once, environment.get("CUDA_VISIBLE_DEVICES"), "CUDA_MPS_PIPE_DIRECTORY" in environment)
+        )
+        assert "device=spread" in arguments
+        return 60.0 * runs / at_once
+
+    monkeypatch.setattr(sweep, "sweep", timed)
+    monkeypatch.setattr(sweep.subprocess, "run", lambda command, **kwargs: calls.append(command))
+    monkeypatch.setattr(sweep.shutil, "which", lambda name: name if mps else None)
+    monkeypatch.setattr(torch.cuda, "device_count", lambda: 2)
+    monkeypatch.delenv("CUDA_VISIBLE_DEVICES", raising=False)
+    monkeypatch.setattr(sys, "argv", ["sweep.py"])
+    sweep.main()
+    shared = [(3, 3, "0", True)] if mps else []
+    assert asked[1:] == [(3, 1, "0", False), (3, 3, "0", False), *shared, (6, 6, None, mps)]
+    assert [row["times one after the other"] for row in rows] == [1.0, 3.0, *([3.0] if mps else []), 6.0]
+    begun, ended = [sweep.SERVICE, "-d"], [sweep.SERVICE]
+    assert calls == ([begun, ended] * 2 if mps else [])
