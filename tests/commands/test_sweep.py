@@ -224,6 +224,7 @@ def test_jobs_of_other_processes_are_looked_after_as_well(tmp_path: Path, launch
     logs = [(tmp_path / "sweep" / f"{k}-reach" / "train.log").read_text() for k in range(count)]
     assert "training broke" in logs[0] and all("results: " in log for log in logs[1:])
     if launcher == "joblib":
+        command[command.index("hydra.launcher.n_jobs=2")] = "hydra.launcher.n_jobs=1"  # in the fork itself
         again = train_in_fork(*command, cwd=tmp_path)
         assert again.returncode == 1 and "job 1 (trainer.lr=0.001) was finished before" in again.stdout
 
