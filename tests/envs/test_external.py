@@ -111,8 +111,6 @@ def test_processes_of_their_own_play_the_same_and_end(monkeypatch: pytest.Monkey
     assert env.step(env.rand_action(env.reset()))["action"].shape == (2, 1)
     assert said == []  # the learner keeps its own
     env.close()
-    # That one was spawned; forks need not load torch again.
-    monkeypatch.setattr("torchrl.envs.batched_envs._get_default_mp_start_method", lambda: "fork")
     config = ExternalConfig(kind="gym", name="CartPole-v1", episode_length=30)
     rollouts = []
     for workers in (0, 2):

@@ -368,7 +368,7 @@ def test_a_seed_that_is_given_decides_alone() -> None:
 @pytest.mark.slow
 def test_processes(plain) -> None:
     """Workers have episodes of their own; seeded, they are those of plain loops."""
-    env = ParallelEnv(2, lambda: TransformedEnv(make(seed=None), RewardSum()), mp_start_method="fork")
+    env = ParallelEnv(2, lambda: TransformedEnv(make(seed=None), RewardSum()))
     try:
         goal = env.reset()["goal"].clone()
         assert not torch.equal(goal[0], goal[1])
