@@ -224,6 +224,7 @@ def test_jobs_of_other_processes_are_looked_after_as_well(tmp_path: Path, launch
     logs = [(tmp_path / "sweep" / f"{k}-reach" / "train.log").read_text() for k in range(count)]
     assert "training broke" in logs[0] and all("results: " in log for log in logs[1:])
     if launcher == "joblib":
+        command[command.index("hydra.launcher.n_jobs=2")] = "hydra.launcher.n_jobs=1"  # in the fork itself
         again = train_in_fork(*command, cwd=tmp_path)
         assert again.returncode == 1 and "job 1 (trainer.lr=0.001) was finished before" in again.stdout
 
@@ -236,9 +237,10 @@ def test_a_search_goes_on_without_the_trial_that_fails(tmp_path: Path) -> None:
     command = ["hydra/sweeper=optuna", "hydra.sweeper.direction=maximize", "hydra.sweeper.n_jobs=1"]
     # Of this seed's trials the second alone breaks; the first and the third differ in the run's seed.
     command += ["hydra.sweeper.sampler.seed=21", "trainer.lr=choice(1e30,1e-3)", "seed=choice(0,1)"]
+    command += ["evaluation.during=[]"]
 
     def search(trials: int) -> subprocess.CompletedProcess[str]:
-        done = sweep(tmp_path, *command, f"hydra.sweeper.n_trials={trials}")
+        done = sweep(tmp_path, *command, *FEW, f"hydra.sweeper.n_trials={trials}")
         assert done.returncode == 1 and "Traceback" not in done.stderr, done.stderr
         last = done.stderr.strip().splitlines()[-1]
         assert last.startswith(f"error: 1 of {trials} jobs failed: job 1: training broke: "), last
@@ -260,7 +262,7 @@ def test_a_search_goes_on_without_the_trial_that_fails(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_jobs_of_several_processes_are_looked_after_as_well(tmp_path: Path) -> None:
-    done = sweep(tmp_path, BREAKS, "gpus=2")
+    done = sweep(tmp_path, BREAKS, "gpus=2", *FEW, "evaluation.during=[]")
     assert done.returncode == 1 and "Traceback" not in done.stderr, done.stderr
     assert "training broke" in done.stderr
     last = done.stderr.strip().splitlines()[-1]

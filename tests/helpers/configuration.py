@@ -40,6 +40,7 @@ def load_what_runs_load() -> None:
     """What each run imports, and computes of its code, before any forks."""
     for name in ("torch.utils.tensorboard", "matplotlib.backends.backend_agg", "mpl_toolkits.mplot3d"):
         importlib.import_module(name)
+    importlib.import_module("newton.solvers").SolverMuJoCo  # noqa: B018  what it needs is loaded when it is asked for
     names = [file.relative_to(source.ROOT).as_posix() for file in conf.FOLDER.parent.rglob("*.py")]
     for name, content in source.read([*names, "train.py"]).items():
         source.code_hash(name, content)

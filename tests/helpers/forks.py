@@ -19,6 +19,7 @@ import socket
 import subprocess
 import sys
 import tempfile
+import threading
 import time
 import traceback
 import warnings
@@ -258,6 +259,28 @@ def _torchrun(work: Callable[[], Any]) -> None:
     work()
 
 
+def torchrun(*arguments: str, hosts: int = 1) -> Callable[[], Any]:
+    """``torchrun ARGUMENT …`` as work for a fork, as are its processes; or the same at once on so many hosts.
+
+    Exit status: the first that is not 0.
+    """
+    return functools.partial(_hosts, torchrun_in_fork(module("torch.distributed.run", *arguments)), hosts)
+
+
+def _hosts(work: Callable[[], Any], count: int) -> None:
+    os.environ["TORCH_DISABLE_SHARE_RDZV_TCP_STORE"] = "1"
+    if count == 1:
+        return work()
+    forks = []
+    for _ in range(count):
+        pid = os.fork()
+        if pid == 0:
+            os._exit(_status(work))
+        forks.append(pid)
+    found = [os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1]) for pid in forks]
+    sys.exit(next(filter(None, found), 0))
+
+
 class _Rank(subprocess.Popen):
     """``PYTHON [-u] FILE …`` or ``PYTHON [-u] -m MODULE …`` in a session of its own, as a fork of this process."""
 
@@ -294,6 +317,7 @@ class _Rank(subprocess.Popen):
                 _script(Path(words[0]), words[1:])
 
         status = _status(all_of_it)
+        threading._shutdown()  # pyright: ignore[reportAttributeAccessIssue]  Python waits for threads at its end
         sys.stdout.flush()
         sys.stderr.flush()
         return status

@@ -5,30 +5,19 @@ from __future__ import annotations
 import os
 import signal
 import socket
-import subprocess
-import sys
 import time
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 import torch
 
+from forks import module, spare, torchrun, torchrun_in_fork
 from franka_wm.commands import several
 from franka_wm.commands.main import main
 from franka_wm.data.lerobot.schema import EPISODE_KEY, SEED
 
-ROOT = Path(__file__).resolve().parents[2]
 SMALL = ["env=reach", "env.substeps=1", "env.episode_length=6", "device=cpu", "num_envs=5", "seed=3"]
-
-
-def begin(out: Path, *words: str, before: tuple[str, ...] = ("-m", "franka_wm"), log: str = "log") -> Any:
-    """``franka-wm collect`` in the background; what it says is in ``OUT.LOG``."""
-    environment = {**os.environ, "OMP_NUM_THREADS": "1", "PYTHONPATH": str(ROOT)}
-    with out.with_suffix(f".{log}").open("w") as said:
-        command = [sys.executable, *before, "collect", f"out={out}", *SMALL, *words]
-        return subprocess.Popen(command, stdout=said, stderr=subprocess.STDOUT, env=environment)
 
 
 def episodes(root: Path) -> dict[tuple[int, ...], int]:
@@ -49,18 +38,15 @@ def test_the_dataset_is_that_of_one_process(tmp_path) -> None:
     with socket.socket() as one:
         one.bind(("localhost", 0))
         port = one.getsockname()[1]
-    nodes = ("-m", "torch.distributed.run", "--nnodes=2", "--nproc-per-node=1", "--local-addr=localhost")
+    nodes = ("--nnodes=2", "--nproc-per-node=1", "--local-addr=localhost")
     nodes = (*nodes, "--rdzv-backend=c10d", f"--rdzv-endpoint=localhost:{port}", "--rdzv-id=9")
-    jobs = [
-        begin(
-            tmp_path / "hosts", "episodes=8", "workers=0", before=(*nodes, "-m", "franka_wm"), log=f"log{k}"
-        )
-        for k in (0, 1)
-    ]
+    words = ("collect", f"out={tmp_path}/hosts", *SMALL, "episodes=8", "workers=0")
+    work = torchrun(*nodes, "-m", "franka_wm", *words, hosts=2)
+    spare().begin(work, tmp_path, tmp_path / "log")
     assert main(["collect", f"out={tmp_path}/one", "episodes=8", "workers=0", *SMALL]) == 0
-    codes = [job.wait(timeout=240) for job in jobs]
-    said = "".join((tmp_path / f"hosts.log{k}").read_text() for k in (0, 1))
-    assert codes == [0, 0], said
+    done = spare().end()
+    said = done.stdout + done.stderr
+    assert done.returncode == 0, said
     assert said.count("episodes 8/8") == said.count("dataset: ") == 1  # one speaks, of all
     alone, together = episodes(tmp_path / "one"), episodes(tmp_path / "hosts")
     assert sorted(seed[1:] for seed in alone) == [
@@ -80,22 +66,20 @@ def test_the_dataset_is_that_of_one_process(tmp_path) -> None:
 @pytest.mark.slow
 def test_a_killed_process_ends_the_others_and_leaves_no_dataset(tmp_path) -> None:
     out = tmp_path / "set"
-    job = begin(out, "episodes=100000", "gpus=2", "shard_frames=30", "workers=0")
+    words = ("collect", f"out={out}", *SMALL, "episodes=100000", "gpus=2", "shard_frames=30", "workers=0")
+    spare().begin(torchrun_in_fork(module("franka_wm", *words)), tmp_path, tmp_path / "log")
     shards = out.with_name("set.writing") / "shards"
     until = time.monotonic() + 120
     while len(list(shards.glob("shard-?????"))) < 2 and time.monotonic() < until:
         time.sleep(0.1)
-    [second] = [
-        int(place.parent.name)
-        for place in Path("/proc").glob("[0-9]*/environ")
-        if f"out={out}".encode() in (place.parent / "cmdline").read_bytes()
-        and b"\0RANK=1\0" in place.read_bytes()
-    ]
+    second = int((tmp_path / "rank1.pid").read_text())
     os.kill(second, signal.SIGKILL)
-    assert job.wait(timeout=60) == 1
-    said = out.with_suffix(".log").read_text()
+    killed = time.monotonic()
+    done = spare().end()
+    said = done.stdout + done.stderr
+    assert done.returncode == 1 and time.monotonic() < killed + 60, said
     assert f"process 1 of the run (pid {second}) was ended by SIGKILL" in said, said
-    assert "collect goes on with resume=true" in said.splitlines()[-1] and "Traceback" not in said
+    assert "collect goes on with resume=true" in done.stderr.splitlines()[-1] and "Traceback" not in said
     assert not out.exists()
     kept = len(list(shards.glob("shard-?????"))) * 5  # episodes of 6 steps
     assert main(["collect", f"out={out}", f"episodes={kept + 3}", "resume=true", "workers=0", *SMALL]) == 0

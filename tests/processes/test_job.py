@@ -21,7 +21,7 @@ import torch
 from safetensors.torch import load_file
 from tensordict import TensorDict
 
-from forks import TRAIN, job_in_fork, script, spare, torchrun_in_fork, train_in_fork
+from forks import TRAIN, job_in_fork, script, spare, torchrun, torchrun_in_fork, train_in_fork
 from franka_wm.console import quoted, resuming
 from franka_wm.envs import FrankaConfig, FrankaEnv
 from franka_wm.evaluation.protocol import evaluate_agent
@@ -32,39 +32,23 @@ SMOKE = [
     "env=reach", "scale=smoke", "device=cpu", "env.episode_length=12", "evaluation.episodes=4", "evaluation.during=[]",
     "evaluation.video_episodes=0", "logger=none",
 ]  # fmt: skip
-TORCHRUN = ["-m", "torch.distributed.run"]
 pytestmark = [pytest.mark.slow]
 
 
-def begin(
-    folder: Path,
-    *overrides: str,
-    before: tuple[str, ...] = (),
-    log: str = "log",
-    within: Path | None = None,
-) -> subprocess.Popen:
-    """A job in the background, within a folder; what it says is in ``FOLDER.log``."""
-    out = folder.with_suffix(f".{log}").open("w")
-    command = [sys.executable, *before, str(TRAIN), *SMOKE, *overrides]
-    command += [f"hydra.run.dir={quoted(str(folder))}"]
-    environment = {**os.environ, "OMP_NUM_THREADS": "1", "TORCH_DISABLE_SHARE_RDZV_TCP_STORE": "1"}
-    return subprocess.Popen(command, stdout=out, stderr=subprocess.STDOUT, env=environment, cwd=within)
-
-
-def finished(job: subprocess.Popen, folder: Path, *, status: int = 0, log: str = "log") -> str:
-    """What a job has said, when it has ended with this status."""
-    code = job.wait(timeout=240)
-    said = folder.with_suffix(f".{log}").read_text()
-    assert code == status, said
-    return said
-
-
 class Forks:
-    """``train.py gpus=2 …`` in a fork, as are the processes that it starts; one at a time."""
+    """``train.py gpus=2 …`` in a fork, as are the processes that it starts; one at a time.
 
-    def __init__(self, folder: Path, *overrides: str) -> None:
+    Args:
+        folder: Where it writes, in the working directory.
+        overrides: Options.
+        before: In place of `gpus=2`, torchrun's own options.
+        hosts: So many, at each of which torchrun is told the same.
+    """
+
+    def __init__(self, folder: Path, *overrides: str, before: tuple[str, ...] = (), hosts: int = 1) -> None:
         words = (*SMOKE, *overrides, f"hydra.run.dir={quoted(str(folder))}")
-        work = torchrun_in_fork(script(TRAIN, *words))
+        alone = torchrun_in_fork(script(TRAIN, *words))
+        work = torchrun(*before, str(TRAIN), *words, hosts=hosts) if before else alone
         self._place = folder.parent
         self.pid = spare().begin(work, self._place, folder.parent / "log")
 
@@ -78,22 +62,6 @@ class Forks:
         done = spare().end()
         assert done.returncode == status, done.stdout + done.stderr
         return done.stdout + done.stderr
-
-
-def workers(folder: Path) -> dict[int, int]:
-    """Rank -> process number of a job that writes into a folder."""
-    found = {}
-    for place in Path("/proc").glob("[0-9]*"):
-        try:
-            if f"hydra.run.dir={folder}".encode() in (place / "cmdline").read_bytes():
-                environment = dict(
-                    one.split(b"=", 1) for one in (place / "environ").read_bytes().split(b"\0") if b"=" in one
-                )
-                if b"RANK" in environment:
-                    found[int(environment[b"RANK"])] = int(place.name)
-        except OSError:  # it has ended
-            continue
-    return found
 
 
 def saved(folder: Path) -> None:
@@ -305,39 +273,44 @@ def test_a_killed_process_ends_the_others(tmp_path) -> None:
     run(tmp_path / "on", advice[1], f"trainer.updates={updates + 2}")
 
 
-def test_torchrun_starts_a_job_anew(tmp_path) -> None:
-    """Two agents as two hosts; after a process has died, all begin again from what was saved, as resumed by hand."""
-    folder, before, again = (tmp_path / name for name in ("anew", "before", "again"))
+def two_hosts() -> tuple[str, ...]:
+    """What torchrun is told on each."""
     with socket.socket() as one:
         one.bind(("localhost", 0))
         port = one.getsockname()[1]
-    meeting = ("--rdzv-backend=c10d", f"--rdzv-endpoint=localhost:{port}", "--rdzv-id=7", "--max-restarts=1")
-    nodes = (*TORCHRUN, "--nnodes=2", "--nproc-per-node=1", "--local-addr=localhost", *meeting)
-    updates = ("trainer.updates=400", "trainer.checkpoint_every=1")
-    jobs = [begin(folder, *updates, before=nodes, log=f"log{k}") for k in range(2)]
+    meeting = ("--rdzv-backend=c10d", f"--rdzv-endpoint=localhost:{port}", "--rdzv-id=7")
+    return ("--nnodes=2", "--nproc-per-node=1", "--local-addr=localhost", *meeting)
+
+
+def test_torchrun_starts_a_job_anew(tmp_path) -> None:
+    """Two agents as two hosts; after a process has died, all begin again from what was saved, as resumed by hand."""
+    folder, before, again = (tmp_path / name for name in ("anew", "before", "again"))
+    updates = ("trainer.updates=80", "trainer.checkpoint_every=0.2")
+    job = Forks(folder, *updates, before=(*two_hosts(), "--max-restarts=1"), hosts=2)
     saved(folder)
-    ended = workers(folder)
+    ended = job.workers()
     os.kill(ended[1], signal.SIGKILL)
-    while {*ended.values()} & {*workers(folder).values()}:
-        time.sleep(0.05)
-    shutil.copytree(folder, before)  # those that begin anew take seconds to load what they need
-    said = "".join(finished(job, folder, log=f"log{k}") for k, job in enumerate(jobs))
-    assert f"started anew: going on from {folder}" in said and "updates 400/400" in said
-    assert checkpoint(folder).counters["updates"] == 400
+    while any(Path(f"/proc/{pid}").exists() for pid in ended.values()):
+        time.sleep(0.02)
+    shutil.copytree(folder, before)  # those that begin anew take seconds to build their worlds
+    said = job.finished(0)
+    assert f"started anew: going on from {folder}" in said and "updates 80/80" in said
+    assert checkpoint(folder).counters["updates"] == 80
     left = checkpoint(before).counters["updates"]
-    assert 0 < left < 400
+    assert 0 < left < 80
     run(again, f"resume={before}")
     one, other = bits(folder), bits(again)
     assert [name for name in one if one[name] != other[name]] == []
 
 
-def test_torchrun_does_not_begin_a_stopped_job_again(tmp_path) -> None:
+def test_torchrun_does_not_begin_a_stopped_job_again(tmp_path, monkeypatch) -> None:
     folder = tmp_path / "stopped"
-    nodes = (*TORCHRUN, "--standalone", "--nproc-per-node=2", "--max-restarts=1")
-    job = begin(folder, "trainer.updates=100000", "trainer.checkpoint_every=1", before=nodes)
+    nodes = ("--standalone", "--nproc-per-node=2", "--max-restarts=1")
+    job = Forks(folder, "trainer.updates=100000", "trainer.checkpoint_every=1", before=nodes)
     saved(folder)
-    os.kill(workers(folder)[1], signal.SIGTERM)
-    said = finished(job, folder, status=1)
+    os.kill(job.workers()[1], signal.SIGTERM)
+    said = job.finished(1)
+    monkeypatch.chdir(tmp_path)  # as it was
     line = f"stopped; go on with: {resuming(folder, {})}"
     assert said.count(line) == 2  # when it stops, and when it is started anew
     assert re.search(rf"error: (process 1: )?{line}", said)
@@ -358,7 +331,7 @@ def test_an_exception_in_one_process_ends_all(tmp_path) -> None:
         "    update, Learner.update = Learner.update, broken\n"
     )
     folder = tmp_path / "run with spaces, [brackets]"
-    said = finished(begin(folder, "gpus=2", "plugins=[breaks]", within=tmp_path), folder, status=1)
+    said = Forks(folder, "gpus=2", "plugins=[breaks]").finished(1)
     assert "KeyError: 'of a plugin'" in said and (folder / "config.yaml").is_file()
 
 
@@ -382,13 +355,14 @@ def test_what_cannot_be_started_is_one_line(tmp_path, overrides, says) -> None:
 
 
 def test_other_options_in_another_process_are_refused(tmp_path) -> None:
-    with socket.socket() as one:
-        one.bind(("localhost", 0))
-        port = one.getsockname()[1]
-    nodes = (*TORCHRUN, "--nnodes=2", "--nproc-per-node=1", "--local-addr=localhost", "--rdzv-backend=c10d")
-    nodes = (*nodes, f"--rdzv-endpoint=localhost:{port}", "--rdzv-id=8")
-    folder = tmp_path / "two"
-    jobs = [begin(folder, f"seed={k}", before=nodes, log=f"log{k}") for k in range(2)]
+    """Of processes that torchrun starts from a shell, none of which is a fork."""
+    folder, jobs = tmp_path / "two", []
+    nodes = (sys.executable, "-m", "torch.distributed.run", *two_hosts(), str(TRAIN), *SMOKE)
+    environment = {**os.environ, "OMP_NUM_THREADS": "1", "TORCH_DISABLE_SHARE_RDZV_TCP_STORE": "1"}
+    for k in range(2):
+        with folder.with_suffix(f".log{k}").open("w") as out:
+            command = [*nodes, f"seed={k}", f"hydra.run.dir={folder}"]
+            jobs.append(subprocess.Popen(command, stdout=out, stderr=subprocess.STDOUT, env=environment))
     assert all(job.wait(timeout=240) for job in jobs)
     said = "".join(folder.with_suffix(f".log{k}").read_text() for k in range(2))
     assert "has options" in said and "start all of a job with the same command" in said

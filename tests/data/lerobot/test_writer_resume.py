@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
+import functools
 import json
 import os
+import pickle
 import random
 import shutil
 import signal
-import subprocess
-import sys
 import time
 from pathlib import Path
 from typing import Any
@@ -18,6 +18,7 @@ import pyarrow.parquet as pq
 import pytest
 
 from dataset_episodes import check_terminals, compare
+from forks import Fork
 from franka_wm.data.lerobot.merge import merge
 from franka_wm.data.lerobot.provenance import describe, read_provenance
 from franka_wm.data.lerobot.schema import EPISODE_KEY
@@ -256,36 +257,34 @@ def test_a_writing_process_that_dies_is_one_line(tmp_path, make_schema, make_epi
     compare(load(out), schema, episodes)
 
 
-KILLED = """
-import os, pickle, sys
-from franka_wm.data.lerobot.writer import DatasetWriter
-schema, episodes = pickle.load(open(sys.argv[1], "rb"))
-options = dict(provenance={"policy": "p"}, workers=2, shard_frames=21, resume=True)
-with DatasetWriter(sys.argv[2], schema, **options) as writer:
-    writer.start(wait=True)
-    print("ready", flush=True)
-    there = writer.keys()
-    writer.add(episode for episode in episodes if episode.key not in there)
-    writer.finish()
-"""
+def _write(given: Path, out: Path) -> None:
+    """What is killed, in a process group of its own."""
+    os.setsid()
+    schema, episodes = pickle.loads(given.read_bytes())
+    options: dict[str, Any] = {"workers": 2, "shard_frames": 21, "resume": True}
+    with DatasetWriter(out, schema, provenance={"policy": "p"}, **options) as writer:
+        writer.start(wait=True)
+        print("ready", flush=True)
+        there = writer.keys()
+        writer.add(episode for episode in episodes if episode.key not in there)
+        writer.finish()
 
 
 def _kill_and_go_on(tmp_path, schema, episodes, load, moments: list[float]) -> None:
-    import pickle
-
-    code, given = tmp_path / "run.py", tmp_path / "given.pkl"
-    code.write_text(KILLED)
+    given = tmp_path / "given.pkl"
     given.write_bytes(pickle.dumps((schema, episodes)))
     out, finished = tmp_path / "set", 0
     by_key = {episode.key: episode for episode in episodes}
-    for moment in moments:
-        with subprocess.Popen(
-            [sys.executable, str(code), str(given), str(out)], stdout=subprocess.PIPE, start_new_session=True
-        ) as process:
-            assert process.stdout is not None
-            process.stdout.readline()
-            time.sleep(moment)
-            os.killpg(process.pid, signal.SIGKILL) if moment < 0.5 else process.kill()
+    for number, moment in enumerate(moments):
+        work = functools.partial(_write, given, out)
+        process = Fork(work, tmp_path, tmp_path / f"log{number}")
+        ends = time.monotonic() + 60
+        while "ready" not in process.said()[0] and time.monotonic() < ends:
+            time.sleep(0.01)
+        time.sleep(moment)
+        os.killpg(process.pid, signal.SIGKILL) if moment < 0.5 else os.kill(process.pid, signal.SIGKILL)
+        status = process.wait(10).returncode
+        assert status == -signal.SIGKILL or out.exists(), process.said()
         if out.exists():  # it was done, and the kill met it while it removed its shards
             continue
         shards = sorted((tmp_path / "set.writing/shards").glob("shard-*[0-9]"))
