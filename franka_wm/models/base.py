@@ -18,6 +18,7 @@ ABILITIES: Mapping[str, tuple[str, ...]] = MappingProxyType(
     {
         "has_next": ("next",),
         "has_reward": ("reward",),
+        "has_arrival_reward": ("arrival_reward",),
         "has_value": ("value",),
         "has_policy": ("policy",),
         "has_goal": ("encode_goal",),
@@ -66,6 +67,7 @@ class WorldModel(nn.Module):
     # Abilities, see `ABILITIES`.
     has_next: bool = False
     has_reward: bool = False
+    has_arrival_reward: bool = False
     has_value: bool = False
     has_policy: bool = False
     has_goal: bool = False
@@ -126,6 +128,10 @@ class WorldModel(nn.Module):
     def reward(self, z: Tensor, action: Tensor) -> Tensor:
         """Expected reward (..., 1) of actions (..., A) in z (..., Z)."""
         raise self._lacks("reward")
+
+    def arrival_reward(self, z: Tensor) -> Tensor:
+        """Expected reward (..., 1) of the action that led to z (..., Z), where a reward depends on that alone."""
+        raise self._lacks("arrival_reward")
 
     def value(self, z: Tensor) -> Tensor:
         """Expected discounted return (..., 1) from z (..., Z)."""

@@ -209,7 +209,11 @@ class Dreamer(WorldModel):
 
     def reward(self, z: Tensor, action: Tensor) -> Tensor:
         """Expected reward (..., 1) of an action (..., action_dim) in z (..., latent_dim): that of the next z."""
-        return self.two_hot.decode(self.reward_head(self.next(z, action)))
+        return self.arrival_reward(self.next(z, action))
+
+    def arrival_reward(self, z: Tensor) -> Tensor:
+        """Expected reward (..., 1) of the action that led to z (..., latent_dim)."""
+        return self.two_hot.decode(self.reward_head(z))
 
     def value(self, z: Tensor) -> Tensor:
         """Expected discounted return (..., 1) of the policy from z (..., latent_dim)."""

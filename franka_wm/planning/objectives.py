@@ -68,11 +68,13 @@ class ReturnModel(Protocol):
     """What `RewardPlusValue.of` asks of a world model."""
 
     has_reward: bool
+    has_arrival_reward: bool
     has_value: bool
     terminates: bool
     discount: float
 
     def reward(self, z: Tensor, action: Tensor) -> Tensor: ...
+    def arrival_reward(self, z: Tensor) -> Tensor: ...
     def value(self, z: Tensor) -> Tensor: ...
     def terminated(self, z: Tensor) -> Tensor: ...
 
@@ -89,6 +91,8 @@ class RewardPlusValue(Objective):
         value: z (..., D) -> (..., 1).
         discount: γ per step.
         terminated: z (..., D) -> (..., 1) bool, whether an episode ends there; None: no episode terminates.
+        arrival_reward: z (..., D) -> (..., 1), the reward of the action that led to z; in place of `reward` where it is
+            given, which then need not predict once more what the action leads to.
 
     Raises:
         ValueError: `discount` outside [0, 1].
@@ -100,10 +104,12 @@ class RewardPlusValue(Objective):
         value: Callable[[Tensor], Tensor],
         discount: float,
         terminated: Callable[[Tensor], Tensor] | None = None,
+        arrival_reward: Callable[[Tensor], Tensor] | None = None,
     ) -> None:
         if not 0.0 <= discount <= 1.0:
             raise ValueError(f"discount must be in [0, 1], got {discount}")
         self.reward, self.value, self.discount, self.terminated = reward, value, discount, terminated
+        self.arrival_reward = arrival_reward
 
     @classmethod
     def of(cls, model: ReturnModel) -> RewardPlusValue:
@@ -116,21 +122,27 @@ class RewardPlusValue(Objective):
         lacking = [name for name, has in there.items() if not has]
         if lacking:
             raise ValueError(f"{type(model).__name__} has no {', '.join(lacking)}")
-        return cls(model.reward, model.value, model.discount, model.terminated if model.terminates else None)
+        ends = model.terminated if model.terminates else None
+        arrival = model.arrival_reward if model.has_arrival_reward else None
+        return cls(model.reward, model.value, model.discount, ends, arrival)
 
     def compiled(self) -> RewardPlusValue:
         """The same, with what it calls compiled by `torch.compile`."""
-        ends = self.terminated
+        ends, arrival = self.terminated, self.arrival_reward
         return RewardPlusValue(
             torch.compile(self.reward, dynamic=False),
             torch.compile(self.value, dynamic=False),
             self.discount,
             None if ends is None else torch.compile(ends, dynamic=False),
+            None if arrival is None else torch.compile(arrival, dynamic=False),
         )
 
     def __call__(self, trajectory: Tensor, actions: Tensor) -> Tensor:
         horizon = actions.shape[2]
-        rewards = self.reward(trajectory[:, :, :horizon], actions).squeeze(-1)  # (E, S, H), one call
+        if self.arrival_reward is None:
+            rewards = self.reward(trajectory[:, :, :horizon], actions).squeeze(-1)  # (E, S, H), one call
+        else:
+            rewards = self.arrival_reward(trajectory[:, :, 1:]).squeeze(-1)
         value = self.value(trajectory[:, :, horizon]).squeeze(-1)
         if self.terminated is not None:
             ended = self.terminated(trajectory[:, :, 1:]).squeeze(-1).cumsum(-1) > 0  # (E, S, H): by then

@@ -12,6 +12,7 @@ from franka_wm.models.returns import lambda_returns
 from franka_wm.models.rssm import divergence
 from franka_wm.models.vision import ConvDecoder
 from franka_wm.models.windows import window_of
+from franka_wm.planning import RewardPlusValue
 from franka_wm.training.learner import Learner
 from small_tdmpc2 import windows
 
@@ -124,6 +125,23 @@ def test_actions_stay_in_their_range_and_the_mode_is_the_mean():
 
 
 # -- gradients ----------------------------------------------------------------------------------------------
+
+
+def test_a_plan_asks_for_the_rewards_of_what_it_has_reached(monkeypatch):
+    """And does not predict once more what its actions lead to."""
+    model = randomise(small()).eval()
+    actions = torch.rand(1, 4, 3, 2) * 2 - 1
+    reached = [torch.zeros(1, 4, model.latent_dim)]
+    for action in actions.unbind(2):
+        reached.append(model.next(reached[-1], action))
+    trajectory = torch.stack(reached, 2)
+    expected = RewardPlusValue(model.reward, model.value, model.discount)(trajectory, actions)
+    objective = RewardPlusValue.of(model)
+    monkeypatch.setattr(model.rssm, "next", None)
+    torch.testing.assert_close(objective(trajectory, actions), expected)
+    assert expected.std() > 1e-3
+    assert objective.compiled().arrival_reward is not None
+
 
 PARTS = ("dynamics_coef", "representation_coef", "decoder_coef", "reward_coef", "replay_value_coef")
 
