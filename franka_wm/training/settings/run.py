@@ -352,7 +352,7 @@ class RunSettings:
 
     @property
     def updates_alone(self) -> int:
-        """So many updates at the start see the first random steps, or demonstrations, and nothing is gathered meanwhile."""
+        """So many updates at the start see the first steps, or demonstrations, and nothing is gathered meanwhile."""
         return max(self.collector.seed_updates, 0 if self.replay.demos is None else self.replay.demo_updates)
 
     def planned_steps(self, updates: int = 0) -> int:
