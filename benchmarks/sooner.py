@@ -1,7 +1,8 @@
 """How much sooner do several GPUs learn a task, where worlds and batches grow with them?
 
     python benchmarks/sooner.py env=push replay.demos=datasets/push          on 1, 2, … GPUs of this host
-    python benchmarks/sooner.py --share 0.9 --gpus 1 4 --learning-rate linear env=lift
+    python benchmarks/sooner.py env=lift --share 0.9 --gpus 1 4 --learning-rate linear
+    python benchmarks/sooner.py env=lift --share 0 --device cpu --scale smoke --every 10 --episodes 4
 
 Arguments beside the options are those of train.py for one GPU. While each job trains, its planner plays held-out
 episodes; *training [s]* is the time without these until the first evaluation in which the share of them that ends in
@@ -66,7 +67,10 @@ def main() -> None:
     args = parser.parse_args()
     there = torch.cuda.device_count() if args.device == "cuda" else 2
     arguments = [*args.arguments, f"scale={args.scale}", f"device={args.device}"]
-    rate = compose(*arguments).trainer.lr or compose(*arguments).model.lr
+    alone = compose(*arguments)
+    if args.every >= alone.trainer.updates:
+        parser.error(f"--every {args.every}: must be less than trainer.updates={alone.trainer.updates}")
+    rate = alone.trainer.lr or alone.model.lr
     rows: list[dict[str, Any]] = []
     for gpus in sorted(args.gpus or [n for n in (1, 2, 4, 8) if n <= there]):
         for seed in args.seeds:
@@ -77,6 +81,7 @@ def main() -> None:
             ]
             job += ["evaluation.during=[planner]", f"evaluation.every={args.every}"]
             job += [f"evaluation.episodes={args.episodes}", "evaluation.during_episodes=null"]
+            print(f"GPUs {gpus}, seed {seed} …", flush=True)
             with tempfile.TemporaryDirectory() as folder:
                 found = first(
                     learned([*job, "evaluation.video_episodes=0"], Path(folder) / "run"), args.share
@@ -86,7 +91,7 @@ def main() -> None:
                 {
                     "GPUs": gpus,
                     "seed": seed,
-                    "batch": compose(*arguments).replay.batch_size * gpus,
+                    "batch": alone.replay.batch_size * gpus,
                     "success [%]": 100 * found[SUCCESS],
                     "training [s]": found["time_s"],
                     "updates": found["updates"],

@@ -1,7 +1,8 @@
 """How many runs an hour does a sweep finish: one after the other on a GPU, several at once there, and on every GPU?
 
     python benchmarks/sweep.py                               of env=reach
-    python benchmarks/sweep.py --at-once 6 env=lift          six at once on a GPU, and six on each
+    python benchmarks/sweep.py env=lift --at-once 6          six at once on a GPU, and six on each
+    python benchmarks/sweep.py --device cpu --scale smoke --at-once 2
 
 Arguments beside the options are those of train.py. Times are of the whole command, starts and evaluations included.
 *MPS*: through NVIDIA's service by which processes compute at once on a GPU; without it they take turns. It is left out
@@ -23,7 +24,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from common import publish
+from common import compose, publish
 
 ROOT = Path(__file__).resolve().parents[1]
 SERVICE = "nvidia-cuda-mps-control"
@@ -77,28 +78,31 @@ def main() -> None:
     parser.add_argument("--out", help="JSON file")
     args = parser.parse_args()
     on_gpu, each = args.device == "cuda", args.at_once
+    if on_gpu and not torch.cuda.device_count():
+        parser.error("--device cuda: there is no GPU here; use --device cpu")
     arguments = [*args.arguments, f"scale={args.scale}", f"device={'spread' if on_gpu else 'cpu'}"]
-    gpus = torch.cuda.device_count() if on_gpu else 0
+    gpus = torch.cuda.device_count() if on_gpu else 1
     mps = on_gpu and shutil.which(SERVICE) is not None
     if on_gpu and not mps:
         print(f"no {SERVICE} here: processes on a GPU take turns")
     visible = os.environ.get("CUDA_VISIBLE_DEVICES") or ",".join(map(str, range(gpus)))
     alone = {"CUDA_VISIBLE_DEVICES": visible.split(",")[0]} if on_gpu else {}
-    short = [*arguments, "trainer.updates=100"]
-    sweep(short, 2, 2, alone)
+    print("filling caches by two short runs …", flush=True)
+    sweep([*arguments, f"trainer.updates={min(100, compose(*arguments).trainer.updates)}"], 2, 2, alone)
     # GPUs, runs, at once, MPS
     plan = [(1, each, 1, False), (1, each, each, False)]
     plan += [(1, each, each, True)] if mps else []
     plan += [(gpus, each * gpus, each * gpus, mps)] if gpus > 1 else []
     rows: list[dict[str, Any]] = []
     for number, runs, at_once, shared in plan:
+        print(f"{runs} runs, {at_once} at once on {number if on_gpu else 'no'} GPU …", flush=True)
         with service(shared) as places:
             took = sweep(arguments, runs, at_once, places | (alone if number == 1 else {}))
         hour = 3600 * runs / took
         first = rows[0]["runs/hour"] if rows else hour
         rows.append(
             {
-                "GPUs": number if on_gpu else 0,
+                "GPUs": number,
                 "runs": runs,
                 "at once": at_once,
                 "MPS": shared,

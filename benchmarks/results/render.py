@@ -381,7 +381,7 @@ def readme_tables(rows: Mapping[str, Row], place: Path = PLACE) -> str:
         nothing = _mean([DISTANCE.of(record, "noop") for record in records])
         found = [*took, f"{distance:.1f} cm", f"{worst:.0f} %", f"{nothing:.0f} cm"]
         arm.append([who, row.model, f"{where}, {runs}", *found])
-    parts = [LEGEND, ""] if arm or manipulation or others else []
+    parts = []
     if arm:
         titles = ["task", "model, planner", "machine", "training", "whole command", "final distance"]
         parts += [table([*titles, "within 5 cm, worst seed", "doing nothing"], arm), ""]
@@ -399,6 +399,8 @@ def readme_tables(rows: Mapping[str, Row], place: Path = PLACE) -> str:
             "*Wanted*: of the control suite the mean of three seeds that TD-MPC2's authors published.",
             "",
         ]
+    if parts:
+        parts += [LEGEND, ""]
     if speed:
         text = (
             "*Collector*: through TorchRL's, resets included. *raw*: Newton's physics, and images where there are "

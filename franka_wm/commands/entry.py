@@ -24,7 +24,7 @@ from franka_wm import conf
 from franka_wm.commands import several
 from franka_wm.commands.overrides import compose, explain, given
 from franka_wm.commands.sweep import Sweep, jobs, names
-from franka_wm.console import quoted, say, terminal_log
+from franka_wm.console import program, quoted, resuming, say, terminal_log
 from franka_wm.errors import REFUSALS, FrankaError, machine_refused
 from franka_wm.interrupt import INTERRUPTED
 
@@ -133,6 +133,8 @@ def _run(main: Callable[[], Any], arguments: list[str]) -> None:
 
         processes.leave()
     problem = None if _sweep is None else _sweep.outcome()
+    if _sweep is not None and _sweep.ran > 1:
+        say(f"its runs in a table: {program()} summary {quoted(_sweep.folder)}")
     if problem is not None:
         fail(problem)
 
@@ -232,7 +234,7 @@ def one_line_errors(main: Callable[[DictConfig], object]) -> Callable[[DictConfi
             _discard()
             raise
         except KeyboardInterrupt:
-            saved = "what was saved is in the run's folder: franka-wm train resume=FOLDER"
+            saved = f"go on from what was saved: {resuming(Path(HydraConfig.get().runtime.output_dir), {})}"
             print(f"stopped; {'nothing was saved yet' if _discard() else saved}", file=sys.stderr)
             sys.exit(INTERRUPTED)
 

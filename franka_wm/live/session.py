@@ -391,8 +391,8 @@ class Session:
     def _check_policy(self, name: str) -> None:
         refuse_old_name("policy", name)
         if name not in self.policies:
-            learned = name in ("planner", "policy")
-            hint = "; that one needs a checkpoint of a family that has it" if learned else ""
+            given = name in ("planner", "policy", "expert")
+            hint = "; that one needs a checkpoint of a family, or a task, that has it" if given else ""
             raise UserError(f"policy={name!r}: choose from {', '.join(self.policies)}{hint}")
 
     def _begin_episode(self) -> None:

@@ -10,6 +10,7 @@ from typing import Any, cast
 import torch
 from tensordict import TensorDictBase
 
+from franka_wm.console import say
 from franka_wm.envs import FrankaEnv, MultiTaskEnv
 from franka_wm.envs.camera import project, whole_arm
 from franka_wm.envs.multitask_config import MultiTaskConfig
@@ -66,6 +67,7 @@ def report_run(
         plot_learning_curves(drawn, folder / "curves.png", x=x, success_distance=mark)
     if settings.evaluation.video_episodes and arms:
         name = acting(policies)
+        say(f"filming the {policy_name(name)} …")
         frames = film(settings, folder, policies[name], name, found)
         if log_video is not None:
             log_video(f"eval/{name}", frames, _slow(next(iter(arms.values())).config.fps))

@@ -65,7 +65,7 @@ def import_plugins(names: object) -> None:
             importlib.import_module(name)
         except ModuleNotFoundError as error:
             raise UserError(
-                f"plugins: no module {error.name!r}; name modules as in `import`, from {Path.cwd()}"
+                f"plugins: no module {error.name!r} where Python looks, nor in {Path.cwd()}; name it as in `import`"
             ) from error
         except FrankaError:
             raise
@@ -281,7 +281,7 @@ def start(cfg: DictConfig) -> Run:
     say(f"device {device}   seed {settings.seed}   results in {folder}")
     if checkpoint is not None:
         done, wanted = int(checkpoint.counters.get("updates", 0)), settings.trainer.updates
-        nothing = f"; nothing is left to train until trainer.updates={wanted}" if done >= wanted else ""
+        nothing = f"; trainer.updates={wanted} are made, a larger number trains on" if done >= wanted else ""
         say(f"going on from update {done} of {checkpoint.folder}{nothing}")
     run = Run(settings, folder, checkpoint, open_loggers(settings, folder))
     if _begun is not None:

@@ -87,6 +87,8 @@ def test_what_training_has_begun_to_log_stays(refused: Refused, tmp_path: Path) 
 
     refused("hydra.run.dir=run", error=UserError("broke"), first=begin)
     assert (tmp_path / "run" / "train.log").is_file()
+    said = refused("hydra.run.dir=other", error=KeyboardInterrupt(), status=130, first=begin)
+    assert f"stopped; go on from what was saved: franka-wm train resume={tmp_path}/other\n" in said
 
 
 def test_a_file_of_the_users_stays(refused: Refused, tmp_path: Path) -> None:

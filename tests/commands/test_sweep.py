@@ -71,6 +71,7 @@ def test_a_job_that_fails_does_not_end_the_others(swept) -> None:
     assert first.startswith("error: job 0 (trainer.lr=1e+30): training broke: ")
     assert last.startswith("error: 1 of 2 jobs failed: job 0 (trainer.lr=1e+30): training broke: ")
     assert last.endswith(f"the same command with hydra.sweep.dir={place}/sweep runs what is missing")
+    assert f"its runs in a table: franka-wm summary {place}/sweep" in done.stdout
     assert (place / "sweep/1-reach/finished.json").is_file()
     logs = [(place / "sweep" / job / "train.log").read_text() for job in ("0-reach", "1-reach")]
     assert first in logs[0] and "training broke" not in logs[1]
@@ -89,6 +90,7 @@ def test_the_same_sweep_again_runs_what_is_missing(swept) -> None:
     assert done.returncode == 1 and "error: 1 of 2 jobs failed: job 0" in done.stderr
     assert (job / "finished.json").is_file()
     assert load_checkpoint(latest_checkpoint(job)).config["resume"] == str(job)
+    assert "are made, a larger number trains on" in (job / "train.log").read_text()
     weights = state(job / "checkpoints")
     done = sweep(place, BREAKS)
     assert f"job 1 (trainer.lr=0.001) was finished before: {job}" in done.stdout, done.stdout + done.stderr

@@ -55,7 +55,7 @@ def test_the_table_is_the_curves_last_point(
         assert drawn[0, "policy"][0] == [50] and logged == []
 
 
-def test_the_video_shows_the_worst_episodes_again(settled, tmp_path: Path, monkeypatch) -> None:
+def test_the_video_shows_the_worst_episodes_again(settled, tmp_path: Path, monkeypatch, capsys) -> None:
     """Of a policy that draws: the same poses and the same draws, so the same ends."""
     few = ("env.substeps=1", "env.episode_length=6", "evaluation.episodes=5", "evaluation.video_episodes=2")
     cfg = settled("scale=smoke", "device=cpu", *few)
@@ -66,6 +66,7 @@ def test_the_video_shows_the_worst_episodes_again(settled, tmp_path: Path, monke
     said: list[str] = []
     monkeypatch.setattr(end_of_run, "draw_labels", lambda frames, lines: said.extend(lines) or frames)
     report_run(cfg, tmp_path, env, policies, results, rows=[])
+    assert "filming the policy …" in capsys.readouterr().out
     distances = results.episodes["policy"]["final_distance"]
     order = distances.argsort(descending=True)[:2].tolist()
     assert said == [f"policy, {100 * float(distances[k]):.1f} cm, no success, episode {k + 1}" for k in order]

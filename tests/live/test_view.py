@@ -117,6 +117,7 @@ def test_bad_worlds_policies_and_checkpoints_are_one_line(
     for arguments, said in (
         (["env.arms=2"], "unknown environment option 'arms'"),
         (["policy=policy"], "policy='policy': choose from planner, ik, random, noop; that one needs"),
+        (["policy=expert"], "policy='expert': choose from planner, ik, random, noop; that one needs"),
         ([f"checkpoint={tmp_path}"], str(tmp_path)),
     ):
         assert cli.main(["view", *CHEAP, "seconds=1", *arguments]) == 1

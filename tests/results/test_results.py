@@ -172,7 +172,7 @@ def test_the_page_tells_mean_worst_and_what_was_wanted(measured) -> None:
         "| One fixed goal | TD-MPC2, MPPI | Two CPU cores, 2 seeds | 30 s | 0.7 min | 2.0 cm | 80 % | 25 cm |"
     )
     assert line in readme
-    assert "| training | whole command |" in readme and readme.startswith(render.LEGEND)
+    assert "| training | whole command |" in readme and readme.index(line) < readme.index(render.LEGEND)
     assert "and the evaluation of each policy on 128 episodes, without a film." in readme
     assert "missed: ≤ 1.5 cm" in overview({"reach": ROW}, place)
 

@@ -137,7 +137,9 @@ def _check_dataset(root: Path) -> None:
     """Raises ``UserError`` unless it is a LeRobot dataset of the version that is published, with episodes."""
     path = root / "meta" / "info.json"
     if not path.is_file():
-        raise UserError(f"publish: root={root} is not a LeRobot dataset (no meta/info.json)")
+        raise UserError(
+            f"publish: root={root} is not a LeRobot dataset (no meta/info.json); franka-wm collect out=FOLDER makes one"
+        )
     info = linked_json(path)
     kinds = {"codebase_version": str, "total_episodes": int, "total_frames": int, "fps": int | float}
     kinds |= {"features": dict, "data_path": str}

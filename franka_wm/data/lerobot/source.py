@@ -134,7 +134,7 @@ def read_source(root: str | Path) -> Source:
     root = Path(root).expanduser()
     info_path = root / "meta" / "info.json"
     if not root.is_dir():
-        raise UserError(f"dataset.root={root}: no such folder")
+        raise UserError(f"dataset.root={root}: no such folder; franka-wm collect out=FOLDER makes one")
     if not info_path.is_file():
         raise UserError(
             f"dataset.root={root}: no LeRobot dataset, meta/info.json is missing; give the folder that holds meta/"
