@@ -62,6 +62,12 @@ def pytest_configure(config: pytest.Config) -> None:
         absl_logging.get_absl_handler().python_handler.stream = sys.__stderr__
 
 
+def pytest_runtest_teardown() -> None:
+    """LeRobot's video encoder, run by root, leaves whoever called it realtime; what is started later would be, too."""
+    if hasattr(os, "SCHED_FIFO") and os.sched_getscheduler(0) == os.SCHED_FIFO:
+        os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
+
+
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Long files first; otherwise as they are found."""
     place = {name: k for k, name in enumerate(LONG)}

@@ -91,8 +91,7 @@ class RewardPlusValue(Objective):
         value: z (..., D) -> (..., 1).
         discount: γ per step.
         terminated: z (..., D) -> (..., 1) bool, whether an episode ends there; None: no episode terminates.
-        arrival_reward: z (..., D) -> (..., 1), the reward of the action that led to z; in place of `reward` where it is
-            given, which then need not predict once more what the action leads to.
+        arrival_reward: z (..., D) -> (..., 1), the reward of the action that led to z; asked in place of `reward`.
 
     Raises:
         ValueError: `discount` outside [0, 1].
@@ -424,8 +423,7 @@ class Smoothness(_OfActions):
                 action belongs to another episode and does not count.
         """
         bound = Smoothness(self.weight, self.masked)
-        last = tensordict.get("action", None)
-        if last is not None:
+        if (last := tensordict.get("action", None)) is not None:
             is_init = tensordict.get("is_init", None)
             acted = torch.ones_like(last[..., :1]) if is_init is None else (~is_init).to(last.dtype)
             # What lies in a fresh buffer may not be finite, and 0 · nan is nan.

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import io
-import os
 import shutil
 import time
 import warnings
@@ -55,8 +54,6 @@ def page(make_session) -> Iterator[Page]:
 
 def started(address: str):
     """A browser that has loaded the page."""
-    # Threads that wait for each other by turns never let go of a core under a realtime class, which some machines give.
-    os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
     options = webdriver.ChromeOptions()
     options.binary_location = CHROMIUM
     for flag in FLAGS:

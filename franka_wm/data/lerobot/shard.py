@@ -9,6 +9,7 @@ file with what LeRobot's recorder makes of the same episodes.
 from __future__ import annotations
 
 import json
+import os
 from collections.abc import Sequence
 from dataclasses import dataclass
 from fractions import Fraction
@@ -29,6 +30,9 @@ DATA_PATH = f"data/{_FILE}.parquet"
 VIDEO_PATH = f"videos/{{video_key}}/{_FILE}.mp4"
 EPISODES_PATH = f"meta/episodes/{_FILE}.parquet"
 TASKS_PATH, INFO_PATH, STATS_PATH = "meta/tasks.parquet", "meta/info.json", "meta/stats.json"
+
+TASKS = Path("/proc/self/task")
+"""Where Linux lists the threads of this process."""
 
 
 def check_episode(schema: Schema, episode: Episode) -> None:
@@ -314,6 +318,11 @@ def encode_video(path: Path, images: Sequence[np.ndarray], schema: Schema) -> No
         stream: Any = container.add_stream(encoder.codec, schema.fps, options=dict(encoder.options))
         stream.pix_fmt, stream.width, stream.height = encoder.pix_fmt, width, height
         stream.time_base = Fraction(1, schema.fps)
+        before = _realtime_threads()
+        stream.codec_context.open(strict=False)
+        # SVT-AV1, run by root, makes its threads and the one that calls it realtime: all else would stand still.
+        for thread in _realtime_threads() - before:
+            os.sched_setscheduler(thread, os.SCHED_OTHER, os.sched_param(0))
         time = 0
         for episode in images:
             for image in episode:
@@ -322,6 +331,14 @@ def encode_video(path: Path, images: Sequence[np.ndarray], schema: Schema) -> No
                 container.mux(stream.encode(frame))
                 time += 1
         container.mux(stream.encode())
+
+
+def _realtime_threads() -> set[int]:
+    """Threads of this process that run before all others until they wait; none where that is not known."""
+    if not hasattr(os, "SCHED_FIFO") or not TASKS.is_dir():
+        return set()
+    threads = {int(one.name) for one in TASKS.iterdir()}
+    return {one for one in threads if os.sched_getscheduler(one) == os.SCHED_FIFO}
 
 
 def check_video(path: Path, frames: int, fps: int) -> None:

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import json
+import os
 import random
 import shutil
+from fractions import Fraction
 
 import numpy as np
 import pyarrow.parquet as pq
@@ -315,6 +317,23 @@ def test_a_video_that_lost_frames_is_noticed(tmp_path, monkeypatch, make_schema,
     schema = make_schema("video_near_lossless")
     with pytest.raises(UserError, match="14 frames were written, 13 can be read"):
         write_shard(tmp_path / "shard", schema, [make_episode(schema, i, 7) for i in range(2)])
+
+
+@pytest.mark.skipif(
+    not hasattr(os, "geteuid") or os.geteuid() != 0, reason="the encoder asks for it as root alone"
+)
+def test_an_encoder_does_not_run_before_all_others(tmp_path, monkeypatch, make_schema, make_episode) -> None:
+    """SVT-AV1 would: it makes its threads, and the one that calls it, realtime."""
+    from franka_wm.data.lerobot import shard
+
+    seen = []
+    monkeypatch.setattr(
+        shard, "Fraction", lambda *of: seen.append(shard._realtime_threads()) or Fraction(*of)
+    )
+    schema = make_schema("video", size=64)
+    write_shard(tmp_path / "shard", schema, [make_episode(schema, 0, 5)])
+    assert len(seen) > 5 and not any(seen)
+    assert os.sched_getscheduler(0) == os.SCHED_OTHER
 
 
 def test_a_merge_that_goes_wrong_is_noticed(tmp_path, monkeypatch, make_schema, make_episode, write) -> None:
