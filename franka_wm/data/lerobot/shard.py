@@ -11,6 +11,7 @@ from __future__ import annotations
 import json
 import os
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from fractions import Fraction
 from pathlib import Path
@@ -322,7 +323,8 @@ def encode_video(path: Path, images: Sequence[np.ndarray], schema: Schema) -> No
         stream.codec_context.open(strict=False)
         # SVT-AV1, run by root, makes its threads and the one that calls it realtime: all else would stand still.
         for thread in _realtime_threads() - before:
-            os.sched_setscheduler(thread, os.SCHED_OTHER, os.sched_param(0))
+            with suppress(ProcessLookupError):  # it has ended
+                os.sched_setscheduler(thread, os.SCHED_OTHER, os.sched_param(0))
         time = 0
         for episode in images:
             for image in episode:
@@ -337,8 +339,12 @@ def _realtime_threads() -> set[int]:
     """Threads of this process that run before all others until they wait; none where that is not known."""
     if not hasattr(os, "SCHED_FIFO") or not TASKS.is_dir():
         return set()
-    threads = {int(one.name) for one in TASKS.iterdir()}
-    return {one for one in threads if os.sched_getscheduler(one) == os.SCHED_FIFO}
+    found = set()
+    for thread in (int(one.name) for one in TASKS.iterdir()):
+        with suppress(ProcessLookupError):
+            if os.sched_getscheduler(thread) == os.SCHED_FIFO:
+                found.add(thread)
+    return found
 
 
 def check_video(path: Path, frames: int, fps: int) -> None:
