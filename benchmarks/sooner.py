@@ -1,12 +1,13 @@
 """How much sooner do several GPUs learn a task, where worlds and batches grow with them?
 
-    python benchmarks/sooner.py env=push replay.demos=datasets/push          on 1, 2, … GPUs of this host
+    python benchmarks/sooner.py experiment=demonstrations env=push replay.demos=datasets/push
     python benchmarks/sooner.py env=lift --share 0.9 --gpus 1 4 --learning-rate linear
     python benchmarks/sooner.py env=lift --share 0 --device cpu --scale smoke --every 10 --episodes 4
 
 Arguments beside the options are those of train.py for one GPU. While each job trains, its planner plays held-out
 episodes; *training [s]* is the time without these until the first evaluation in which the share of them that ends in
-success reaches --share, *updates* those until then. A job that never reaches it has its best share and no time.
+success reaches --share, *updates* those until then. The last evaluation is --every updates before the end. A job that
+never reaches the share has its best one and no time.
 """
 
 from __future__ import annotations
@@ -66,6 +67,8 @@ def main() -> None:
     parser.add_argument("--out", help="JSON file")
     args = parser.parse_args()
     there = torch.cuda.device_count() if args.device == "cuda" else 2
+    if not there:
+        parser.error("--device cuda: there is no GPU here; use --device cpu")
     arguments = [*args.arguments, f"scale={args.scale}", f"device={args.device}"]
     alone = compose(*arguments)
     if args.every >= alone.trainer.updates:

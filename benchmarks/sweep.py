@@ -5,8 +5,9 @@
     python benchmarks/sweep.py --device cpu --scale smoke --at-once 2
 
 Arguments beside the options are those of train.py. Times are of the whole command, starts and evaluations included.
-*MPS*: through NVIDIA's service by which processes compute at once on a GPU; without it they take turns. It is left out
-where there is none. A short run of each kind before fills the caches.
+One after the other they share a process, which imports once; several at once have one each (the extra joblib). *MPS*:
+through NVIDIA's service by which processes compute at once on a GPU, started here; without it they take turns. It is
+left out where there is none. Two short runs before fill the caches.
 """
 
 from __future__ import annotations
@@ -88,7 +89,8 @@ def main() -> None:
     visible = os.environ.get("CUDA_VISIBLE_DEVICES") or ",".join(map(str, range(gpus)))
     alone = {"CUDA_VISIBLE_DEVICES": visible.split(",")[0]} if on_gpu else {}
     print("filling caches by two short runs …", flush=True)
-    sweep([*arguments, f"trainer.updates={min(100, compose(*arguments).trainer.updates)}"], 2, 2, alone)
+    short = min(100, compose(*arguments).trainer.updates)
+    sweep([*arguments, f"trainer.updates={short}", "replay.demo_updates=0"], 2, 2, alone)
     # GPUs, runs, at once, MPS
     plan = [(1, each, 1, False), (1, each, each, False)]
     plan += [(1, each, each, True)] if mps else []

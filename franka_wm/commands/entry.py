@@ -6,12 +6,13 @@ import functools
 import gc
 import math
 import os
+import shlex
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, nullcontext
 from itertools import islice
 from pathlib import Path
-from typing import Any, NoReturn, TextIO
+from typing import Any, NoReturn, TextIO, cast
 
 from hydra.core.hydra_config import HydraConfig
 from hydra.core.override_parser.overrides_parser import OverridesParser
@@ -133,8 +134,12 @@ def _run(main: Callable[[], Any], arguments: list[str]) -> None:
 
         processes.leave()
     problem = None if _sweep is None else _sweep.outcome()
-    if _sweep is not None and _sweep.ran > 1:
-        say(f"its runs in a table: {program()} summary {quoted(_sweep.folder)}")
+    if (
+        _sweep is not None
+        and len(_sweep.failed) < _sweep.ran
+        and Path(_sweep.folder, "multirun.yaml").is_file()
+    ):
+        say(f"its runs in a table: {program()} summary {shlex.quote(_sweep.folder)}")
     if problem is not None:
         fail(problem)
 
@@ -234,7 +239,11 @@ def one_line_errors(main: Callable[[DictConfig], object]) -> Callable[[DictConfi
             _discard()
             raise
         except KeyboardInterrupt:
-            saved = f"go on from what was saved: {resuming(Path(HydraConfig.get().runtime.output_dir), {})}"
+            folder = Path(HydraConfig.get().runtime.output_dir)
+            values = cast(dict[str, object], OmegaConf.to_container(cfg))
+            saved = f"what was written is in {folder}"
+            if (folder / "checkpoints" / "latest").exists():
+                saved = f"go on from what was saved: {resuming(folder, values)}"
             print(f"stopped; {'nothing was saved yet' if _discard() else saved}", file=sys.stderr)
             sys.exit(INTERRUPTED)
 

@@ -65,7 +65,7 @@ def import_plugins(names: object) -> None:
             importlib.import_module(name)
         except ModuleNotFoundError as error:
             raise UserError(
-                f"plugins: no module {error.name!r} where Python looks, nor in {Path.cwd()}; name it as in `import`"
+                f"plugins: no module {error.name!r}, looked for in {Path.cwd()}, too; name modules as in `import`"
             ) from error
         except FrankaError:
             raise

@@ -87,8 +87,22 @@ def test_what_training_has_begun_to_log_stays(refused: Refused, tmp_path: Path) 
 
     refused("hydra.run.dir=run", error=UserError("broke"), first=begin)
     assert (tmp_path / "run" / "train.log").is_file()
-    said = refused("hydra.run.dir=other", error=KeyboardInterrupt(), status=130, first=begin)
-    assert f"stopped; go on from what was saved: franka-wm train resume={tmp_path}/other\n" in said
+
+
+@pytest.mark.parametrize("saved", [False, True])
+def test_what_is_stopped_says_what_there_is(saved: bool, refused: Refused, tmp_path: Path) -> None:
+    """Under Ctrl-C, with a module of one's own that going on needs, too."""
+
+    def begin(folder: Path) -> None:
+        Run.keep(None)  # type: ignore[arg-type]
+        if saved:
+            (folder / "checkpoints" / "latest").mkdir(parents=True)
+
+    (tmp_path / "mine.py").touch()
+    words = ("hydra.run.dir=run", "plugins=[mine]")
+    said = refused(*words, error=KeyboardInterrupt(), status=130, first=begin)
+    on = f"go on from what was saved: franka-wm train resume={tmp_path}/run 'plugins=[mine]'"
+    assert f"stopped; {on if saved else f'what was written is in {tmp_path}/run'}\n" in said
 
 
 def test_a_file_of_the_users_stays(refused: Refused, tmp_path: Path) -> None:

@@ -32,7 +32,7 @@ VIDEO_PATH = f"videos/{{video_key}}/{_FILE}.mp4"
 EPISODES_PATH = f"meta/episodes/{_FILE}.parquet"
 TASKS_PATH, INFO_PATH, STATS_PATH = "meta/tasks.parquet", "meta/info.json", "meta/stats.json"
 
-TASKS = Path("/proc/self/task")
+THREADS = Path("/proc/self/task")
 """Where Linux lists the threads of this process."""
 
 
@@ -337,10 +337,10 @@ def encode_video(path: Path, images: Sequence[np.ndarray], schema: Schema) -> No
 
 def _realtime_threads() -> set[int]:
     """Threads of this process that run before all others until they wait; none where that is not known."""
-    if not hasattr(os, "SCHED_FIFO") or not TASKS.is_dir():
+    if not hasattr(os, "sched_getscheduler") or not THREADS.is_dir():
         return set()
     found = set()
-    for thread in (int(one.name) for one in TASKS.iterdir()):
+    for thread in (int(one.name) for one in THREADS.iterdir()):
         with suppress(ProcessLookupError):
             if os.sched_getscheduler(thread) == os.SCHED_FIFO:
                 found.add(thread)
