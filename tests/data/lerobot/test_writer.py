@@ -326,12 +326,13 @@ def test_an_encoder_does_not_run_before_all_others(tmp_path, monkeypatch, make_s
     """SVT-AV1 would: it makes its threads, and the one that calls it, realtime."""
     from franka_wm.data.lerobot import shard
 
-    seen = []
-    monkeypatch.setattr(
-        shard, "Fraction", lambda *of: seen.append(shard._realtime_threads()) or Fraction(*of)
-    )
+    seen, asked, realtime = [], [], shard._realtime_threads
+    monkeypatch.setattr(shard, "Fraction", lambda *of: seen.append(realtime()) or Fraction(*of))
+    monkeypatch.setattr(shard, "_realtime_threads", lambda: asked.append(realtime()) or asked[-1])
     schema = make_schema("video", size=64)
     write_shard(tmp_path / "shard", schema, [make_episode(schema, 0, 5)])
+    if not any(asked):
+        pytest.skip("this root may not make threads realtime")
     assert len(seen) > 5 and not any(seen)
     assert os.sched_getscheduler(0) == os.SCHED_OTHER
 
