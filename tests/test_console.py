@@ -1,4 +1,4 @@
-"""What Python prints, copied into a run's log."""
+"""What is said on the terminal: commands to type, and its copy in a run's log."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from franka_wm.console import log_to, terminal_log
+from franka_wm.console import log_to, program, terminal_log
 
 
 def test_what_is_printed_before_and_after_there_is_a_file(tmp_path: Path, capsys) -> None:
@@ -42,3 +42,19 @@ def test_a_closed_pipe_ends_a_command_quietly(flushed: bool, monkeypatch: pytest
             print("nobody reads this", flush=flushed)
             assert not flushed
         assert caught.value.code == 1
+
+
+def test_what_to_type_is_a_path_where_the_shell_does_not_find_the_name(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    beside = tmp_path / "my env" / "bin" / "franka-wm"
+    beside.parent.mkdir(parents=True)
+    monkeypatch.setattr(sys, "executable", str(beside.with_name("python")))
+    monkeypatch.setenv("PATH", str(tmp_path))
+    assert program() == "franka-wm", "there is none beside this Python"
+    beside.touch(mode=0o755)
+    assert program() == f"'{beside}'"
+    monkeypatch.chdir(tmp_path)
+    assert program() == "'my env/bin/franka-wm'"
+    monkeypatch.setenv("PATH", str(beside.parent))
+    assert program() == "franka-wm"
