@@ -50,7 +50,9 @@ def pytest_configure(config: pytest.Config) -> None:
     if config.getoption("numprocesses", None) and not hasattr(config, "workerinput"):
         return  # others run the tests
     # What to type is said as `franka-wm` where the shell finds it, else as a path: tests compare the first.
-    os.environ["PATH"] = os.pathsep.join((str(Path(sys.executable).parent), os.environ.get("PATH", os.defpath)))
+    os.environ["PATH"] = os.pathsep.join(
+        (str(Path(sys.executable).parent), os.environ.get("PATH", os.defpath))
+    )
     # Until all modules are loaded: a sixth of the time goes into looking for garbage among what stays.
     gc.disable()
     import torch
