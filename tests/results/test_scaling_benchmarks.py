@@ -6,7 +6,7 @@ import math
 import sys
 from importlib import import_module
 from pathlib import Path
-from types import ModuleType
+from types import ModuleType, SimpleNamespace
 from typing import Any
 
 import pytest
@@ -107,3 +107,42 @@ def test_a_sweep_is_timed_alone_at_once_and_on_every_gpu(benchmark, monkeypatch,
     assert [row["times one after the other"] for row in rows] == [1.0, 3.0, *([3.0] if mps else []), 6.0]
     begun, ended = [sweep.SERVICE, "-d"], [sweep.SERVICE]
     assert calls == ([begun, ended] * 2 if mps else [])
+
+
+def test_a_sweep_runs_train_py_and_counts_what_finished(benchmark, monkeypatch) -> None:
+    sweep, _ = benchmark("sweep")
+    asked, lost = [], []
+
+    def run(command: list[str], **kwargs: Any) -> SimpleNamespace:
+        asked.append((command, kwargs["env"]["MINE"]))
+        folder = Path(command[-1 if at_once == 1 else -3].removeprefix("hydra.sweep.dir="))
+        for k in range(3 - len(lost)):
+            (folder / str(k)).mkdir()
+            (folder / str(k) / "finished.json").touch()
+        return SimpleNamespace(returncode=0, stdout="said", stderr="")
+
+    monkeypatch.setattr(sweep.subprocess, "run", run)
+    for at_once in (1, 3):
+        assert sweep.sweep(["env=lift"], 3, at_once, {"MINE": "1"}) > 0
+        command, mine = asked.pop()
+        assert command[1:4] == [str(TOP / "train.py"), "--multirun", "env=lift"] and mine == "1"
+        assert "seed=range(0,3)" in command and set(sweep.QUIET) <= set(command)
+        launcher = ["hydra/launcher=joblib", "hydra.launcher.n_jobs=3"] if at_once == 3 else []
+        assert [word for word in command if "launcher" in word] == launcher
+    lost.append("a run")
+    with pytest.raises(SystemExit, match="said"):
+        sweep.sweep(["env=lift"], 3, at_once, {"MINE": "1"})
+
+
+def test_a_job_that_fails_ends_the_benchmark_with_what_it_said(benchmark, monkeypatch, tmp_path) -> None:
+    sooner, _ = benchmark("sooner")
+    asked = []
+
+    def run(command: list[str], **kwargs: Any) -> SimpleNamespace:
+        asked.append(command)
+        return SimpleNamespace(returncode=1, stdout="", stderr="error: no such task")
+
+    monkeypatch.setattr(sooner.subprocess, "run", run)
+    with pytest.raises(SystemExit, match="no such task"):
+        sooner.learned(["env=lift"], tmp_path)
+    assert asked == [[sys.executable, str(TOP / "train.py"), "env=lift", f"hydra.run.dir={tmp_path}"]]
