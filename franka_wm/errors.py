@@ -30,6 +30,7 @@ class UserError(FrankaError, ValueError):
     """
 
 
+_LOOP = "a link leads to itself; remove it"
 _REFUSED = {
     errno.ENOSPC: "the disk is full",
     errno.EDQUOT: "the disk quota is used up",
@@ -39,6 +40,8 @@ _REFUSED = {
     errno.EMFILE: "too many open files (ulimit -n)",
     errno.ENFILE: "too many open files on this machine",
     errno.ENOMEM: "out of memory",
+    errno.ENAMETOOLONG: "a name is longer than the file system allows; choose a shorter one",
+    errno.ELOOP: _LOOP,
 }
 _NO_MEMORY = (
     "can't allocate memory",
@@ -57,6 +60,10 @@ def machine_refused(error: BaseException) -> str | None:
     """In one line, what the machine had no more of; `None` for any other error."""
     reason = _REFUSED.get(error.errno or 0) if isinstance(error, OSError) else None
     said = str(error).strip().splitlines()
+    if isinstance(error, RuntimeError) and str(error).startswith(
+        "Symlink loop"
+    ):  # Python 3.12's Path.resolve
+        reason = _LOOP
     for one in (error, error.__cause__):  # of a library that cannot be loaded, only the cause says why
         lines = [line for line in str(one).splitlines() if any(words in line for words in _NO_MEMORY)]
         if isinstance(one, MemoryError) or (isinstance(one, REFUSALS) and lines):

@@ -1,6 +1,8 @@
 """Files that appear whole or not at all."""
 
+import os
 import tempfile
+import uuid
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -29,6 +31,15 @@ def unwritable(folder: str | Path, size: int = 0) -> str | None:
     return None
 
 
+def sync(path: Path) -> None:
+    """Make sure that a file's content, or a folder's list of names, has reached the disk."""
+    descriptor = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
+
+
 @contextmanager
 def atomic_write(path: str | Path) -> Iterator[Path]:
     """Yield a temporary path beside `path`; on success it becomes `path`, on failure it is removed.
@@ -39,7 +50,8 @@ def atomic_write(path: str | Path) -> Iterator[Path]:
         UserError: the file cannot be written.
     """
     target = Path(path)
-    temporary = target.with_name(target.name + ".writing")
+    # A name of its own: another process may be writing the same file.
+    temporary = target.with_name(f"{target.name}.{uuid.uuid4().hex[:8]}.writing")
     try:
         target.parent.mkdir(parents=True, exist_ok=True)
         yield temporary

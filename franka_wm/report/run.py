@@ -155,6 +155,9 @@ def read_config(folder: str | Path) -> dict[str, object]:
 def but_for_the_seed(config: Mapping[str, object]) -> str:
     """The same for repetitions, and for nothing else; empty for an empty configuration."""
     kept = {name: value for name, value in config.items() if name not in SAME_BUT}
+    dataset = kept.get("dataset")
+    if isinstance(dataset, Mapping) and dataset.get("seed") == config.get("seed"):  # follows it
+        kept["dataset"] = {name: value for name, value in dataset.items() if name != "seed"}
     return json.dumps(kept, sort_keys=True, default=str) if kept else ""
 
 

@@ -26,18 +26,21 @@ from typing import Any
 
 import torch
 from omegaconf import DictConfig, OmegaConf
+from omegaconf.errors import OmegaConfBaseException
 from safetensors import SafetensorError
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor, nn
 
 from franka_wm.conf import use_present_names
 from franka_wm.errors import UserError
+from franka_wm.files import sync
 from franka_wm.options import is_real
 from franka_wm.seeding import random_state, restore_random_state
-from franka_wm.training.manifest import MANIFEST, Manifest, read_manifest, saved_at, sync, write_manifest
+from franka_wm.training.manifest import MANIFEST, Manifest, read_manifest, saved_at, write_manifest
 from franka_wm.training.optimizer_state import Optimizers, load_optimizer_state, optimizer_state
 from franka_wm.training.tree import (
     damaged,
+    first_difference,
     only_tensors,
     read_tensors,
     read_tree,
@@ -201,7 +204,8 @@ class Checkpoint:
             UserError: the model is another one.
         """
         saved = read_tensors(self.folder, "model")
-        difference = _first_difference(saved, _tensor_state(model))
+        self._manifest.check_same(self.folder)
+        difference = first_difference(saved, _tensor_state(model))
         if difference is not None:
             raise UserError(
                 f"checkpoint {self.folder} holds a {self.model_name} that does not fit this "
@@ -284,7 +288,11 @@ class Checkpoint:
         return self._tree("extra")
 
     def _tree(self, name: str) -> Any:
-        return read_tree(self.folder, name) if f"{name}.json" in self._manifest.files else None
+        if f"{name}.json" not in self._manifest.files:
+            return None
+        tree = read_tree(self.folder, name)
+        self._manifest.check_same(self.folder)
+        return tree
 
 
 def load_checkpoint(folder: str | Path) -> Checkpoint:
@@ -316,17 +324,20 @@ def _read_config(path: Path) -> dict[str, Any]:
         raise UserError(
             f"checkpoint {path} is damaged: config.yaml holds no configuration; use another checkpoint."
         )
-    # Saved configurations are resolved; reading one `${oc.env:…}` would take secrets from this machine.
-    if "${" in json.dumps(written, default=str):
-        raise UserError(
-            f"checkpoint {path}: its config.yaml holds an interpolation (${{…}}), which no run writes; "
-            "use another checkpoint."
-        )
     with damaged(path, "config.yaml"):
-        config = OmegaConf.load(path / "config.yaml")
-        assert isinstance(config, DictConfig)
-        use_present_names(config)
-        plain: Any = OmegaConf.to_container(config, throw_on_missing=True)
+        # Saved configurations are resolved; reading one `${oc.env:…}` would take secrets from this machine.
+        if "${" in json.dumps(written, default=str):
+            raise UserError(
+                f"checkpoint {path}: its config.yaml holds an interpolation (${{…}}), which no run writes; "
+                "use another checkpoint."
+            )
+        try:
+            config = OmegaConf.load(path / "config.yaml")
+            assert isinstance(config, DictConfig)
+            use_present_names(config)
+            plain: Any = OmegaConf.to_container(config, throw_on_missing=True)
+        except OmegaConfBaseException as error:
+            raise ValueError(str(error)) from error
     return plain
 
 
@@ -369,23 +380,6 @@ def _found(places: Sequence[Path]) -> list[tuple[int, Path]]:
     # A NAME.old that lost its NAME to a kill stands for NAME.
     names = {p.with_name(p.name.removesuffix(_OLD)) for p in inside if not p.name.endswith(WRITING)}
     return [(saved_at(whole), name) for name in names if (whole := _find(name)) is not None]
-
-
-# -- comparing -------------------------------------------------------------------------------------------
-
-
-def _first_difference(saved: Mapping[str, Tensor], here: Mapping[str, Tensor]) -> str | None:
-    """In words, the first entry (in the model's order) that is not the same in shape and dtype."""
-    for name, tensor in here.items():
-        if name not in saved:
-            return f"{name} is missing in the checkpoint"
-        for what in ("shape", "dtype"):
-            there, wanted = getattr(saved[name], what), getattr(tensor, what)
-            if there != wanted:
-                there, wanted = (tuple(v) if what == "shape" else v for v in (there, wanted))
-                return f"{name} has {what} {there} in the checkpoint and {wanted} in the model"
-    unknown = next((name for name in saved if name not in here), None)
-    return None if unknown is None else f"{unknown} is in the checkpoint but not in the model"
 
 
 # -- parts of the state ------------------------------------------------------------------------------------

@@ -1,13 +1,13 @@
 """The checkpoint's manifest: what was written, by name, size and SHA-256, so that damage is found before it is read."""
 
 import hashlib
-import os
 import time
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
 from franka_wm.errors import UserError
+from franka_wm.files import sync
 from franka_wm.training.tree import write_json
 from franka_wm.untrusted import UntrustedFolder
 from franka_wm.version import __version__
@@ -52,6 +52,18 @@ class Manifest(NamedTuple):
             raise UserError(
                 f"checkpoint {folder} is damaged: {name} has the right size but other content than was written; "
                 "copy it again or use another checkpoint."
+            )
+
+    def check_same(self, folder: Path) -> None:
+        """Raise a `UserError` if the run has saved another checkpoint in its place since."""
+        try:
+            there = read_manifest(folder)
+        except UserError:  # just now one takes the place of the other
+            there = None
+        if there != self:
+            raise UserError(
+                f"checkpoint {folder}: its run has saved a newer one in its place meanwhile; start again, or copy the "
+                "folder first"
             )
 
 
@@ -127,15 +139,6 @@ def saved_at(folder: Path) -> int:
         return int((UntrustedFolder(folder).json(MANIFEST) or {})["saved_at_ns"])
     except (ValueError, KeyError, TypeError, OverflowError):
         return -1
-
-
-def sync(path: Path) -> None:
-    """Make sure that a file's content, or a folder's list of names, has reached the disk."""
-    descriptor = os.open(path, os.O_RDONLY)
-    try:
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)
 
 
 def _sha256(path: Path) -> str:

@@ -16,6 +16,7 @@ from typing import Any, NoReturn
 
 import torch
 from hydra.core.hydra_config import HydraConfig
+from hydra.core.override_parser.overrides_parser import OverridesParser
 from omegaconf import DictConfig, OmegaConf
 from tensordict import TensorDictBase
 from torchrl.record.loggers import Logger
@@ -24,7 +25,7 @@ from franka_wm import processes
 from franka_wm.console import announced, log_to, resuming, say
 from franka_wm.data.demonstrations import Demonstrations
 from franka_wm.data.hindsight import Hindsight
-from franka_wm.data.lerobot.export import export_run
+from franka_wm.data.lerobot.export import check_export_place, export_run
 from franka_wm.data.lerobot.windows import RecordedWindows
 from franka_wm.data.replay import WindowReplay
 from franka_wm.device import resolve_device
@@ -272,6 +273,8 @@ def start(cfg: DictConfig) -> Run:
     problem = occupied(folder, settings.resume)  # also of a sweep, whose folders only Hydra knows
     if problem is not None:
         raise UserError(problem)
+    if settings.export.kind != "none":  # asked now, and not after hours of training
+        check_export_place(settings.values, Path(settings.export.out or folder / "dataset"))
     for mark in (FINISHED, STOPPED):
         (folder / mark).unlink(missing_ok=True)
     log_to(folder / "train.log")
@@ -350,19 +353,27 @@ def resumed(cfg: DictConfig, overrides: list[str]) -> tuple[Checkpoint, DictConf
     checkpoint = load_checkpoint(latest_checkpoint(str(cfg.resume)))
     saved = checkpoint.config
     saved = saved.get("whole_run") or saved  # of a first stage's checkpoint
-    changes = []
+    changes, parser = (
+        OmegaConf.create(),
+        OverridesParser.create(),
+    )  # a value means what it means without resume=
     for override in overrides:
-        name = override.split("=", 1)[0].lstrip("+~")
-        if name in ("resume", "plugins"):
+        name = override.split("=", 1)[0].lstrip("+")
+        if name in ("resume", "plugins") or name.startswith(("hydra.", "hydra/")):
             continue
+        if name.startswith("~"):
+            raise FrankaError(
+                f"{override}: a run that resumes keeps all its options; change their values (GROUP.key=…)"
+            )
         same = name in ("scale", "size", "seed") and str(cfg[name]) == str(saved.get(name))
         if "." not in name and not same and name not in ("device", "gpus"):
             raise FrankaError(
                 f"{override}: a run that resumes keeps its {name}; leave it out, or change single values ({name}.key=…)"
             )
         # Of device=spread the GPU that was chosen, which the configuration has.
-        changes.append(f"device={cfg.device}" if name == "device" else override.lstrip("+"))
-    merged = OmegaConf.merge(OmegaConf.create(saved), OmegaConf.from_dotlist(changes))
+        value = cfg.device if name == "device" else parser.parse_override(override).value()
+        OmegaConf.update(changes, name, value)
+    merged = OmegaConf.merge(OmegaConf.create(saved), changes)
     assert isinstance(merged, DictConfig)
     merged.resume = str(cfg.resume)
     return checkpoint, merged

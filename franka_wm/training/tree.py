@@ -84,6 +84,20 @@ def damaged(folder: Path, name: str = "one of its files") -> AbstractContextMana
     return values_of(f"checkpoint {folder} is damaged: {name}", "use another checkpoint.")
 
 
+def first_difference(saved: Mapping[str, Tensor], here: Mapping[str, Tensor]) -> str | None:
+    """In words, the first entry (in the model's order) that is not the same in shape and dtype."""
+    for name, tensor in here.items():
+        if name not in saved:
+            return f"{name} is missing in the checkpoint"
+        for what in ("shape", "dtype"):
+            there, wanted = getattr(saved[name], what), getattr(tensor, what)
+            if there != wanted:
+                there, wanted = (tuple(v) if what == "shape" else v for v in (there, wanted))
+                return f"{name} has {what} {there} in the checkpoint and {wanted} in the model"
+    unknown = next((name for name in saved if name not in here), None)
+    return None if unknown is None else f"{unknown} is in the checkpoint but not in the model"
+
+
 def tree_files(name: str) -> tuple[str, str]:
     """The names of the two files."""
     return f"{name}.json", f"{name}.safetensors"

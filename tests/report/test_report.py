@@ -198,6 +198,17 @@ def test_an_interrupted_write_keeps_the_old_file(tmp_path: Path) -> None:
     assert list(tmp_path.iterdir()) == [path]
 
 
+def test_two_who_write_one_file_at_once_do_not_mix(tmp_path: Path) -> None:
+    path = tmp_path / "a.txt"
+    with atomic_write(path) as mine:
+        mine.write_text("mine, longer")
+        with atomic_write(path) as other:
+            other.write_text("other")
+        assert path.read_text() == "other"
+    assert path.read_text() == "mine, longer"
+    assert list(tmp_path.iterdir()) == [path]
+
+
 # -- tables ------------------------------------------------------------------------------------------------
 
 

@@ -9,6 +9,7 @@ from franka_wm.commands.summary import summary
 from franka_wm.errors import UserError
 from franka_wm.evaluation.intervals import bootstrap_mean
 from franka_wm.evaluation.results import END
+from franka_wm.report.run import but_for_the_seed
 from franka_wm.report.seeds import cells_told, read_evaluation, runs_of, seeds_table
 from light import answers
 
@@ -121,6 +122,14 @@ def test_runs_of_different_tasks_are_not_averaged(tmp_path, capsys):
     out = capsys.readouterr().out
     assert "2 runs (0-reach, 2-reach)" in out and "2.00 (1.00 – 3.00)" in out
     assert "1 run (1-reach_fixed)" in out and "| planner | 2.00 | 100 |" in out
+
+
+def test_the_seed_of_recorded_data_follows_the_runs(tmp_path):
+    """Runs on a dataset are repetitions, too, unless its own seed was chosen."""
+    alike = [but_for_the_seed({"seed": k, "dataset": {"root": "there", "seed": k}}) for k in (0, 1)]
+    chosen = [but_for_the_seed({"seed": k, "dataset": {"root": "there", "seed": 5 + k}}) for k in (0, 1)]
+    other = but_for_the_seed({"seed": 0, "dataset": {"root": "here", "seed": 0}})
+    assert alike[0] == alike[1] and len({alike[0], *chosen, other}) == 4
 
 
 def test_a_run_given_twice_is_refused(tmp_path, capsys):

@@ -292,3 +292,30 @@ def test_a_folder_without_permission(tmp_path: Path) -> None:
     tmp_path.chmod(0o500)
     with pytest.raises(UserError, match="Permission denied"):
         save(tmp_path / "a")
+
+
+def test_a_newer_checkpoint_in_its_place_is_not_mixed_with_it(tmp_path: Path) -> None:
+    """A run that goes on saves while another command, which has read the counters, builds its worlds."""
+    folder = save(tmp_path / "latest", Small(), step=1, extra={"a": 1})
+    opened = load_checkpoint(folder)
+    save(folder, Small(), step=2, extra={"a": 2})
+    for read in (lambda: opened.load_model(Small()), opened.extra, opened.restore_rng):
+        with pytest.raises(UserError, match="has saved a newer one in its place meanwhile; start again"):
+            read()
+    (folder / "manifest.json").rename(tmp_path / "gone")  # amid the swap
+    with pytest.raises(UserError, match="has saved a newer one"):
+        opened.load_model(Small())
+
+
+@pytest.mark.parametrize("line", ["foo: ???", "2020-01-01: 3"])
+def test_a_configuration_that_omegaconf_refuses_is_one_line(line: str, tmp_path: Path) -> None:
+    folder = save(tmp_path / "latest", Small())
+    path, manifest = folder / "config.yaml", folder / "manifest.json"
+    path.write_text(f"{path.read_text()}{line}\n")
+    said = json.loads(manifest.read_text())
+    content = path.read_bytes()
+    said["files"]["config.yaml"] = {"bytes": len(content), "sha256": hashlib.sha256(content).hexdigest()}
+    manifest.write_text(json.dumps(said))
+    with pytest.raises(UserError, match=r"config\.yaml holds values of another form") as caught:
+        load_checkpoint(folder)
+    assert "\n" not in str(caught.value)

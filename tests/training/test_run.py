@@ -6,6 +6,7 @@ import multiprocessing
 import sys
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
@@ -112,3 +113,21 @@ def test_a_resumed_run_keeps_what_it_was(word: str, tmp_path: Path) -> None:
     same = [f"resume={tmp_path}", "scale=smoke", "seed=0", "trainer.updates=50"]
     _, merged = resumed(compose(*same), same)
     assert merged.trainer.updates == 50 and merged.seed == 0
+
+
+def test_a_value_means_the_same_with_resume(tmp_path: Path) -> None:
+    """Hydra's grammar, not YAML's; and what is Hydra's own is none of the run's."""
+    words = ("scale=smoke", "device=cpu", "env=reach_fixed")
+    began = OmegaConf.create(OmegaConf.to_container(compose(*words), resolve=True))
+    save_checkpoint(tmp_path, model=torch.nn.Linear(1, 1), config=began, counters={})
+    resume = f"resume={tmp_path}"
+
+    def merged(*more: str) -> Any:
+        cfg = compose(resume, *[word for word in more if not word.startswith("hydra")])
+        return resumed(cfg, [resume, *more])[1]
+
+    found = merged("trainer.schedule=no", "trainer.lr=1e-3", "env.home=[0,1]", "hydra/launcher=joblib")
+    assert found.trainer.schedule == "no" and found.trainer.lr == 1e-3 and found.env.home == [0, 1]
+    assert found.keys() == began.keys() and merged("hydra.sweep.dir=x").keys() == began.keys()
+    with pytest.raises(FrankaError, match=r"~trainer\.schedule: a run that resumes keeps all its options"):
+        merged("~trainer.schedule")

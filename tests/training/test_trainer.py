@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 import signal
 import time
 from collections.abc import Callable
@@ -438,3 +439,8 @@ def test_a_run_that_exports_keeps_what_the_task_says(train, tmp_path: Path, monk
         "of the steps before this resume nothing says which episodes were cut short"
         in capsys.readouterr().out
     )
+    # In its own folder the dataset of the shorter run is in the way: said before anything is trained.
+    shutil.copytree(tmp_path / "older", tmp_path / "same")  # the lock of the other is this process's
+    train(f"resume={tmp_path}/same", "trainer.updates=20", folder=tmp_path / "same", status=1)
+    assert "same/dataset exists, from another run or from this one with other" in capsys.readouterr().err
+    assert (tmp_path / "same" / "finished.json").is_file()

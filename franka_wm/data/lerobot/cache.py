@@ -31,6 +31,7 @@ from franka_wm.data.lerobot.decode_workers import Say
 from franka_wm.data.lerobot.mapping import FeatureMap
 from franka_wm.data.lerobot.source import Source
 from franka_wm.errors import UserError
+from franka_wm.files import sync
 from franka_wm.untrusted import linked_json
 
 
@@ -92,7 +93,7 @@ def open_cache(
     parent = Path(cache_dir).expanduser() if cache_dir else default_cache_dir()
     name = f"{source.root.resolve().name}-{hashlib.sha256(identity.encode()).hexdigest()[:24]}"
     folder = parent / name
-    if (cache := _read(folder, say)) is not None:
+    if (cache := _read(folder, lambda _: None)) is not None:
         return cache
     try:
         parent.mkdir(parents=True, exist_ok=True)
@@ -106,12 +107,19 @@ def open_cache(
             # Another process may have built it while this one waited.
             if (cache := _read(folder, say)) is not None:
                 return cache
+            if folder.is_dir():
+                shutil.rmtree(folder)
             for left_over in parent.glob(f"{glob.escape(name)}.writing-*"):
                 shutil.rmtree(left_over)
             temporary = parent / f"{name}.writing-{uuid.uuid4().hex[:8]}"
             try:
                 temporary.mkdir()
                 build_cache(source, mapping, fingerprint, temporary, workers, say)
+                for path in (
+                    *temporary.iterdir(),
+                    temporary,
+                ):  # else a power cut leaves names without content
+                    sync(path)
                 temporary.replace(folder)
             finally:
                 if temporary.is_dir():
@@ -129,7 +137,7 @@ def open_cache(
 
 
 def _read(folder: Path, say: Say) -> Cache | None:
-    """The cache in ``folder``; ``None`` if there is none. One that is damaged is removed."""
+    """The cache in ``folder``; ``None`` if there is none, or one that is damaged."""
     if not folder.is_dir():
         return None
     try:
@@ -144,9 +152,8 @@ def _read(folder: Path, say: Say) -> Cache | None:
                 raise ValueError(f"{name}.npy is {array.dtype} {array.shape}")
             arrays[name] = array
         return Cache(folder, float(facts["fps"]), episodes, arrays, tuple(facts["notes"]))
-    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+    except (OSError, EOFError, ValueError, KeyError, TypeError, AttributeError) as error:
         say(f"the cache {folder} is damaged ({error}); building it again")
-        shutil.rmtree(folder)
         return None
 
 

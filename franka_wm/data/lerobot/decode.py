@@ -126,7 +126,8 @@ class TableJob:
                 f"{self.path}: {feature} holds no image but a path; embed the images (LeRobot's own writer does)"
             )
         try:
-            with Image.open(io.BytesIO(data)) as image:
+            # Of other formats some are programs: Pillow starts Ghostscript for PostScript.
+            with Image.open(io.BytesIO(data), formats=("PNG", "JPEG")) as image:
                 if image.width * image.height > MOST_PIXELS:
                     raise ValueError(f"{image.width} × {image.height} pixels")
                 return np.asarray(image.convert("RGB"))

@@ -260,6 +260,17 @@ def check_export(settings: Mapping[str, Any]) -> None:
             hub_client(wanted["repo_id"])
         except UserError as error:
             raise UserError(f"export.repo_id={wanted['repo_id']}: {error}") from error
-    out = wanted["out"]
-    if out and Path(out).exists() and not written_before(settings, Path(out)):
-        raise UserError(f"export.out={out} exists; choose another folder")
+    if wanted["out"]:
+        check_export_place(settings, Path(wanted["out"]))
+
+
+def check_export_place(settings: Mapping[str, Any], out: Path) -> None:
+    """Refuses a dataset that is there, unless the run that this one goes on with has written it.
+
+    Raises:
+        UserError: One line.
+    """
+    if out.exists() and not written_before(settings, out):
+        raise UserError(
+            f"export.out={out} exists, from another run or from this one with other options; choose another folder"
+        )

@@ -37,14 +37,15 @@ def decode_png(data: bytes) -> np.ndarray:
     """PNG as (H, W, 3) uint8.
 
     Raises:
-        ValueError: It has too many pixels.
+        ValueError: It is none, is damaged, or has too many pixels.
     """
     from PIL import Image
 
     try:
-        with Image.open(io.BytesIO(data)) as image:
+        with Image.open(io.BytesIO(data), formats=("PNG",)) as image:
             if image.width * image.height > MOST_PIXELS:
                 raise ValueError(f"an image of {image.width} × {image.height} pixels")
             return np.asarray(image.convert("RGB"))
-    except Image.DecompressionBombError as error:  # of many more: Pillow asks before we can
+    # Of very many pixels Pillow warns first.
+    except (OSError, SyntaxError, Image.DecompressionBombError) as error:
         raise ValueError(str(error)) from error

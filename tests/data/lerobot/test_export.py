@@ -11,7 +11,7 @@ from huggingface_hub import constants
 
 from fake_hub import TOKEN, Hub
 from franka_wm.data.lerobot import export, publish
-from franka_wm.data.lerobot.export import check_export, export_run, written_before
+from franka_wm.data.lerobot.export import check_export, check_export_place, export_run, written_before
 from franka_wm.data.lerobot.provenance import describe
 from franka_wm.data.lerobot.schema import PROVENANCE
 from franka_wm.errors import UserError
@@ -46,6 +46,10 @@ def test_a_dataset_is_that_of_the_run_which_goes_on(tmp_path: Path, make_schema,
         assert not written_before(other, out)
         with pytest.raises(UserError, match=r"export\.out=.*set exists"):
             check_export(other | exports)
+        with pytest.raises(UserError, match=r"set exists, from another run or from this one"):
+            check_export_place(other, out)
+    check_export_place(again, out)
+    check_export_place(RUN, tmp_path / "none")
     for damaged in ("{}", '{"sessions": 3}', '{"sessions": [{}]}'):
         (out / PROVENANCE).write_text(damaged)
         with pytest.raises(UserError, match=r"another form than was written.*choose another export\.out"):

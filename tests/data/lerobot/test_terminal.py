@@ -94,3 +94,15 @@ def test_a_png_of_too_many_pixels_is_no_value(side: int) -> None:
     bomb = data[:12] + header + struct.pack(">I", zlib.crc32(header)) + data[33:]
     with pytest.raises(ValueError, match="pixels"):
         decode_png(bomb)
+
+
+def test_only_a_whole_png_is_a_value() -> None:
+    """Pillow would start Ghostscript for a program in PostScript, and has errors of its own for what is damaged."""
+    with pytest.raises(ValueError, match="cannot identify"):
+        decode_png(b"%!PS-Adobe-3.0 EPSF-3.0\n%%BoundingBox: 0 0 16 16\n%%EndComments\nshowpage\n%%EOF\n")
+    data = encode_png(np.random.default_rng(0).integers(0, 256, (64, 64, 3), np.uint8))
+    begun = (
+        data[:33] + struct.pack(">I", 2000) + data[37:2041] + b"crc?"
+    )  # a part of the values, and then no chunk
+    with pytest.raises(ValueError, match="broken PNG"):
+        decode_png(begun + struct.pack(">I", 100) + b"\1\2\3\4" + data[2041:])

@@ -15,6 +15,7 @@ from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
 
+import filelock
 import numpy as np
 import pytest
 import torch
@@ -241,8 +242,9 @@ def padded(path: Path) -> None:
         endless,
         lambda folder: padded(folder / "cache.json"),
         lambda folder: (folder / "cache.json").write_text('{"arrays": []}'),
+        lambda folder: (folder / "episodes.npy").write_bytes(b""),
     ],
-    ids=["many episodes", "large", "no names"],
+    ids=["many episodes", "large", "no names", "empty"],
 )
 def test_a_strangers_cache_is_built_again(change, pictures: Path, opened: Callable, tmp_path: Path) -> None:
     opened(pictures)
@@ -250,7 +252,40 @@ def test_a_strangers_cache_is_built_again(change, pictures: Path, opened: Callab
     change(tmp_path / "cache" / name)
     lines: list[str] = []
     opened(pictures, say=lines.append)
-    assert any("is damaged" in line for line in lines)
+    assert sum("is damaged" in line for line in lines) == 1
+
+
+def test_a_damaged_cache_that_another_process_mends_meanwhile_is_taken(
+    pictures: Path, opened: Callable, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """Only who holds the lock removes one."""
+    opened(pictures)
+    (name,) = folders(tmp_path / "cache")
+    good = (tmp_path / "cache" / name / "episodes.npy").read_bytes()
+    (tmp_path / "cache" / name / "episodes.npy").write_bytes(b"")
+
+    class Mends(filelock.FileLock):
+        def acquire(self, *args, **kwargs):
+            (tmp_path / "cache" / name / "episodes.npy").write_bytes(good)
+            return super().acquire(*args, **kwargs)
+
+    monkeypatch.setattr(filelock, "FileLock", Mends)
+    monkeypatch.setattr(cache, "build_cache", lambda *_: pytest.fail("decoded again"))
+    opened(pictures)
+
+
+def test_a_cache_has_reached_the_disk_before_it_has_its_name(
+    pictures: Path, opened: Callable, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    synced: list[Path] = []
+    monkeypatch.setattr(cache, "sync", lambda path: synced.append(path))
+    opened(pictures)
+    (name,) = folders(tmp_path / "cache")
+    assert all(path.parts[-2].startswith(f"{name}.writing-") for path in synced[:-1])
+    assert {path.name for path in synced[:-1]} == {
+        path.name for path in (tmp_path / "cache" / name).iterdir()
+    }
+    assert synced[-1].name.startswith(f"{name}.writing-")
 
 
 def test_what_a_fingerprint_reads_is_bounded(pictures: Path, tmp_path: Path) -> None:
@@ -302,8 +337,11 @@ def edited_info(root: Path, to: Path, **changes: object) -> Path:
     return to
 
 
-def damaged_picture(root: Path, to: Path) -> Path:
-    """One PNG of the first column overwritten in the middle of the file."""
+POSTSCRIPT = b"%!PS-Adobe-3.0 EPSF-3.0\n%%BoundingBox: 0 0 16 16\n%%EndComments\nshowpage\n%%EOF\n"
+
+
+def damaged_picture(root: Path, to: Path, cell: bytes = b"no picture") -> Path:
+    """One PNG of the first column replaced."""
     import pyarrow.parquet as pq
 
     shutil.copytree(root, to)
@@ -311,7 +349,7 @@ def damaged_picture(root: Path, to: Path) -> Path:
     table = pq.read_table(path)
     at = table.column_names.index("observation.images.top")
     cells = table.column(at).to_pylist()
-    cells[7]["bytes"] = b"no picture"
+    cells[7]["bytes"] = cell
     table = table.set_column(at, table.field(at), [cells])
     pq.write_table(table, path)
     return to
@@ -380,6 +418,8 @@ def test_damaged_rows(pictures: Path, opened: Callable, tmp_path: Path) -> None:
 
     with pytest.raises(UserError, match=r"an image of .* cannot be decoded"):
         opened(damaged_picture(pictures, tmp_path / "picture"))
+    with pytest.raises(UserError, match="cannot be decoded: cannot identify"):  # Ghostscript is not asked
+        opened(damaged_picture(pictures, tmp_path / "program", POSTSCRIPT))
 
     def rewritten(name: str, change: Callable[[pa.Table], pa.Table]) -> Path:
         shutil.copytree(pictures, tmp_path / name)
