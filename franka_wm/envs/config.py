@@ -106,8 +106,8 @@ class FrankaConfig:
         success_distance: The task is solved where the tool is closer to the goal than this [m].
         terminate_on_success: End the episode at the first success.
         gravity_compensation: Cancel gravity's load on the arm, as the real robot's controller does.
-        limit_velocity: Keep the servo from driving a joint faster than the robot's own limit, and its target
-            from running ahead of what the arm can follow.
+        limit_velocity: Keep the servo from driving a joint faster than the robot's own limit, and its target from
+            running ahead of what the arm can follow. By the gains as they are given, also where they are randomized.
         solver_iterations: Constraint solver iterations per physics step (MuJoCo).
         solver_ls_iterations: Line-search iterations of each of those.
         auto_reset: How ``step_and_maybe_reset``, the call of TorchRL's collectors, begins new episodes:
@@ -256,9 +256,11 @@ class FrankaConfig:
             raise UserError("goal_pixels shows a goal that stands still; leave it out with task=track")
         if self.randomization.any() and self.solver == "featherstone":
             raise UserError("randomization needs solver=mujoco")
-        if self.limit_velocity and not all(k > 0 for k in self.gains("target_ke")):
+        if self.limit_velocity and not all(
+            k > 0 for name in ("target_ke", "target_kd") for k in self.gains(name)
+        ):
             raise UserError(
-                "limit_velocity needs target_ke above 0: it limits how far the servo's set point may lead"
+                "limit_velocity needs target_ke and target_kd above 0: they say how far a set point leads"
             )
         self._check_scene()
         self._check_own_options()

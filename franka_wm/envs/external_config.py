@@ -34,6 +34,8 @@ class ExternalConfig:
     def __post_init__(self) -> None:
         if self.kind not in ("gym", "dm_control"):
             raise UserError(f"env.kind={self.kind!r}: must be franka, gym or dm_control")
+        if self.kind == "gym" and self.task is not None:
+            raise UserError(f"env.task={self.task}: Gymnasium's environments have one; leave it out")
         for name in ("episode_length", "frame_skip"):
             check_whole(f"env.{name}", getattr(self, name))
 
@@ -55,5 +57,7 @@ def external_config(values: Mapping[str, Any]) -> ExternalConfig:
             f"env.observations={observations!r}: must be keys with lists of the environment's own, "
             "as in {state: [position, velocity]}"
         )
+    if not {"kind", "name"} <= given.keys():
+        raise UserError("env.kind and env.name: both are needed, as in env=gym env.name=Pendulum-v1")
     given["observations"] = dict(observations)
     return ExternalConfig(**given)

@@ -25,7 +25,7 @@ from franka_wm.envs.config import FrankaConfig
 from franka_wm.envs.frames import FrameStack
 from franka_wm.envs.simulation import Simulation
 from franka_wm.envs.specs import LOST, MARKS, goals_given, observation_spec
-from franka_wm.envs.start import check_robot, check_task
+from franka_wm.envs.start import check_arguments, check_robot, check_task
 from franka_wm.envs.tasks import Task, goal_distance
 from franka_wm.errors import UserError
 from franka_wm.options import check_whole
@@ -116,7 +116,8 @@ class FrankaEnv(EnvBase):
         task: Task | None = None,
     ):
         config = FrankaConfig() if config is None else config
-        check_whole("num_envs", num_envs)
+        seed = own_seed() if seed is None else seed
+        check_arguments(config, num_envs, seed, first_world)
         device = resolve_device(device)
         super().__init__(device=device, batch_size=torch.Size([num_envs]))
         if task is None:
@@ -130,7 +131,6 @@ class FrankaEnv(EnvBase):
         self.config = config
         self.num_envs = num_envs
         started = time.perf_counter()
-        seed = own_seed() if seed is None else seed
         log.info("building %d worlds on %s with seed %d", num_envs, device, seed)
         self.simulation = Simulation(
             config, num_envs, str(device), seed=seed, first_world=first_world, urdf_path=urdf_path, task=task
@@ -250,8 +250,8 @@ class FrankaEnv(EnvBase):
     def set_state(self, state: TensorDictBase) -> TensorDict:
         """Puts all worlds where :meth:`get_state` found them and returns what they observe, as a reset does.
 
-        The same actions then lead to the same states, bit for bit on the CPU. Later resets draw by a world's own
-        number: branches are alike until then.
+        The same actions then lead to the same states, bit for bit on the CPU. Resets and noise draw by a world's
+        own number: branches are alike until the first of them.
 
         Raises:
             UserError: The state is of another config or number of worlds; nothing is changed then.
@@ -271,7 +271,7 @@ class FrankaEnv(EnvBase):
                 )
         sim.set_state(dict(state.items()))
         if self._stack is not None:
-            self._stack.load(frames)
+            self._stack.load({key: stacked.to(self.device) for key, stacked in frames.items()})
         return self._observed_anew()
 
     def set_goal(self, goal: torch.Tensor) -> TensorDict:
@@ -353,7 +353,7 @@ class FrankaEnv(EnvBase):
         return self.simulation.tensors.state[:, :7].clone()
 
     def joint_targets(self) -> torch.Tensor:
-        """The servo's commanded angles, (N, 7) [rad]."""
+        """The servo's commanded angles, (N, 7) [rad]; with a gripper (N, 8), the last a finger's place [m]."""
         return self.simulation.tensors.joint_target.clone()
 
     def tool_position(self) -> torch.Tensor:
@@ -402,9 +402,9 @@ class FrankaEnv(EnvBase):
         """
         size = self.config.image_size if size is None else size
         views = self.num_envs if num_views is None else min(num_views, self.num_envs)
-        if size < 1 or samples < 1 or views < 1:
-            raise UserError(f"render({size=}, {samples=}, {num_views=}): all must be at least 1")
-        key = (size, samples, camera_framing(config := config or self.config))
+        for name, value in {"size": size, "samples": samples, "num_views": views}.items():
+            check_whole(name, value)
+        key = (size, samples, config := config or self.config)
         camera = self._renderers.get(key)
         if camera is None or camera.num_views != views:
             camera = Camera(self.model, config, size=size, num_views=views, samples=samples)

@@ -112,8 +112,8 @@ class FrankaVectorEnv(gymnasium.vector.VectorEnv):
             observations = tuple(config.pop("observations", ("pixels", "state")))
             fields_given = FrankaConfig.from_mapping({"observations": observations, **config})
             env = FrankaEnv(fields_given, num_envs=num_envs, device=device, seed=seed)
-        elif config:
-            raise UserError(f"{next(iter(config))}: env=… is already built; give its options to FrankaEnv")
+        elif named := [*config, *(["num_envs"] * (num_envs != 1)), *(["device"] * (device is not None))]:
+            raise UserError(f"{named[0]}: env=… is already built; give its options to FrankaEnv")
         if "state" not in env.config.observations:
             raise UserError(
                 f"observations={env.config.observations}: agent_pos is read from 'state'; add it to observations"
@@ -240,14 +240,19 @@ class FrankaVectorEnv(gymnasium.vector.VectorEnv):
             self.env.close()
 
     def _one_seed(self, seed: int | Sequence[int] | None) -> int | None:
-        if seed is None or isinstance(seed, (int, np.integer)):
-            return None if seed is None else int(seed)
-        seeds = [int(s) for s in seed]
-        if seeds != list(range(seeds[0], seeds[0] + self.num_envs)) if seeds else True:
+        if seed is None:
+            return None
+        several = isinstance(seed, Sequence | np.ndarray) and not isinstance(seed, str)
+        seeds: list[Any] = list(seed) if several else [seed]
+        if several and seeds == [None] * self.num_envs:
+            return None
+        if not all(isinstance(one, int | np.integer) and one >= 0 for one in seeds):
+            raise UserError(f"seed={seed!r}: must be a whole number of at least 0, or None")
+        if several and (not seeds or seeds != list(range(seeds[0], seeds[0] + self.num_envs))):
             raise UserError(
                 f"seed={seeds}: worlds share one seed; give a number s, or the list s, s + 1, … of {self.num_envs}"
             )
-        return seeds[0]
+        return int(seeds[0])
 
     def _to_numpy(self, tensordict: TensorDictBase) -> tuple[dict[str, Any], np.ndarray]:
         """Observations and success; the copy to the host."""

@@ -20,7 +20,7 @@ class Randomization:
         brightness: Factor of the whole image.
         camera_position: Offset of the front camera's eye [m] in x, y and z; the side camera moves alike.
         camera_target: Offset of the point it looks at [m].
-        gains: Factor of the servo's stiffness and damping.
+        gains: Factor of the servo's stiffness and damping, one each; ``limit_velocity`` does not know of it.
         armature: Factor of the joints' armature.
         friction: Largest dry friction of a joint [N·m]; drawn from [0, friction].
         mass: Factor of every link's and object's mass and inertia.

@@ -37,6 +37,7 @@ def smooth_actions(
     Returns:
         (num_sequences, length, action_dim) float32.
     """
+    check_whole("length", length)
     if not 0.0 <= smoothness < 1.0:
         raise UserError(f"smoothness={smoothness}: must be at least 0 and below 1")
     noise = torch.randn(num_sequences, length, action_dim, device=device, generator=generator)
@@ -148,10 +149,9 @@ def franka_sequences(
 
 def play_actions(env: FrankaEnv, actions: torch.Tensor, seed: int | None) -> TensorDict:
     """What :meth:`FrankaEnv.rollout_actions` says."""
-    if actions.dim() != 3 or actions.shape[0] != env.num_envs or actions.shape[2] != env.action_dim:
-        raise UserError(
-            f"actions has shape {tuple(actions.shape)}; it must be ({env.num_envs}, T, {env.action_dim})"
-        )
+    shape = tuple(actions.shape)
+    if len(shape) != 3 or not shape[1] or (shape[0], shape[2]) != (env.num_envs, env.action_dim):
+        raise UserError(f"actions has shape {shape}; it must be ({env.num_envs}, T, {env.action_dim})")
     env.reset(seed=seed)
     t, renderer = env.simulation.tensors, env.simulation.renderer
     states, videos, rewards, dones = [t.state.clone()], [], [], []

@@ -20,6 +20,7 @@ from franka_wm.envs.robots import Robot, gripper, links, load_robot
 from franka_wm.envs.scene import Scene, Solid
 from franka_wm.envs.tasks import Task
 from franka_wm.errors import UserError
+from franka_wm.options import check_whole
 
 FINGERS_ABOVE = 0.045
 """From the tool back to the joints of a Franka Hand's fingers [m]."""
@@ -31,6 +32,17 @@ class _Box(NamedTuple):
     at: np.ndarray
     rotation: np.ndarray
     half: np.ndarray
+
+
+def check_arguments(config: object, num_envs: object, seed: object, first_world: object) -> None:
+    """Refuses what is no configuration, no number of worlds, or no seed."""
+    if not isinstance(config, FrankaConfig):
+        raise UserError(
+            f"config={config!r}: must be a FrankaConfig; of a dictionary, FrankaConfig.from_mapping"
+        )
+    check_whole("num_envs", num_envs)
+    check_whole("seed", seed, least=0, most=2**64 - 1)
+    check_whole("first_world", first_world, least=0, most=2**31 - 1)
 
 
 def check_robot(config: FrankaConfig, urdf_path: str | Path | None = None) -> None:
@@ -53,7 +65,7 @@ def check_task(task: Task, config: FrankaConfig, urdf_path: str | Path | None = 
 
 
 def check_start(config: FrankaConfig, robot: Robot) -> None:
-    """Refuses a scene that hand or arm would start in, and objects on a table too high or low for the arm.
+    """Refuses a start beyond the joints' limits, a scene that hand or arm would start in, and objects out of reach.
 
     Of round things counts the box inside them, and meshes are not looked at, since the box around one may be mostly
     empty. Nor are arms and hands that are not Franka's.
@@ -61,6 +73,9 @@ def check_start(config: FrankaConfig, robot: Robot) -> None:
     Raises:
         UserError: One line, with the name of what is in the way.
     """
+    for joint, (q, low, high) in enumerate(zip(config.start_pose, robot.lower, robot.upper, strict=True)):
+        if not low <= q <= high:
+            raise UserError(f"home: joint {joint + 1} at {q:g} rad; its limits are {low:.3f} and {high:.3f}")
     scene = config.resolved_scene
     if scene is None:
         return

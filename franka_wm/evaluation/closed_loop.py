@@ -92,8 +92,8 @@ def play_episodes(
         * ``final_distance`` and ``closest_distance``, tool to goal [m], where success is to be near the goal;
         * ``measures``, by name, at the end: the task's own (:meth:`~franka_wm.envs.tasks.Task.measures`);
         * ``path_length`` of the tool [m];
-        * ``action_change``: mean over steps and components of the squared change of the action as the servo
-          gets it, in units of the action;
+        * ``action_change``: mean over steps and components of the squared change of the action as commanded (before
+          what ``randomization`` does to it), in units of the action;
         * ``jerk``: root mean square of the tool's third difference × fps³ [m/s³]; 0 for episodes of under three steps.
     """
     n, device = env.num_envs, env.device

@@ -39,9 +39,9 @@ def training_diagnostics(model: WorldModel, batch: TensorDictBase) -> dict[str, 
         of up to :data:`SAMPLES` windows, on ``embed`` where the family has it;
         :func:`~franka_wm.evaluation.spectrum.collapse_warning` reads it. Of families with ``value`` and ``discount``
         on data with rewards ``value/…``: ``mean``; ``td_bias``, mean of V(z_0) − (Σ γ^t r_t + γ^H V(z_H)) over the
-        windows; and ``td_correlation`` between the two. This is calibration against the model's own later
-        value and the behaviour in the replay; against true returns see ``franka-wm evaluate``. Empty where an
-        encoding is not finite.
+        windows that no time limit cuts in two; and ``td_correlation`` between the two. This is calibration against
+        the model's own later value and the behaviour in the replay; against true returns see
+        ``franka-wm evaluate``. Empty where an encoding is not finite.
     """
     device = batch.device if batch.device is not None else batch.get("action").device
     keys = model.observation_keys
@@ -56,13 +56,26 @@ def training_diagnostics(model: WorldModel, batch: TensorDictBase) -> dict[str, 
         reward = batch.get(("next", "reward"), None)
         if reward is not None and model.has_value:
             last = model.encode(batch.get("next").select(*keys)[:, -1])
-            out |= _value_consistency(model, first, last, reward, batch.get(("next", "terminated")))
+            terminated = batch.get(("next", "terminated"))
+            whole = _within_an_episode(batch.get("is_init", None), terminated)
+            out |= _value_consistency(
+                model, *(x if whole is None else x[whole] for x in (first, last, reward, terminated))
+            )
     return out
+
+
+def _within_an_episode(is_init: Tensor | None, terminated: Tensor) -> Tensor | None:
+    """Windows (B,) that no time limit cuts in two: what follows one is worth nothing to what came before."""
+    if is_init is None:
+        return None
+    return ~(is_init[:, 1:] & ~terminated[:, :-1]).flatten(1).any(1)
 
 
 def _value_consistency(
     model: WorldModel, first: Tensor, last: Tensor, reward: Tensor, terminated: Tensor
 ) -> dict[str, float]:
+    if not len(first):
+        return {}
     value = model.value(first).squeeze(-1).float()
     target = model.value(last).squeeze(-1).float()
     for t in reversed(range(reward.shape[1])):

@@ -9,6 +9,8 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 from franka_wm.envs import FrankaConfig, FrankaEnv
+from franka_wm.envs.config import ACTION_MODES
+from franka_wm.envs.constants import NUM_JOINTS
 from franka_wm.envs.kinematics import Kinematics
 from franka_wm.models.base import WorldModel
 from franka_wm.planning import MPPI
@@ -52,8 +54,10 @@ def commanded_path(env: FrankaEnv, plan: Tensor) -> Tensor:
     Returns:
         Tool positions (N, H + 1, 3) [m]; the first belongs to the present targets.
     """
-    targets = [env.joint_targets()]
-    for action in plan.unbind(1):
+    targets = [env.joint_targets()[:, :NUM_JOINTS]]
+    for action in plan[..., : ACTION_MODES[env.config.action_mode]].unbind(
+        1
+    ):  # a gripper's is its last number
         targets.append(next_targets(env.config, env.kinematics, targets[-1], action))
     return env.kinematics.forward(torch.stack(targets, 1))
 

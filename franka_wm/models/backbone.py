@@ -107,7 +107,13 @@ class Backbone(nn.Module):
             own, self.width = self.network.grid, self.network.width
         elif encoder_from is not None or architecture is not None or kind == "vit":
             if encoder_from is not None:
-                self.network = ViT.from_weights(read_encoder(encoder_from))
+                weights = read_encoder(encoder_from)
+                try:
+                    self.network = ViT.from_weights(weights)
+                except ValueError as error:
+                    raise ValueError(
+                        f"encoder_from={encoder_from}: {error}; give another checkpoint"
+                    ) from error
             elif architecture is not None:
                 self.network = ViT.of(Architecture(*architecture))
             else:

@@ -106,9 +106,10 @@ class HistoryWorldModel(WorldModel):
         Returns:
             Frames (N, K, F), the action taken at each (N, K, A), and which frames are real (N, K).
         """
-        frames, actions, valid = (x.reshape(-1, *x.shape[z.dim() - 1 :]) for x in self.history.split(z))
-        flat = action.reshape(-1, self.history.action_dim)
-        return frames, torch.cat((actions, flat.unsqueeze(1).to(actions.dtype)), dim=1), valid
+        count = z.shape[:-1].numel()  # and not -1: of K = 1 frame there are no actions, which tell no size
+        frames, actions, valid = (x.reshape(count, *x.shape[z.dim() - 1 :]) for x in self.history.split(z))
+        now = action.reshape(count, 1, self.history.action_dim)
+        return frames, torch.cat((actions, now.to(actions.dtype)), dim=1), valid
 
     def feed_back(self, frames: Tensor, action: Tensor, steps: int) -> Tensor:
         """Predict the last frames of windows, each from the prediction before.

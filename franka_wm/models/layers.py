@@ -376,7 +376,7 @@ class GaussianPolicy(nn.Module):
         return torch.tanh(raw), density.sum(-1, keepdim=True)
 
     def imitation_error(self, z: Tensor, action: Tensor, shown: Tensor) -> Tensor:
-        """Squared error (,) of the mode against actions (..., action_dim), 0 where not `shown` (..., 1): the mean."""
+        """Mean squared error (,) of the mode against actions (..., A), 0 where not `shown` (..., 1) or (..., A)."""
         return ((self(z, deterministic=True) - action).square() * shown).mean()
 
     @staticmethod

@@ -85,7 +85,8 @@ def _centred(x: Tensor) -> tuple[Tensor, float]:
 def covariance_loss(x: Tensor) -> Tensor:
     """VICReg's squared covariances off the diagonal, summed and divided by D: (..., n, D) -> ()."""
     x, samples = _centred(x.float())
-    covariance = processes.mean(x.mT @ x) / samples
+    with torch.autocast(x.device.type, enabled=False):  # in bfloat16 the difference below is rounding
+        covariance = processes.mean(x.mT @ x) / samples
     off = covariance.square().sum((-2, -1)) - covariance.diagonal(dim1=-2, dim2=-1).square().sum(-1)
     return (off / x.shape[-1]).mean()
 
@@ -254,7 +255,8 @@ def participation_ratio(x: Tensor) -> Tensor:
     """
     x = x.detach().float().reshape(-1, x.shape[-1])
     x = x - x.mean(0)
-    covariance = x.mT @ x / x.shape[0]
+    with torch.autocast(x.device.type, enabled=False):
+        covariance = x.mT @ x / x.shape[0]
     return covariance.trace().square() / covariance.square().sum().clamp_min(1e-30)
 
 

@@ -29,7 +29,7 @@ from franka_wm.models.returns import discount_per_step, value_range
 from franka_wm.models.simplicial import SimplicialWorldModel
 from franka_wm.models.streams import side_stream
 from franka_wm.models.windows import check_windows, window_of
-from franka_wm.options import COEFFICIENT, DEPTH, POSITIVE, Bounds, with_defaults
+from franka_wm.options import COEFFICIENT, DEPTH, FRACTION, POSITIVE, Bounds, with_defaults
 
 
 class TDMPC2(SimplicialWorldModel):
@@ -96,11 +96,11 @@ class TDMPC2(SimplicialWorldModel):
 
     ranges: ClassVar[Mapping[str, Bounds]] = {
         **dict.fromkeys(("action_dim", "latent_dim", "simnorm_dim", "encoder_dim"), POSITIVE),
-        **dict.fromkeys(("encoder_layers", "hidden_dim", "value_members", "channels"), POSITIVE),
-        **dict.fromkeys(
-            ("consistency_coef", "reward_coef", "value_coef", "termination_coef", "imitation_coef"),
-            COEFFICIENT,
-        ),
+        **dict.fromkeys(("encoder_grid", "hidden_dim", "value_members", "channels"), POSITIVE),
+        **dict.fromkeys(("consistency_coef", "reward_coef", "value_coef", "termination_coef"), COEFFICIENT),
+        **dict.fromkeys(("imitation_coef", "entropy_coef", "encoder_lr_scale"), COEFFICIENT),
+        **dict.fromkeys(("log_std_min", "log_std_max"), Bounds(least=-20, most=20)),
+        "rho": FRACTION,
         **dict.fromkeys(("num_q", "bins"), Bounds(least=2)),
         **dict.fromkeys(("discount", "dropout"), Bounds(least=0, below=1)),
         "tau": Bounds(above=0, most=1),
@@ -333,9 +333,9 @@ class TDMPC2(SimplicialWorldModel):
         if self.imitation_coef and shown is not None:
             # Values that have seen demonstrations alone know no other actions: then the policy imitates alone,
             # and the encoder learns for it, too (MoDem's first phase).
-            alone = self.policy_head.all_shown(shown)
-            z = torch.where(alone, encoded[:-1], detached[:-1])
-            error = self.policy_head.imitation_error(z, action, shown.transpose(0, 1))
+            z = torch.where(alone := self.policy_head.all_shown(shown), encoded[:-1], detached[:-1])
+            known = self.masked(z, shown.transpose(0, 1))
+            error = self.policy_head.imitation_error(self.features(z), action, known)
             policy_loss = torch.where(alone, 0.0, policy_loss) + self.imitation_coef * error
 
         total = (

@@ -15,6 +15,7 @@ from torch.nn import functional as F
 from franka_wm.models.attention import attention
 from franka_wm.models.images import check_images
 from franka_wm.models.layers import initialize
+from franka_wm.options import is_whole
 
 SIZES = {"tiny": (192, 12, 3), "small": (384, 12, 6)}
 """Published sizes of vision transformers: width, depth, heads (arXiv:2012.12877, table 1)."""
@@ -258,8 +259,28 @@ class ViT(nn.Module):
 
     @classmethod
     def from_weights(cls, weights: Mapping[str, Tensor]) -> "ViT":
-        """A `ViT` of the architecture that `weights`, its state dict, names, with these weights."""
-        vit = cls.of(Architecture(*weights["architecture"].tolist()))
+        """A `ViT` of the architecture that `weights`, its state dict, names, with these weights.
+
+        Raises:
+            ValueError: they are those of another one, or not all. Nothing of the size that they claim was built.
+        """
+        numbers = weights["architecture"].flatten().tolist()
+        named = Architecture._fields
+        # More layers than weights would take for ever to refuse.
+        if (
+            len(numbers) != len(named)
+            or not all(map(is_whole, numbers))
+            or numbers[named.index("depth")] > len(weights)
+        ):
+            raise ValueError(f"the encoder's architecture must be {', '.join(named)}, got {numbers}")
+        with torch.device("meta"):
+            wanted = cls.of(Architecture(*numbers)).state_dict()
+        for name in {**wanted, **weights}:
+            shapes = [tuple(x[name].shape) if name in x else None for x in (weights, wanted)]
+            if shapes[0] != shapes[1]:
+                said, asked = (shape or "nothing" for shape in shapes)
+                raise ValueError(f"the encoder's {name} holds {said} and its architecture asks for {asked}")
+        vit = cls.of(Architecture(*numbers))
         vit.load_state_dict(dict(weights))
         return vit
 

@@ -52,8 +52,10 @@ def graph_key(value: object, depth: int = LOOKED_INTO) -> Hashable:
     if isinstance(value, Mapping | TensorDictBase):
         entries = sorted(((str(key), key) for key in value.keys()), key=lambda entry: entry[0])  # noqa: SIM118
         return tuple((name, graph_key(value[key], depth - 1)) for name, key in entries)
-    if isinstance(value, list | tuple):
-        return tuple(graph_key(one, depth - 1) for one in value)
+    if isinstance(
+        value, list | tuple
+    ):  # what they hold is no deeper for it: a sum of sums has two lists on the way
+        return tuple(graph_key(one, depth) for one in value)
     slots = [name for kind in type(value).__mro__ for name in _names(kind) if hasattr(value, name)]
     if slots or hasattr(value, "__dict__"):
         held = {name: getattr(value, name) for name in slots} | getattr(value, "__dict__", {})

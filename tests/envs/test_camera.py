@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -90,7 +91,9 @@ def test_render_without_pixels_among_the_observations(small_env) -> None:
     assert (difference(pictures[0], pictures[1]) > 20).any()
 
 
-@pytest.mark.parametrize("options", [{"size": 0}, {"samples": 0}, {"num_views": 0}, {"size": -3}])
+@pytest.mark.parametrize(
+    "options", [{"size": 0}, {"samples": 0}, {"num_views": 0}, {"size": -3}, {"size": 2.5}]
+)
 def test_impossible_render(env: FrankaEnv, options: dict[str, int]) -> None:
     with pytest.raises(UserError):
         env.render(**options)
@@ -143,6 +146,16 @@ def test_projection_hits_the_fingers(small_env) -> None:
         assert rows.numel() > 20
         distance = torch.hypot(columns + 0.5 - marks[k, 0], rows + 0.5 - marks[k, 1])
         assert distance.mean() < 16 and distance.min() < 14, (k, distance.mean(), distance.min())
+
+
+def test_another_lens_is_another_camera(small_env) -> None:
+    """All that a configuration says about images counts, not where the camera stands alone."""
+    env = small_env(1)
+    env.reset(seed=0)
+    before = env.render(48)
+    for change in ({"camera_fov_degrees": 20.0}, {"enable_shadows": not env.config.enable_shadows}):
+        assert not torch.equal(env.render(48, config=replace(env.config, **change)), before), change
+    assert torch.equal(env.render(48), before)
 
 
 def test_the_camera_of_videos_has_the_whole_arm_in_view_and_leaves_observations_alone(small_env) -> None:

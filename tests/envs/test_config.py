@@ -82,6 +82,9 @@ def test_impossible_combinations() -> None:
         FrankaConfig(camera_distance=0.0, camera_height=0.5, camera_target_height=0.5)
     with pytest.raises(UserError):
         FrankaConfig(solver="featherstone", substeps=3)
+    for gain in ("target_ke", "target_kd"):  # without one, no set point may lead: the arm would not move
+        with pytest.raises(UserError, match="limit_velocity needs target_ke and target_kd above 0"):
+            FrankaConfig(limit_velocity=True, **{gain: 0.0})
 
 
 @pytest.mark.parametrize(

@@ -137,3 +137,10 @@ def test_processes_of_their_own_play_the_same_and_end(monkeypatch: pytest.Monkey
     ):
         assert torch.equal(one[key], other[key]), key
     assert not multiprocessing.active_children()
+
+
+def test_a_configuration_that_names_too_much_or_too_little_is_one_line() -> None:
+    with pytest.raises(UserError, match=r"env\.task=hard: Gymnasium's environments have one"):
+        ExternalConfig(kind="gym", name="CartPole-v1", task="hard")
+    with pytest.raises(UserError, match=r"env\.kind and env\.name: both are needed"):
+        external_config({"kind": "gym"})

@@ -192,6 +192,13 @@ def test_wrong_use_is_one_line() -> None:
     view.reset()
     with pytest.raises(UserError, match=r"\(2, 7\)"):
         view.step(np.zeros((3, 7), np.float32))
+    view.reset(seed=[None, None])  # as Gymnasium may be asked
+    for seed in (3.5, -1, "x", [1.5, 2.5]):
+        with pytest.raises(UserError, match="must be a whole number of at least 0"):
+            view.reset(seed=seed)  # type: ignore[arg-type]
+    for given in ({"num_envs": 5}, {"device": "cpu"}, {"substeps": 2}):
+        with pytest.raises(UserError, match=f"{next(iter(given))}: env=… is already built"):
+            FrankaVectorEnv(env=view.env, **given)
 
 
 @pytest.mark.filterwarnings("ignore:.*")

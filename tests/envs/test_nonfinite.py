@@ -150,3 +150,19 @@ def test_nothing_of_an_episode_reaches_the_next(small_env, harm: Harm | None, ra
     for t in range(begins, begins + 6):
         tensordict = env.step(tensordict.set("action", actions[:, t]))["next"]
         assert torch.equal(data["next", "state"][BROKEN, t], tensordict["state"][BROKEN]), t
+
+
+def test_a_broken_world_has_not_succeeded(small_env) -> None:
+    """It is put back to where it was, which may be at the goal: neither its entry nor the statistics count that."""
+    env = small_env(N, success_distance=5.0, terminate_on_success=True)
+    root = env.reset(seed=0)
+    action = torch.zeros(N, 7)
+    action[BROKEN, 0] = NAN
+    step = env.step(root.set("action", action))["next"]
+    expected = torch.ones(N, 1, dtype=torch.bool)
+    expected[BROKEN] = False
+    for key in ("success", "terminated"):
+        assert step[key].equal(expected), key
+    assert step["truncated"].equal(~expected)
+    found = env.statistics()
+    assert found["episodes"] == N and found["success"] == found["success_once"] == pytest.approx(2 / 3)

@@ -73,7 +73,7 @@ def test_rollout_actions_at_the_end_of_an_episode(small_env, random_actions) -> 
     assert (played["done"].squeeze(-1) == (torch.arange(6) == 3)).all()
 
 
-@pytest.mark.parametrize("shape", [(2, 7), (3, 4, 7), (2, 4, 6)])
+@pytest.mark.parametrize("shape", [(2, 7), (3, 4, 7), (2, 4, 6), (2, 0, 7)])
 def test_rollout_of_the_wrong_shape(env: FrankaEnv, shape: tuple[int, ...]) -> None:
     with pytest.raises(UserError):
         env.rollout_actions(torch.zeros(shape))

@@ -225,3 +225,27 @@ def test_a_disc_moved_by_hand_lies_on_the_table() -> None:
     assert (
         Push.marker is not None and env.step(there.set("action", torch.zeros(4, 8)))["next", "success"].all()
     )
+
+
+def test_a_start_beyond_the_joints_limits_is_refused() -> None:
+    """It would be moved within them without a word, and another pose be checked."""
+    with pytest.raises(UserError, match=r"home: joint 2 at 2\.5 rad; its limits are -1\.78\d and 1\.78\d"):
+        FrankaEnv(FrankaConfig(home=(0.0, 2.5, 0.0, -1.5, 0.0, 1.5, 0.0)), num_envs=1, device="cpu")
+
+
+@pytest.mark.parametrize(
+    ("given", "says"),
+    [
+        ({"config": {"task": "reach"}}, "must be a FrankaConfig"),
+        ({"seed": 1.5}, "seed=1.5"),
+        ({"seed": "x"}, "seed="),
+        ({"seed": -1}, "seed=-1"),
+        ({"first_world": 2**40}, "first_world="),
+        ({"first_world": -1}, "first_world=-1"),
+        ({"num_envs": 2.5}, r"num_envs=2\.5"),
+    ],
+)
+def test_what_is_no_argument_is_one_line(given: dict[str, Any], says: str) -> None:
+    with pytest.raises(UserError, match=says) as caught:
+        FrankaEnv(**({"num_envs": 1, "device": "cpu"} | given))
+    assert "\n" not in str(caught.value)

@@ -236,3 +236,16 @@ def test_what_cannot_be_is_one_line(changes: dict, said: str) -> None:
     with pytest.raises(UserError) as caught:
         FrankaConfig(**({"task": "lift", "observations": ("state",)} | changes))
     assert said in str(caught.value) and "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("task", ["reach", "track"])
+def test_goals_are_above_a_raised_table(task: str) -> None:
+    """The scene's own height, and what a draw adds to it."""
+    scene = Scene(table={"at": (0.35, 0.0, 0.2), "size": (1.1, 1.4, 0.05)})  # type: ignore[arg-type]
+    options: dict[str, Any] = {"goal_sampling": "reachable", "goal_noise": 0.6, "observations": ("state",)}
+    env = make(128, task=task, scene=scene, height=0.1, gripper=True, **options)
+    goal = env.reset(seed=0)["goal"]
+    above = goal[:, 2] - 0.2 - raised(env)
+    least = 0.05 if task == "track" else 0.10
+    assert above.min() > least - 1e-6 and above.min() < least + 0.1
+    assert (goal[:, 2] < 0.45).any(), "without the table some would be lower"

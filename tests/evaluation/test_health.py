@@ -180,3 +180,19 @@ def test_pairs_are_narrower_than_their_parts() -> None:
     gain = paired_gain(*(TensorDict(part, batch_size=[60]) for part in (one, two)))
     assert set(gain) == {"return"}
     assert 0.9 < gain["return"]["low"] < 1 + float(noise.mean()) < gain["return"]["high"] < 1.1
+
+
+def test_a_time_limit_in_a_window_says_nothing_of_values(model: TDMPC2, batch: TensorDict) -> None:
+    """Families whose windows go on into the next episode: only a termination ends what a value counts."""
+    model.value = lambda z: torch.zeros_like(z[..., :1])
+    batch["next", "reward"].fill_(1.0)
+    alone = training_diagnostics(model, batch)
+    assert alone["value/td_bias"] == pytest.approx(-(1 + model.discount + model.discount**2))
+    batch["is_init"][:32, 2] = True
+    assert training_diagnostics(model, batch)["value/td_bias"] == pytest.approx(alone["value/td_bias"])
+    batch["next", "terminated"][:32, 1] = True  # these end there, and are worth the two rewards before
+    expected = (alone["value/td_bias"] - (1 + model.discount)) / 2
+    assert training_diagnostics(model, batch)["value/td_bias"] == pytest.approx(expected)
+    batch["next", "terminated"].fill_(False)
+    batch["is_init"][:, 2] = True
+    assert not {"value/td_bias", "value/mean"} & training_diagnostics(model, batch).keys()

@@ -6,7 +6,7 @@ import pytest
 import torch
 from tensordict import TensorDict
 
-from franka_wm.live.commanded import KinematicModel, commanded_path, kinematic_planner
+from franka_wm.live.commanded import KinematicModel, commanded_path, kinematic_planner, planned_path
 
 
 @pytest.mark.parametrize("mode", ["joint_delta", "joint_position", "ee_delta"])
@@ -21,6 +21,18 @@ def test_it_is_what_the_environment_makes_of_the_same_actions(small_env, mode: s
         now = env.step_and_maybe_reset(now.set("action", plan[:, t]))[1]
         commanded = env.kinematics.forward(env.joint_targets())
         torch.testing.assert_close(path[:, t + 1], commanded, rtol=0, atol=2e-4)
+
+
+@pytest.mark.parametrize("mode", ["joint_delta", "joint_position", "ee_delta"])
+def test_a_gripper_does_not_move_the_tool(small_env, mode: str) -> None:
+    """Its command is the last number of an action, and its place the last of the targets."""
+    options = {"action_mode": mode, "action_scale": 0.05, "ee_scale": 0.02}
+    arm, hand = small_env(2, **options), small_env(2, gripper=True, **options)
+    plan = torch.randn(2, 4, hand.action_dim, generator=torch.Generator().manual_seed(0))
+    for env in (arm, hand):
+        env.reset(seed=1)
+    path = planned_path(hand, TensorDict({"plan": plan}, [2]))
+    assert path is not None and path.equal(commanded_path(arm, plan[..., : arm.action_dim]))
 
 
 def test_it_stays_within_the_joint_limits(small_env) -> None:

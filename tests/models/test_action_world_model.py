@@ -228,6 +228,9 @@ def test_what_is_no_checkpoint_is_refused_in_one_line(tmp_path, jepa_folder):
         with pytest.raises(ValueError, match=message) as error:
             read_encoder(tmp_path / path)
         assert "\n" not in str(error.value)
+    save_file({"encoder.architecture": torch.zeros(3, dtype=torch.int64)}, tmp_path / "model.safetensors")
+    with pytest.raises(ValueError, match=r"encoder_from=.*architecture must be .*; give another checkpoint"):
+        small(encoder_from=str(tmp_path))
     with pytest.raises(ValueError, match="multiples of 4"):
         small(encoder_from=str(jepa_folder[0]), image_sizes={"pixels": (18, 18, 3)})
 

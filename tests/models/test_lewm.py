@@ -419,6 +419,14 @@ def test_the_loss_traces_without_graph_breaks_or_host_reads(dots):
     assert compiled(batch["pixels"], batch["next", "pixels"], batch["action"]).isfinite()
 
 
+def test_one_frame_of_memory_learns_and_plans(dots):
+    """Of one frame there are no actions in between."""
+    model, batch = small(history=1, rollout=2), dots.windows(4, 3)
+    model.loss(batch)["loss"].backward()
+    z = model.eval().encode(batch[:, 0])
+    assert model.next(z.unsqueeze(1).expand(-1, 5, -1), torch.rand(4, 5, 2)).shape == (4, 5, z.shape[-1])
+
+
 def test_settings_that_cannot_work_are_refused(dots):
     for wrong, message in [
         (dict(image_sizes={}), "nothing to read"),

@@ -10,6 +10,7 @@ from franka_wm.models.regularizers import (
     CollapseGuard,
     ProjectionMLP,
     SIGReg,
+    covariance_loss,
     effective_rank,
     feature_std,
     info_nce,
@@ -165,3 +166,12 @@ def test_batch_normalisation_asks_which_statistics():
     one = norm.train()(x, batch_statistics=False)[:1, :1]
     assert torch.equal(norm(x[:1, :1], batch_statistics=False), one)  # whatever else is in the batch
     assert ProjectionMLP(3, 5)(x, batch_statistics=True).shape == (4, 50, 5)
+
+
+@pytest.mark.parametrize("measure", [covariance_loss, participation_ratio])
+def test_covariances_are_float32_whatever_the_update_computes_in(measure):
+    torch.manual_seed(0)
+    x = torch.randn(4096, 64)
+    with torch.autocast("cpu", torch.bfloat16):
+        half = measure(x)
+    assert half.dtype == torch.float32 and half.equal(measure(x))

@@ -155,3 +155,15 @@ def losses_by_window(made: Any, batch: TensorDict) -> dict[str, torch.Tensor]:
         "value": made.two_hot.loss(made.q_ensemble(before), target).mean((0, 1, 3)),
     }
     return {name: loss.detach() for name, loss in found.items()}
+
+
+def test_demonstrations_teach_only_what_the_task_has() -> None:
+    made = make("tdmpc2", action_masks=MASKS, imitation_coef=1.0, **SMALL)
+    randomise(made)
+    batch = windows([0, 0, 1, 1])
+    batch["demonstrated"] = torch.ones(4, 3, 1, dtype=torch.bool)
+    found, other = loss_of(made, batch)["loss"], batch.clone()
+    other["action"][:2, :, 2] = 0.9  # the first task lacks it
+    assert loss_of(made, other)["loss"].equal(found)
+    other["action"][2:, :, 2] = 0.9
+    assert not loss_of(made, other)["loss"].equal(found)

@@ -309,3 +309,21 @@ def test_a_policy_imitates_alone_where_the_windows_of_all_processes_are_demonstr
         among_others = loss()
     monkeypatch.setattr(processes, "mean", lambda x: x / 2)
     assert loss() == among_others != alone
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        {"rho": -1.0},
+        {"rho": 1.5},
+        {"entropy_coef": -1.0},
+        {"encoder_lr_scale": -1.0},
+        {"log_std_max": 500.0},
+        {"log_std_min": -500.0},
+        {"encoder_grid": -3},
+    ],
+)
+def test_what_would_train_it_the_wrong_way_is_refused(wrong):
+    """A negative weight, or rate, ascends where it should descend."""
+    with pytest.raises(ValueError, match=f"{next(iter(wrong))}.*: must be"):
+        small(**wrong)

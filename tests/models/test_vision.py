@@ -2,7 +2,7 @@ import pytest
 import torch
 
 from franka_wm.models.images import RandomShift
-from franka_wm.models.vision import Block, ConvEncoder, ViT, vit_size
+from franka_wm.models.vision import Architecture, Block, ConvEncoder, ViT, vit_size
 
 
 @pytest.fixture(autouse=True)
@@ -165,3 +165,27 @@ def test_sizes():
     for wrong in (dict(patch_size=5), dict(width=30), dict(depth=0), dict(tubelet=0)):
         with pytest.raises(ValueError):
             small(**wrong)
+
+
+def test_weights_of_another_architecture_are_one_line():
+    """Somebody else may have written them: nothing is built by what they claim before it is held against them."""
+    weights = dict(ViT(image_size=(16, 16, 3), patch_size=8, width=16, depth=1, heads=2).state_dict())
+    names, numbers = Architecture._fields, weights["architecture"].tolist()
+
+    def claiming(**other: int) -> dict[str, torch.Tensor]:
+        said = [other.get(name, number) for name, number in zip(names, numbers, strict=True)]
+        return weights | {"architecture": torch.tensor(said)}
+
+    first = next(name for name in weights if name != "architecture")
+    for given, says in (
+        ({name: x for name, x in weights.items() if name != first}, f"{first} holds nothing"),
+        (weights | {first: torch.zeros(3)}, f"{first} holds"),
+        (weights | {"other": torch.zeros(3)}, "other holds .* asks for nothing"),
+        (claiming(width=4_000_000), "its architecture asks for"),
+        (claiming(depth=10**9), "architecture must be height, "),
+        (weights | {"architecture": torch.tensor([1, 2])}, "architecture must be height, "),
+        (weights | {"architecture": torch.rand(len(names))}, "architecture must be height, "),
+    ):
+        with pytest.raises(ValueError, match=says) as caught:
+            ViT.from_weights(given)
+        assert "\n" not in str(caught.value)

@@ -7,6 +7,7 @@ import numpy as np
 import torch
 from tensordict import TensorDict
 
+from franka_wm.planning.objectives import ActionPenalty, Sum
 from franka_wm.policies.graph_key import graph_key
 
 
@@ -79,3 +80,12 @@ def test_what_has_no_settings_keeps_its_address():
     """Arrays made one after the other lie where the one before lay, unless a key keeps that alive."""
     keys = [graph_key(Other(goal=np.full(3, float(n)))) for n in range(5)]
     assert len(set(keys)) == 5
+
+
+def test_a_sum_of_sums_is_looked_into():
+    """A weight that changes in it is another graph: terms of one's own stand beside those that a run has made."""
+    innermost = ActionPenalty(1.0)
+    score = Sum([(1.0, Sum([(1.0, innermost)]))])
+    before = graph_key(score)
+    innermost.weight = 5.0
+    assert graph_key(score) != before

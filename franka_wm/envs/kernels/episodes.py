@@ -12,12 +12,12 @@ from franka_wm.envs.kernels.functions import JOINTS, episode_rng
 @wp.kernel(enable_backward=False)
 def end_step(
     reward: wp.array2d[float],
-    success: wp.array2d[wp.bool],
     broken: wp.array[wp.bool],
     cut: wp.array[wp.bool],
     episode_length: int,
     terminate_on_success: bool,
     # in and out
+    success: wp.array2d[wp.bool],
     step_count: wp.array2d[int],
     episode_return: wp.array2d[float],
     episode_success: wp.array2d[wp.bool],
@@ -32,7 +32,7 @@ def end_step(
     """Ends episodes and keeps their statistics.
 
     A broken world is truncated, not terminated: where rewards are negative, as reach's are, an end worth 0 would
-    pay an agent for breaking the simulation. So is a world that is ``cut`` short: what comes then has no reward of its own,
+    pay an agent for breaking the simulation. Nor has it succeeded, wherever it was before. So is a world that is ``cut`` short: what comes then has no reward of its own,
     but is not worth 0 either. A world that is stepped on after its end, without a reset, stays done by
     time or success, and is not counted again.
     """
@@ -42,7 +42,9 @@ def end_step(
     step_count[world, 0] = count
     total = episode_return[world, 0] + reward[world, 0]
     episode_return[world, 0] = total
-    solved = success[world, 0] and not broken[world] and not over
+    if broken[world]:
+        success[world, 0] = False
+    solved = success[world, 0] and not over
     once = episode_success[world, 0] or solved
     episode_success[world, 0] = once
     stops = terminate_on_success and once

@@ -84,6 +84,7 @@ def reachable_goal(
     child_frames: wp.array[wp.transformf],
     axes: wp.array[wp.vec3f],
     tool_frame: wp.array[wp.transformf],
+    lowest: float,
     raised: wp.array[float],
     goal_q: wp.array2d[float],
     goal: wp.array2d[float],
@@ -99,7 +100,7 @@ def reachable_goal(
             for j in range(JOINTS):
                 goal_q[world, j] = wp.clamp(home[j] + wp.randf(rng, -noise, noise), lower[j], upper[j])
             tool = chain_forward(goal_q, world, parent_frames, child_frames, axes, tool_frame)
-            if tool[2] > 0.10 + raised[world] and wp.sqrt(tool[0] * tool[0] + tool[1] * tool[1]) > 0.25:
+            if tool[2] > lowest + raised[world] and wp.sqrt(tool[0] * tool[0] + tool[1] * tool[1]) > 0.25:
                 for i in range(3):
                     goal[world, i] = tool[i]
                 found = True
@@ -153,7 +154,7 @@ class Reach(Task):
     """Bring the tool to the goal and keep it there.
 
     **Goal**: ``config.goal``, or with ``goal_sampling="reachable"`` the tool position of a pose drawn
-    uniformly within ``goal_noise`` of home, above 0.10 m (and what ``randomization.table_height`` adds) and at least
+    uniformly within ``goal_noise`` of home, at least 0.10 m above the ground, or the table where there is one, and
     0.25 m from the base's axis, new in every world and episode. **Reward**: :func:`reach_reward`. **Success**: tool
     within ``success_distance``.
     """
@@ -195,6 +196,12 @@ class Reach(Task):
     def reset(self, sim: "Simulation", mask: wp.array) -> None:
         self.choose(sim, mask, sim.warp.task_goal)
 
+    @property
+    def table_top(self) -> float:
+        """Height of the table before ``randomization.table_height`` adds to it; 0 without a scene [m]."""
+        scene = self.config.resolved_scene
+        return 0.0 if scene is None else scene.top
+
     def choose(self, sim: "Simulation", mask: wp.array, goal: wp.array) -> None:
         """Writes the masked worlds' goals into ``goal`` (N, 3) and poses that reach them into ``goal_q``."""
         w, c, n = sim.warp, sim.chain, sim.num_envs
@@ -217,7 +224,7 @@ class Reach(Task):
             n,
             [
                 mask, w.seed, w.episode, c.home, self.config.goal_noise, c.lower, c.upper,
-                c.parent_frames, c.child_frames, c.axes, c.tool_frame, w.raised, w.goal_q, goal,
+                c.parent_frames, c.child_frames, c.axes, c.tool_frame, 0.10 + self.table_top, w.raised, w.goal_q, goal,
             ],
             device=sim.device,
         )  # fmt: skip

@@ -30,6 +30,7 @@ def circle_goal(
     radius: float,
     period: float,
     lowest: float,
+    raised: wp.array[float],
     center: wp.array2d[float],
     goal: wp.array2d[float],
 ):
@@ -42,14 +43,14 @@ def circle_goal(
         angle = phase[world] + 2.0 * wp.pi * float(step_count[world, 0] + ahead) * dt / period
         goal[world, 0] = center[world, 0]
         goal[world, 1] = center[world, 1] + radius * wp.cos(angle)
-        goal[world, 2] = wp.max(center[world, 2] + radius * wp.sin(angle), lowest)
+        goal[world, 2] = wp.max(center[world, 2] + radius * wp.sin(angle), lowest + raised[world])
 
 
 class Track(Reach):
     """Follow a goal that moves on an upright circle.
 
     **Goal**: a circle of ``track_radius`` in the plane x = const around a centre that is chosen as
-    :class:`Reach` chooses its goal, but 5 cm above the ground where it would be lower; one turn in
+    :class:`Reach` chooses its goal, but 5 cm above ground and table where it would be lower; one turn in
     ``track_period`` seconds, from a random phase. What is observed is the goal's position at that moment.
     **Reward** and **success**: as in :class:`Reach`, at that moment.
     """
@@ -82,7 +83,7 @@ class Track(Reach):
             sim.num_envs,
             [
                 mask, everywhere, w.seed, w.episode, w.step_count, w.phase, ahead, 1.0 / c.fps, c.track_radius,
-                c.track_period, self.lowest_goal, w.goal_center, w.task_goal,
+                c.track_period, self.lowest_goal + self.table_top, w.raised, w.goal_center, w.task_goal,
             ],
             device=sim.device,
         )  # fmt: skip
