@@ -242,8 +242,9 @@ class FrankaVectorEnv(gymnasium.vector.VectorEnv):
     def _one_seed(self, seed: int | Sequence[int] | None) -> int | None:
         if seed is None:
             return None
-        several = isinstance(seed, Sequence | np.ndarray) and not isinstance(seed, str)
-        seeds: list[Any] = list(seed) if several else [seed]
+        given: Any = seed
+        several = isinstance(given, Sequence | np.ndarray) and not isinstance(given, str)
+        seeds: list[Any] = list(given) if several else [given]
         if several and seeds == [None] * self.num_envs:
             return None
         if not all(isinstance(one, int | np.integer) and one >= 0 for one in seeds):

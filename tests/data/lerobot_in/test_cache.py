@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import shutil
 import signal
@@ -330,13 +329,6 @@ def test_changed_while_read(
 # Datasets that cannot be used
 
 
-def edited_info(root: Path, to: Path, **changes: object) -> Path:
-    shutil.copytree(root, to)
-    path = to / "meta" / "info.json"
-    path.write_text(json.dumps(json.loads(path.read_text()) | changes))
-    return to
-
-
 POSTSCRIPT = b"%!PS-Adobe-3.0 EPSF-3.0\n%%BoundingBox: 0 0 16 16\n%%EndComments\nshowpage\n%%EOF\n"
 
 
@@ -353,63 +345,6 @@ def damaged_picture(root: Path, to: Path, cell: bytes = b"no picture") -> Path:
     table = table.set_column(at, table.field(at), [cells])
     pq.write_table(table, path)
     return to
-
-
-@pytest.mark.parametrize(
-    ("changes", "message"),
-    [
-        ({"codebase_version": "v2.1"}, r"format v2\.1; v3 is read.*convert_dataset_v21_to_v30"),
-        ({"total_episodes": 0}, "holds 0 episodes"),
-        ({"total_episodes": 5}, "tells of 5 episodes, meta/episodes of 3.*probably killed"),
-        ({"total_frames": 99}, "tells of 99 frames, its episodes of 16"),
-        ({"fps": 0}, "make no sense"),
-        ({"data_path": "../{chunk_index}"}, "leaves the dataset"),
-        ({"data_path": "{nothing}"}, "makes no path"),
-    ],
-)
-def test_metadata_that_cannot_be(
-    changes: dict, message: str, pictures: Path, opened: Callable, tmp_path: Path
-) -> None:
-    root = edited_info(pictures, tmp_path / "data", **changes)
-    with pytest.raises(UserError, match=message) as error:
-        opened(root)
-    assert "\n" not in str(error.value)
-
-
-def test_no_dataset(opened: Callable, tmp_path: Path) -> None:
-    with pytest.raises(UserError, match="no such folder"):
-        opened(tmp_path / "nothing")
-    (tmp_path / "empty").mkdir()
-    with pytest.raises(UserError, match=r"no LeRobot dataset, meta/info\.json is missing"):
-        opened(tmp_path / "empty")
-    with pytest.raises(UserError, match="not on this machine, and HF_HUB_OFFLINE is set"):
-        source.find_dataset("nobody/nothing")
-    with pytest.raises(UserError, match="must look like user/name"):
-        source.find_dataset("a/b/c d")
-
-
-@pytest.mark.parametrize(
-    ("kind", "pattern"), [("pictures", "data"), ("video", "videos"), ("video", "meta/episodes")]
-)
-def test_missing_files(
-    kind: str, pattern: str, request: pytest.FixtureRequest, opened: Callable, tmp_path: Path
-) -> None:
-    root = tmp_path / "data"
-    shutil.copytree(request.getfixturevalue(kind), root)
-    for path in (root / pattern).rglob("file-*"):
-        path.unlink()
-    with pytest.raises(UserError, match=r"files are missing|meta/episodes is empty"):
-        opened(root)
-
-
-def test_a_writer_that_was_killed(pictures: Path, opened: Callable, tmp_path: Path) -> None:
-    """A parquet file without its end, as LeRobot's writer leaves it."""
-    root = tmp_path / "data"
-    shutil.copytree(pictures, root)
-    path = next((root / "meta" / "episodes").rglob("*.parquet"))
-    path.write_bytes(path.read_bytes()[:-50])
-    with pytest.raises(UserError, match=r"meta/episodes cannot be read.*probably killed"):
-        opened(root)
 
 
 def test_damaged_rows(pictures: Path, opened: Callable, tmp_path: Path) -> None:
