@@ -76,7 +76,9 @@ def collect(gpus: int, overrides: Sequence[str], **options: Any) -> int:
         return _collect(overrides, **options)
     check_policy(options["policy"], options["checkpoint"], overrides, noise=options["noise"])
     _require_worlds(options["num_envs"] or options["episodes"], gpus)
-    several.launch_verb(["collect", *_typed()], gpus, _device(overrides), "collect goes on with resume=true")
+    several.launch_verb(
+        ["collect", *_typed()], gpus, _device(overrides), lambda: "collect goes on with resume=true"
+    )
     return 0
 
 

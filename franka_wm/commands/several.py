@@ -10,7 +10,7 @@ import sys
 import tempfile
 import traceback
 import uuid
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -60,17 +60,28 @@ def launch(flags: list[str], overrides: list[str], gpus: int, device: str) -> No
     folder = run_folder(overrides)
     fixed = [one for one in overrides if not one.startswith("hydra.run.dir=")]
     command = ["train", *flags, *fixed, f"hydra.run.dir={quoted(str(folder))}"]
-    launch_verb(command, gpus, device, f"go on from the last checkpoint: {resuming(folder, {})}")
+
+    def advice() -> str:
+        from franka_wm.training.checkpoint import latest_checkpoint
+
+        try:
+            latest_checkpoint(folder)
+        except UserError:
+            return "nothing was saved before; start it again"
+        plugins = {"plugins": list(compose(overrides).plugins or [])}
+        return f"go on from the last checkpoint: {resuming(folder, plugins)}"
+
+    launch_verb(command, gpus, device, advice)
 
 
-def launch_verb(command: list[str], gpus: int, device: str, advice: str) -> None:
+def launch_verb(command: list[str], gpus: int, device: str, advice: Callable[[], str]) -> None:
     """Starts so many processes of a command on this host, and waits for them.
 
     Args:
         command: The verb and its arguments, checked.
         gpus: How many.
         device: The configuration's.
-        advice: What to do where a process was killed.
+        advice: Says what to do where a process was killed.
 
     Raises:
         UserError: This host has fewer GPUs, or a process was killed.
@@ -107,7 +118,7 @@ def launch_verb(command: list[str], gpus: int, device: str, advice: str) -> None
             sys.exit(failure.exitcode)
         raise UserError(
             f"process {rank} of the run (pid {failure.pid}) was ended by {failure.signal_name()}, the others with it; "
-            f"{advice}"
+            f"{advice()}"
         ) from None
 
 
@@ -148,7 +159,7 @@ def launch_job(overrides: list[str], cfg: DictConfig, folder: Path) -> None:
     handlers = {one: signal.getsignal(one) for one in (signal.SIGINT, signal.SIGTERM)}
     log = f"its lines above say why, or {folder / 'train.log'}"
     try:
-        launch_verb(command, cfg.gpus, str(cfg.device), log)
+        launch_verb(command, cfg.gpus, str(cfg.device), lambda: log)
     except SystemExit as ended:
         if ended.code in (INTERRUPTED, 128 + signal.SIGTERM):
             raise

@@ -5,6 +5,8 @@ They run on the CPU, one copy after the other (``SerialEnv``), in several proces
 
 from __future__ import annotations
 
+import os
+from collections.abc import Callable
 from functools import partial
 from typing import Any
 
@@ -79,7 +81,7 @@ class ExternalEnv(TransformedEnv):
         if ray:
             base = RayEnv(make, num_envs=num_envs, workers=workers, device=device)
         elif workers:
-            share = partial(SerialEnv, num_envs // workers, make, device="cpu")
+            share = partial(_worker, os.getpid(), num_envs // workers, make)
             # Daemons end with this process, however it ends. It keeps its threads: TorchRL would take one for each
             # worker, and with fewer the learner is slower and rounds otherwise.
             keeps = {"daemon": True, "num_threads": torch.get_num_threads()}
@@ -163,6 +165,14 @@ def check_external(config: ExternalConfig) -> tuple[dict[str, int], int, int]:
 def _flat(data: Any) -> Any:
     """(processes, copies of each, …) → (N, …)"""
     return data.flatten(0, 1)
+
+
+def _worker(starter: int, num_envs: int, make: Callable[[], EnvBase]) -> SerialEnv:
+    """The worlds of a worker, which leaves the group of processes that Ctrl-C and launchers signal: who has started it
+    ends what it is at, with its worlds, and saves. TorchRL calls this in that process, too."""
+    if os.getpid() != starter:
+        os.setsid()
+    return SerialEnv(num_envs, make, device="cpu")
 
 
 def _make_one(config: ExternalConfig) -> EnvBase:

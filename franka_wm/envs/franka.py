@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import copy
 import itertools
 import logging
 import multiprocessing
@@ -123,13 +124,12 @@ class FrankaEnv(EnvBase):
         if task is None:
             check_robot(config, urdf_path)
         elif isinstance(task, Task):
+            task = copy.copy(task)  # another environment may be given it, too
             config = task.config = check_task(task, replace(config, **task.brings()), urdf_path)
         else:
-            raise UserError(
-                f"task={task!r}: must be an instance of Task; by name it is FrankaConfig(task=NAME)"
-            )
+            raise UserError(f"task={task!r}: must be an instance of Task; by name: FrankaConfig(task=NAME)")
         self.config = config
-        self.num_envs = num_envs
+        self.num_envs = num_envs = int(num_envs)
         started = time.perf_counter()
         log.info("building %d worlds on %s with seed %d", num_envs, device, seed)
         self.simulation = Simulation(
@@ -173,7 +173,7 @@ class FrankaEnv(EnvBase):
         if action is None or action.shape != expected:
             given = "there is no action" if action is None else f"action has shape {tuple(action.shape)}"
             raise UserError(f"{given}; it must be {expected}: (worlds, joints)")
-        sim.tensors.action.copy_(action)
+        sim.tensors.action.copy_(action.detach())  # else the graphs of all steps hang on each other, for ever
         sim.step(restart=self._restart)
         for key in self._stacked:
             self._stack.push(key, sim.renderer.next_images[key])

@@ -54,6 +54,9 @@ class MultiTaskEnv(EnvBase):
         first_world: int = 0,
     ):
         check_whole("num_envs", num_envs)
+        num_envs = int(num_envs)
+        if seed is not None:
+            check_whole("seed", seed, least=0, most=2**64 - 1)
         count = len(config.tasks)
         if num_envs < count:
             raise UserError(f"num_envs={num_envs}: {count} tasks need at least as many worlds")

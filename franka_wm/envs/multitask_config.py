@@ -24,6 +24,8 @@ class MultiTaskConfig:
     def __post_init__(self) -> None:
         if not self.tasks:
             raise UserError("env.tasks is empty: it must name at least one task, as env=multitask does")
+        if self.auto_reset != "native":
+            raise UserError(f"auto_reset={self.auto_reset}: tasks together need native")
         for name, config in self.tasks.items():
             if config.images:
                 raise UserError(

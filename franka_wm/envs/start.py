@@ -48,10 +48,8 @@ def check_arguments(config: object, num_envs: object, seed: object, first_world:
 def check_robot(config: FrankaConfig, urdf_path: str | Path | None = None) -> None:
     """Refuses a robot that cannot be loaded, a fixed goal out of its reach, and what :func:`check_start` refuses."""
     robot = load_robot(config, urdf_path)
-    if config.fixed_goal and not Kinematics(robot).reachable(config.goal):
-        raise UserError(
-            f"goal={config.goal} m: out of the arm's reach; it reaches about 0.85 m from (0, 0, 0.333)"
-        )
+    if config.fixed_goal:
+        _check_goal(config, robot)
     check_start(config, robot)
 
 
@@ -60,8 +58,18 @@ def check_task(task: Task, config: FrankaConfig, urdf_path: str | Path | None = 
     type(task).check(config)
     if config.reward not in task.rewards:
         raise UserError(f"reward={config.reward!r}: {type(task).__name__} has {', '.join(task.rewards)}")
-    check_start(config, load_robot(config, urdf_path))
+    robot = load_robot(config, urdf_path)
+    if not task.draws_goals and config.goal_sampling != "reachable":
+        _check_goal(config, robot)
+    check_start(config, robot)
     return config
+
+
+def _check_goal(config: FrankaConfig, robot: Robot) -> None:
+    if not Kinematics(robot).reachable(config.goal):
+        raise UserError(
+            f"goal={config.goal} m: out of the arm's reach; it reaches about 0.85 m from (0, 0, 0.333)"
+        )
 
 
 def check_start(config: FrankaConfig, robot: Robot) -> None:

@@ -10,6 +10,7 @@ from torchrl.envs import Compose, EnvBase, TransformedEnv
 from torchrl.envs.transforms import VecNorm, VecNormV2
 
 from franka_wm.envs.franka import FrankaEnv
+from franka_wm.errors import UserError
 
 
 class TransformedFrankaEnv(TransformedEnv):
@@ -22,6 +23,14 @@ class TransformedFrankaEnv(TransformedEnv):
     """
 
     device: torch.device
+
+    def set_state(self, state: TensorDictBase) -> TensorDictBase:
+        """Transforms keep what they have seen, so a state of the worlds alone cannot be put back here.
+
+        Raises:
+            UserError: It names what can.
+        """
+        raise UserError("set_state: transforms have memories of their own; call base_env.set_state(state)")
 
     def _step_and_maybe_reset(self, tensordict: TensorDictBase) -> tuple[TensorDictBase, TensorDictBase]:
         if not self._resets_every_step():

@@ -172,6 +172,7 @@ class Page:
             kinds = ("video", "dataset")
             self._kind = gui.add_dropdown("as", kinds, initial_value="video", hint=KINDS)
             self._allow(self._kind, is_one_of(kinds))
+            self._recorded = "video"
             self._record = gui.add_button("Record", icon="player-record", color="gray")
             self._allow(self._record, is_click)
             self._record.on_click(lambda _: self._try(self.toggle_recording))
@@ -233,9 +234,10 @@ class Page:
         kind = str(self._kind.value)
         if not self.session.recording:
             self.session.start_recording(kind)
+            self._recorded = kind  # whatever the menu says by the time it is written
             self._record.label, self._kind.disabled = "Stop and save", True
             return
-        name = f"live-{datetime.now():%Y-%m-%d-%H-%M-%S}{'.mp4' if kind == 'video' else ''}"
+        name = f"live-{datetime.now():%Y-%m-%d-%H-%M-%S}{'.mp4' if self._recorded == 'video' else ''}"
         try:
             path = self.session.stop_recording(self.folder / name)
         finally:  # what could not be written is kept, and the button still saves it

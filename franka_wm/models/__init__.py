@@ -73,8 +73,8 @@ def register(name: str, cls: type[WorldModel], *, line: str = "") -> None:
     """
     from franka_wm.models.base import WorldModel
 
-    if not issubclass(cls, WorldModel):
-        raise UserError(f"model {name!r}: {cls.__name__} must be a subclass of franka_wm.models.WorldModel")
+    if not (isinstance(cls, type) and issubclass(cls, WorldModel)):
+        raise UserError(f"model {name!r}: {cls!r} must be a subclass of franka_wm.models.WorldModel")
     _REGISTERED[name] = (cls, line)
 
 

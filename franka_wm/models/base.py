@@ -92,8 +92,15 @@ class WorldModel(nn.Module):
 
     def __init_subclass__(cls, **kwargs: Any) -> None:
         super().__init_subclass__(**kwargs)
+        # Its own, and those of bases that are no models themselves, whose flags are set already.
+        own = {
+            name
+            for kind in cls.__mro__
+            if kind is cls or not issubclass(kind, WorldModel)
+            for name in vars(kind)
+        }
         for flag, methods in ABILITIES.items():
-            if flag not in cls.__dict__ and any(method in cls.__dict__ for method in methods):
+            if flag not in cls.__dict__ and own.intersection(methods):
                 setattr(cls, flag, all(getattr(cls, m) is not getattr(WorldModel, m) for m in methods))
 
     # ------------------------------------------------------------------ every family

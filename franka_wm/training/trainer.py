@@ -192,10 +192,10 @@ class Trainer:
                 if saves:
                     self.save(last=False)
                     saved = time.perf_counter()
-            self.interrupted = stopping
             if ahead:
                 say(f"  evaluation.at_steps={ahead}: not evaluated, the run ends at {self.env_steps} steps")
             self.save()
+            [self.interrupted] = processes.agree([stopping or stop()], [])
         if self._collector is not None:
             self._collector.shutdown()
 

@@ -410,3 +410,15 @@ def test_lists_that_are_empty_or_endless(words: list[str], said: str, capsys) ->
         list(entry.swept(words))
     told = capsys.readouterr().err
     assert told.startswith("error: ") and said in told and told.count("\n") == 1
+
+
+def test_what_to_do_after_a_killed_process_is_what_can_be_done(monkeypatch, tmp_path: Path) -> None:
+    told = []
+    monkeypatch.setattr(several, "launch_verb", lambda command, gpus, device, advice: told.append(advice))
+    monkeypatch.setattr(several, "run_folder", lambda _: tmp_path)
+    several.launch([], ["scale=smoke", "device=cpu", "plugins=[mine]"], 2, "cpu")
+    (advice,) = told
+    assert advice() == "nothing was saved before; start it again"
+    begun(tmp_path, "scale=smoke")
+    assert advice().startswith("go on from the last checkpoint: ")
+    assert advice().endswith(f"train resume={tmp_path} 'plugins=[mine]'")

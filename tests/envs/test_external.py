@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import multiprocessing
+import os
+
 import pytest
 import torch
 
@@ -144,3 +147,16 @@ def test_a_configuration_that_names_too_much_or_too_little_is_one_line() -> None
         ExternalConfig(kind="gym", name="CartPole-v1", task="hard")
     with pytest.raises(UserError, match=r"env\.kind and env\.name: both are needed"):
         external_config({"kind": "gym"})
+
+
+def test_signals_to_the_whole_group_are_not_for_workers() -> None:
+    """Ctrl-C is sent to all in it: who has started them could not save what it is at without its worlds."""
+    group = os.getpgrp()
+    env = ExternalEnv(ExternalConfig(kind="gym", name="Pendulum-v1"), num_envs=2, workers=2)
+    try:
+        groups = [os.getpgid(process.pid) for process in multiprocessing.active_children()]  # type: ignore[arg-type]
+        assert len(groups) == 2 and group not in groups and os.getpgrp() == group
+        env.rollout(3)
+    finally:
+        env.close()
+    assert not multiprocessing.active_children()

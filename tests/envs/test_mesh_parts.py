@@ -12,6 +12,7 @@ import torch
 import trimesh
 
 from franka_wm.envs import FrankaConfig, FrankaEnv
+from franka_wm.envs.robots import meshes
 from franka_wm.envs.scene import Body, Obstacle, Scene
 from franka_wm.errors import UserError
 
@@ -161,3 +162,12 @@ def test_bad_parts_are_one_line(files: Path, changes: dict[str, Any], said: str)
     with pytest.raises(UserError) as caught:
         Scene.of({"objects": [values]})
     assert said in str(caught.value) and "\n" not in str(caught.value)
+
+
+def test_a_mesh_file_that_changed_is_read_again(tmp_path: Path) -> None:
+    pytest.importorskip("trimesh", reason="needs pip install 'franka-wm[meshes]'")
+    path, sizes = tmp_path / "part.obj", []
+    for side in (1, 1, 20):
+        path.write_text(f"v 0 0 0\nv {side} 0 0\nv 0 {side} 0\nf 1 2 3\n")
+        sizes.append(meshes.read(path)[0])
+    assert sizes[0].vertices.max() == 1 and sizes[2].vertices.max() == 20

@@ -215,3 +215,11 @@ def test_diagnostics_see_each_task_at_random_and_by_the_model(env) -> None:
     policies: Any = {"random": Always(0.5), "policy": Always(-0.5)}
     played, _ = gather_episodes(env, mixture(policies, env), steps=1)
     assert played["action"][:, 0, 0].tolist() == [0.5, 0.5, -0.5, -0.5, 0.5]
+
+
+def test_what_cannot_be_is_one_line(config) -> None:
+    with pytest.raises(UserError, match="auto_reset=standard: tasks together need native"):
+        MultiTaskConfig(tasks=config.tasks, auto_reset="standard")
+    for seed in (-1, 1.5, "a"):
+        with pytest.raises(UserError, match="seed="):
+            MultiTaskEnv(config, num_envs=2, device="cpu", seed=seed)  # type: ignore[arg-type]

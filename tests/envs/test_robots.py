@@ -205,7 +205,7 @@ def test_a_texture_is_not_taken_from_elsewhere(tmp_path: Path) -> None:
     found = {}
     for name in ("own.png", "../secret.png", str(tmp_path / "secret.png")):
         (folder / "a.mtl").write_text(f"newmtl m\nmap_Kd {name}\n")
-        meshes.read.cache_clear()
+        meshes._read.cache_clear()
         found[name] = meshes.read(folder / "a.obj")[0].texture is not None
     assert list(found.values()) == [True, False, False], found
 

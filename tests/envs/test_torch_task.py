@@ -10,7 +10,7 @@ import torch
 from tensordict import TensorDictBase
 
 from franka_wm.envs import FrankaConfig, FrankaEnv, TransformedFrankaEnv
-from franka_wm.envs.tasks import Task, TorchTask
+from franka_wm.envs.tasks import Reach, Task, TorchTask
 from franka_wm.errors import UserError
 
 N, LENGTH = 4, 6
@@ -212,3 +212,45 @@ def test_hindsight_reads_the_objects_where_there_are_any(box) -> None:
 
 def test_hindsight_needs_a_task_that_is_about_a_distance(make) -> None:
     assert not Wrong.relabels()
+
+
+def test_two_environments_may_be_given_one_task(box: type[TorchTask]) -> None:
+    """Each has a copy with its own config: that of the second is none of the first one's."""
+    near, far = (FrankaConfig(**SMALL, success_distance=distance) for distance in (0.001, 5.0))
+    task = box(near)
+    first = FrankaEnv(near, num_envs=2, device="cpu", seed=0, task=task)
+    second = FrankaEnv(far, num_envs=2, device="cpu", seed=0, task=task)
+    assert task.config is near
+    for env, expected in ((first, near), (second, far)):
+        assert (
+            env.simulation.task.config == env.config
+            and env.config.success_distance == expected.success_distance
+        )
+
+
+def test_gradients_of_who_acts_end_at_the_world(make) -> None:
+    """A policy in training mode may act in a rollout: its graph neither stays nor comes back in rewards."""
+    env = make()
+    root, weight = env.reset(), torch.ones(N, 7, requires_grad=True)
+    for _ in range(2):
+        step = env.step(root.clone().set("action", 0.1 * weight))
+        assert not any(value.requires_grad for value in step["next"].values())
+        assert not env.simulation.tensors.action.requires_grad
+        step["action"].sum().backward()
+
+
+@pytest.mark.parametrize("wrong", [{"goal": (0.4, 0.0, 0.4)}, {"goal_sampling": "fixed"}])
+def test_goals_that_it_draws_itself_are_not_taken(make, wrong: dict[str, Any]) -> None:
+    with pytest.raises(
+        UserError, match=f"{next(iter(wrong))}=.*: task=Box draws its own goals; leave it out"
+    ):
+        make(**wrong)
+
+
+def test_a_goal_of_a_task_given_as_an_object_is_within_reach() -> None:
+    class Mine(Reach):
+        pass
+
+    config = FrankaConfig(**SMALL, goal=(3.0, 0.0, 3.0))
+    with pytest.raises(UserError, match="out of the arm's reach"):
+        FrankaEnv(config, num_envs=1, device="cpu", task=Mine(config))

@@ -20,6 +20,7 @@ from torchrl.envs.utils import check_env_specs, step_mdp
 from torchrl.objectives.value import GAE
 
 from franka_wm.envs import FrankaConfig, FrankaEnv, TransformedFrankaEnv, franka
+from franka_wm.errors import UserError
 
 N, T, LENGTH, LIMIT = 3, 14, 5, 3
 OPTIONS = {
@@ -392,3 +393,12 @@ def test_a_collector_of_another_process(plain) -> None:
         check(next(iter(collector)), plain())
     finally:
         collector.shutdown()
+
+
+def test_a_state_is_put_back_below_the_transforms() -> None:
+    env = TransformedFrankaEnv(make(), StepCounter())
+    env.reset()
+    state = env.get_state()
+    with pytest.raises(UserError, match=r"transforms have memories of their own; call base_env\.set_state"):
+        env.set_state(state)
+    assert env.base_env.set_state(state).batch_size == (N,)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
@@ -41,3 +42,29 @@ def test_a_longest_path_comes_back_with_more_simulations() -> None:
     assert few.num_simulations == 2
     again = rebuilt(few, num_simulations=16)
     assert again.max_depth == search.max_depth == 4
+
+
+def test_a_recording_is_written_as_it_was_begun(tmp_path: Path) -> None:
+    """The menu may have changed since; a dataset has no ending, a video has one."""
+    written: list[Path] = []
+    session: Any = SimpleNamespace(recording=False)
+
+    def begin(kind: str) -> None:
+        session.recording = True
+
+    def end(path: Path) -> Path:
+        written.append(path)
+        session.recording = False
+        return path
+
+    session.start_recording, session.stop_recording = begin, end
+    menu, button = SimpleNamespace(value="video", disabled=False), SimpleNamespace(label="Record")
+    page: Any = SimpleNamespace(
+        session=session, folder=tmp_path, _kind=menu, _record=button, _notify=lambda *_: None
+    )
+    for begun, later in (("video", "dataset"), ("dataset", "video")):
+        menu.value = begun
+        Page.toggle_recording(page)
+        menu.value = later
+        Page.toggle_recording(page)
+        assert written[-1].suffix == (".mp4" if begun == "video" else "") and button.label == "Record"

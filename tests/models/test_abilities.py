@@ -176,3 +176,26 @@ def test_annotations_that_only_type_checkers_know_are_left_to_the_class():
     Mine.validate({"encoder": 3, "latent_dim": 16})
     with pytest.raises(UserError, match="must be a whole number"):
         Mine.validate({"encoder": 3, "latent_dim": "wide"})
+
+
+def test_abilities_of_a_mixin_count():
+    class Moves:
+        def next(self, z, action):
+            return z
+
+        def reward(self, z, action):
+            return z[..., :1]
+
+    class Mine(Moves, WorldModel):
+        pass
+
+    class Plain(WorldModel):
+        pass
+
+    assert Mine.has_next and Mine.has_reward and not Mine.has_value
+    assert not Plain.has_next and not Plain.has_reward
+
+
+def test_what_is_no_class_is_no_family():
+    with pytest.raises(UserError, match=r"model 'x': 3 must be a subclass"):
+        models.register("x", 3)  # type: ignore[arg-type]

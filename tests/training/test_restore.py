@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import signal
 from collections.abc import Callable
 from dataclasses import replace
 from types import SimpleNamespace
@@ -340,3 +342,18 @@ def test_experience_of_another_form_is_refused(key: Any, value: Any, said: str) 
     other = whole.exclude(key) if value is None else whole.set(key, value)
     with pytest.raises((ValueError, KeyError), match=said):
         resume._fitting(gathering(), other)
+
+
+def test_a_signal_during_the_last_save_counts(make: Make) -> None:
+    """Else a scheduler's only one is lost: a second stage would begin, or the end of the run go on."""
+    trainer = make("stopped", updates=UPDATES)
+    save = trainer.save
+
+    def late(**options: bool) -> None:
+        os.kill(os.getpid(), signal.SIGTERM)
+        save(**options)
+
+    trainer.save = late  # type: ignore[method-assign]
+    trainer.fit()
+    assert trainer.interrupted and trainer.learner.updates == UPDATES
+    assert load_checkpoint(latest_checkpoint(trainer.folder)).counters["updates"] == UPDATES

@@ -17,6 +17,7 @@ from franka_wm.data.lerobot.mapping import FeatureMap, map_features
 from franka_wm.data.lerobot.source import Source, find_dataset, read_source
 from franka_wm.data.lerobot.windows import RecordedWindows, Recording
 from franka_wm.data.memory import free_memory
+from franka_wm.device import resolve_device
 from franka_wm.errors import UserError
 
 MEMORY_SHARE = 0.5
@@ -75,7 +76,8 @@ def open_dataset(
         UserError: One line, for a dataset that cannot be used as asked.
     """
     roots = [folder for _, folder in find_datasets(root, repo_id)]
-    device = torch.empty(0, device=device).device  # with its index
+    asked = None if device is None else resolve_device(device)
+    device = torch.empty(0, device=asked).device  # with its index
     sources, mappings = read_datasets(
         roots,
         features=features,

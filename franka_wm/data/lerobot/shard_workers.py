@@ -150,7 +150,8 @@ def _do(kind: str, *job: Any) -> str | None:
 
 def work() -> None:
     """A writing process: does jobs until the connection, whose number is its first argument, ends."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the process that sends the jobs
+    for one in (signal.SIGINT, signal.SIGTERM):  # to a group, they are for the process that sends the jobs
+        signal.signal(one, signal.SIG_IGN)
     connection, working = Connection(int(sys.argv[1])), Path(sys.argv[2])
     descriptor = os.open(working / LOCK, os.O_RDWR | os.O_CREAT, 0o644)
     fcntl.flock(descriptor, fcntl.LOCK_SH)

@@ -151,13 +151,18 @@ def draw(builder: newton.ModelBuilder, body: int, pieces: list[Piece], cell: flo
         builder.add_shape_mesh(body, mesh=mesh, cfg=config)
 
 
-@lru_cache(maxsize=64)
 def read(path: Path) -> tuple[Piece, ...]:
-    """A mesh file (DAE, OBJ, STL, GLB, …), cut into its materials; memory is kept for the next environment.
+    """A mesh file (DAE, OBJ, STL, GLB, …), cut into its materials; kept for the next environment until it changes.
 
     Raises:
         UserError: If the reader is not installed, or the file is no mesh, too large or of another format.
     """
+    found = path.stat() if path.exists() else None
+    return _read(path, found and (found.st_mtime_ns, found.st_size))
+
+
+@lru_cache(maxsize=64)
+def _read(path: Path, _written: tuple[int, int] | None) -> tuple[Piece, ...]:
     if path.suffix.lower().lstrip(".") not in FORMATS:
         raise UserError(f"{path}: must be a file that ends in {', '.join(f'.{one}' for one in FORMATS)}")
     try:

@@ -86,11 +86,22 @@ class Task:
 
     @classmethod
     def check(cls, config: FrankaConfig) -> None:
-        """Refuses a config in which the task cannot be played, before anything is built.
+        """Refuses a config in which the task cannot be played, before anything is built: goals that it draws itself.
 
         Raises:
             UserError: One line.
         """
+        given = {
+            "goal": config.goal != type(config).goal,
+            "goal_sampling": config.goal_sampling == "fixed",
+            "goal_noise": config.goal_noise != type(config).goal_noise,
+        }
+        for name in given:
+            if cls.draws_goals and given[name]:
+                label = config.task if config.task_class is cls else cls.__name__
+                raise UserError(
+                    f"{name}={getattr(config, name)}: task={label} draws its own goals; leave it out (docs/tasks.md)"
+                )
 
     @classmethod
     def check_goal_image(cls) -> None:

@@ -171,15 +171,7 @@ class GripperTask(Task):
 
     @classmethod
     def check(cls, config: "FrankaConfig") -> None:
-        for name, value, idle in (
-            ("goal", config.goal, config.goal == type(config).goal),
-            ("goal_sampling", config.goal_sampling, config.goal_sampling != "fixed"),
-            ("goal_noise", config.goal_noise, config.goal_noise == type(config).goal_noise),
-        ):
-            if not idle:
-                raise UserError(
-                    f"{name}={value}: task={config.task} draws its own goals; leave it out (docs/tasks.md)"
-                )
+        super().check(config)
         if config.num_objects < cls.least_objects:
             raise UserError(
                 f"scene: task={config.task} is about {cls.least_objects} objects, the scene has "

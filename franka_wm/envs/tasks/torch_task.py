@@ -99,7 +99,7 @@ class TorchTask(Task):
                 f"{type(self).__name__}.{name} gave {tuple(value.shape)} {value.dtype}; for {shape[0]} worlds it must "
                 f"give {shape} {'bool' if boolean else 'float'}"
             )
-        return value
+        return value.detach()
 
 
 def _seen(state: torch.Tensor, objects: torch.Tensor | None) -> torch.Tensor:

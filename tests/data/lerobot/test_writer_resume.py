@@ -379,3 +379,20 @@ def test_a_strangers_dataset_is_not_added_to(
     with pytest.raises(UserError, match=says):
         write(out, schema, [make_episode(schema, 1)], resume=True)
     assert {path: path.read_bytes() for path in out.rglob("*") if path.is_file()} == before
+
+
+def test_signals_to_the_whole_group_are_not_for_writing_processes(
+    tmp_path, make_schema, make_episode, load
+) -> None:
+    """Who sends them their jobs ends what it is at; what they have begun is written."""
+    schema = make_schema()
+    episodes = [make_episode(schema, i) for i in range(4)]
+    with DatasetWriter(tmp_path / "set", schema, provenance={}, workers=1, shard_frames=7) as writer:
+        writer.add(episodes[:2])
+        writer.flush()
+        worker = writer._workers[0]
+        for number in (signal.SIGINT, signal.SIGTERM):
+            os.kill(worker._process.pid, number)  # pyright: ignore[reportAttributeAccessIssue]
+        writer.add(episodes[2:])
+        writer.finish()
+    compare(load(tmp_path / "set"), schema, episodes)
