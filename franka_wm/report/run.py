@@ -69,8 +69,10 @@ class RunFiles:
 
     @property
     def extras(self) -> Mapping[str, Any]:
-        """What was found besides the policies, by whichever looked."""
-        return {name: value for one in reversed(self.results) for name, value in one.extras.items()}
+        """What was found besides the policies, by whichever looked at the weights that are shown."""
+        shown = self.results[0].updates if self.results else None
+        same = [one for one in self.results if one.updates == shown or None in (one.updates, shown)]
+        return {name: value for one in reversed(same) for name, value in one.extras.items()}
 
     @property
     def name(self) -> str:

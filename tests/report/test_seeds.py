@@ -8,8 +8,8 @@ from franka_wm.commands.main import main
 from franka_wm.commands.summary import summary
 from franka_wm.errors import UserError
 from franka_wm.evaluation.intervals import bootstrap_mean
-from franka_wm.evaluation.results import END
-from franka_wm.report.run import but_for_the_seed
+from franka_wm.evaluation.results import END, Result
+from franka_wm.report.run import RunFiles, but_for_the_seed
 from franka_wm.report.seeds import cells_told, read_evaluation, runs_of, seeds_table
 from light import answers
 
@@ -195,3 +195,12 @@ def test_compare_tells_which_results_were_planned_otherwise(tmp_path, capsys):
     assert main(words) == 0
     page = (tmp_path / "page.html").read_text()
     assert "measured by" in page and page.count(", planned with planner.num_samples=8") == 1
+
+
+def test_what_was_found_of_older_weights_does_not_stand_beside_newer_ones(tmp_path):
+    """A run that went on after `franka-wm evaluate`: its warnings and probes are not those of the table."""
+    old = Result(tmp_path / "evaluation.json", {"updates": 20}, {}, {"probes": 1})
+    new = Result(tmp_path / "evaluation.json", {"updates": 40}, {}, {"open_loop": 2})
+    unsaid = Result(tmp_path / "evaluation.json", {}, {}, {"calibration": 3})
+    assert RunFiles(tmp_path, results=[new, old]).extras == {"open_loop": 2}
+    assert RunFiles(tmp_path, results=[new, unsaid]).extras == {"open_loop": 2, "calibration": 3}
