@@ -8,6 +8,8 @@ import os
 import signal
 import sys
 import tempfile
+import threading
+import time
 import traceback
 import uuid
 from collections.abc import Callable, Iterator, Mapping
@@ -27,6 +29,8 @@ from franka_wm.versions import PACKAGES, usable_cores, versions
 
 SAVING = 1800
 """How long processes that were asked to stop may take to save [s]."""
+LAUNCHER = "FRANKA_WM_LAUNCHER"
+"""Number of the process that has started those of a job on this host by ``gpus=N``."""
 JOB = "FRANKA_WM_JOB"
 """In the environment of a process: it is one of several of a sweep's job, whose folder this is."""
 
@@ -96,6 +100,7 @@ def launch_verb(command: list[str], gpus: int, device: str, advice: Callable[[],
     os.environ.setdefault("OMP_NUM_THREADS", str(max(1, usable_cores() // gpus)))
     places = [str(conf.FOLDER.parents[1]), *filter(None, [os.environ.get("PYTHONPATH")])]
     os.environ["PYTHONPATH"] = os.pathsep.join(places)
+    os.environ[LAUNCHER] = str(os.getpid())
     try:
         with tempfile.TemporaryDirectory(prefix="franka_wm-") as logs, patience():
             config = LaunchConfig(
@@ -120,6 +125,8 @@ def launch_verb(command: list[str], gpus: int, device: str, advice: Callable[[],
             f"process {rank} of the run (pid {failure.pid}) was ended by {failure.signal_name()}, the others with it; "
             f"{advice()}"
         ) from None
+    finally:
+        del os.environ[LAUNCHER]
 
 
 def refused_job(overrides: list[str]) -> str | None:
@@ -264,6 +271,8 @@ def meet(options: list[str], device: str, configuration: Mapping[str, object] | 
     """
     from franka_wm import processes
 
+    if LAUNCHER in os.environ:
+        end_with(int(os.environ[LAUNCHER]))
     if os.environ["RANK"] != "0":
         sys.stdout = open(os.devnull, "w")  # noqa: SIM115  # as long as the process
     processes.join(cuda=device != "cpu")
@@ -273,6 +282,23 @@ def meet(options: list[str], device: str, configuration: Mapping[str, object] | 
     for some in (configuration or {}, code):
         if len({*processes.objects(_hash(repr(sorted(some.items())).encode()))}) > 1:
             _require_same(some)
+
+
+def end_with(launcher: int, *, every: float = 2.0) -> None:
+    """Asks this process to stop once the one that started it is no more, as after ``kill -9``: else it would train on,
+    holding its GPU and the run's folder, and nobody would know.
+
+    Args:
+        launcher: Number of that process.
+        every: How often it is looked for [s].
+    """
+
+    def watch() -> None:
+        while os.getppid() == launcher:
+            time.sleep(every)
+        os.kill(os.getpid(), signal.SIGTERM)  # what it is at is saved
+
+    threading.Thread(target=watch, name="launcher", daemon=True).start()
 
 
 def _require_same(mine: Mapping[str, object]) -> None:

@@ -4,9 +4,12 @@ from __future__ import annotations
 
 import gc
 import os
+import signal
 import sys
 import traceback
-from collections.abc import Callable
+import uuid
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -17,6 +20,7 @@ from franka_wm import conf
 from franka_wm.commands import several
 from franka_wm.console import log_anew, say
 from franka_wm.errors import REFUSALS, FrankaError, UserError, machine_refused
+from franka_wm.interrupt import INTERRUPTED
 from franka_wm.versions import FINISHED
 
 
@@ -79,6 +83,7 @@ class Sweep:
         names, folders: Names and folders of the jobs that are known beforehand.
         process: Number of the process that checked them; others may run them.
         folder: Folder of the sweep.
+        token: Its own, in the name of the mark by which jobs in other processes know that it is stopped.
         failed: By number, the jobs that failed in this process, and why.
     """
 
@@ -86,6 +91,7 @@ class Sweep:
     folders: list[Path] = field(default_factory=list)
     process: int = field(default_factory=os.getpid)
     folder: str = ""
+    token: str = field(default_factory=lambda: uuid.uuid4().hex[:8])
     ran: int = 0
     failed: dict[int, str] = field(default_factory=dict)
 
@@ -105,6 +111,11 @@ class Sweep:
         name = self.names[number] if number < len(self.names) else f"job {number}"
         self.folder = str(told.sweep.dir)
         self.ran += 1
+        mark = Path(self.folder, f".stopped-{self.token}")
+        # Of joblib's: an exception there kills the jobs beside it, before they have saved.
+        beside_others = self.process != os.getpid() and told.runtime.choices["hydra/launcher"] == "joblib"
+        if beside_others and mark.exists():
+            return None
         try:
             left = None if cfg.resume is not None else left_by(folder, cfg)
             if left == "finished":
@@ -120,6 +131,9 @@ class Sweep:
             several.launch_job([*told.overrides.task, *paths], cfg, folder)
             return _score(folder)
         except (KeyboardInterrupt, SystemExit):  # the latter is how a run ends that has saved after Ctrl-C
+            if beside_others:
+                mark.touch()
+                return None
             say(f"the sweep is stopped; {self.advice}")
             raise
         except Exception as error:
@@ -129,6 +143,36 @@ class Sweep:
         finally:
             log_anew()
             gc.collect()  # the next one needs the memory
+
+    @contextmanager
+    def waiting(self) -> Iterator[None]:
+        """Ctrl-C reaches jobs in processes of their own by itself: they save, and this one waits for them.
+
+        Raises:
+            SystemExit: After that; a second Ctrl-C stops at once.
+        """
+        pressed = False
+
+        def note(signum: int, frame: object) -> None:
+            nonlocal pressed
+            if pressed:
+                raise KeyboardInterrupt
+            pressed = True
+
+        before = signal.signal(signal.SIGINT, note)
+        try:
+            yield
+        except SystemExit:
+            if not pressed:
+                raise
+        finally:
+            signal.signal(signal.SIGINT, before)
+        if pressed:
+            self.folder = self.folder or (str(self.folders[0].parent) if self.folders else "")
+            for mark in Path(self.folder).glob(f".stopped-{self.token}"):
+                mark.unlink()
+            say(f"the sweep is stopped; {self.advice}")
+            sys.exit(INTERRUPTED)
 
     @property
     def advice(self) -> str:

@@ -412,13 +412,31 @@ def test_lists_that_are_empty_or_endless(words: list[str], said: str, capsys) ->
     assert told.startswith("error: ") and said in told and told.count("\n") == 1
 
 
-def test_what_to_do_after_a_killed_process_is_what_can_be_done(monkeypatch, tmp_path: Path) -> None:
-    told = []
-    monkeypatch.setattr(several, "launch_verb", lambda command, gpus, device, advice: told.append(advice))
-    monkeypatch.setattr(several, "run_folder", lambda _: tmp_path)
-    several.launch([], ["scale=smoke", "device=cpu", "plugins=[mine]"], 2, "cpu")
-    (advice,) = told
-    assert advice() == "nothing was saved before; start it again"
-    begun(tmp_path, "scale=smoke")
-    assert advice().startswith("go on from the last checkpoint: ")
-    assert advice().endswith(f"train resume={tmp_path} 'plugins=[mine]'")
+@pytest.mark.slow
+def test_ctrl_c_lets_all_jobs_of_a_sweep_save(tmp_path: Path) -> None:
+    """Two at once, in processes of their own: each is asked by Ctrl-C itself, and the third does not begin."""
+    pytest.importorskip(
+        "hydra_plugins.hydra_joblib_launcher", reason="hydra/launcher=joblib is not installed"
+    )
+    command = ["hydra/launcher=joblib", "hydra.launcher.n_jobs=2", *SMOKE, *SMALL, "trainer.updates=1000000"]
+    command += ["trainer.log_every=0.2", "seed=0,1,2", f"hydra.sweep.dir={tmp_path}/sweep"]
+    train = script(TRAIN, "--multirun", *command)
+
+    def apart() -> None:
+        os.setsid()
+        train()
+
+    fork = Fork(apart, cwd=tmp_path, log=tmp_path / "log")
+    logs = [tmp_path / "sweep" / f"{k}-reach" / "train.log" for k in range(2)]
+    ends = time.monotonic() + 120
+    while not all(log.is_file() and "\nupdates" in log.read_text() for log in logs):
+        assert time.monotonic() < ends, fork.said()
+        time.sleep(0.05)
+    os.killpg(fork.pid, signal.SIGINT)
+    done = fork.wait(60)
+    assert done.returncode == 130 and "Traceback" not in done.stderr, done.stdout + done.stderr
+    assert f"hydra.sweep.dir={tmp_path}/sweep runs what is missing" in done.stdout
+    for log in logs:
+        assert latest_checkpoint(log.parent)
+    assert not (tmp_path / "sweep" / "2-reach" / "config.yaml").exists()
+    assert not list((tmp_path / "sweep").glob(".stopped-*"))

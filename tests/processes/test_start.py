@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import signal
 import socket
 import subprocess
 import time
@@ -28,6 +29,7 @@ from franka_wm.console import quoted
 from franka_wm.errors import UserError
 from franka_wm.training import run
 from franka_wm.versions import versions
+from small_checkpoint import save
 
 
 @pytest.fixture
@@ -302,3 +304,40 @@ def test_comparing_weights_takes_little_memory(monkeypatch) -> None:
     with Watch():
         processes.require_same({"large": large})
     assert made and max(made) <= 8 * processes.PIECE < large.nbytes
+
+
+def test_what_to_do_after_a_killed_process_is_what_can_be_done(monkeypatch, tmp_path: Path) -> None:
+    told = []
+    monkeypatch.setattr(several, "launch_verb", lambda command, gpus, device, advice: told.append(advice))
+    monkeypatch.setattr(several, "run_folder", lambda _: tmp_path)
+    several.launch([], ["scale=smoke", "device=cpu", "plugins=[mine]"], 2, "cpu")
+    (advice,) = told
+    assert advice() == "nothing was saved before; start it again"
+    save(tmp_path / "checkpoints" / "latest")
+    assert advice().startswith("go on from the last checkpoint: ")
+    assert advice().endswith(f"train resume={tmp_path} 'plugins=[mine]'")
+
+
+def test_processes_end_with_who_has_started_them(tmp_path: Path) -> None:
+    """Killed, it can tell them nothing; they would hold GPUs and the run's folder."""
+    note = tmp_path / "started"
+
+    def launch() -> None:
+        if os.fork():
+            time.sleep(60)
+        several.end_with(os.getppid(), every=0.05)
+        note.write_text(str(os.getpid()))
+        time.sleep(60)
+
+    launcher = Fork(launch, cwd=tmp_path, log=tmp_path / "log")
+    ends = time.monotonic() + 30
+    while not (note.is_file() and note.read_text()) and time.monotonic() < ends:
+        time.sleep(0.02)
+    started = int(note.read_text())
+    time.sleep(0.3)
+    os.kill(started, 0)  # it lives as long as the other does
+    os.kill(launcher.pid, signal.SIGKILL)
+    launcher.wait(10)
+    while Path(f"/proc/{started}").exists() and time.monotonic() < ends:
+        time.sleep(0.02)
+    assert not Path(f"/proc/{started}").exists()
