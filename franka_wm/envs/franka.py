@@ -80,7 +80,7 @@ class FrankaEnv(EnvBase):
     whether a world is done and resets by mask; :class:`TransformedFrankaEnv` does not ask.
 
     **A world that is no longer finite** is put back to its last finite observation, truncated, reset and
-    counted (``statistics()["nonfinite"]``); no NaN is emitted.
+    counted (``statistics()["nonfinite"]``): physics emits no NaN.
 
     **Randomness** depends on seed × world × episode alone: world k sees the same episodes whatever N is.
 
