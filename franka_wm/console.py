@@ -110,8 +110,10 @@ def terminal_log() -> Iterator[None]:
     _log = io.StringIO()
     sys.stdout, sys.stderr = (_Copied(stream) for stream in streams)  # type: ignore[assignment]
     try:
-        yield
-        sys.stdout.flush()  # here, where a closed pipe is caught, and not at exit
+        try:
+            yield
+        finally:
+            sys.stdout.flush()  # here, where a closed pipe is caught, and not at exit
     finally:
         sys.stdout, sys.stderr = streams
         if _log is not None:
