@@ -30,7 +30,7 @@ from franka_wm.versions import PACKAGES, usable_cores, versions
 SAVING = 1800
 """How long processes that were asked to stop may take to save [s]."""
 LAUNCHER = "FRANKA_WM_LAUNCHER"
-"""Number of the process that has started those of a job on this host by ``gpus=N``."""
+"""Process ID of the one that has started those of a job on this host by ``gpus=N``."""
 JOB = "FRANKA_WM_JOB"
 """In the environment of a process: it is one of several of a sweep's job, whose folder this is."""
 
@@ -285,11 +285,12 @@ def meet(options: list[str], device: str, configuration: Mapping[str, object] | 
 
 
 def end_with(launcher: int, *, every: float = 2.0) -> None:
-    """Asks this process to stop once the one that started it is no more, as after ``kill -9``: else it would train on,
-    holding its GPU and the run's folder, and nobody would know.
+    """Asks this process to stop once the one that started it is gone, as after ``kill -9``.
+
+    Else it would train on, holding its GPU and the run's folder, and nobody would know.
 
     Args:
-        launcher: Number of that process.
+        launcher: Process ID of that one.
         every: How often it is looked for [s].
     """
 

@@ -168,8 +168,11 @@ def _flat(data: Any) -> Any:
 
 
 def _worker(starter: int, num_envs: int, make: Callable[[], EnvBase]) -> SerialEnv:
-    """The worlds of a worker, which leaves the group of processes that Ctrl-C and launchers signal: who has started it
-    ends what it is at, with its worlds, and saves. TorchRL calls this in that process, too."""
+    """The worlds of a worker, which leaves the process group that Ctrl-C and launchers signal.
+
+    The process that has started it still needs its worlds, to end what it is at and save. TorchRL calls this in that
+    process, too, whose group stays.
+    """
     if os.getpid() != starter:
         os.setsid()
     return SerialEnv(num_envs, make, device="cpu")

@@ -115,10 +115,11 @@ def open_cache(
             try:
                 temporary.mkdir()
                 build_cache(source, mapping, fingerprint, temporary, workers, say)
+                # Else a power cut leaves names without content.
                 for path in (
                     *temporary.iterdir(),
                     temporary,
-                ):  # else a power cut leaves names without content
+                ):
                     sync(path)
                 temporary.replace(folder)
             finally:

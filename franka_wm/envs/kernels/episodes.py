@@ -32,9 +32,9 @@ def end_step(
     """Ends episodes and keeps their statistics.
 
     A broken world is truncated, not terminated: where rewards are negative, as reach's are, an end worth 0 would
-    pay an agent for breaking the simulation. Nor has it succeeded, wherever it was before. So is a world that is ``cut`` short: what comes then has no reward of its own,
-    but is not worth 0 either. A world that is stepped on after its end, without a reset, stays done by
-    time or success, and is not counted again.
+    pay an agent for breaking the simulation. Nor has it succeeded, wherever it was before. A world that is ``cut``
+    short is truncated, too: what comes then has no reward of its own, but is not worth 0 either. A world that is
+    stepped on after its end, without a reset, stays done by time or success, and is not counted again.
     """
     world = wp.tid()
     over = ended[world]
