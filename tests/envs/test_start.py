@@ -249,3 +249,8 @@ def test_what_is_no_argument_is_one_line(given: dict[str, Any], says: str) -> No
     with pytest.raises(UserError, match=says) as caught:
         FrankaEnv(**({"num_envs": 1, "device": "cpu"} | given))
     assert "\n" not in str(caught.value)
+
+
+def test_a_number_of_numpys_is_a_number_of_worlds() -> None:
+    env = FrankaEnv(FrankaConfig(observations=("state",)), num_envs=np.int64(2), device="cpu")  # type: ignore[arg-type]
+    assert env.reset().batch_size == (2,) and type(env.num_envs) is int

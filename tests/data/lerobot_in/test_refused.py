@@ -8,6 +8,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+import torch
 
 from franka_wm.data.lerobot import source
 from franka_wm.errors import UserError
@@ -75,3 +76,10 @@ def test_a_writer_that_was_killed(pictures: Path, opened: Callable, tmp_path: Pa
     path.write_bytes(path.read_bytes()[:-50])
     with pytest.raises(UserError, match=r"meta/episodes cannot be read.*probably killed"):
         opened(root)
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="there is a GPU")
+def test_a_gpu_that_is_not_there(pictures: Path, opened: Callable) -> None:
+    with pytest.raises(UserError, match="cuda"):
+        opened(pictures, device="cuda")
+    assert opened(pictures, device="auto").device.type == "cpu"
