@@ -112,3 +112,14 @@ def test_a_resumed_run_keeps_what_it_was(word: str, tmp_path: Path) -> None:
     same = [f"resume={tmp_path}", "scale=smoke", "seed=0", "trainer.updates=50"]
     _, merged = resumed(compose(*same), same)
     assert merged.trainer.updates == 50 and merged.seed == 0
+
+
+def test_the_first_steps_are_learned_before_more_is_gathered(train, tmp_path: Path) -> None:
+    def counters(updates: int) -> dict[str, float]:
+        words = (f"collector.seed_updates={updates}", "evaluation.during=[]")
+        return train(*words, folder=tmp_path / f"{updates}").counters
+
+    usual, alone = counters(0), counters(20)
+    assert usual["updates"] == alone["updates"] == 30
+    # Three batches of five steps of three worlds, each before ten updates; the second is not gathered.
+    assert usual["env_steps"] - alone["env_steps"] == 3 * 5

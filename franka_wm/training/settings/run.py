@@ -350,6 +350,11 @@ class RunSettings:
             f"use planner={' or '.join(fitting)}"
         )
 
+    @property
+    def updates_alone(self) -> int:
+        """So many updates at the start see the first steps, or demonstrations, and nothing is gathered meanwhile."""
+        return max(self.collector.seed_updates, 0 if self.replay.demos is None else self.replay.demo_updates)
+
     def planned_steps(self, updates: int = 0) -> int:
         """Steps that each world will make until the end of the run, after so many ``updates``."""
         c, t = self.collector, self.trainer
