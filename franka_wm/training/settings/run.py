@@ -160,7 +160,9 @@ class RunSettings:
                 "whole_run": self.values,
                 "model": self.pretrain.model,
                 "trainer": {**self.values["trainer"], "updates": self.pretrain.updates},
-                "replay": {**self.values["replay"], "future": False},  # for the goals of the second stage
+                # For the goals, and the policy, of the second stage.
+                "replay": {**self.values["replay"], "future": False, "demo_updates": 0},
+                "collector": {**self.values["collector"], "seed_updates": 0},
                 "export": {**self.values["export"], "kind": "none"},
             }
         )
