@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
@@ -358,9 +359,11 @@ class RunSettings:
         return max(self.collector.seed_updates, 0 if self.replay.demos is None else self.replay.demo_updates)
 
     def planned_steps(self, updates: int = 0) -> int:
-        """Steps that each world will make until the end of the run, after so many ``updates``."""
+        """Steps that each world will make until the end of the run, at most, after so many ``updates``."""
         c, t = self.collector, self.trainer
-        return c.seed_steps + -(-max(t.updates - updates, 0) // t.updates_per_batch) * c.steps_per_batch
+        first = max(updates, self.updates_alone)  # from here on each batch of updates follows one of steps
+        batches = math.ceil(t.updates / t.updates_per_batch) - math.ceil(first / t.updates_per_batch)
+        return c.seed_steps + (max(batches, 0) + (updates < first)) * c.steps_per_batch
 
 
 def _listed(names: Any) -> Any:
