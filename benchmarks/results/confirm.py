@@ -37,7 +37,7 @@ SIZES = (
     "replay.capacity",
     "replay.batch_size",
 )
-SMALLER = {"replay.demo_updates": 10, "planner.num_policy_samples": 4}
+SMALLER = {"replay.demo_updates": 10, "collector.seed_updates": 10, "planner.num_policy_samples": 4}
 """What a row asks for beyond a smoke run's 30 updates and 16 candidates, and what a short run has instead."""
 ONE_CORE = {"OMP_NUM_THREADS": "1", "CUDA_VISIBLE_DEVICES": ""}
 SHORT = ("scale=smoke", "device=cpu", "seed=3", "logger=none", "evaluation.video_episodes=0")

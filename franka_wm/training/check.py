@@ -145,6 +145,10 @@ def _check_windows(run: RunSettings) -> None:
         )
     if capacity < c.num_envs * c.steps_per_batch:
         raise UserError(f"{typed}: smaller than one batch of the collector")
+    if c.seed_updates > run.trainer.updates:
+        raise UserError(
+            f"collector.seed_updates={c.seed_updates}: must be at most trainer.updates={run.trainer.updates}"
+        )
 
 
 def _check_hindsight(run: RunSettings) -> None:

@@ -152,8 +152,8 @@ class Trainer:
             while self.learner.updates < total and not stopping:
                 before = self.learner.updates
                 done = before % trainer.updates_per_batch  # by a run that ended amid a batch's updates
-                shown = self.settings.replay.demo_updates if self.demonstrations else 0
-                if self.env is not None and (anew or (not done and before >= shown)):
+                alone = self.settings.updates_alone
+                if self.env is not None and (anew or (not done and before >= alone)):
                     self.gather()
                     anew = False
                 for _ in range(min(trainer.updates_per_batch - done, total - before)):

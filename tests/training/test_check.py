@@ -108,3 +108,8 @@ def test_a_family_of_ones_own_is_built_whole(settled, monkeypatch) -> None:
     monkeypatch.setitem(models._REGISTERED, "mine", (Mine, ""))
     sketch = built(settled("device=cpu", "scale=smoke", "model.name=mine"), monkeypatch)
     assert {one.device.type for one in sketch.parameters()} == {"cpu"}
+
+
+def test_more_updates_of_the_first_steps_than_there_are(settled) -> None:
+    with pytest.raises(UserError, match=r"collector\.seed_updates=31: must be at most trainer\.updates=30"):
+        check(settled("device=cpu", "scale=smoke", "collector.seed_updates=31"))

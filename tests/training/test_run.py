@@ -131,3 +131,43 @@ def test_a_value_means_the_same_with_resume(tmp_path: Path) -> None:
     assert found.keys() == began.keys() and merged("hydra.sweep.dir=x").keys() == began.keys()
     with pytest.raises(FrankaError, match=r"~trainer\.schedule: a run that resumes keeps all its options"):
         merged("~trainer.schedule")
+
+
+def test_the_first_steps_are_learned_before_more_is_gathered(train, tmp_path: Path) -> None:
+    """Three batches of five steps of three worlds, each before ten updates; the second is not gathered."""
+    gathered = []
+    for updates in (0, 11):  # the second in whole batches of updates
+        words = (f"collector.seed_updates={updates}", "evaluation.during=[]")
+        saved = train(*words, folder=tmp_path / f"{updates}")
+        run = RunSettings.of(saved.config)
+        assert saved.counters["updates"] == run.trainer.updates == 30
+        assert saved.counters["env_steps"] == run.collector.num_envs * run.planned_steps()
+        gathered.append(saved.counters["env_steps"])
+    assert gathered[0] - gathered[1] == 3 * 5
+
+
+@pytest.mark.parametrize(
+    ("words", "updates", "steps"),
+    [
+        (["collector.seed_updates=0"], 0, 15),
+        (["collector.seed_updates=30"], 0, 5),  # that of the untrained actor
+        (["collector.seed_updates=11"], 20, 5),  # those after 20
+        (["collector.seed_updates=11"], 5, 10),  # resumed without replay: anew
+        (["replay.demos=there", "replay.demo_updates=20"], 0, 10),
+    ],
+)
+def test_room_is_asked_for_what_will_be_gathered(words: list[str], updates: int, steps: int, settled) -> None:
+    run = settled("device=cpu", "scale=smoke", *words)
+    assert run.planned_steps(updates) == run.collector.seed_steps + steps
+
+
+def test_a_first_stage_gathers_all_the_time(settled) -> None:
+    """What the second stage's policy learns alone, or from demonstrations, is no matter of an encoder's."""
+    words = (
+        "experiment=two_stages",
+        "collector.seed_updates=20",
+        "replay.demos=there",
+        "replay.demo_updates=20",
+    )
+    run = settled("device=cpu", "scale=smoke", *words)
+    assert run.updates_alone == 20 and run.first_stage().updates_alone == 0

@@ -27,6 +27,7 @@ OUT_OF_RANGE = {
     "collector.num_envs": [0],
     "collector.steps_per_batch": [0],
     "collector.seed_steps": [0],
+    "collector.seed_updates": [-1],
     "collector.smoothness": [-0.1, 1.0],
     "collector.noise": [-0.1, 2.1],
     "collector.planner_worlds": [-1],

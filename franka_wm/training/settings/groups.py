@@ -55,6 +55,7 @@ class CollectorSettings:
     num_envs: int = whole(least=1, most=10**6)
     steps_per_batch: int = whole(least=1, most=10**6)
     seed_steps: int = whole(least=1)
+    seed_updates: int = whole(0, least=0, most=MOST_UPDATES)
     smoothness: float = real(0.7, least=0, below=1)
     noise: float = real(0.0, least=0, most=2, unit="units of the action")
     planner_worlds: int = whole(0, least=0)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
@@ -160,7 +161,9 @@ class RunSettings:
                 "whole_run": self.values,
                 "model": self.pretrain.model,
                 "trainer": {**self.values["trainer"], "updates": self.pretrain.updates},
-                "replay": {**self.values["replay"], "future": False},  # for the goals of the second stage
+                # For the goals, and the policy, of the second stage.
+                "replay": {**self.values["replay"], "future": False, "demo_updates": 0},
+                "collector": {**self.values["collector"], "seed_updates": 0},
                 "export": {**self.values["export"], "kind": "none"},
             }
         )
@@ -350,10 +353,17 @@ class RunSettings:
             f"use planner={' or '.join(fitting)}"
         )
 
+    @property
+    def updates_alone(self) -> int:
+        """So many updates at the start see the first steps, or demonstrations, and nothing is gathered meanwhile."""
+        return max(self.collector.seed_updates, 0 if self.replay.demos is None else self.replay.demo_updates)
+
     def planned_steps(self, updates: int = 0) -> int:
-        """Steps that each world will make until the end of the run, after so many ``updates``."""
+        """Steps that each world will make until the end of the run, at most, after so many ``updates``."""
         c, t = self.collector, self.trainer
-        return c.seed_steps + -(-max(t.updates - updates, 0) // t.updates_per_batch) * c.steps_per_batch
+        first = max(updates, self.updates_alone)  # from here on each batch of updates follows one of steps
+        batches = math.ceil(t.updates / t.updates_per_batch) - math.ceil(first / t.updates_per_batch)
+        return c.seed_steps + (max(batches, 0) + (updates < first)) * c.steps_per_batch
 
 
 def _listed(names: Any) -> Any:
