@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import signal
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any
 
@@ -13,20 +13,28 @@ INTERRUPTED = 130
 """Exit status after Ctrl-C, as shells expect."""
 
 
+def _tell(signum: int) -> None:
+    say("\ninterrupted: finishing this step and saving; press Ctrl-C again to stop at once")
+
+
 @contextmanager
-def interruptible() -> Iterator[Any]:
+def interruptible(first: Callable[[int], None] = _tell) -> Iterator[Any]:
     """Yields a function that tells whether the run shall end: after Ctrl-C, or the SIGTERM of a cluster's scheduler.
 
-    A second one stops at once.
+    Ctrl-C after that stops at once. Another SIGTERM does not: it may come from a scheduler and from our parent as well.
+
+    Args:
+        first: is called with the number of the first signal.
     """
     pressed = False
 
     def note(signum: int, frame: Any) -> None:
         nonlocal pressed
-        if pressed:
+        if not pressed:
+            pressed = True
+            first(signum)
+        elif signum == signal.SIGINT:
             raise KeyboardInterrupt
-        pressed = True
-        say("\ninterrupted: finishing this step and saving; press Ctrl-C again to stop at once")
 
     numbers = (signal.SIGINT, signal.SIGTERM)
     try:

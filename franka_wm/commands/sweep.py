@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gc
+import multiprocessing
 import os
 import signal
 import sys
@@ -20,7 +21,7 @@ from franka_wm import conf
 from franka_wm.commands import several
 from franka_wm.console import log_anew, say
 from franka_wm.errors import REFUSALS, FrankaError, UserError, machine_refused
-from franka_wm.interrupt import INTERRUPTED
+from franka_wm.interrupt import INTERRUPTED, interruptible
 from franka_wm.versions import FINISHED
 
 
@@ -146,28 +147,27 @@ class Sweep:
 
     @contextmanager
     def waiting(self) -> Iterator[None]:
-        """Ctrl-C reaches jobs in processes of their own by itself: they save, and this one waits for them.
+        """Jobs in processes of their own save when the sweep is stopped, and this process waits for them.
+
+        Ctrl-C reaches them by itself; a SIGTERM to this process alone is passed on.
 
         Raises:
-            SystemExit: After that; a second Ctrl-C stops at once.
+            SystemExit: After that.
+            KeyboardInterrupt: Ctrl-C once more.
         """
-        pressed = False
 
-        def note(signum: int, frame: object) -> None:
-            nonlocal pressed
-            if pressed:
-                raise KeyboardInterrupt
-            pressed = True
+        def pass_on(signum: int) -> None:
+            if signum == signal.SIGTERM:
+                for job in multiprocessing.active_children():
+                    job.terminate()
 
-        before = signal.signal(signal.SIGINT, note)
-        try:
-            yield
-        except SystemExit:
-            if not pressed:
-                raise
-        finally:
-            signal.signal(signal.SIGINT, before)
-        if pressed:
+        with interruptible(pass_on) as stopped:
+            try:
+                yield
+            except SystemExit:
+                if not stopped():
+                    raise
+        if stopped():
             self.folder = self.folder or (str(self.folders[0].parent) if self.folders else "")
             for mark in Path(self.folder).glob(f".stopped-{self.token}"):
                 mark.unlink()

@@ -413,8 +413,12 @@ def test_lists_that_are_empty_or_endless(words: list[str], said: str, capsys) ->
 
 
 @pytest.mark.slow
-def test_ctrl_c_lets_all_jobs_of_a_sweep_save(tmp_path: Path) -> None:
-    """Two at once, in processes of their own: each is asked by Ctrl-C itself, and the third does not begin."""
+@pytest.mark.parametrize("stop", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_lets_all_jobs_of_a_sweep_save(stop: signal.Signals, tmp_path: Path) -> None:
+    """Two at once, in processes of their own, and the third does not begin.
+
+    Each is asked by Ctrl-C itself; the SIGTERM of a scheduler may be for the first process alone.
+    """
     pytest.importorskip(
         "hydra_plugins.hydra_joblib_launcher", reason="hydra/launcher=joblib is not installed"
     )
@@ -432,7 +436,7 @@ def test_ctrl_c_lets_all_jobs_of_a_sweep_save(tmp_path: Path) -> None:
     while not all(log.is_file() and "\nupdates" in log.read_text() for log in logs):
         assert time.monotonic() < ends, fork.said()
         time.sleep(0.05)
-    os.killpg(fork.pid, signal.SIGINT)
+    (os.killpg if stop == signal.SIGINT else os.kill)(fork.pid, stop)
     done = fork.wait(60)
     assert done.returncode == 130 and "Traceback" not in done.stderr, done.stdout + done.stderr
     assert f"hydra.sweep.dir={tmp_path}/sweep runs what is missing" in done.stdout
