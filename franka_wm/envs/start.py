@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
+import torch
 import warp as wp
 
 from franka_wm.envs.config import FrankaConfig
@@ -35,7 +36,12 @@ class _Box(NamedTuple):
 
 
 def check_arguments(config: object, num_envs: object, seed: object, first_world: object) -> None:
-    """Refuses what is no configuration, no number of worlds, or no seed."""
+    """Refuses what is no configuration, no number of worlds, or no seed, and another default of PyTorch than float32."""
+    if torch.get_default_dtype() != torch.float32:
+        raise UserError(
+            f"torch.set_default_dtype({torch.get_default_dtype()}): worlds are simulated in float32; "
+            "call torch.set_default_dtype(torch.float32), and convert what the environment gives"
+        )
     if not isinstance(config, FrankaConfig):
         raise UserError(
             f"config={config!r}: must be a FrankaConfig; of a dictionary, FrankaConfig.from_mapping"

@@ -254,3 +254,14 @@ def test_what_is_no_argument_is_one_line(given: dict[str, Any], says: str) -> No
 def test_a_number_of_numpys_is_a_number_of_worlds() -> None:
     env = FrankaEnv(FrankaConfig(observations=("state",)), num_envs=np.int64(2), device="cpu")  # type: ignore[arg-type]
     assert env.reset().batch_size == (2,) and type(env.num_envs) is int
+
+
+def test_another_default_than_float32_is_refused() -> None:
+    torch.set_default_dtype(torch.float64)
+    try:
+        with pytest.raises(
+            UserError, match=r"set_default_dtype\(torch\.float64\): worlds are simulated in float32; call"
+        ):
+            FrankaEnv(FrankaConfig(), num_envs=1, device="cpu")
+    finally:
+        torch.set_default_dtype(torch.float32)
