@@ -43,7 +43,12 @@ MEETING = timedelta(minutes=10)
 
 def restarted() -> bool:
     """Whether the job was started anew: by torchrun after a process had died, or by SLURM, which requeued it."""
-    return _anew or requeued()
+    return begun_again() or requeued()
+
+
+def by_torchrun() -> bool:
+    """Whether torchrun has started this process, which it may do again."""
+    return "TORCHELASTIC_RUN_ID" in os.environ
 
 
 def requeued() -> bool:
@@ -52,8 +57,9 @@ def requeued() -> bool:
 
 
 def begun_again() -> bool:
-    """Whether torchrun has started the processes of the job anew."""
-    return _anew
+    """Whether torchrun has started the processes of the job anew; one alone does not meet others, who would tell."""
+    alone = by_torchrun() and os.environ.get("WORLD_SIZE") == "1"
+    return _anew or (alone and int(os.environ.get("TORCHELASTIC_RESTART_COUNT") or 0) > 0)
 
 
 _anew = False

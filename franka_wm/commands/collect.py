@@ -314,6 +314,11 @@ def _agent(part: str, checkpoint: str, overrides: Sequence[str], worlds: int) ->
     check_worlds("num_envs", worlds, device)
     with announced(f"loading {checkpoint}"):
         agent = load_agent(checkpoint, num_envs=worlds, device=device, env_changes=changes, seed=seed)
+    if not agent.settings.is_arm:
+        raise UserError(
+            f"collect: {checkpoint} acts in env.kind={agent.settings.env.kind!r}: datasets are gathered from the arm with "
+            "one task (env=reach, …)"
+        )
     part = part or ("planner" if "planner" in agent.policies else "policy")
     if part not in agent.policies:
         raise UserError(f"collect: policy={part}: {checkpoint} has only {', '.join(agent.policies)}")

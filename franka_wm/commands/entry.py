@@ -245,7 +245,9 @@ def one_line_errors(main: Callable[[DictConfig], object]) -> Callable[[DictConfi
             saved = f"what was written is in {folder}"
             if (folder / "checkpoints" / "latest").exists():
                 saved = f"go on from what was saved: {resuming(folder, values)}"
-            print(f"stopped; {'nothing was saved yet' if _discard() else saved}", file=sys.stderr)
+            gone = _discard()  # of several processes the first one made the folder, and knows
+            if int(os.environ.get("RANK") or 0) == 0 or not several.started_by_torchrun():
+                print(f"stopped; {'nothing was saved yet' if gone else saved}", file=sys.stderr)
             sys.exit(INTERRUPTED)
 
     return wrapped

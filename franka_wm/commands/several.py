@@ -413,4 +413,5 @@ def speaks() -> bool:
 
 def named(message: str) -> str:
     """A line of an error, with the process that says it."""
-    return f"process {os.environ['RANK']}: {message}" if os.environ.get("RANK", "0") != "0" else message
+    rank = os.environ.get("RANK", "0") if started_by_torchrun() else "0"
+    return message if rank == "0" else f"process {rank}: {message}"

@@ -86,6 +86,7 @@ class Sweep:
         folder: Folder of the sweep.
         token: Its own, in the name of the mark by which jobs in other processes know that it is stopped.
         failed: By number, the jobs that failed in this process, and why.
+        inside: Whether one runs in the process that checked them.
     """
 
     names: list[str] = field(default_factory=list)
@@ -95,6 +96,7 @@ class Sweep:
     token: str = field(default_factory=lambda: uuid.uuid4().hex[:8])
     ran: int = 0
     failed: dict[int, str] = field(default_factory=dict)
+    inside: bool = False
 
     def run(self, main: Callable[[DictConfig], object], cfg: DictConfig) -> object:
         """One job: skipped if it is done, gone on with if it was begun; if it fails, the others go on all the same.
@@ -112,6 +114,7 @@ class Sweep:
         name = self.names[number] if number < len(self.names) else f"job {number}"
         self.folder = str(told.sweep.dir)
         self.ran += 1
+        self.inside = self.process == os.getpid()
         mark = Path(self.folder, f".stopped-{self.token}")
         # Of joblib's: an exception there kills the jobs beside it, before they have saved.
         beside_others = self.process != os.getpid() and told.runtime.choices["hydra/launcher"] == "joblib"
@@ -142,6 +145,7 @@ class Sweep:
             print(f"error: {self.failed[number]}", file=sys.stderr, flush=True)
             return None
         finally:
+            self.inside = False
             log_anew()
             gc.collect()  # the next one needs the memory
 
@@ -157,6 +161,8 @@ class Sweep:
         """
 
         def pass_on(signum: int) -> None:
+            if self.inside:  # joblib runs a single job at a time in this process
+                raise KeyboardInterrupt
             if signum == signal.SIGTERM:
                 for job in multiprocessing.active_children():
                     job.terminate()
@@ -165,12 +171,13 @@ class Sweep:
             try:
                 yield
             except SystemExit:
-                if not stopped():
+                if not stopped() or self.ran:  # the job that ran in this process has said it
                     raise
-        if stopped():
-            self.folder = self.folder or (str(self.folders[0].parent) if self.folders else "")
-            for mark in Path(self.folder).glob(f".stopped-{self.token}"):
-                mark.unlink()
+        self.folder = self.folder or (str(self.folders[0].parent) if self.folders else "")
+        marks = list(Path(self.folder).glob(f".stopped-{self.token}"))  # also of a job that was stopped alone
+        for mark in marks:
+            mark.unlink()
+        if stopped() or marks:
             say(f"the sweep is stopped; {self.advice}")
             sys.exit(INTERRUPTED)
 

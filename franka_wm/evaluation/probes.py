@@ -10,6 +10,9 @@ from torch import Tensor
 ALPHAS = tuple(10.0**k for k in range(-4, 5))
 """Ridge penalties that :func:`ridge_probe` chooses from."""
 
+NOISE = 1e-6
+"""A target whose standard deviation [m, rad, m/s or rad/s] is smaller does not vary: it is what rounding leaves."""
+
 NEIGHBOURS = 5
 """k of the nearest-neighbour probe."""
 
@@ -72,7 +75,7 @@ def r_squared(truth: Tensor, predicted: Tensor) -> float | None:
     """
     y, error = truth.double(), (truth - predicted).double()
     total = (y - y.mean(0)).square().sum(0)
-    varies = total > 1e-10 * y.square().sum(0).clamp_min(1e-30)
+    varies = total > torch.maximum(1e-10 * y.square().sum(0), torch.tensor(NOISE**2 * len(y)))
     if not bool(varies.any()):
         return None
     return float((1 - error.square().sum(0)[varies] / total[varies]).mean())

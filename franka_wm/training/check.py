@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import fields
 from typing import TYPE_CHECKING
 
@@ -279,26 +279,32 @@ def _check_parts(run: RunSettings) -> None:
     if run.is_arm:
         check_robot(run.env.arm, run.env.urdf_path)
     spaces = known_spaces(run)
-    if run.is_offline or spaces is None:
+    if spaces is None:
+        return
+    if run.is_offline:  # the data has the sizes; what acts in the environment needs its goals
+        _check_goal_images(run, [key for key in run.model.observations or () if key in spaces.image_sizes], spaces)
         return
     say_unread(run, spaces)
     run = _with_encoder(run, spaces)
     model = sketch(run, spaces)
     if model is None:
         model = build.make_model(run, spaces)
-    if run.objective_name == "goal_image":
-        goals = goal_images(model.image_sizes).values()
-        if not goals or any(goal not in spaces.image_sizes for goal in goals):
-            there = [*spaces.observation_sizes, *spaces.image_sizes]
-            raise UserError(
-                f"planning to a goal image needs goal_pixels (here are {', '.join(there)}), and a model that reads "
-                f"pixels, not {model.observation_keys}; "
-                "use env=reach_goal_image, lift_goal_image or another …_goal_image"
-            )
+    _check_goal_images(run, model.image_sizes, spaces)
     build.make_objective(run, model)
     if model.has_next:
         build.make_planner(run, spaces.num_actions or spaces.action_dim)
     check_memory(run, model, spaces)
+
+
+def _check_goal_images(run: RunSettings, images: Iterable[str], spaces: Spaces) -> None:
+    """Whether the environment shows its goal as the model reads the world; of ``images`` the model reads."""
+    goals = goal_images(images).values()
+    if run.objective_name == "goal_image" and (not goals or any(one not in spaces.image_sizes for one in goals)):
+        there = [*spaces.observation_sizes, *spaces.image_sizes]
+        raise UserError(
+            f"planning to a goal image needs goal_pixels (here are {', '.join(there)}), and a model that reads "
+            f"pixels, not {run.model.observations}; use env=reach_goal_image, lift_goal_image or another …_goal_image"
+        )
 
 
 def known_spaces(run: RunSettings) -> Spaces | None:
@@ -352,6 +358,11 @@ def _check_dataset(run: RunSettings) -> None:
     if run.is_discrete:
         raise UserError(
             f"dataset={run.dataset.kind}: model={run.model.name} learns from its own search, not from recordings"
+        )
+    if run.env.kind not in ("none", "franka"):
+        raise UserError(
+            f"dataset={run.dataset.kind}: env={run.env.kind} cannot be compared with recordings of an arm; use env=none, "
+            "or the recorded task"
         )
     root, repo_id = run.dataset.root, run.dataset.repo_id
     if (root is None) == (repo_id is None):

@@ -202,7 +202,7 @@ class Run:
         """The last line of a run that was interrupted and has saved; exits with 130."""
         close_loggers(self.loggers)
         line = f"stopped; go on with: {resuming(self.folder, self.settings.values)}"
-        if processes.is_first() and processes.count() > 1:
+        if processes.is_first() and (processes.count() > 1 or processes.by_torchrun()):
             (self.folder / STOPPED).write_text(f"{line}\n")
         say(line)
         with suppress(UserError):  # nobody leaves before the mark is there: torchrun would end who writes it

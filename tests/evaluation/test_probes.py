@@ -72,6 +72,8 @@ def test_r_squared_of_what_does_not_vary() -> None:
     assert r_squared(fixed, fixed + 1) is None
     y = torch.cat((torch.arange(10.0)[:, None], torch.full((10, 1), 0.3)), 1)
     assert r_squared(y, y + torch.tensor([0.0, 5.0])) == 1.0
+    y[:, 1] = 1e-8 * torch.randn(10, generator=torch.Generator().manual_seed(1))  # rounding, about zero
+    assert r_squared(y, y + torch.tensor([0.0, 5.0])) == 1.0
 
 
 def test_episodes_are_split_without_overlap() -> None:

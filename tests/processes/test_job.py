@@ -54,7 +54,8 @@ class Forks:
 
     def workers(self) -> dict[int, int]:
         """Rank -> process number, of those that live."""
-        found = {k: int((self._place / f"rank{k}.pid").read_text()) for k in range(2)}
+        files = {k: self._place / f"rank{k}.pid" for k in range(2)}
+        found = {k: int(file.read_text()) for k, file in files.items() if file.exists()}
         return {rank: pid for rank, pid in found.items() if Path(f"/proc/{pid}").exists()}
 
     def finished(self, status: int) -> str:
@@ -243,13 +244,21 @@ def test_another_number_of_processes_goes_on(half, tmp_path) -> None:
     assert torch.equal(longer["state"][:, : after.shape[1]], after["state"])  # no world is lost or exchanged
 
 
-@pytest.mark.parametrize("whole", [False, True], ids=["SIGTERM to one", "Ctrl-C"])
-def test_a_signal_saves_all(tmp_path, whole) -> None:
+@pytest.mark.parametrize("to", ["SIGTERM to one", "Ctrl-C", "SIGTERM to all, the launcher last"])
+def test_a_signal_saves_all(tmp_path, to) -> None:
     folder = tmp_path / "stopped"
     job = Forks(folder, "gpus=2", "trainer.updates=100000", "trainer.checkpoint_every=1")
     saved(folder)
-    os.kill(*(job.pid, signal.SIGINT) if whole else (job.workers()[1], signal.SIGTERM))
-    said = job.finished(130)
+    if to == "Ctrl-C":
+        os.kill(job.pid, signal.SIGINT)
+    else:
+        workers = job.workers()
+        for one in [workers[1]] if to == "SIGTERM to one" else workers.values():
+            os.kill(one, signal.SIGTERM)
+    if to.endswith("last"):
+        time.sleep(0.1)  # it passes it on: each is told twice
+        os.kill(job.pid, signal.SIGTERM)
+    said = job.finished(143 if to.endswith("last") else 130)
     assert said.count("stopped; go on with") == 1
     updates = checkpoint(folder).counters["updates"]
     assert checkpoint(folder).processes == 2
@@ -303,12 +312,23 @@ def test_torchrun_starts_a_job_anew(tmp_path) -> None:
     assert [name for name in one if one[name] != other[name]] == []
 
 
-def test_torchrun_does_not_begin_a_stopped_job_again(tmp_path, monkeypatch) -> None:
+def test_one_process_that_torchrun_starts_anew_goes_on(tmp_path) -> None:
+    folder = tmp_path / "anew"
+    nodes = ("--standalone", "--nproc-per-node=1", "--max-restarts=1")
+    job = Forks(folder, "trainer.updates=80", "trainer.checkpoint_every=0.2", before=nodes)
+    saved(folder)
+    os.kill(job.workers()[0], signal.SIGKILL)
+    said = job.finished(0)
+    assert f"started anew: going on from {folder}" in said and "updates 80/80" in said
+
+
+@pytest.mark.parametrize("count", [1, 2])
+def test_torchrun_does_not_begin_a_stopped_job_again(count: int, tmp_path, monkeypatch) -> None:
     folder = tmp_path / "stopped"
-    nodes = ("--standalone", "--nproc-per-node=2", "--max-restarts=1")
+    nodes = ("--standalone", f"--nproc-per-node={count}", "--max-restarts=1")
     job = Forks(folder, "trainer.updates=100000", "trainer.checkpoint_every=1", before=nodes)
     saved(folder)
-    os.kill(job.workers()[1], signal.SIGTERM)
+    os.kill(job.workers()[count - 1], signal.SIGTERM)
     said = job.finished(1)
     monkeypatch.chdir(tmp_path)  # as it was
     line = f"stopped; go on with: {resuming(folder, {})}"

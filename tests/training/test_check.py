@@ -9,7 +9,7 @@ from torch import nn
 from franka_wm import models
 from franka_wm.errors import UserError
 from franka_wm.training import build
-from franka_wm.training.check import check, known_spaces
+from franka_wm.training.check import _check_parts, check, known_spaces
 from franka_wm.training.spaces import Spaces
 
 MODELS = (
@@ -113,3 +113,20 @@ def test_a_family_of_ones_own_is_built_whole(settled, monkeypatch) -> None:
 def test_more_updates_of_the_first_steps_than_there_are(settled) -> None:
     with pytest.raises(UserError, match=r"collector\.seed_updates=31: must be at most trainer\.updates=30"):
         check(settled("device=cpu", "scale=smoke", "collector.seed_updates=31"))
+
+
+RECORDED = ("trainer=offline", "dataset=lerobot", "dataset.root=there")
+
+
+@pytest.mark.parametrize("env", ["multitask", "gym"])
+def test_recordings_are_of_the_arm(env: str, settled) -> None:
+    with pytest.raises(UserError, match=f"env={env} cannot be compared with recordings of an arm; use env=none"):
+        check(settled("device=cpu", "scale=smoke", f"env={env}", *RECORDED))
+
+
+def test_a_goal_that_no_image_shows_is_refused_offline_too(settled) -> None:
+    words = ("device=cpu", "scale=smoke", "model=lewm", "planner=icem", *RECORDED)
+    with pytest.raises(UserError, match="planning to a goal image needs goal_pixels"):
+        _check_parts(settled("env=push_pixels", *words))
+    _check_parts(settled("env=push_goal_image", *words))
+    _check_parts(settled("env=none", *words))

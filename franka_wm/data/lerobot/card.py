@@ -126,7 +126,7 @@ dataset = LeRobotDataset("{repo_id}")
 ```
 
 ```bash
-franka-wm train dataset=lerobot trainer=offline dataset.repo_id={repo_id}   # a world model
+franka-wm train dataset=lerobot trainer=offline env=none dataset.repo_id={repo_id}   # a world model
 ```
 
 ## What a row holds

@@ -154,9 +154,9 @@ def gather(
                         f"{count(played)} played ({count(played / (now - started))}/s){rest}"
                     )
                     said = now
-        collector.shutdown()
-        tell_lost("collect", lost)
-        return writer.finish(), done >= left
+            collector.shutdown()
+            tell_lost("collect", lost)
+            return writer.finish(), done >= left  # still within: a signal to stop must not end it half-written
 
 
 class _Choice:
