@@ -28,6 +28,7 @@ from typing import Any, Literal, NamedTuple, TypeGuard, Union, get_args, get_ori
 
 from franka_wm.errors import UserError
 
+ROBOT_OF_ONES_OWN = "; one of your own: plugins=[MODULE] imports its module, which must set SOURCES[NAME]"
 OF_ONES_OWN = "; one of your own: plugins=[MODULE] imports its module, which must call register(NAME, …)"
 """Ends the refusal of a task, model or planner that is not known."""
 

@@ -197,6 +197,11 @@ def check_policy(
         raise UserError(
             f"collect: policy={name} is a part of a trained agent; give checkpoint=RUN, or policy=RUN"
         )
+    if name in _SIMPLE and checkpoint:
+        raise UserError(
+            f"collect: checkpoint={checkpoint} goes with policy=planner or policy=policy, and here policy={name} acts; "
+            f"policy={checkpoint} alone is the whole agent"
+        )
     if name not in (*_SIMPLE, *_PARTS):
         if checkpoint:
             raise UserError(f"collect: policy={name!r}: must be one of {', '.join((*_SIMPLE, *_PARTS))}")
@@ -316,8 +321,8 @@ def _agent(part: str, checkpoint: str, overrides: Sequence[str], worlds: int) ->
         agent = load_agent(checkpoint, num_envs=worlds, device=device, env_changes=changes, seed=seed)
     if not agent.settings.is_arm:
         raise UserError(
-            f"collect: {checkpoint} acts in env.kind={agent.settings.env.kind!r}: datasets are gathered from the arm with "
-            "one task (env=reach, …)"
+            f"collect: {checkpoint} acts in env.kind={agent.settings.env.kind!r}: datasets are gathered from the arm "
+            "with one task (env=reach, …)"
         )
     part = part or ("planner" if "planner" in agent.policies else "policy")
     if part not in agent.policies:

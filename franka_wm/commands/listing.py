@@ -72,6 +72,7 @@ def registered(plugins: Sequence[str]) -> dict[str, dict[str, str]]:
     """What modules of the user's register: title → name → line."""
     from franka_wm import models
     from franka_wm.envs import tasks
+    from franka_wm.envs.robots.sources import SOURCES
     from franka_wm.planning import registry
     from franka_wm.training.run import import_plugins
 
@@ -82,6 +83,9 @@ def registered(plugins: Sequence[str]) -> dict[str, dict[str, str]]:
             "planners of your plugins (planner.name=)": registry.available(),
             "tasks of your plugins (env.task=)": {
                 name: text.split("\n")[0] for name, text in of_tasks.items()
+            },
+            "robots of your plugins (env.robot=)": {
+                name: (inspect.getdoc(one.find) or "").split("\n")[0] for name, one in SOURCES.items()
             },
         }
 

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 @verb(
     "view",
-    others="env.",
+    others=("env.", "hydra.searchpath="),
     shown=(
         "env.KEY=VALUE",
         "a field of the environment's configuration; episodes have no end unless env.episode_length is given",
@@ -76,7 +76,7 @@ def options_of(
     """The words of the verb as options; what they need is looked at before the simulator is imported.
 
     Args:
-        overrides: ``env.KEY=VALUE`` …
+        overrides: ``env.KEY=VALUE`` …, and ``hydra.searchpath=`` where ``env`` is of one's own.
         rerun: File for the Rerun viewer.
         env: Name of an environment of train.py.
         checkpoint: Where an agent is, which has an environment of its own.
@@ -91,7 +91,9 @@ def options_of(
         raise UserError(f"view: rerun={rerun}: must end in .rrd")
     if rerun is not None and (why := unwritable(Path(rerun).parent)) is not None:
         raise UserError(f"view: rerun={rerun}: {why}; choose another place")
-    fields = _named(env, checkpoint) | changes("view", overrides).get("env", {})
+    paths = [one for one in overrides if one.startswith("hydra.searchpath=")]
+    own = [one for one in overrides if one not in paths]
+    fields = _named(env, checkpoint, paths) | changes("view", own).get("env", {})
     if rerun is None:
         import_viser()
     else:
@@ -101,7 +103,7 @@ def options_of(
     return Options(rerun=rerun, checkpoint=checkpoint, env=fields, **given)
 
 
-def _named(env: str | None, checkpoint: str | None) -> dict[str, Any]:
+def _named(env: str | None, checkpoint: str | None, paths: Sequence[str]) -> dict[str, Any]:
     """Fields of the environment that a name of train.py stands for; none without a name."""
     if env is None:
         return {}
@@ -113,10 +115,11 @@ def _named(env: str | None, checkpoint: str | None) -> dict[str, Any]:
 
     from franka_wm.commands.overrides import compose
 
-    values: Any = OmegaConf.to_container(compose([f"env={env}"]).env, resolve=True)
+    values: Any = OmegaConf.to_container(compose([f"env={env}", *paths]).env, resolve=True)
     if values.pop("kind") != "franka":
         raise UserError(f"view: env={env}: the page shows the arm only")
-    values.pop("urdf_path")
+    if values["urdf_path"] is None:
+        del values["urdf_path"]
     del values["episode_length"]  # while somebody watches, an episode has no end
     images = [key for key in values["observations"] if "pixels" in key]
     return values | {"observations": [key for key in values["observations"] if key not in images]}

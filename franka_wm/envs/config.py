@@ -11,7 +11,7 @@ from franka_wm.envs.constants import HAND_DIM, HOME, JOINT_DIM, NUM_FINGERS, NUM
 from franka_wm.envs.ranges import Randomization
 from franka_wm.envs.scene import Scene
 from franka_wm.errors import UserError
-from franka_wm.options import OF_ONES_OWN, check_whole, is_real
+from franka_wm.options import OF_ONES_OWN, ROBOT_OF_ONES_OWN, check_whole, is_real
 
 if TYPE_CHECKING:
     from franka_wm.envs.tasks import Task
@@ -238,7 +238,7 @@ class FrankaConfig:
         from franka_wm.envs.robots.sources import SOURCES  # here: robots need this module
         from franka_wm.envs.tasks import TASKS
 
-        self._check_choice("robot", tuple(SOURCES))
+        self._check_choice("robot", tuple(SOURCES), more=ROBOT_OF_ONES_OWN)
         if self.goal_sampling is not None:
             self._check_choice("goal_sampling", ("fixed", "reachable"))
         self._check_choice("action_mode", tuple(ACTION_MODES))

@@ -36,7 +36,7 @@ class _Box(NamedTuple):
 
 
 def check_arguments(config: object, num_envs: object, seed: object, first_world: object) -> None:
-    """Refuses what is no configuration, no number of worlds, or no seed, and another default of PyTorch than float32."""
+    """Refuses what is no configuration, number of worlds or seed, and another default of PyTorch than float32."""
     if torch.get_default_dtype() != torch.float32:
         raise UserError(
             f"torch.set_default_dtype({torch.get_default_dtype()}): worlds are simulated in float32; "

@@ -13,6 +13,7 @@ from torch import Tensor, nn
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from franka_wm.envs import Environment, FrankaEnv, MultiTaskEnv
+from franka_wm.errors import UserError
 from franka_wm.evaluation.intervals import bootstrap_mean, wilson
 from franka_wm.training.build import arm_of
 
@@ -190,6 +191,12 @@ class _Motion:
         self.success = torch.where(running, succeeds, self.success)
         self.once |= running & succeeds
         for name, value in self.task.measures(sim).items():
+            if not isinstance(value, Tensor) or value.shape != running.shape:
+                given = tuple(value.shape) if isinstance(value, Tensor) else repr(value)
+                raise UserError(
+                    f"{type(self.task).__name__}.measures gave {name!r} as {given}; it must be a tensor "
+                    f"({len(running)},), one number for each world"
+                )
             self.measures[name] = torch.where(running, value.float(), self.measures.get(name, 0.0))
         self._tools = [*self._tools[-3:], sim.tensors.next_true_state[:, 14:17].clone()]
         self.path += running * (self._tools[-1] - self._tools[-2]).norm(dim=-1)

@@ -117,11 +117,12 @@ def check_arm(checkpoint: str) -> None:
 
 def untrained(options: Options, changes: Mapping[str, Any]) -> Stage:
     """The arm without a checkpoint."""
-
-    config = FrankaConfig.from_mapping({**ARM, **changes})
+    fields = {**ARM, **changes}
+    urdf_path = fields.pop("urdf_path", None)
+    config = FrankaConfig.from_mapping(fields)
     if config.object_dim and "objects" not in config.observations:  # what the expert reads
         config = replace(config, observations=(*config.observations, "objects"))
-    env = FrankaEnv(config, num_envs=1, device=options.device, seed=options.seed)
+    env = FrankaEnv(config, num_envs=1, device=options.device, seed=options.seed, urdf_path=urdf_path)
     policies: dict[str, Any] = {}
     task = env.simulation.task
     if config.has_gripper:

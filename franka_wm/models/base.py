@@ -153,7 +153,12 @@ class WorldModel(nn.Module):
         raise self._lacks("policy")
 
     def encode_goal(self, observation: TensorDictBase) -> Tensor:
-        """Embedding (..., D) of a goal from its images, in the space of `embed`."""
+        """Embedding (..., D) of a goal from its images, in the space of `embed`.
+
+        Args:
+            observation: the images that the model reads, under its own keys (`pixels`, not `goal_pixels`), showing the
+                goal; no vectors.
+        """
         raise self._lacks("encode_goal")
 
     def goal_policy(self, z: Tensor, goal: Tensor, deterministic: bool = False) -> Tensor:

@@ -282,13 +282,11 @@ def _check_parts(run: RunSettings) -> None:
     if spaces is None:
         return
     if run.is_offline:  # the data has the sizes; what acts in the environment needs its goals
-        _check_goal_images(run, [key for key in run.model.observations or () if key in spaces.image_sizes], spaces)
-        return
+        images = [key for key in run.model.observations or () if key in spaces.image_sizes]
+        return _check_goal_images(run, images, spaces)
     say_unread(run, spaces)
     run = _with_encoder(run, spaces)
-    model = sketch(run, spaces)
-    if model is None:
-        model = build.make_model(run, spaces)
+    model = sketch(run, spaces) or build.make_model(run, spaces)
     _check_goal_images(run, model.image_sizes, spaces)
     build.make_objective(run, model)
     if model.has_next:
@@ -299,7 +297,8 @@ def _check_parts(run: RunSettings) -> None:
 def _check_goal_images(run: RunSettings, images: Iterable[str], spaces: Spaces) -> None:
     """Whether the environment shows its goal as the model reads the world; of ``images`` the model reads."""
     goals = goal_images(images).values()
-    if run.objective_name == "goal_image" and (not goals or any(one not in spaces.image_sizes for one in goals)):
+    shown = goals and all(one in spaces.image_sizes for one in goals)
+    if run.objective_name == "goal_image" and not shown:
         there = [*spaces.observation_sizes, *spaces.image_sizes]
         raise UserError(
             f"planning to a goal image needs goal_pixels (here are {', '.join(there)}), and a model that reads "
@@ -361,8 +360,7 @@ def _check_dataset(run: RunSettings) -> None:
         )
     if run.env.kind not in ("none", "franka"):
         raise UserError(
-            f"dataset={run.dataset.kind}: env={run.env.kind} cannot be compared with recordings of an arm; use env=none, "
-            "or the recorded task"
+            f"dataset={run.dataset.kind}: env={run.env.kind} is not what the arm recorded; use env=none or that task"
         )
     root, repo_id = run.dataset.root, run.dataset.repo_id
     if (root is None) == (repo_id is None):

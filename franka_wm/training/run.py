@@ -5,6 +5,7 @@ from __future__ import annotations
 import gc
 import importlib
 import logging
+import os
 import sys
 import traceback
 from collections.abc import Callable, Collection, Sequence
@@ -17,7 +18,7 @@ from typing import Any, NoReturn
 import torch
 from hydra.core.hydra_config import HydraConfig
 from hydra.core.override_parser.overrides_parser import OverridesParser
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig, ListConfig, OmegaConf
 from tensordict import TensorDictBase
 from torchrl.record.loggers import Logger
 
@@ -65,6 +66,8 @@ def import_plugins(names: object) -> None:
         try:
             importlib.import_module(name)
         except ModuleNotFoundError as error:
+            if error.name is None or not f"{name}.".startswith(f"{error.name}."):  # one that it imports
+                raise UserError(f"plugins: {name} fails: {error}; install it, or mend {name}") from error
             raise UserError(
                 f"plugins: no module {error.name!r}, looked for in {Path.cwd()}, too; name modules as in `import`"
             ) from error
@@ -259,6 +262,7 @@ def start(cfg: DictConfig) -> Run:
         # On the device of now: another GPU may be its turn, or there are fewer.
         checkpoint, cfg = resumed(cfg, [f"device={cfg.device}"] if again else typed)
         _require_same(checkpoint)
+    _make_absolute(cfg.env)
     settings = RunSettings.of(cfg, saved=checkpoint is not None)
     if settings != _checked:
         check(settings)
@@ -290,6 +294,19 @@ def start(cfg: DictConfig) -> Run:
     if _begun is not None:
         _begun = (folder, _files(folder), run.loggers)
     return run
+
+
+def _make_absolute(node: DictConfig | ListConfig) -> None:
+    """Names of files in an environment's configuration as from any folder: robots and meshes of the user's own.
+
+    Else another folder would have no such file, or another one by that name.
+    """
+    for key in list(node) if isinstance(node, DictConfig) else range(len(node)):
+        value: Any = None if OmegaConf.is_interpolation(node, key) else node[key]
+        if isinstance(value, DictConfig | ListConfig):
+            _make_absolute(value)
+        elif isinstance(value, str) and os.path.isfile(path := os.path.expanduser(value)):
+            node[key] = os.path.abspath(path)
 
 
 _begun: tuple[Path, set[Path], list[Logger]] | None = None

@@ -98,7 +98,7 @@ def test_impossible_combinations() -> None:
         ({"task": "peg", "track_period": 2.0}, "track_period=2.0: task=peg does not read it, track does"),
         (
             {"task": "drawer", "success_distance": 0.02},
-            "task=drawer does not read it, reach, track do; leave",
+            "task=drawer does not read it, reach, track",
         ),
         ({"goal_noise": 0.3}, "goal_noise=0.3: is for goals that are drawn"),
         ({"gripper_force": 30.0}, "gripper_force=30.0: needs the gripper; task=reach has none"),

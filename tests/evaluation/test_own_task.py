@@ -12,6 +12,7 @@ import torch
 from franka_wm.commands.main import main
 from franka_wm.envs import FrankaConfig, FrankaEnv
 from franka_wm.envs.tasks import Reach, Track
+from franka_wm.errors import UserError
 from franka_wm.evaluation.closed_loop import play_episodes, success_distance
 from franka_wm.evaluation.protocol import Evaluation, describe, evaluate_policies, numbers_to_log, thresholds
 from franka_wm.evaluation.results import END, last_row
@@ -143,3 +144,13 @@ def test_what_a_shift_breaks_is_said_by_success() -> None:
     row = {"return": interval, "success": interval, "return_change": None, "verdict": ""}
     table = robustness_table({"as trained": {"planner": row}}, 0.05)
     assert table.header == ["shift", "policy", "return", "change", "success [%]", "verdict"]
+
+
+@pytest.mark.parametrize(
+    ("given", "said"), [(torch.zeros(6, 1), r"\(6, 1\)"), (3.0, "3.0")], ids=["a column", "a number"]
+)
+def test_a_measure_of_another_shape_is_named(given: object, said: str, env: FrankaEnv, monkeypatch) -> None:
+    monkeypatch.setattr(env.simulation.task, "measures", lambda sim: {"height [m]": given})
+    line = rf"RaiseTool\.measures gave 'height \[m\]' as {said}; it must be a tensor \(6,\), one number for each world"
+    with pytest.raises(UserError, match=line):
+        play_episodes(env, NoopPolicy(), seed=2)

@@ -331,6 +331,20 @@ def test_a_task_with_a_gripper_is_shown_by_its_expert() -> None:
         options_of([], None, env="stack", checkpoint="somewhere")
 
 
+def test_an_arm_and_an_environment_of_ones_own_are_shown(tmp_path, monkeypatch) -> None:
+    """As train takes them: a preset in a folder that is named, and the URDF that it names, or the command line."""
+    (tmp_path / "env").mkdir()
+    preset = "defaults: [reach, _self_]\nrobot: urdf\nurdf_path: mine.urdf\n"
+    (tmp_path / "env" / "mine.yaml").write_text(preset)
+    paths = f"hydra.searchpath=[file://{tmp_path}]"
+    for words, urdf in (([paths], "mine.urdf"), ([paths, "env.urdf_path=other.urdf"], "other.urdf")):
+        options = options_of(words, None, env="mine", seed=0, device="cpu")
+        assert options.env["robot"] == "urdf" and options.env["urdf_path"] == urdf
+        with pytest.raises(UserError, match=f"urdf_path={urdf}: no such file"):
+            build(options)
+    assert "urdf_path" not in options_of([], None, env="reach").env
+
+
 @pytest.mark.parametrize("length", ["0", "-3", "1e1", "ten"])
 def test_a_recording_of_no_such_length_is_refused_before_anything_is_built(
     length: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]

@@ -120,7 +120,7 @@ RECORDED = ("trainer=offline", "dataset=lerobot", "dataset.root=there")
 
 @pytest.mark.parametrize("env", ["multitask", "gym"])
 def test_recordings_are_of_the_arm(env: str, settled) -> None:
-    with pytest.raises(UserError, match=f"env={env} cannot be compared with recordings of an arm; use env=none"):
+    with pytest.raises(UserError, match=f"env={env} is not what the arm recorded; use env=none"):
         check(settled("device=cpu", "scale=smoke", f"env={env}", *RECORDED))
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import multiprocessing
 import sys
 from dataclasses import replace
+from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +17,7 @@ from franka_wm.conf import compose
 from franka_wm.errors import FrankaError, UserError
 from franka_wm.training import build
 from franka_wm.training.checkpoint import load_checkpoint, save_checkpoint
-from franka_wm.training.run import Run, import_plugins, resumed
+from franka_wm.training.run import Run, _make_absolute, import_plugins, resumed
 from franka_wm.training.settings import RunSettings
 from franka_wm.training.spaces import Spaces
 from small_checkpoint import save
@@ -88,12 +89,14 @@ def test_values_of_a_resumed_run_keep_their_range(settled, tmp_path: Path, capsy
         (["torn"], "torn fails: SyntaxError: "),
         (["raising"], r"raising fails: ValueError: boom \(.*raising.py, line 1\)"),
         (["leaving"], "leaving fails: SystemExit: 3"),
+        (["lacking"], "lacking fails: No module named 'not_there'; install it, or mend lacking"),
     ],
 )
 def test_plugins_that_cannot_be_imported_are_one_line(names, said: str, tmp_path: Path, monkeypatch) -> None:
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr("sys.path", [*sys.path])
     texts = {"torn": "def f(:", "raising": "raise ValueError('boom')", "leaving": "raise SystemExit(3)"}
+    texts["lacking"] = "import not_there"
     for name, text in texts.items():
         (tmp_path / f"{name}.py").write_text(text)
     with pytest.raises(UserError, match=said) as caught:
@@ -171,3 +174,23 @@ def test_a_first_stage_gathers_all_the_time(settled) -> None:
     )
     run = settled("device=cpu", "scale=smoke", *words)
     assert run.updates_alone == 20 and run.first_stage().updates_alone == 0
+
+
+def test_a_robot_of_ones_own_is_found_from_any_folder(train, tmp_path: Path) -> None:
+    """And no other one by that name is taken for it."""
+    (tmp_path / "robot").mkdir()
+    text = (files("franka_wm.envs.robots") / "fr3.urdf").read_text()
+    (tmp_path / "robot" / "own.urdf").write_text(text)
+    words = ("env.robot=urdf", "env.urdf_path=robot/own.urdf", "evaluation.during=[]")
+    saved = train(*words, "trainer.updates=10")
+    assert saved.config["env"]["urdf_path"] == str(tmp_path / "robot" / "own.urdf")
+
+
+def test_files_anywhere_in_an_environment_are_named_from_the_root(tmp_path: Path, monkeypatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "wedge.obj").touch()
+    scene = {"objects": [{"name": "wedge", "file": "wedge.obj", "at": [0.4, 0.0]}], "same": "${env.robot}"}
+    cfg = OmegaConf.create({"env": {"robot": "embedded", "scene": scene, "goal": None}})
+    _make_absolute(cfg.env)
+    scene["objects"][0]["file"] = str(tmp_path / "wedge.obj")
+    assert OmegaConf.to_container(cfg.env) == {"robot": "embedded", "scene": scene, "goal": None}

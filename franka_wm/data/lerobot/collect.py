@@ -156,7 +156,10 @@ def gather(
                     said = now
             collector.shutdown()
             tell_lost("collect", lost)
-            return writer.finish(), done >= left  # still within: a signal to stop must not end it half-written
+            return (
+                writer.finish(),
+                done >= left,
+            )  # still within: a signal to stop must not end it half-written
 
 
 class _Choice:

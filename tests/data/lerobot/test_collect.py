@@ -205,6 +205,10 @@ def test_ctrl_c_leaves_a_dataset(tmp_path, load) -> None:
         (["out=x", "policy=planner", "policy=ik"], "policy= is given twice"),
         (["out=x", "format=gif"], "must be one of exact, video"),
         (["out=x", "policy=planner"], "give checkpoint="),
+        (
+            ["out=x", "checkpoint=."],
+            "checkpoint=. goes with policy=planner or policy=policy, and here policy=random acts",
+        ),
         (["out=x", "policy=smooth"], "collect: policy=smooth: this policy is called random now"),
         (["out=x", "policy=nonsense"], "random, noop, ik, expert, or the folder of a run"),
         (
