@@ -9,6 +9,7 @@ from __future__ import annotations
 import contextlib
 import gc
 import io
+import logging
 import math
 import sys
 import threading
@@ -28,6 +29,11 @@ RATE, BURST = 300.0, 600.0
 """Messages per second of one client, and how many at once: a dragged goal sends one for each image of the screen."""
 CLIENTS = 128
 """Clients at once: each takes a descriptor and 0.2 MB."""
+POLICY = "frame-ancestors 'none'; connect-src 'self' ws://{} data: blob:"
+"""For browsers: no other page may hold this one in a frame, and it talks to this server alone, whatever its link says.
+
+viser's page takes another server from `?websocket=` and runs what that one sends.
+"""
 LEFT = 16
 """After so many clients have left, what they held is collected."""
 
@@ -82,12 +88,16 @@ class Gate:
                     return connection.respond(
                         HTTPStatus.SERVICE_UNAVAILABLE, f"{CLIENTS} clients are here, the most at once.\n"
                     )
-                return process_request(connection, asked)
+                answer = process_request(connection, asked)
+                if answer is not None:
+                    answer.headers["Content-Security-Policy"] = POLICY.format(asked.headers["Host"])
+                return answer
 
             return real(
                 self._guarded(handler), *args, process_request=request, **(options | {"max_size": LARGEST})
             )
 
+        logging.getLogger("websockets.server").addFilter(_is_worth_telling)
         network.serve = guarded  # the server binds in its constructor, and has no option for this
         try:
             with contextlib.redirect_stdout(
@@ -200,6 +210,11 @@ class Gate:
         self._left += 1
         if self._left % LEFT == 0:
             gc.collect()
+
+
+def _is_worth_telling(record: logging.LogRecord) -> bool:
+    """Not that somebody has connected without asking, as editors do that look for open ports."""
+    return "handshake failed" not in record.getMessage()
 
 
 class _WithoutFarewell:

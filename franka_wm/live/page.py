@@ -14,6 +14,7 @@ import numpy as np
 
 from franka_wm.envs.scene import FLOOR
 from franka_wm.errors import UserError
+from franka_wm.files import unwritable
 from franka_wm.live.extras import import_viser
 from franka_wm.live.frame import Frame
 from franka_wm.live.gate import Gate, is_number, is_point, stop
@@ -233,17 +234,28 @@ class Page:
         """Starts to record, or writes ``live-DATE-TIME…`` into the folder and says where."""
         kind = str(self._kind.value)
         if not self.session.recording:
+            if (why := unwritable(self.folder)) is not None:
+                raise UserError(f"out={self.folder}: {why}")
             self.session.start_recording(kind)
             self._recorded = kind  # whatever the menu says by the time it is written
             self._record.label, self._kind.disabled = "Stop and save", True
+            self.show(self.session.frame())
             return
+        self._notify("Saved", str(self.save_recording()))
+
+    def save_recording(self) -> Path:
+        """Writes ``live-DATE-TIME…`` into the folder.
+
+        Raises:
+            UserError: Nothing is recorded, or it cannot be written.
+        """
         name = f"live-{datetime.now():%Y-%m-%d-%H-%M-%S}{'.mp4' if self._recorded == 'video' else ''}"
         try:
-            path = self.session.stop_recording(self.folder / name)
+            return self.session.stop_recording(self.folder / name).resolve()
         finally:  # what could not be written is kept, and the button still saves it
             if not self.session.recording:
                 self._record.label, self._kind.disabled = "Record", False
-        self._notify("Saved", str(path.resolve()))
+            self.show(self.session.frame())
 
     def _ask_object(self, name: str, point: Sequence[float]) -> None:
         try:

@@ -22,7 +22,7 @@ from franka_wm.live.commanded import planned_path
 from franka_wm.live.frame import Frame
 from franka_wm.live.objects import free_objects, move_object, point_over_table, touching
 from franka_wm.live.recorder import DatasetRecorder, VideoRecorder
-from franka_wm.live.sliders import Setting, planner_settings, retuned
+from franka_wm.live.sliders import Setting, place_of, planner_settings, retuned
 from franka_wm.policies.names import refuse_old_name
 
 SPEEDS = (0.1, 1.0)
@@ -203,7 +203,7 @@ class Session:
             if self.planner is None:
                 raise UserError("this session has no planner; give a checkpoint")
             other = retuned(self.planner, changes, seconds=self._planning_time, budget=BUDGET)
-            self.policies["planner"].planner = other
+            setattr(policy := self.policies["planner"], place_of(policy), other)
             self._forget()
 
     @torch.no_grad()
@@ -228,8 +228,8 @@ class Session:
 
     @property
     def planner(self) -> Any:
-        """The planner behind the policy ``planner``; None where there is none."""
-        return getattr(self.policies.get("planner"), "planner", None)
+        """The planner, or tree search, behind the policy ``planner``; None where there is none."""
+        return getattr(policy := self.policies.get("planner"), place_of(policy), None)
 
     @property
     def settings(self) -> list[Setting]:

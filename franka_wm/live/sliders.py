@@ -31,6 +31,11 @@ class Setting:
     step: float
 
 
+def place_of(policy: Any) -> str:
+    """The attribute under which a policy keeps its planner, or its tree search."""
+    return "search" if hasattr(policy, "search") else "planner"
+
+
 def planner_settings(planner: Any) -> list[Setting]:
     """Those of :data:`RANGES` that this planner has; an empty list for None."""
     out = []

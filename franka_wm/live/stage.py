@@ -168,17 +168,21 @@ def serve(stage: Stage, options: Options) -> None:
     gc.freeze()  # what is built stays: the collections after clients have left need not look through it
     gc.collect()
     try:
-        taken = f" (port {options.port} is taken)" if options.port not in (0, page.port) else ""
+        taken = f" (port {options.port} cannot be had)" if options.port not in (0, page.port) else ""
         say(f"{page.address}{taken}   Ctrl-C ends it")
         session.play()
         end = float("inf") if options.seconds is None else time.monotonic() + options.seconds
         while time.monotonic() < end and session.error is None:
             time.sleep(min(0.2, max(0.0, end - time.monotonic())))
+        if session.recording:
+            say(f"recorded until now: {page.save_recording()}")
         page.close()
     except KeyboardInterrupt:  # the way to end it, also while a long decision or a slow disk holds a thread
         hurry = threading.Timer(GRACE, os._exit, (INTERRUPTED,))
         hurry.daemon = True
         hurry.start()
+        if session.recording:
+            say("a recording was not saved: Stop and save comes before Ctrl-C")
         page.close(timeout=0.3 * GRACE)
         if session.error is None:
             sys.stdout.flush()

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import gc
 import json
+import logging
 import math
+import socket
 import time
 from collections.abc import Iterator
 from http.client import HTTPConnection
@@ -228,6 +230,25 @@ def test_other_hosts_names_are_turned_away(host: str, page: Page) -> None:
         said = answer.read().decode()
         assert status == 200 or f"machine: '{name}'." in said
         connection.close()
+
+
+def test_a_browser_is_told_what_the_page_may_do(page: Page) -> None:
+    """No page holds it in a frame, and a link cannot make it listen to another server."""
+    connection = HTTPConnection("127.0.0.1", page.port, timeout=10)
+    connection.request("GET", "/?websocket=ws://127.0.0.1:9")
+    policy = connection.getresponse().headers["Content-Security-Policy"]
+    assert policy == f"frame-ancestors 'none'; connect-src 'self' ws://127.0.0.1:{page.port} data: blob:"
+    connection.close()
+
+
+def test_who_connects_and_asks_nothing_is_not_told_of(page: Page, caplog, capfd) -> None:
+    """An editor that looks for open ports, for example: the library would print three tracebacks."""
+    with caplog.at_level(logging.INFO, "websockets.server"):
+        socket.create_connection(("127.0.0.1", page.port)).close()
+        deadline = time.monotonic() + 5
+        while not caplog.records and time.monotonic() < deadline - 4:
+            time.sleep(0.05)
+    assert not caplog.records and "Traceback" not in capfd.readouterr().err
 
 
 def test_many_messages_at_once_are_cut_off() -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import threading
 import time
 from pathlib import Path
+from unittest.mock import Mock
 
 import av
 import numpy as np
@@ -14,6 +15,8 @@ import torch
 from franka_wm.errors import UserError
 from franka_wm.live.frame import Frame
 from franka_wm.live.session import Session
+from franka_wm.planning.mcts import MCTS
+from franka_wm.policies.search import SearchPolicy
 
 LEFT, RIGHT = (0.40, 0.25, 0.45), (0.40, -0.25, 0.45)
 
@@ -287,3 +290,14 @@ def test_what_has_no_place_in_a_dataset_is_said_at_the_start(make_session) -> No
     with pytest.raises(UserError, match="depth has no place in a LeRobot dataset"):
         session.start_recording("dataset")
     assert not session.recording
+
+
+def test_a_tree_search_has_its_settings(make_session) -> None:
+    session = make_session()
+    search = MCTS(num_actions=3, num_simulations=16, max_depth=4)
+    session.policies["planner"] = policy = SearchPolicy(
+        search, encode=torch.zeros_like, prediction=Mock(), recurrent=Mock(), observation_keys=["state"]
+    )
+    assert "num_simulations" in [one.name for one in session.settings]
+    session.set_planner(num_simulations=8)
+    assert policy.search.num_simulations == session.planner.num_simulations == 8

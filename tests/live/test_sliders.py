@@ -8,6 +8,7 @@ from typing import Any
 
 import pytest
 
+from franka_wm.errors import UserError
 from franka_wm.live.page import Page
 from franka_wm.live.sliders import RANGES, Setting, rebuilt
 from franka_wm.planning import MCTS
@@ -58,13 +59,29 @@ def test_a_recording_is_written_as_it_was_begun(tmp_path: Path) -> None:
         return path
 
     session.start_recording, session.stop_recording = begin, end
+    shown: list[bool] = []
+    session.frame = lambda: session.recording
     menu, button = SimpleNamespace(value="video", disabled=False), SimpleNamespace(label="Record")
     page: Any = SimpleNamespace(
-        session=session, folder=tmp_path, _kind=menu, _record=button, _notify=lambda *_: None
+        session=session,
+        folder=tmp_path,
+        _kind=menu,
+        _record=button,
+        _notify=lambda *_: None,
+        show=shown.append,
     )
+    page.save_recording = lambda: Page.save_recording(page)
     for begun, later in (("video", "dataset"), ("dataset", "video")):
         menu.value = begun
         Page.toggle_recording(page)
         menu.value = later
         Page.toggle_recording(page)
         assert written[-1].suffix == (".mp4" if begun == "video" else "") and button.label == "Record"
+    assert shown == [True, False, True, False]  # what the page says of it, while paused, too
+    (tmp_path / "file").touch()
+    page.folder = tmp_path / "file"
+    with pytest.raises(
+        UserError, match=r"out=.*file: .* is not a folder"
+    ):  # and not when it is to be written
+        Page.toggle_recording(page)
+    assert not session.recording

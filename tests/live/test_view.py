@@ -22,6 +22,8 @@ from franka_wm.commands.view import view as view_verb
 from franka_wm.envs import FrankaConfig
 from franka_wm.errors import UserError
 from franka_wm.live import gate
+from franka_wm.live.recorder import DatasetRecorder
+from franka_wm.live.session import Session
 from franka_wm.live.stage import ARM, Options, build, serve
 
 CHEAP = ["env.substeps=2", "device=cpu"]
@@ -231,7 +233,7 @@ def test_a_port_in_use_is_said(capsys: pytest.CaptureFixture[str]) -> None:
         other.listen()
         taken = other.getsockname()[1]
         assert cli.main(["view", *CHEAP, f"port={taken}", "policy=noop", "seconds=0.1"]) == 0
-    assert f"(port {taken} is taken)" in capsys.readouterr().out
+    assert f"(port {taken} cannot be had)" in capsys.readouterr().out
 
 
 @pytest.mark.slow
@@ -270,6 +272,36 @@ def test_an_exception_while_it_plays_ends_it(monkeypatch: pytest.MonkeyPatch) ->
     stage.policies["noop"] = broken
     with pytest.raises(UserError, match="the policy is out"):
         serve(stage, parse(["policy=noop", "port=0"]))
+
+
+def test_what_is_recorded_when_the_time_is_up_is_written(tmp_path, capsys, monkeypatch) -> None:
+    stage = build(parse([*CHEAP, "policy=noop", "port=0"]))
+    play = Session.play
+
+    def recording(session: Session) -> None:
+        session.start_recording("dataset")
+        play(session)
+
+    monkeypatch.setattr(Session, "play", recording)
+    monkeypatch.setattr(DatasetRecorder, "write", lambda self, path: Path(path))
+    serve(stage, parse(["policy=noop", "port=0", "seconds=1", f"out={tmp_path}"]))
+    assert re.search(rf"recorded until now: {tmp_path}/live-", capsys.readouterr().out)
+
+
+def recording() -> None:
+    """A stage that plays and records."""
+    play = Session.play
+    Session.play = lambda session: session.start_recording("dataset") or play(session)  # type: ignore[method-assign]
+    serve(build(Options(device="cpu", env={"substeps": 2})), Options(policy="noop", port=0))
+
+
+def test_what_ctrl_c_loses_is_said(tmp_path) -> None:
+    fork = Fork(recording, cwd=tmp_path, log=tmp_path / "log")
+    until = time.monotonic() + 120
+    while "Ctrl-C ends it" not in fork.said() and time.monotonic() < until:
+        time.sleep(0.05)
+    os.kill(fork.pid, signal.SIGINT)
+    assert "a recording was not saved" in fork.wait(30).stdout
 
 
 def deciding_for_a_minute() -> None:
