@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 from franka_wm.errors import UserError
 from franka_wm.report import style
-from franka_wm.report.figure import as_label, finish_axes, new_figure
+from franka_wm.report.figure import as_label, finish_axes, new_figure, shortened
 from franka_wm.report.style import INK, LIGHT, PAPER, Theme
 
 if TYPE_CHECKING:
@@ -78,7 +78,7 @@ def bars_figure(
             )
             for line in (*drawn.lines[1], *drawn.lines[2]):  # caps and bars stay visible on a dark bar
                 line.set_path_effects([withStroke(linewidth=2.8, foreground=theme.colour(PAPER))])
-    axes.set_yticks(range(len(values)), [as_label(name) for name in values])
+    axes.set_yticks(range(len(values)), [as_label(name) for name in shortened(values)])
     axes.invert_yaxis()
     if limits is not None:
         axes.set_xlim(*limits)

@@ -16,6 +16,7 @@ from franka_wm.report.figure import (
     finish_axes,
     new_figure,
     save_figure,
+    shortened,
     title_figure,
 )
 from franka_wm.report.style import LIGHT, Theme
@@ -173,7 +174,7 @@ def seeds_figure(
     figure, (axes,) = new_figure(theme=theme)
     leaf = _leaf(key)
     label, scale = QUANTITIES.get(leaf, (key, 1.0))
-    for index, (name, runs) in enumerate(groups.items()):
+    for index, (name, runs) in enumerate(zip(shortened(groups), groups.values(), strict=True)):
         band = seed_bands(runs, key, x=x)
         if not band["x"].size:
             continue

@@ -7,6 +7,7 @@ pyplot: no global state, no window, whatever backend the user has set.
 import hashlib
 import io
 import re
+from collections.abc import Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 from xml.sax.saxutils import escape, quoteattr
@@ -22,6 +23,10 @@ if TYPE_CHECKING:
 FORMATS = ("pdf", "png", "svg")
 WIDTH, HEIGHT = 4.6, 3.1
 """Size of one panel [inch]: still readable across a phone."""
+MOST_IN_COLUMN = 16
+"""Entries of a legend."""
+LONGEST = 40
+"""Characters of a run's name beside its bar or curve."""
 
 _VARIABLES = {light.lower(): f"var(--{name})" for light, name in NAMES.items()}
 
@@ -74,8 +79,20 @@ def finish_axes(
         axes.grid(axis=grid, color=theme.colour(FAINT), linewidth=0.6)  # pyright: ignore[reportArgumentType]
     if not axes.has_data():
         empty(axes, theme=theme)
-    elif legend and axes.get_legend_handles_labels()[1]:
-        axes.legend(frameon=False, fontsize=8, labelcolor=ink)
+    elif legend and (count := len(axes.get_legend_handles_labels()[1])):
+        small, columns = count > 10, 1 + (count - 1) // MOST_IN_COLUMN
+        drawn = axes.legend(frameon=False, fontsize=6 if small else 8, labelcolor=ink, ncols=columns)
+        drawn.set_in_layout(False)  # else a long one leaves the curves no room
+
+
+def shortened(names: Iterable[str]) -> list[str]:
+    """Names of runs without the middle of long ones; those that look the same then are numbered."""
+    out: list[str] = []
+    for name in names:
+        text = name if len(name) <= LONGEST else f"{name[: LONGEST // 2 - 2]}…{name[1 - LONGEST // 2 :]}"
+        same = sum(one == text or one.startswith(f"{text} (") for one in out)
+        out.append(f"{text} ({same + 1})" if same else text)
+    return out
 
 
 def as_label(text: str) -> str:

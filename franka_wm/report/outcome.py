@@ -91,9 +91,7 @@ def _bars(policies: Mapping[str, Mapping[str, Any]]) -> str:
         ("return", "return of an episode", 1.0, "Further to the right is better."),
     ):
         values = {
-            style.policy_name(name): {"": one[key]}
-            for name, one in policies.items()
-            if is_interval(one.get(key))
+            style.policy_name(name): {"": one[key]} for name, one in policies.items() if _known(one.get(key))
         }
         if values:
             colours = {style.policy_name(name): style.policy_colour(name) for name in policies}
@@ -141,7 +139,7 @@ def success_rates(policies: Mapping[str, Mapping[str, Any]]) -> dict[str, dict[s
         rates = values.get("success")
         rates = {"": rates} if is_interval(rates) else rates
         if isinstance(rates, Mapping):
-            kept = {d: rate for d, rate in rates.items() if is_interval(rate)}
+            kept = {d: rate for d, rate in rates.items() if _known(rate)}
             if kept:
                 out[policy] = kept
     return out

@@ -8,7 +8,7 @@ from numpy.typing import ArrayLike
 
 from franka_wm.errors import UserError
 from franka_wm.report import style
-from franka_wm.report.figure import as_label, finish_axes, new_figure
+from franka_wm.report.figure import as_label, finish_axes, new_figure, shortened
 from franka_wm.report.style import GREY, INK, LIGHT, Theme
 
 if TYPE_CHECKING:
@@ -39,7 +39,7 @@ def spectrum_figure(
     figure, (axes,) = new_figure(theme=theme)
     if not spectra:
         raise UserError("no singular values to draw; give at least one list by name.")
-    for index, (name, values) in enumerate(spectra.items()):
+    for index, (name, values) in enumerate(zip(shortened(spectra), spectra.values(), strict=True)):
         ordered = np.sort(np.asarray(values, dtype=np.float64))[::-1]
         if ordered.size == 0 or ordered[-1] < 0 or not np.isfinite(ordered).all():
             raise UserError(f"singular values of {name!r} must be finite, not negative, at least one.")

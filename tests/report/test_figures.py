@@ -353,3 +353,27 @@ def test_masks_veil_exactly_the_hidden_patches() -> None:
 def test_the_palette_is_what_series_are_drawn_in() -> None:
     drawn = horizon_figure({"a": {"mean": [1]}, "b": {"mean": [2]}}).axes[0].get_lines()
     assert [line.get_color() for line in drawn] == list(PALETTE[:2])
+
+
+@pytest.mark.filterwarnings("error")
+def test_many_runs_leave_room_for_their_curves(tmp_path: Path) -> None:
+    runs = {f"{k}-reach": [[{"env_steps": 0, "loss": 1.0}, {"env_steps": 5, "loss": 0.5 + k}]] for k in range(30)}
+    figure = seeds_figure(runs, "loss")
+    save_figure(figure, tmp_path / "curves.png")
+    assert len(figure.axes[0].get_lines()) == 30 and figure.axes[0].get_position().height > 0.6
+    spectrum = spectrum_figure({name: [3.0, 2.0, 1.0] for name in runs})
+    save_figure(spectrum, tmp_path / "spectrum.png")
+    assert spectrum.axes[0].get_position().height > 0.6
+
+
+@pytest.mark.filterwarnings("error")
+def test_long_names_of_runs_leave_room_and_differ(tmp_path: Path) -> None:
+    """As of Hydra's override_dirname; tables have them whole."""
+    middle = "planner.horizon={},planner.num_samples=512,model.latent_dim=128"
+    names = [f"10{k}-{middle.format(k)},seed={k % 2}" for k in range(4)] + [f"103-{middle.format(7)},seed=1"]
+    bar = {"mean": 0.1, "low": 0.05, "high": 0.2}
+    figure = bars_figure({name: {"": bar} for name in names}, label="distance")
+    save_figure(figure, tmp_path / "bars.png")
+    assert figure.axes[0].get_position().width > 0.3
+    labels = [one.get_text() for one in figure.axes[0].get_yticklabels()]
+    assert len({*labels}) == 5 and labels[-1].endswith("seed=1 (2)")
