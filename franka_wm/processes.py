@@ -14,6 +14,7 @@ import time
 import uuid
 from collections.abc import Iterable, Mapping, Sequence
 from datetime import timedelta
+from multiprocessing import util
 from pathlib import Path
 from typing import Any
 
@@ -164,6 +165,7 @@ def leave(status: int = 0) -> None:
         sys.stderr.flush()
         if status == 1 and is_first():
             time.sleep(LAST_WORDS)
+        util._run_finalizers(0)  # semaphores of the replay, of which Python would tell as leaked  # pyright: ignore
         os._exit(status)
 
 

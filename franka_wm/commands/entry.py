@@ -128,8 +128,13 @@ def _run(main: Callable[[], Any], arguments: list[str]) -> None:
             place = Path(given(overrides, "hydra.run.dir") or "outputs").resolve()
             _there = frozenset(one for one in (place, *place.parents, *place.glob("*")) if one.is_dir())
     sys.argv[1:] = [*flags, *overrides]
-    with _sweep.waiting() if _sweep is not None and "hydra/launcher=joblib" in overrides else nullcontext():
-        main()
+    try:
+        with (
+            _sweep.waiting() if _sweep is not None and "hydra/launcher=joblib" in overrides else nullcontext()
+        ):
+            main()
+    except FrankaError as error:
+        fail(str(error))
     if joins:
         from franka_wm import processes
 

@@ -96,7 +96,8 @@ def launch_verb(command: list[str], gpus: int, device: str, advice: Callable[[],
     from torch.distributed.elastic.multiprocessing.errors import ChildFailedError
     from torch.distributed.launcher.api import LaunchConfig, elastic_launch
 
-    logging.getLogger("torch.distributed").setLevel(logging.CRITICAL)  # ours say what happened
+    for name in ("torch.distributed", "torch.distributed.elastic.agent.server.api"):
+        logging.getLogger(name).setLevel(logging.CRITICAL)  # ours say what happened
     os.environ.setdefault("OMP_NUM_THREADS", str(max(1, usable_cores() // gpus)))
     places = [str(conf.FOLDER.parents[1]), *filter(None, [os.environ.get("PYTHONPATH")])]
     os.environ["PYTHONPATH"] = os.pathsep.join(places)

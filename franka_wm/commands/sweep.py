@@ -10,6 +10,7 @@ import sys
 import traceback
 import uuid
 from collections.abc import Callable, Iterator
+from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -87,6 +88,7 @@ class Sweep:
         token: Its own, in the name of the mark by which jobs in other processes know that it is stopped.
         failed: By number, the jobs that failed in this process, and why.
         inside: Whether one runs in the process that checked them.
+        stopped: Whether that process was asked to stop, perhaps between two of them.
     """
 
     names: list[str] = field(default_factory=list)
@@ -97,6 +99,7 @@ class Sweep:
     ran: int = 0
     failed: dict[int, str] = field(default_factory=dict)
     inside: bool = False
+    stopped: bool = False
 
     def run(self, main: Callable[[DictConfig], object], cfg: DictConfig) -> object:
         """One job: skipped if it is done, gone on with if it was begun; if it fails, the others go on all the same.
@@ -121,6 +124,8 @@ class Sweep:
         if beside_others and mark.exists():
             return None
         try:
+            if self.stopped:
+                raise KeyboardInterrupt
             left = None if cfg.resume is not None else left_by(folder, cfg)
             if left == "finished":
                 say(f"{name} was finished before: {folder}")
@@ -158,22 +163,28 @@ class Sweep:
         Raises:
             SystemExit: After that.
             KeyboardInterrupt: Ctrl-C once more.
+            FrankaError: A job's process was killed, and joblib has killed the others.
         """
 
         def pass_on(signum: int) -> None:
+            self.stopped = True
             if self.inside:  # joblib runs a single job at a time in this process
                 raise KeyboardInterrupt
             if signum == signal.SIGTERM:
                 for job in multiprocessing.active_children():
                     job.terminate()
 
-        with interruptible(pass_on) as stopped:
+        self.folder = str(self.folders[0].parent) if self.folders else ""
+        with interruptible(pass_on) as stopped, _hydra_raises():
             try:
                 yield
             except SystemExit:
                 if not stopped() or self.ran:  # the job that ran in this process has said it
                     raise
-        self.folder = self.folder or (str(self.folders[0].parent) if self.folders else "")
+            except BrokenProcessPool as error:
+                raise FrankaError(
+                    f"the process of a job was killed, and joblib ended the others before they had saved; {self.advice}"
+                ) from error
         marks = list(Path(self.folder).glob(f".stopped-{self.token}"))  # also of a job that was stopped alone
         for mark in marks:
             mark.unlink()
@@ -200,6 +211,21 @@ class Sweep:
             return None
         reasons = "; ".join(self.failed.values())
         return str(FrankaError(f"{len(self.failed)} of {self.ran} jobs failed: {reasons}; {self.advice}"))
+
+
+@contextmanager
+def _hydra_raises() -> Iterator[None]:
+    """Hydra hands exceptions on; else it prints them and ends the process."""
+    name = "HYDRA_FULL_ERROR"
+    given = os.environ.get(name)
+    os.environ[name] = "1"
+    try:
+        yield
+    finally:
+        if given is None:
+            del os.environ[name]
+        else:
+            os.environ[name] = given
 
 
 def _score(folder: Path) -> float | None:

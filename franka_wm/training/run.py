@@ -262,7 +262,8 @@ def start(cfg: DictConfig) -> Run:
         # On the device of now: another GPU may be its turn, or there are fewer.
         checkpoint, cfg = resumed(cfg, [f"device={cfg.device}"] if again else typed)
         _require_same(checkpoint)
-    _make_absolute(cfg.env)
+    if "env" in cfg:
+        _make_absolute(cfg.env)
     settings = RunSettings.of(cfg, saved=checkpoint is not None)
     if settings != _checked:
         check(settings)

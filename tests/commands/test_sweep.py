@@ -410,37 +410,3 @@ def test_lists_that_are_empty_or_endless(words: list[str], said: str, capsys) ->
         list(entry.swept(words))
     told = capsys.readouterr().err
     assert told.startswith("error: ") and said in told and told.count("\n") == 1
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("stop", [signal.SIGINT, signal.SIGTERM])
-def test_a_signal_lets_all_jobs_of_a_sweep_save(stop: signal.Signals, tmp_path: Path) -> None:
-    """Two at once, in processes of their own, and the third does not begin.
-
-    Each is asked by Ctrl-C itself; the SIGTERM of a scheduler may be for the first process alone.
-    """
-    pytest.importorskip(
-        "hydra_plugins.hydra_joblib_launcher", reason="hydra/launcher=joblib is not installed"
-    )
-    command = ["hydra/launcher=joblib", "hydra.launcher.n_jobs=2", *SMOKE, *SMALL, "trainer.updates=1000000"]
-    command += ["trainer.log_every=0.2", "seed=0,1,2", f"hydra.sweep.dir={tmp_path}/sweep"]
-    train = script(TRAIN, "--multirun", *command)
-
-    def apart() -> None:
-        os.setsid()
-        train()
-
-    fork = Fork(apart, cwd=tmp_path, log=tmp_path / "log")
-    logs = [tmp_path / "sweep" / f"{k}-reach" / "train.log" for k in range(2)]
-    ends = time.monotonic() + 120
-    while not all(log.is_file() and "\nupdates" in log.read_text() for log in logs):
-        assert time.monotonic() < ends, fork.said()
-        time.sleep(0.05)
-    (os.killpg if stop == signal.SIGINT else os.kill)(fork.pid, stop)
-    done = fork.wait(60)
-    assert done.returncode == 130 and "Traceback" not in done.stderr, done.stdout + done.stderr
-    assert f"hydra.sweep.dir={tmp_path}/sweep runs what is missing" in done.stdout
-    for log in logs:
-        assert latest_checkpoint(log.parent)
-    assert not (tmp_path / "sweep" / "2-reach" / "config.yaml").exists()
-    assert not list((tmp_path / "sweep").glob(".stopped-*"))

@@ -387,3 +387,21 @@ def test_other_options_in_another_process_are_refused(tmp_path) -> None:
     said = "".join(folder.with_suffix(f".log{k}").read_text() for k in range(2))
     assert "has options" in said and "start all of a job with the same command" in said
     assert not folder.exists()
+
+
+def test_who_leaves_takes_its_semaphores_along(tmp_path) -> None:
+    """Python would tell of them, after a run that has ended well, once for each process."""
+    text = f"""
+import multiprocessing
+from torch import distributed
+from franka_wm import processes
+if __name__ == "__main__":
+    distributed.init_process_group("gloo", init_method="file://{tmp_path}/meeting", rank=0, world_size=1)
+    shared = multiprocessing.get_context("spawn").Value("i", 0)
+    processes.leave()
+"""
+    (tmp_path / "leaves.py").write_text(text)
+    done = subprocess.run(
+        [sys.executable, "leaves.py"], cwd=tmp_path, capture_output=True, text=True, timeout=120
+    )
+    assert (done.returncode, done.stderr) == (0, "")

@@ -357,7 +357,9 @@ def test_the_palette_is_what_series_are_drawn_in() -> None:
 
 @pytest.mark.filterwarnings("error")
 def test_many_runs_leave_room_for_their_curves(tmp_path: Path) -> None:
-    runs = {f"{k}-reach": [[{"env_steps": 0, "loss": 1.0}, {"env_steps": 5, "loss": 0.5 + k}]] for k in range(30)}
+    runs = {
+        f"{k}-reach": [[{"env_steps": 0, "loss": 1.0}, {"env_steps": 5, "loss": 0.5 + k}]] for k in range(30)
+    }
     figure = seeds_figure(runs, "loss")
     save_figure(figure, tmp_path / "curves.png")
     assert len(figure.axes[0].get_lines()) == 30 and figure.axes[0].get_position().height > 0.6

@@ -8,6 +8,7 @@ import re
 import signal
 import threading
 import time
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -39,6 +40,7 @@ from franka_wm.envs import FrankaConfig, FrankaEnv
 from franka_wm.errors import UserError
 from franka_wm.policies.scripted import SmoothRandomPolicy
 from franka_wm.seeding import derive_seed
+from franka_wm.training import load as load_module
 
 SMALL = [
     "env=reach_fixed_pixels",
@@ -137,6 +139,15 @@ def test_what_is_changed_for_an_agent_is_played_and_told() -> None:
         assert options["action_penalty"] == 0.5
     assert source.env.config.randomization.action_noise == 0.1
     assert source.config["env"]["randomization"]["action_noise"] == 0.1
+
+
+def test_an_agent_of_several_tasks_is_refused_in_one_line(monkeypatch) -> None:
+    agent = SimpleNamespace(settings=SimpleNamespace(is_arm=False, env=SimpleNamespace(kind="multitask")))
+    monkeypatch.setattr(load_module, "load_agent", lambda *_, **__: agent)
+    with pytest.raises(
+        UserError, match=r"acts in env\.kind='multitask': datasets are gathered from the arm with one"
+    ):
+        open_source(str(AGENT), overrides=["device=cpu"], episodes=1)
 
 
 def test_the_same_seed_gives_the_same_dataset(collected, tmp_path, load) -> None:

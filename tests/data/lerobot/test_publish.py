@@ -53,6 +53,8 @@ def test_a_dataset_goes_with_our_card_and_tag(hub, publish, dataset) -> None:
     assert {name: repo["files"][name] for name in local} == local
     card = repo["files"]["README.md"].decode()
     assert all(text in card for text in ("license: cc-by-4.0", "@software", "terminal", "LeRobot"))
+    # Its actions may not be those of the default environment.
+    assert "franka-wm train dataset=lerobot trainer=offline env=none dataset.repo_id=user/arm" in card
     assert "observation.images.front" in card and "episode.gif" in card
     assert "More Information Needed" not in card  # what push_to_hub's own card says
     assert repo["tags"] == {"v3.0": f"{repo['commits']:040x}"}  # the newest commit, the one with the card
