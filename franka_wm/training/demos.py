@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import Any
 
 from tensordict import TensorDict
@@ -133,6 +134,12 @@ def check_demonstrations(run: RunSettings) -> None:
             raise UserError(
                 f"replay.demos={source.root}: recorded with env.{name}={there}, this run has {getattr(arm, name)}"
             )
+        for session in sessions:
+            scene = session.get("config", {}).get("env", {}).get("scene")
+            if replace(arm, scene=scene).resolved_scene != arm.resolved_scene:
+                raise UserError(
+                    f"replay.demos={source.root}: recorded with another env.scene, whose objects are other ones"
+                )
 
 
 def _check_seen(share: float, where: str, drawn: Mapping[str, Any]) -> None:

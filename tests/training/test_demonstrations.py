@@ -426,3 +426,12 @@ def test_recorded_data_that_do_not_fit_are_refused_before_anything_is_built(
                 "scale=smoke", "trainer=offline", "dataset=lerobot", f"dataset.root={demos}", *ARM, *changes
             )
         )
+
+
+def test_demonstrations_of_another_scene_are_refused(pushes: Path, settled) -> None:
+    """Its cubes would begin inside the table, for example."""
+    words = ("scale=smoke", *GRIPPER, f"replay.demos={pushes}")
+    check_demonstrations(settled(*words))
+    larger = "env.scene={objects: [{name: cube, size: [0.08, 0.08, 0.08], at: [0.45, 0.0]}]}"
+    with pytest.raises(UserError, match=r"replay\.demos=\S+: recorded with another env\.scene"):
+        check_demonstrations(settled(*words, larger))
