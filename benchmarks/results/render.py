@@ -19,7 +19,7 @@ BEGIN, END = "<!-- results: written by `make results` -->", "<!-- end of results
 LEGEND = (
     "*m of n seeds*: the row declares n, and m were measured with that commit; none was left out for its result. "
     "*n at a time*: so many runs shared the machine, so each took longer than by itself; *alone (m of n runs)*: "
-    "times of those that had it to themselves; *beside other work*: none had. ¹ and ², an earlier commit: see "
+    "times of those that had it to themselves; *beside other work*: none had. Raised numbers: an earlier commit, see "
     "below the tables."
 )
 """What README says of its tables' words."""

@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 import gc
-import multiprocessing
 import os
 import signal
 import sys
+import tempfile
 import traceback
-import uuid
 from collections.abc import Callable, Iterator
 from concurrent.futures.process import BrokenProcessPool
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -24,6 +23,9 @@ from franka_wm.console import log_anew, say
 from franka_wm.errors import REFUSALS, FrankaError, UserError, machine_refused
 from franka_wm.interrupt import INTERRUPTED, interruptible
 from franka_wm.versions import FINISHED
+
+JOB, STOPPED, FOLDER = "job-", "stopped", "folder"
+"""Names of files in `Sweep.place`."""
 
 
 @dataclass(frozen=True)
@@ -85,7 +87,7 @@ class Sweep:
         names, folders: Names and folders of the jobs that are known beforehand.
         process: Number of the process that checked them; others may run them.
         folder: Folder of the sweep.
-        token: Its own, in the name of the mark by which jobs in other processes know that it is stopped.
+        place: A folder of this machine, while it waits for jobs in other processes: which run, and that it is stopped.
         failed: By number, the jobs that failed in this process, and why.
         inside: Whether one runs in the process that checked them.
         stopped: Whether that process was asked to stop, perhaps between two of them.
@@ -95,7 +97,7 @@ class Sweep:
     folders: list[Path] = field(default_factory=list)
     process: int = field(default_factory=os.getpid)
     folder: str = ""
-    token: str = field(default_factory=lambda: uuid.uuid4().hex[:8])
+    place: str = ""
     ran: int = 0
     failed: dict[int, str] = field(default_factory=dict)
     inside: bool = False
@@ -117,13 +119,15 @@ class Sweep:
         name = self.names[number] if number < len(self.names) else f"job {number}"
         self.folder = str(told.sweep.dir)
         self.ran += 1
-        self.inside = self.process == os.getpid()
-        mark = Path(self.folder, f".stopped-{self.token}")
         # Of joblib's: an exception there kills the jobs beside it, before they have saved.
-        beside_others = self.process != os.getpid() and told.runtime.choices["hydra/launcher"] == "joblib"
+        beside_others = bool(self.place) and self.process != os.getpid()
+        mark = Path(self.place, STOPPED)
         if beside_others and mark.exists():
             return None
+        self.inside = self.process == os.getpid()
         try:
+            if beside_others:
+                self._register()
             if self.stopped:
                 raise KeyboardInterrupt
             left = None if cfg.resume is not None else left_by(folder, cfg)
@@ -151,8 +155,23 @@ class Sweep:
             return None
         finally:
             self.inside = False
+            if beside_others:
+                signal.signal(
+                    signal.SIGTERM, signal.SIG_IGN
+                )  # until the next one: it would kill the jobs beside it
+                Path(self.place, f"{JOB}{os.getpid()}").unlink(missing_ok=True)
             log_anew()
             gc.collect()  # the next one needs the memory
+
+    def _register(self) -> None:
+        """From here on SIGTERM to this process is for the job in it, which saves where it trains."""
+
+        def stop(signum: int, frame: object) -> None:
+            raise KeyboardInterrupt
+
+        signal.signal(signal.SIGTERM, stop)
+        Path(self.place, f"{JOB}{os.getpid()}").write_text(self.folder)
+        Path(self.place, FOLDER).write_text(self.folder)
 
     @contextmanager
     def waiting(self) -> Iterator[None]:
@@ -170,27 +189,35 @@ class Sweep:
             self.stopped = True
             if self.inside:  # joblib runs a single job at a time in this process
                 raise KeyboardInterrupt
-            if signum == signal.SIGTERM:
-                for job in multiprocessing.active_children():
-                    job.terminate()
+            for job in Path(self.place).glob(f"{JOB}*") if signum == signal.SIGTERM else ():
+                with suppress(ProcessLookupError):
+                    os.kill(int(job.name.removeprefix(JOB)), signal.SIGTERM)
 
-        self.folder = str(self.folders[0].parent) if self.folders else ""
-        with interruptible(pass_on) as stopped, _hydra_raises():
-            try:
-                yield
-            except SystemExit:
-                if not stopped() or self.ran:  # the job that ran in this process has said it
-                    raise
-            except BrokenProcessPool as error:
-                raise FrankaError(
-                    f"the process of a job was killed, and joblib ended the others before they had saved; {self.advice}"
-                ) from error
-        marks = list(Path(self.folder).glob(f".stopped-{self.token}"))  # also of a job that was stopped alone
-        for mark in marks:
-            mark.unlink()
-        if stopped() or marks:
+        killed = False
+        with tempfile.TemporaryDirectory(prefix="franka_wm-") as self.place:
+            with interruptible(pass_on), _hydra_raises():
+                try:
+                    yield
+                except SystemExit:
+                    if not self.stopped or self.ran:  # the job that ran in this process has said it
+                        raise
+                except BrokenProcessPool:
+                    killed = True
+            stopped = self.stopped or Path(self.place, STOPPED).exists()  # or a job was, alone
+            if (told := Path(self.place, FOLDER)).exists():
+                self.folder = told.read_text()
+        if not self.folder and self.folders:
+            self.folder = str(self.folders[0].parent)
+        if stopped:
             say(f"the sweep is stopped; {self.advice}")
             sys.exit(INTERRUPTED)
+        if killed:
+            raise FrankaError(
+                f"the process of a job was killed, and joblib ended the others before they had saved; {self.advice}"
+            )
+        if not self.folders and self.folder and not self.ran:  # a search by joblib: they are known now
+            self.folders = sorted(one.parent for one in Path(self.folder).glob("*/.hydra"))
+            self.names = [f"job {one.name}" for one in self.folders]
 
     @property
     def advice(self) -> str:

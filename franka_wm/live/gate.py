@@ -73,6 +73,11 @@ class Gate:
     def serve(self, make: Callable[[], Any]) -> Any:
         """The viser server that `make` starts, behind this gate."""
         import websockets.asyncio.server as network
+        from websockets.exceptions import InvalidMessage
+
+        def is_worth_telling(record: logging.LogRecord) -> bool:
+            """Not that somebody has connected and left without asking, as editors do that look for open ports."""
+            return not (record.exc_info and isinstance(record.exc_info[1], InvalidMessage | EOFError))
 
         real = network.serve
 
@@ -97,7 +102,7 @@ class Gate:
                 self._guarded(handler), *args, process_request=request, **(options | {"max_size": LARGEST})
             )
 
-        logging.getLogger("websockets.server").addFilter(_is_worth_telling)
+        logging.getLogger("websockets.server").addFilter(is_worth_telling)
         network.serve = guarded  # the server binds in its constructor, and has no option for this
         try:
             with contextlib.redirect_stdout(
@@ -210,11 +215,6 @@ class Gate:
         self._left += 1
         if self._left % LEFT == 0:
             gc.collect()
-
-
-def _is_worth_telling(record: logging.LogRecord) -> bool:
-    """Not that somebody has connected without asking, as editors do that look for open ports."""
-    return "handshake failed" not in record.getMessage()
 
 
 class _WithoutFarewell:

@@ -174,8 +174,11 @@ def serve(stage: Stage, options: Options) -> None:
         end = float("inf") if options.seconds is None else time.monotonic() + options.seconds
         while time.monotonic() < end and session.error is None:
             time.sleep(min(0.2, max(0.0, end - time.monotonic())))
-        if session.recording:
-            say(f"recorded until now: {page.save_recording()}")
+        try:
+            if session.recording:
+                say(f"recorded until now: {page.save_recording()}")
+        except UserError as error:
+            say(f"the recording was not saved: {error}")
         page.close()
     except KeyboardInterrupt:  # the way to end it, also while a long decision or a slow disk holds a thread
         hurry = threading.Timer(GRACE, os._exit, (INTERRUPTED,))

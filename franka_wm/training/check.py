@@ -282,8 +282,8 @@ def _check_parts(run: RunSettings) -> None:
     if spaces is None:
         return
     if run.is_offline:  # the data has the sizes; what acts in the environment needs its goals
-        images = [key for key in run.model.observations or () if key in spaces.image_sizes]
-        return _check_goal_images(run, images, spaces)
+        known = run.model.observations
+        return None if known is None else _check_goal_images(run, [k for k in known if "pixels" in k], spaces)
     say_unread(run, spaces)
     run = _with_encoder(run, spaces)
     model = sketch(run, spaces) or build.make_model(run, spaces)
@@ -302,7 +302,7 @@ def _check_goal_images(run: RunSettings, images: Iterable[str], spaces: Spaces) 
         there = [*spaces.observation_sizes, *spaces.image_sizes]
         raise UserError(
             f"planning to a goal image needs goal_pixels (here are {', '.join(there)}), and a model that reads "
-            f"pixels, not {run.model.observations}; use env=reach_goal_image, lift_goal_image or another …_goal_image"
+            f"pixels, not {[*images]}; use env=reach_goal_image or another …_goal_image (with a dataset also env=none)"
         )
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
@@ -13,6 +14,7 @@ from franka_wm.data.hindsight import Hindsight
 from franka_wm.data.image_storage import BOUNDARY
 from franka_wm.device import resolve_device
 from franka_wm.envs import Environment
+from franka_wm.envs.scene import Scene
 from franka_wm.envs.simulation.demonstrated import READS
 from franka_wm.errors import UserError
 from franka_wm.training import build
@@ -136,10 +138,15 @@ def check_demonstrations(run: RunSettings) -> None:
             )
         for session in sessions:
             scene = session.get("config", {}).get("env", {}).get("scene")
-            if replace(arm, scene=scene).resolved_scene != arm.resolved_scene:
+            if _placeless(replace(arm, scene=scene).resolved_scene) != _placeless(arm.resolved_scene):
                 raise UserError(
                     f"replay.demos={source.root}: recorded with another env.scene, whose objects are other ones"
                 )
+
+
+def _placeless(scene: Scene | None) -> str:
+    """A scene without the folders of its files: a dataset may come from another machine."""
+    return re.sub(r"'[^']*/([^'/]+)'", r"'\1'", repr(scene))
 
 
 def _check_seen(share: float, where: str, drawn: Mapping[str, Any]) -> None:

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import fcntl
+import os
 from pathlib import Path
-from typing import IO
+from typing import IO, Any
 
-from omegaconf import DictConfig
+from omegaconf import DictConfig, ListConfig, OmegaConf
 
 from franka_wm import files
 from franka_wm.errors import UserError
@@ -17,6 +18,10 @@ from franka_wm.versions import FINISHED
 
 SMALL_FILES = 65536
 """Room for a run's configuration and first lines, which are written before there is anything to lose [bytes]."""
+
+
+OF_FILES = ("urdf_path", "file", "parts")
+"""Fields of an environment, and of what stands in a scene, that name a file."""
 
 
 def unwritable(folder: Path, option: str = "hydra.run.dir") -> str | None:
@@ -58,6 +63,8 @@ def left_by(folder: Path, cfg: DictConfig) -> str | None:
     except UserError:  # there is none
         return None
     there = leaves(UntrustedFolder(folder).yaml("config.yaml"))
+    cfg = cfg.copy()
+    make_absolute(cfg)  # as the run wrote it
     here = leaves(plain(cfg))
     if here.get("device") == "spread" and str(there.get("device")).startswith("cuda:"):
         here["device"] = there["device"]
@@ -68,6 +75,19 @@ def left_by(folder: Path, cfg: DictConfig) -> str | None:
             "choose another folder with hydra.run.dir=…, or that of a sweep with hydra.sweep.dir=…"
         )
     return "finished" if (folder / FINISHED).is_file() else "begun"
+
+
+def make_absolute(node: DictConfig | ListConfig) -> None:
+    """Names the files of robots and meshes of the user's own as from any folder.
+
+    Else another folder would have no such file, or another one by that name.
+    """
+    for key in list(node) if isinstance(node, DictConfig) else range(len(node)):
+        value: Any = None if OmegaConf.is_interpolation(node, key) else node[key]
+        if isinstance(value, DictConfig | ListConfig):
+            make_absolute(value)
+        elif key in OF_FILES and isinstance(value, str) and os.path.isfile(path := os.path.expanduser(value)):
+            node[key] = os.path.abspath(path)  # pyright: ignore[reportArgumentType]
 
 
 def leaves(values: object, name: str = "") -> dict[str, object]:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import gc
 import importlib
 import logging
-import os
 import sys
 import traceback
 from collections.abc import Callable, Collection, Sequence
@@ -18,7 +17,7 @@ from typing import Any, NoReturn
 import torch
 from hydra.core.hydra_config import HydraConfig
 from hydra.core.override_parser.overrides_parser import OverridesParser
-from omegaconf import DictConfig, ListConfig, OmegaConf
+from omegaconf import DictConfig, OmegaConf
 from tensordict import TensorDictBase
 from torchrl.record.loggers import Logger
 
@@ -40,7 +39,7 @@ from franka_wm.training.check import check
 from franka_wm.training.checkpoint import Checkpoint, latest_checkpoint, load_checkpoint
 from franka_wm.training.demos import open_demonstrations, start_along
 from franka_wm.training.loggers import close_loggers, log_config, log_video, make_loggers
-from franka_wm.training.place import lock_run_dir, occupied
+from franka_wm.training.place import lock_run_dir, make_absolute, occupied
 from franka_wm.training.settings import RunSettings
 from franka_wm.training.spaces import Spaces
 from franka_wm.training.tree import damaged
@@ -262,8 +261,7 @@ def start(cfg: DictConfig) -> Run:
         # On the device of now: another GPU may be its turn, or there are fewer.
         checkpoint, cfg = resumed(cfg, [f"device={cfg.device}"] if again else typed)
         _require_same(checkpoint)
-    if "env" in cfg:
-        _make_absolute(cfg.env)
+    make_absolute(cfg)
     settings = RunSettings.of(cfg, saved=checkpoint is not None)
     if settings != _checked:
         check(settings)
@@ -295,19 +293,6 @@ def start(cfg: DictConfig) -> Run:
     if _begun is not None:
         _begun = (folder, _files(folder), run.loggers)
     return run
-
-
-def _make_absolute(node: DictConfig | ListConfig) -> None:
-    """Names of files in an environment's configuration as from any folder: robots and meshes of the user's own.
-
-    Else another folder would have no such file, or another one by that name.
-    """
-    for key in list(node) if isinstance(node, DictConfig) else range(len(node)):
-        value: Any = None if OmegaConf.is_interpolation(node, key) else node[key]
-        if isinstance(value, DictConfig | ListConfig):
-            _make_absolute(value)
-        elif isinstance(value, str) and os.path.isfile(path := os.path.expanduser(value)):
-            node[key] = os.path.abspath(path)
 
 
 _begun: tuple[Path, set[Path], list[Logger]] | None = None

@@ -74,18 +74,17 @@ def test_a_killed_job_of_a_sweep_is_one_line(two_at_once, tmp_path: Path) -> Non
 
 def test_one_job_that_is_stopped_stops_the_sweep(two_at_once, tmp_path: Path) -> None:
     """It has saved, and those that never began have not failed."""
-    fork, _ = two_at_once
+    fork, logs = two_at_once
     first, second = workers(fork.pid)
     os.kill(first, signal.SIGTERM)
     ends = time.monotonic() + 60
-    while not list((tmp_path / "sweep").glob(".stopped-*")):
+    while not any("stopped; go on" in log.read_text() for log in logs):
         assert time.monotonic() < ends, fork.said()
         time.sleep(0.05)
     os.kill(second, signal.SIGTERM)
     done = fork.wait(60)
     assert done.returncode == 130 and "failed" not in done.stderr, done.stdout + done.stderr
     assert f"the sweep is stopped; the same command with hydra.sweep.dir={tmp_path}/sweep" in done.stdout
-    assert not list((tmp_path / "sweep").glob(".stopped-*"))
 
 
 @pytest.mark.parametrize("stop", [signal.SIGINT, signal.SIGTERM])
@@ -99,7 +98,6 @@ def test_a_signal_lets_all_jobs_of_a_sweep_save(stop: signal.Signals, two_at_onc
     for log in logs:
         assert latest_checkpoint(log.parent)
     assert not (tmp_path / "sweep" / "2-reach" / "config.yaml").exists()
-    assert not list((tmp_path / "sweep").glob(".stopped-*"))
 
 
 def test_ctrl_c_ends_a_job_that_joblib_runs_in_the_first_process(tmp_path: Path) -> None:
@@ -119,3 +117,22 @@ def test_ctrl_c_ends_a_job_that_joblib_runs_in_the_first_process(tmp_path: Path)
     )
     assert not list((tmp_path / "sweep").glob("*/finished.json")) and "Traceback" not in done.stderr
     assert not (tmp_path / "sweep" / "1-reach" / "config.yaml").exists()
+
+
+def test_a_signal_does_not_kill_a_process_without_a_job(tmp_path: Path) -> None:
+    """One has finished its job and waits: joblib would end the other one, amid its save, with it."""
+    pytest.importorskip("hydra_plugins.hydra_joblib_launcher")
+    words = ("hydra/launcher=joblib", "hydra.launcher.n_jobs=2", *SMALL, "trainer.updates=4,1000000")
+    fork = Fork(
+        script(TRAIN, "--multirun", *words, f"hydra.sweep.dir={tmp_path}/sweep"), tmp_path, tmp_path / "log"
+    )
+    ends = time.monotonic() + 120
+    first, second = (tmp_path / "sweep" / f"{k}-reach" for k in range(2))
+    while not (first / "finished.json").is_file() or "\nupdates" not in (second / "train.log").read_text():
+        assert time.monotonic() < ends, fork.said()
+        time.sleep(0.05)
+    time.sleep(1)  # until it waits
+    os.kill(fork.pid, signal.SIGTERM)
+    done = fork.wait(60)
+    assert done.returncode == 130 and latest_checkpoint(second), done.stdout + done.stderr
+    assert f"hydra.sweep.dir={tmp_path}/sweep runs what is missing" in done.stdout

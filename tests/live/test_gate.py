@@ -248,7 +248,7 @@ def test_who_connects_and_asks_nothing_is_not_told_of(page: Page, caplog, capfd)
         deadline = time.monotonic() + 5
         while not caplog.records and time.monotonic() < deadline - 4:
             time.sleep(0.05)
-    assert not caplog.records and "Traceback" not in capfd.readouterr().err
+        assert not caplog.records and "Traceback" not in capfd.readouterr().err
 
 
 def test_many_messages_at_once_are_cut_off() -> None:

@@ -17,7 +17,8 @@ from franka_wm.conf import compose
 from franka_wm.errors import FrankaError, UserError
 from franka_wm.training import build
 from franka_wm.training.checkpoint import load_checkpoint, save_checkpoint
-from franka_wm.training.run import Run, _make_absolute, import_plugins, resumed
+from franka_wm.training.place import left_by, make_absolute
+from franka_wm.training.run import Run, import_plugins, resumed
 from franka_wm.training.settings import RunSettings
 from franka_wm.training.spaces import Spaces
 from small_checkpoint import save
@@ -184,13 +185,18 @@ def test_a_robot_of_ones_own_is_found_from_any_folder(train, tmp_path: Path) -> 
     words = ("env.robot=urdf", "env.urdf_path=robot/own.urdf", "evaluation.during=[]")
     saved = train(*words, "trainer.updates=10")
     assert saved.config["env"]["urdf_path"] == str(tmp_path / "robot" / "own.urdf")
+    typed = OmegaConf.create(OmegaConf.to_container(OmegaConf.load(tmp_path / "run" / "config.yaml")))
+    typed.env.urdf_path = "robot/own.urdf"
+    assert left_by(tmp_path / "run", typed) == "finished"  # the same command again
+    assert typed.env.urdf_path == "robot/own.urdf"
 
 
 def test_files_anywhere_in_an_environment_are_named_from_the_root(tmp_path: Path, monkeypatch) -> None:
     monkeypatch.chdir(tmp_path)
-    (tmp_path / "wedge.obj").touch()
+    for name in ("wedge.obj", "embedded"):
+        (tmp_path / name).touch()
     scene = {"objects": [{"name": "wedge", "file": "wedge.obj", "at": [0.4, 0.0]}], "same": "${env.robot}"}
     cfg = OmegaConf.create({"env": {"robot": "embedded", "scene": scene, "goal": None}})
-    _make_absolute(cfg.env)
+    make_absolute(cfg)
     scene["objects"][0]["file"] = str(tmp_path / "wedge.obj")
     assert OmegaConf.to_container(cfg.env) == {"robot": "embedded", "scene": scene, "goal": None}

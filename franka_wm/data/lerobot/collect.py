@@ -156,10 +156,8 @@ def gather(
                     said = now
             collector.shutdown()
             tell_lost("collect", lost)
-            return (
-                writer.finish(),
-                done >= left,
-            )  # still within: a signal to stop must not end it half-written
+            # A signal must not leave it half-written, so still within.
+            return writer.finish(), done >= left
 
 
 class _Choice:
