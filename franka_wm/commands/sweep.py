@@ -156,9 +156,8 @@ class Sweep:
         finally:
             self.inside = False
             if beside_others:
-                signal.signal(
-                    signal.SIGTERM, signal.SIG_IGN
-                )  # until the next one: it would kill the jobs beside it
+                # Until the next one: this process would die, and joblib kill the jobs beside it.
+                signal.signal(signal.SIGTERM, signal.SIG_IGN)
                 Path(self.place, f"{JOB}{os.getpid()}").unlink(missing_ok=True)
             log_anew()
             gc.collect()  # the next one needs the memory
