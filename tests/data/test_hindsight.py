@@ -91,7 +91,8 @@ def test_a_cube_is_judged_for_another_goal_as_the_simulator_does(name: str, rewa
     env = FrankaEnv(config, num_envs=4, device="cpu", seed=2)
     task, policy = env.simulation.task, ExpertPolicy(env.simulation.task, env.kinematics, env.config)
     root, judged, solved = env.reset(), 0, 0
-    away = 0.06 if name == "push" else 0.02  # twice that is no success
+    # Twice as far is no success; a goal of push keeps the height of a lying cube, whatever is asked for.
+    away, up = (0.06, 0.01) if name == "push" else (0.02, 0.003)
     for t in range(65):
         root = policy(root)
         state = env.get_state()
@@ -100,15 +101,14 @@ def test_a_cube_is_judged_for_another_goal_as_the_simulator_does(name: str, rewa
         same = task.relabel(window, root["goal"])
         torch.testing.assert_close(same["next", "reward"], window["next", "reward"], atol=1e-5, rtol=0)
         if t % 8 == 7:  # the same step with the goal near where the cube is
-            goal = step["next", "objects"][:, :3] + torch.tensor([away, 0.0, 0.003]) * (t % 3)
+            goal = step["next", "objects"][:, :3] + torch.tensor([away, 0.0, up]) * (t % 3)
             again = env.set_state(state)
             env.set_goal(goal)
-            goal = env.simulation.tensors.task_goal.clone()  # of push it lies on the table
             other = env.step(again.set("action", root["action"]))["next"]
             there = task.relabel(window, goal)["next"]
             torch.testing.assert_close(there["reward"][:, 0], other["reward"], atol=1e-5, rtol=0)
             assert torch.equal(there["terminated"][:, 0], other["success"])
-            torch.testing.assert_close(there["state"][:, 0], other["state"], atol=1e-6, rtol=0)
+            torch.testing.assert_close(there["state"][:, 0], other["state"], atol=1e-4, rtol=0)
             judged, solved = judged + 1, solved + int(other["success"].sum())
             env.set_state(state)
             step = env.step(root)

@@ -125,7 +125,10 @@ class Push(GripperTask):
         self.launch_reward(sim, push_reward_and_success, RADIUS, BEHIND)
 
     def relabel(self, transitions: TensorDictBase, goal: torch.Tensor) -> TensorDictBase:
-        return relabel_place(self, push_reward, transitions, goal)
+        # Where the cube was it may have been tilted; as in goal_was_set, the goal keeps the height of a lying one.
+        state = transitions.get("state")[:, 0]
+        height = state[:, 16:17] - state[:, 19:20]
+        return relabel_place(self, push_reward, transitions, torch.cat([goal[:, :2], height], -1))
 
     def measures(self, sim: "Simulation") -> dict[str, torch.Tensor]:
         way = sim.tensors.next_true_objects[:, :2] - sim.tensors.next_goal[:, :2]
