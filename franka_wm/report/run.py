@@ -2,7 +2,7 @@
 
     config.yaml             what was run
     .hydra/overrides.yaml   what was typed after ``train.py``
-    .hydra/hydra.yaml       and where configurations of the user's own are
+    .hydra/hydra.yaml       where configurations of the user's own are, and the preset that was chosen for `env`
     versions.json           packages and machine, as `franka_wm.versions` writes them
     evaluation.json         results, as :mod:`franka_wm.evaluation.results` describes them
     checkpoints/…           counters and the logged rows; without a checkpoint, rows come from ``csv/``
@@ -42,6 +42,7 @@ class RunFiles:
         folder: of the run.
         config: as the run saved it; interpolations are never resolved here.
         overrides: typed after ``train.py``, of Hydra's own only where configurations of the user's are.
+        preset: what was chosen for ``env``, typed or by an experiment; empty where that is not known.
         versions: of packages and machine.
         results: of the run's end and of ``franka-wm evaluate``; the one that is shown first, see `results`.
         rows: logged while training, and what its end found.
@@ -54,6 +55,7 @@ class RunFiles:
     folder: Path
     config: Mapping[str, Any] = field(default_factory=dict)
     overrides: list[str] = field(default_factory=list)
+    preset: str = ""
     versions: Mapping[str, Any] = field(default_factory=dict)
     results: Sequence[Result] = ()
     rows: list[dict[str, float]] = field(default_factory=list)
@@ -125,6 +127,7 @@ def _read_run(run: Path) -> RunFiles:
             "as train.py prints it last."
         )
     rows, counters, version, damage = _history(files)
+    typed, hydras = list(map(str, files.yaml(".hydra/overrides.yaml") or [])), files.yaml(".hydra/hydra.yaml")
     versions = files.json("versions.json") or ({"franka_wm": version} if version else {})
     end = last_row(found, ((config or {}).get("evaluation") or {}).get("during") or ())
     numbers = end.keys() - {"env_steps", "time_s"}
@@ -134,7 +137,8 @@ def _read_run(run: Path) -> RunFiles:
     return RunFiles(
         folder=run.resolve(),
         config=config or {},
-        overrides=_overrides(files),
+        overrides=[*typed, *_searchpath(hydras)],
+        preset=_preset(typed, hydras),
         versions=versions,
         results=found,
         rows=rows,
@@ -181,12 +185,22 @@ def _config(files: UntrustedFolder) -> dict[str, Any] | None:
     return found
 
 
-def _overrides(files: UntrustedFolder) -> list[str]:
-    hydras = files.yaml(".hydra/hydra.yaml")
-    for key in ("hydra", "overrides", "hydra"):  # most of these, such as the folder, are this run's alone
-        hydras = hydras.get(key) if isinstance(hydras, dict) else None
-    paths = [one for one in map(str, hydras or []) if one.startswith("hydra.searchpath=")]
-    return [*map(str, files.yaml(".hydra/overrides.yaml") or []), *paths]
+def _searchpath(hydras: Any) -> list[str]:
+    own = _entry(hydras, "hydra", "overrides", "hydra")  # most, such as the folder, are this run's alone
+    return [one for one in map(str, own or []) if one.startswith("hydra.searchpath=")]
+
+
+def _preset(typed: Sequence[str], hydras: Any) -> str:
+    if any(one.lstrip("+").startswith("resume=") for one in typed):
+        return ""  # its environment is that of the run that it goes on with, whatever Hydra chose
+    return str(_entry(hydras, "hydra", "runtime", "choices", "env") or "")
+
+
+def _entry(values: Any, *keys: str) -> Any:
+    """What lies below the keys; None where a level is missing, or is no mapping."""
+    for key in keys:
+        values = values.get(key) if isinstance(values, dict) else None
+    return values
 
 
 def _image(files: UntrustedFolder, name: str) -> Path | None:

@@ -38,7 +38,10 @@ def tasks_table(runs: Iterable[RunFiles]) -> Table | None:
 
 
 def task_of(run: RunFiles) -> str:
-    """The task that was typed, else the preset, else the configuration's task; of other libraries with its domain."""
+    """The task that was typed, else the preset, else the configuration's task; of other libraries with its domain.
+
+    A preset that is called otherwise than its task, or whose task an experiment changed, stands behind it.
+    """
     env = run.config.get("env")
     env = env if isinstance(env, Mapping) else {}
     domain, task = env.get("name"), env.get("task")
@@ -46,6 +49,8 @@ def task_of(run: RunFiles) -> str:
         return f"{domain} {task}" if task else str(domain)
     if task and any(one.lstrip("+").startswith("env.task=") for one in run.overrides):
         return str(task)
+    if run.preset:
+        return run.preset if not task or str(task) in run.preset else f"{task} ({run.preset})"
     typed = [one.removeprefix("env=") for one in run.overrides if one.startswith("env=")]
     return typed[-1] if typed else str(task or MISSING)
 

@@ -3,8 +3,10 @@
 from dataclasses import replace
 from pathlib import Path
 
+import pytest
+
 from franka_wm.evaluation.results import Result
-from franka_wm.report.run import RunFiles
+from franka_wm.report.run import RunFiles, read_run
 from franka_wm.report.tasks import task_of, tasks_table
 
 
@@ -58,6 +60,26 @@ def test_a_task_of_ones_own_is_named_after_itself() -> None:
     """Not after the preset whose rate and camera it has."""
     mine = replace(run("mine", "tdmpc2", {}), overrides=["plugins=[mine]", "env=reach", "env.task=mine"])
     assert task_of(mine) == "mine"
+
+
+@pytest.mark.parametrize(
+    ("typed", "chosen", "said"),
+    [
+        ("experiment=images_fixed", "reach_fixed_pixels", "reach_fixed_pixels"),
+        ("experiment=of_mine", "push", "reach (push)"),  # which changes the preset's task
+        ("env=reach env.task=reach", "push", "reach"),
+        ("resume=/before", "push", "reach"),  # Hydra composed the defaults, which the run then left
+        ("env=reach_fixed", None, "reach_fixed"),
+    ],
+)
+def test_a_preset_that_an_experiment_chose_is_its_name(
+    typed: str, chosen: str | None, said: str, make_run
+) -> None:
+    hydras = make_run() / ".hydra"  # of the task reach
+    (hydras / "overrides.yaml").write_text("".join(f"- {one}\n" for one in typed.split()))
+    if chosen is not None:
+        (hydras / "hydra.yaml").write_text(f"hydra: {{runtime: {{choices: {{env: {chosen}}}}}}}")
+    assert task_of(read_run(hydras.parent)) == said
 
 
 def test_what_was_measured_differently_is_not_averaged() -> None:
