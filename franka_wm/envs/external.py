@@ -194,9 +194,8 @@ def _make_one(config: ExternalConfig) -> EnvBase:
         extra = config.kind
         raise UserError(f"env={extra} needs pip install 'franka-wm[{extra}]' ({error})") from error
     except Exception as error:  # whatever the other library raises for a name that it does not know
-        what = config.name if config.task is None else f"{config.name} {config.task}"
         reason = (str(error).strip() or type(error).__name__).splitlines()[0]
-        raise UserError(f"env={config.kind}: cannot make {what!r}: {reason}") from error
+        raise UserError(f"env={config.kind}: cannot make {config.label!r}: {reason}") from error
 
 
 def _groups(config: ExternalConfig, env: EnvBase) -> dict[str, list[str]]:
@@ -214,6 +213,6 @@ def _groups(config: ExternalConfig, env: EnvBase) -> dict[str, list[str]]:
         for key in groups[name]:
             if key not in vectors:
                 raise UserError(
-                    f"env.observations: no {key!r}; {config.name} has {', '.join(map(str, vectors))}"
+                    f"env.observations: no {key!r}; {config.label} has {', '.join(map(str, vectors))}"
                 )
     return groups

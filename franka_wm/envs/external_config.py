@@ -39,6 +39,11 @@ class ExternalConfig:
         for name in ("episode_length", "frame_skip"):
             check_whole(f"env.{name}", getattr(self, name))
 
+    @property
+    def label(self) -> str:
+        """Its name; of the suite the domain and its task."""
+        return self.name if self.task is None else f"{self.name} {self.task}"
+
 
 def external_config(values: Mapping[str, Any]) -> ExternalConfig:
     """From a plain mapping.

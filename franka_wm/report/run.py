@@ -91,9 +91,9 @@ class RunFiles:
 
     @property
     def environment(self) -> str:
-        """Task and where its goals come from, in words of the configuration."""
+        """Task and where its goals come from, in words of the configuration; of the suite the domain before it."""
         env = self.config.get("env") or {}
-        task = env.get("task") or env.get("name") or env.get("kind")
+        task = " ".join(str(env[key]) for key in ("name", "task") if env.get(key)) or env.get("kind")
         if task is None:
             return "unknown environment"
         goals = env.get("goal_sampling")

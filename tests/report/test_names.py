@@ -10,6 +10,7 @@ from franka_wm.report.bars import bars_figure
 from franka_wm.report.curves import seeds_figure
 from franka_wm.report.figure import inline_svg
 from franka_wm.report.horizon import horizon_figure
+from franka_wm.report.page import page
 from franka_wm.report.run import RunFiles
 from franka_wm.report.sections import what
 from franka_wm.report.spectra import spectrum_figure
@@ -32,6 +33,18 @@ def test_names_of_runs_are_no_formulas_and_stay_in_the_legend(figure: Any) -> No
     svg = inline_svg(figure(), "names")
     for name in NAMES:
         assert name in svg or name.replace("_", " ") in svg, name
+
+
+@pytest.mark.parametrize(
+    ("env", "named"),
+    [
+        ({"kind": "dm_control", "name": "walker", "task": "run"}, "walker run · dreamer"),
+        ({"kind": "gym", "name": "CartPole-v1"}, "CartPole-v1 · dreamer"),
+        ({"kind": "multitask"}, "multitask · dreamer"),
+    ],
+)
+def test_a_page_names_a_task_with_its_domain(env: dict[str, str], named: str, tmp_path: Any) -> None:
+    assert named in page(RunFiles(tmp_path, config={"env": env, "model": {"name": "dreamer"}}))
 
 
 def test_a_configuration_of_others_is_not_parsed(tmp_path: Any) -> None:

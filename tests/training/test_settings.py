@@ -233,6 +233,20 @@ def test_settings_are_what_several_options_make_of_them() -> None:
 
 
 @pytest.mark.parametrize(
+    ("words", "label"),
+    [
+        (("env=dm_control", "env.name=walker", "env.task=run"), "walker run"),
+        (("env=gym",), "CartPole-v1"),
+        (("env=push",), "push"),
+        (("env=multitask",), "multitask"),
+    ],
+)
+def test_a_task_is_named_with_its_domain(words: tuple[str, ...], label: str) -> None:
+    """The suite has several tasks of one walker."""
+    assert RunSettings.of(compose("scale=smoke", *words)).env.label == label
+
+
+@pytest.mark.parametrize(
     ("overrides", "says"),
     [
         (

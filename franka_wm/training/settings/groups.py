@@ -312,10 +312,10 @@ class EnvSettings:
 
     @property
     def label(self) -> str:
-        """The arm's task, or the name of another library's environment."""
+        """The arm's task, or the name of another library's environment, of the suite's with its task."""
         if isinstance(self.config, FrankaConfig):
             return self.config.task
-        return self.config.name if isinstance(self.config, ExternalConfig) else self.kind
+        return self.config.label if isinstance(self.config, ExternalConfig) else self.kind
 
 
 @dataclass(frozen=True)
