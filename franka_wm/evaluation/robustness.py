@@ -151,7 +151,9 @@ def check_shiftable(agent: Agent) -> None:
         UserError: Not the arm.
     """
     if arm_of(agent.env) is None:
-        raise UserError("robustness=true: only the arm can be shifted; this run's environment is another's")
+        raise UserError(
+            "robustness=true: only the arm can be shifted, in one task; this run's environment is another"
+        )
 
 
 def note(episodes: int) -> str:

@@ -289,13 +289,12 @@ def reproduce(run: RunFiles) -> str:
         again = any(one.startswith("resume=") for one in run.overrides)  # its scale is that of the first part
         words = [one for one in run.overrides if not (again and one.startswith("scale="))]
         lines += ["# train it again", f"franka-wm train {shlex.join(words)}", ""]
-    if run.counters:
-        lines += [
-            "# evaluate it, also in shifted worlds",
-            f"franka-wm evaluate {place}{_episodes(run)} robustness=true{own}",
-            "",
-        ]
-    if run.counters:
+    kind = (run.config.get("env") or {}).get("kind", "franka")
+    if run.counters and kind != "none":  # there is nothing to act in
+        shifted, option = (", also in shifted worlds", " robustness=true") if kind == "franka" else ("", "")
+        evaluate = f"franka-wm evaluate {place}{_episodes(run)}{option}{own}"
+        lines += [f"# evaluate it{shifted}", evaluate, ""]
+    if run.counters and kind == "franka":
         lines += ["# watch it", f"franka-wm view checkpoint={place}{own}", ""]
     if run.counters and run.overrides:
         resume = shlex.quote(f"resume={quoted(str(_near(run.folder)))}")

@@ -12,7 +12,7 @@ from franka_wm.report.figure import inline_svg
 from franka_wm.report.horizon import horizon_figure
 from franka_wm.report.page import page
 from franka_wm.report.run import RunFiles
-from franka_wm.report.sections import what
+from franka_wm.report.sections import reproduce, what
 from franka_wm.report.spectra import spectrum_figure
 
 NAMES = ("_omitted", "b$x^{$", r"c\$d$")
@@ -45,6 +45,24 @@ def test_names_of_runs_are_no_formulas_and_stay_in_the_legend(figure: Any) -> No
 )
 def test_a_page_names_a_task_with_its_domain(env: dict[str, str], named: str, tmp_path: Any) -> None:
     assert named in page(RunFiles(tmp_path, config={"env": env, "model": {"name": "dreamer"}}))
+
+
+@pytest.mark.parametrize(
+    ("kind", "said"),
+    [
+        ("franka", ("evaluate", "robustness", "view")),
+        ("multitask", ("evaluate",)),
+        ("dm_control", ("evaluate",)),
+        ("none", ()),
+    ],
+)
+def test_a_page_names_only_commands_that_the_run_can_have(
+    kind: str, said: tuple[str, ...], tmp_path: Any
+) -> None:
+    run = RunFiles(tmp_path, config={"env": {"kind": kind}}, counters={"updates": 1.0}, overrides=["seed=1"])
+    text = reproduce(run)
+    assert tuple(word for word in ("evaluate", "robustness", "view") if word in text) == said
+    assert "train" in text and "resume=" in text and "report" in text
 
 
 def test_a_configuration_of_others_is_not_parsed(tmp_path: Any) -> None:
