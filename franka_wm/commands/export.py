@@ -35,16 +35,17 @@ def export(source: str, out: str, format: str, workers: int) -> None:
     from franka_wm.training.checkpoint import latest_checkpoint, load_checkpoint
 
     checkpoint = load_checkpoint(latest_checkpoint(source))
+    resolved = checkpoint.config
+    config = arm_config(resolved)
     data = checkpoint.replay()
     if data is None:
         raise UserError(
             f"export: {checkpoint.folder} was saved without its replay; train with trainer.checkpoint_replay=true"
         )
-    resolved = checkpoint.config
     with announced(f"writing {data.numel()} steps"):
         done = export_replay(
             data,
-            config=arm_config(resolved),
+            config=config,
             out=out,
             seed=int(resolved["seed"]),
             policy=f"training run {source}",

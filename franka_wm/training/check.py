@@ -343,7 +343,7 @@ def _check_export(run: RunSettings) -> None:
     from franka_wm.data.lerobot.export import check_export
 
     if not run.is_arm or run.is_offline:
-        raise UserError("export: only what a run gathers with the arm can be exported")
+        raise UserError("export: only what a run gathers with the arm in one task can be exported")
     check_export(run.values)
     steps = min(run.planned_steps(), run.replay.capacity // run.collector.num_envs)
     if steps < run.env.episode_length and not run.env.arm.terminate_on_success:

@@ -230,15 +230,17 @@ def model_card(folder: Path, *, repo_id: str, license: str) -> str:
         library_name="franka_wm",
         tags=[
             "world-model",
-            *(["robotics", "franka"] if cfg.env.kind == "franka" else []),
+            *(["robotics", "franka"] if cfg.env.kind in ("franka", "multitask") else []),
             str(cfg.model.name),
         ],
     )
+    recorded = (cfg.get("dataset") or {}).get("kind", "none") != "none"
+    seen = " on recorded episodes" if recorded else f", {counters.get('env_steps', 0):,} environment steps"
     text = f"""
 # {repo_id.split("/")[-1]}
 
 A latent world model ({cfg.model.name}) of {_world(cfg.env)}, trained with {_project()}:
-{counters.get("updates", 0):,} updates, {counters.get("env_steps", 0):,} environment steps, seed {cfg.seed}.
+{counters.get("updates", 0):,} updates{seen}, seed {cfg.seed}.
 
 ## Evaluation
 
@@ -268,6 +270,8 @@ def _world(env: Any) -> str:
     """What a model is a model of."""
     if env.kind == "franka":
         return "a simulated Franka arm"
+    if env.kind == "multitask":
+        return f"a simulated Franka arm in {len(env.tasks)} tasks ({', '.join(map(str, env.tasks))})"
     if env.kind == "none":
         return "recorded episodes"
     named = [str(env[key]) for key in ("name", "task") if env.get(key)]

@@ -53,12 +53,19 @@ def arm_config(settings: Mapping[str, Any]) -> FrankaConfig:
     """The arm's config in a run's resolved configuration.
 
     Raises:
-        UserError: The run was not about the arm.
+        UserError: The run gathered nothing, or not with the arm and one task.
     """
     from franka_wm.envs import FrankaConfig
 
     env = dict(settings["env"])
-    if env.pop("kind") != "franka":
+    kind = env.pop("kind")
+    if (settings.get("dataset") or {}).get("kind", "none") != "none":
+        raise UserError(
+            "export: the run learned from recorded episodes and gathered none; those are a dataset"
+        )
+    if kind == "multitask":
+        raise UserError("export: the run has several tasks at once (env=multitask); a dataset is of one task")
+    if kind != "franka":
         raise UserError("export: the run's environment is not the arm; there is no schema for its data")
     env.pop("urdf_path", None)
     return FrankaConfig.from_mapping(env)

@@ -363,9 +363,8 @@ def test_export_of_a_run_without_replay_is_one_line(tmp_path, capsys) -> None:
 
     from franka_wm.training.checkpoint import save_checkpoint
 
-    save_checkpoint(
-        tmp_path / "run", model=torch.nn.Linear(2, 2), config=OmegaConf.create({"seed": 0}), counters={}
-    )
+    config = OmegaConf.create({"seed": 0, "env": {"kind": "franka"}})
+    save_checkpoint(tmp_path / "run", model=torch.nn.Linear(2, 2), config=config, counters={})
     assert main(["export", f"source={tmp_path / 'run'}", f"out={tmp_path / 'set'}"]) == 1
     assert "without its replay" in capsys.readouterr().err
 

@@ -7,14 +7,17 @@ from typing import Any
 
 import huggingface_hub
 import pytest
+import torch
 from huggingface_hub import constants
 
 from fake_hub import TOKEN, Hub
+from franka_wm.commands.main import main
 from franka_wm.data.lerobot import export, publish
 from franka_wm.data.lerobot.export import check_export, check_export_place, export_run, written_before
 from franka_wm.data.lerobot.provenance import describe
 from franka_wm.data.lerobot.schema import PROVENANCE
 from franka_wm.errors import UserError
+from franka_wm.training.checkpoint import save_checkpoint
 
 RUN: dict[str, Any] = {
     "resume": None,
@@ -101,6 +104,23 @@ def test_a_run_without_experience_says_why(tmp_path: Path) -> None:
     for resume, says in ((None, "that it was trained on"), ("run", r"trainer\.checkpoint_replay=true")):
         with pytest.raises(UserError, match=rf"has gathered nothing.*{says}"):
             export_run(RUN | {"resume": resume}, None, folder=tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("other", "says"),
+    [
+        ({"env": {"kind": "multitask", "tasks": {}}}, "several tasks at once"),
+        ({"env": {"kind": "none"}, "dataset": {"kind": "lerobot"}}, "learned from recorded episodes"),
+        ({"dataset": {"kind": "lerobot"}}, "learned from recorded episodes"),
+        ({"env": {"kind": "gym"}, "dataset": {"kind": "none"}}, "is not the arm"),
+    ],
+)
+def test_what_has_no_dataset_says_why(other: dict[str, Any], says: str, tmp_path: Path, capsys) -> None:
+    """Whether a replay was saved or not: a run on recorded data was told to save one."""
+    save_checkpoint(tmp_path / "run", model=torch.nn.Linear(2, 2), config=RUN | other, counters={})
+    assert main(["export", f"source={tmp_path / 'run'}", f"out={tmp_path / 'set'}"]) == 1
+    said = capsys.readouterr().err
+    assert says in said and said.count("\n") == 1 and not (tmp_path / "set").exists()
 
 
 @pytest.mark.parametrize(

@@ -101,6 +101,54 @@ def test_a_models_card_has_the_newest_evaluation_and_the_right_world(tmp_path) -
         load_checkpoint(place)
 
 
+TASKS = {"kind": "multitask", "tasks": {"reach": {}, "push": {}}}
+
+
+@pytest.mark.parametrize(
+    ("family", "env", "dataset", "says", "not_said"),
+    [
+        (
+            "tdmpc2",
+            TASKS,
+            "none",
+            ("of a simulated Franka arm in 2 tasks (reach, push)", "- franka\n", "70 environment steps"),
+            ("`multitask`", "recorded episodes"),
+        ),
+        (
+            "tdmpc2",
+            {"kind": "franka"},
+            "lerobot",
+            ("7 updates on recorded episodes, seed", 'policies["planner"]', 'src="https'),
+            ("environment steps",),
+        ),
+        (
+            "of_ones_own",
+            {"kind": "dm_control", "name": "walker", "task": "run"},
+            "none",
+            ("A latent world model (of_ones_own) of `dm_control walker run`", 'policies["planner"]'),
+            (),
+        ),
+    ],
+)
+def test_a_models_card_says_what_the_run_was(
+    family: str, env: dict, dataset: str, says: tuple, not_said: tuple, run_folder, tmp_path
+) -> None:
+    """Several tasks, and recorded data that trained without a step."""
+    run, place = run_folder[0], tmp_path / "place"
+    config = {"seed": 4, "model": {"name": family}, "env": env, "dataset": {"kind": dataset}}
+    save_checkpoint(
+        run / "checkpoints" / "latest",
+        model=run_folder[1],
+        config=config,
+        counters={"updates": 7, "env_steps": 70},
+    )
+    place.mkdir()
+    card = (stage_model(run, place, repo_id="user/model", license="mit") / "README.md").read_text()
+    assert all(text in card for text in says), card
+    assert not any(text in card for text in not_said), card
+    assert "planner | 1 cm" in card
+
+
 @pytest.mark.parametrize(("verbs", "shown"), [(3, "the run's"), (4, "the verb's")])
 def test_of_two_evaluations_the_one_of_more_episodes_is_published(run_folder, tmp_path, verbs, shown) -> None:
     run, place = run_folder[0], tmp_path / "place"
