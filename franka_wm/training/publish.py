@@ -8,6 +8,7 @@ from pathlib import Path
 
 from omegaconf import OmegaConf
 
+from franka_wm import models
 from franka_wm.console import say
 from franka_wm.data.lerobot.card import FILM, model_card
 from franka_wm.data.lerobot.hub import check_license, check_repo_id
@@ -88,11 +89,21 @@ def stage_model(checkpoint: Path, place: Path, *, repo_id: str, license: str) ->
             (place / "evaluation.md").write_text(shortened(text), encoding="utf-8")
     if None in measured.values() and not (place / "evaluation.json").is_file():
         say(f"no evaluation goes along: that of {run} is of other weights; franka-wm evaluate {folder} first")
-    if (film := files.path(FILM)) and measured[""] is not None:
+    acting = _acting(config["model"]["name"])  # a film of an encoder's run shows a policy without it
+    if (film := files.path(FILM)) and measured[""] is not None and acting is not None:
         shutil.copyfile(film, place / FILM)
-    card = model_card(place, repo_id=repo_id, license=license)
+    card = model_card(place, repo_id=repo_id, license=license, acting=acting)
     (place / README).write_text(card, encoding="utf-8")
     return place
+
+
+def _acting(model: str) -> str | None:
+    """The policy that a family is about; ``None`` for an encoder. One of one's own, which is not here, plans."""
+    if model not in models.available():
+        return "planner"
+    family = models.family(model)
+    able = {"planner": family.has_next, "policy": family.has_policy}
+    return next((name for name, has in able.items() if has), None)
 
 
 def _episodes(files: UntrustedFolder, place: str, updates: float | None) -> tuple[bool, int] | None:

@@ -205,7 +205,7 @@ def _first_episode(source: Source, name: str, kind: str) -> np.ndarray:
     return np.stack([frame.to_ndarray(format="rgb24") for frame, _ in frames])
 
 
-def model_card(folder: Path, *, repo_id: str, license: str) -> str:
+def model_card(folder: Path, *, repo_id: str, license: str, acting: str | None = "planner") -> str:
     """README.md of a trained model.
 
     Args:
@@ -213,6 +213,7 @@ def model_card(folder: Path, *, repo_id: str, license: str) -> str:
             was evaluated.
         repo_id: Where it goes.
         license: Identifier.
+        acting: The policy that its use shows; ``None`` for an encoder alone, which has none.
     """
     from omegaconf import DictConfig, OmegaConf
 
@@ -222,6 +223,8 @@ def model_card(folder: Path, *, repo_id: str, license: str) -> str:
     counters = linked_json(folder / "counters.json")
     evaluation = folder / "evaluation.md"
     table = evaluation.read_text(encoding="utf-8") if evaluation.is_file() else "Not evaluated."
+    if acting is None and evaluation.is_file():
+        table = f"An encoder does not act: these policies need no model.\n\n{table}"
     if (folder / FILM).is_file():
         place = f"https://huggingface.co/{repo_id}/resolve/main/{FILM}"
         table = f'<video src="{place}" autoplay loop muted controls></video>\n\n{table}'
@@ -229,17 +232,19 @@ def model_card(folder: Path, *, repo_id: str, license: str) -> str:
         license=license,
         library_name="franka_wm",
         tags=[
-            "world-model",
+            "encoder" if acting is None else "world-model",
             *(["robotics", "franka"] if cfg.env.kind in ("franka", "multitask") else []),
             str(cfg.model.name),
         ],
     )
+    name = cfg.model.name
+    what = f"An encoder ({name}) for images" if acting is None else f"A latent world model ({name})"
     recorded = (cfg.get("dataset") or {}).get("kind", "none") != "none"
     seen = " on recorded episodes" if recorded else f", {counters.get('env_steps', 0):,} environment steps"
     text = f"""
 # {repo_id.split("/")[-1]}
 
-A latent world model ({cfg.model.name}) of {_world(cfg.env)}, trained with {_project()}:
+{what} of {_world(cfg.env)}, trained with {_project()}:
 {counters.get("updates", 0):,} updates{seen}, seed {cfg.seed}.
 
 ## Evaluation
@@ -249,7 +254,7 @@ A latent world model ({cfg.model.name}) of {_world(cfg.env)}, trained with {_pro
 ## Use it
 
 ```python
-{_use(cfg.env.kind, repo_id)}
+{_use(None if cfg.env.kind == "none" else acting, repo_id)}
 ```
 
 Weights are safetensors, everything else is JSON and YAML; nothing is unpickled or executed. The configuration is in
@@ -278,11 +283,11 @@ def _world(env: Any) -> str:
     return f"`{' '.join([str(env.kind), *named])}`"
 
 
-def _use(kind: str, repo_id: str) -> str:
-    if kind == "none":  # nothing to act in
+def _use(acting: str | None, repo_id: str) -> str:
+    if acting is None:  # or nothing to act in
         return f'from franka_wm.training.load import load_model\n\nmodel = load_model("hf:{repo_id}")'
     return (
         "from franka_wm.training.load import load_agent\n\n"
         f'agent = load_agent("hf:{repo_id}")\n'
-        'rollout = agent.env.rollout(50, agent.policies["planner"])'
+        f'rollout = agent.env.rollout(50, agent.policies["{acting}"])'
     )

@@ -122,6 +122,13 @@ TASKS = {"kind": "multitask", "tasks": {"reach": {}, "push": {}}}
             ("environment steps",),
         ),
         (
+            "jepa",
+            {"kind": "franka"},
+            "none",
+            ("An encoder (jepa) for images of a simulated", "load_model(", "- encoder\n", "does not act"),
+            ("world-model", "A latent world model", "policies[", "load_agent", "<video"),
+        ),
+        (
             "of_ones_own",
             {"kind": "dm_control", "name": "walker", "task": "run"},
             "none",
@@ -133,7 +140,7 @@ TASKS = {"kind": "multitask", "tasks": {"reach": {}, "push": {}}}
 def test_a_models_card_says_what_the_run_was(
     family: str, env: dict, dataset: str, says: tuple, not_said: tuple, run_folder, tmp_path
 ) -> None:
-    """Several tasks, and recorded data that trained without a step."""
+    """Several tasks, recorded data that trained without a step, and an encoder, which has no planner."""
     run, place = run_folder[0], tmp_path / "place"
     config = {"seed": 4, "model": {"name": family}, "env": env, "dataset": {"kind": dataset}}
     save_checkpoint(
