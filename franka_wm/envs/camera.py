@@ -50,7 +50,8 @@ def camera_framing(config: FrankaConfig) -> tuple[tuple[float, float, float], tu
 def whole_arm(config: FrankaConfig, kinematics: Kinematics) -> FrankaConfig:
     """The configuration with its camera moved so that the arm stays in the image in every pose: for videos.
 
-    The direction is the same, the distance as small as possible, and each world's camera stands alike.
+    So does what it can meet of a scene, see :meth:`~franka_wm.envs.scene.Scene.outline`. The direction is the same, the
+    distance as small as possible, and each world's camera stands alike.
     """
     eye, target = (np.array(point) for point in camera_framing(config))
     back = (eye - target) / np.linalg.norm(eye - target)
@@ -60,13 +61,19 @@ def whole_arm(config: FrankaConfig, kinematics: Kinematics) -> FrankaConfig:
     lower, upper = kinematics.lower.cpu(), kinematics.upper.cpu()
     tools = kinematics.forward((lower + shares * (upper - lower)).to(kinematics.lower.device)).cpu().numpy()
     tools = tools[tools[:, 2] > 0.0]  # above the ground
+    scene, raised = config.resolved_scene, (0.0, 0.0, config.randomization.table_height)
+    around = np.array(scene.outline() if scene else []).reshape(-1, 3)
+    around = np.concatenate([around - raised, around + raised])
     slope = math.tan(0.5 * math.radians(config.camera_fov_degrees))
 
+    def needed(points: np.ndarray, height: float) -> np.ndarray:
+        """How far the camera must be to see each point, if it looks at this height."""
+        seen = (points - (0.0, 0.0, height)) @ axes
+        return (np.abs(seen[:, :2]).max(1) + LINK) / slope + seen[:, 2]
+
     def distance(height: float) -> float:
-        """How far the camera must be if it looks at this height."""
-        seen = (tools - (0.0, 0.0, height)) @ axes
-        needed = (np.abs(seen[:, :2]).max(1) + LINK) / slope + seen[:, 2]
-        return float(np.quantile(needed, 0.97))  # the rest are stretched out to the limit
+        arm = np.quantile(needed(tools, height), 0.97)  # the rest are stretched out to the limit
+        return float(needed(around, height).max(initial=arm))
 
     height = min(np.linspace(0.0, tools[:, 2].max(), 33).tolist(), key=distance)
     eye = (0.0, 0.0, height) + distance(height) * back

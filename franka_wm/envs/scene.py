@@ -171,6 +171,33 @@ class Scene:
                 out.append((*one.at[:2], *sides, *turn, 0.0 if box else one.radius))
         return out
 
+    def outline(self) -> list[tuple[float, float, float]]:
+        """Corners of what a task may be about [m]: the table as far as the arm reaches, objects where they may start,
+        drawers and doors where they may stand, open, and obstacles as far as the arm reaches."""
+        top, far, table = self.top, REACH[1], self.table
+        out = []
+        for k in range(32):
+            point = (far * math.cos(math.tau * k / 32), far * math.sin(math.tau * k / 32))
+            x, y = (_within(point[i], table.at[i], 0.5 * table.size[i]) for i in range(2))
+            out.append((x, y, top))
+        for one in self.objects:
+            u, v = (s + one.radius for s in one.spread)
+            out += _corners((*one.at, u, v, 1.0, 0.0), top, top + 2 * one.half_height)
+        for one in self.articulated:
+            high = top + max(one.size[2], one.grip_at(one.travel)[2])
+            for place in one.places():
+                out += _corners(box_on_table(one, *place), top, high)
+        for one in self.obstacles:
+            if math.hypot(*one.at[:2]) - one.radius > far:
+                continue
+            u, v = (0.5 * w for w in one.widths)
+            box = (*one.at[:2], u, v, math.cos(one.angle), math.sin(one.angle))
+            corners = _corners(box, one.at[2] - one.half_height, one.at[2] + one.half_height)
+            out += [
+                (_within(x, 0.0, far), _within(y, 0.0, far), min(max(z, top), far)) for x, y, z in corners
+            ]
+        return out
+
     def _check_room(self) -> None:
         """Refuses a scene whose bodies overlap, an obstacle or one another, in any of some draws, or hang over."""
         table = self.table
@@ -232,6 +259,17 @@ def _articulated(values: Any) -> Articulated | ArticulatedFile:
     ):
         return ArticulatedFile.of(values)
     return Articulated.of(values)
+
+
+def _corners(box: Sequence[float], low: float, high: float) -> list[tuple[float, float, float]]:
+    """Corners of a box on the table (x, y, half sides, cosine and sine of its angle) between two heights [m]."""
+    x, y, half_u, half_v, cos, sin = box[:6]
+    sides = [(i * half_u, j * half_v) for i in (-1, 1) for j in (-1, 1)]
+    return [(x + cos * u - sin * v, y + sin * u + cos * v, z) for u, v in sides for z in (low, high)]
+
+
+def _within(value: float, middle: float, half: float) -> float:
+    return min(max(value, middle - half), middle + half)
 
 
 def _distance(x: float, y: float, blocked: tuple[float, ...]) -> float:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -174,6 +175,60 @@ def test_the_camera_of_videos_has_the_whole_arm_in_view_and_leaves_observations_
     assert ((seen > 0) & (seen < 100)).float().mean() > 0.99
     seen = project(tools[tools[:, 2] > 0], env.config, 100)
     assert ((seen > 0) & (seen < 100)).all(-1).float().mean() < 0.9, "the camera of observations cuts"
+
+
+LOW = {
+    "camera_distance": 1.1,
+    "camera_height": 0.5,
+    "camera_target_distance": 0.45,
+    "camera_target_height": 0.12,
+}
+OVER = {**LOW, "camera_distance": 1.5, "camera_height": 1.05, "camera_target_distance": 0.55}
+
+
+@pytest.mark.parametrize(
+    ("task", "camera"), [("push", LOW), ("drawer", OVER)]
+)  # those of env=push, env=drawer
+def test_the_camera_of_videos_has_what_a_task_is_about_in_view(small_env, task: str, camera: dict) -> None:
+    env = small_env(128, task=task, camera_fov_degrees=50.0, **camera)
+    env.reset(seed=1)
+    tensors, goal = env.simulation.tensors, env.goal
+    if task == "push":
+        disc = 0.1 * torch.tensor([[1.0, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0]])
+        points = torch.cat([goal[:, None] + disc, tensors.true_objects[:, None, :3]], 1)
+    else:
+        (chest,) = env.config.resolved_scene.articulated
+        length, width, height = chest.size
+        corners = [
+            (0.5 * i * length, 0.5 * j * width, z) for i in (-1, 1) for j in (-1, 1) for z in (0, height)
+        ]
+        x, y, z, w = tensors.bases[:, 0, 3:].unbind(-1)
+        assert x.abs().max() < 1e-6 and y.abs().max() < 1e-6  # it stands upright
+        cos, sin = (1 - 2 * z * z)[:, None], (2 * z * w)[:, None]
+        u, v, up = torch.tensor(corners).unbind(-1)
+        turned = torch.stack([cos * u - sin * v, sin * u + cos * v, up.expand(len(goal), 8)], -1)
+        points = torch.cat([tensors.bases[:, :1, :3] + turned, goal[:, None]], 1)  # goal: the handle, open
+    config = whole_arm(env.config, env.kinematics)
+    seen = project(points, config, 100)
+    assert seen.shape[1] > 4 and ((seen > 0) & (seen < 100)).all()
+    arm = project(torch.tensor([[0.0, 0.0, 0.0], [0.0, 0.0, 1.0]]), config, 100)
+    assert 30 < arm[0, 1] - arm[1, 1] < 60  # a metre of it is a third of the image at least
+
+
+def test_the_camera_of_videos_without_a_scene_and_with_one_beyond_reach(env: FrankaEnv) -> None:
+    """What the arm cannot meet does not make it small."""
+
+    def framed(**changes: Any) -> list[float]:
+        config = whole_arm(FrankaConfig(**changes), env.kinematics)
+        return [config.camera_distance, config.camera_height, config.camera_target_height]
+
+    assert framed() == pytest.approx([1.654562, 0.806710, 0.518960], abs=1e-5)
+    wall = {"name": "wall", "size": [0.02, 3.0, 2.0], "at": [0.6, 0.0, 1.0]}
+    cut, far = {**wall, "size": [0.02, 1.6, 0.8], "at": [0.6, 0.0, 0.4]}, {**wall, "at": [9.0, 0.0, 1.0]}
+    none, beyond, whole, part = (
+        framed(gripper=True, scene={"obstacles": some}) for some in ([], [far], [wall], [cut])
+    )
+    assert beyond == none and whole == pytest.approx(part) and whole[0] > none[0]
 
 
 def test_framing(env: FrankaEnv) -> None:
