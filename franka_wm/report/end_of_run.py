@@ -70,7 +70,7 @@ def report_run(
         say(f"filming the {policy_name(name)} …")
         frames = film(settings, folder, policies[name], name, found)
         if log_video is not None:
-            log_video(f"eval/{name}", frames, _slow(next(iter(arms.values())).config.fps))
+            log_video(f"eval/{name}", frames, max(_slow(arm.config.fps) for arm in arms.values()))
     Console(width=120).print(terminal(evaluation_tables(found.policies)[0]))
 
 
@@ -91,6 +91,7 @@ def film(settings: RunSettings, folder: Path, policy: Any, name: str, found: Eva
     env = make_evaluation_env(settings, num_envs=tasks)
     arms = _arms(env)
     size = settings.evaluation.video_size
+    fps = max(_slow(arm.config.fps) for arm in arms.values())
     films, lines = [], []
     for number in _filmed(rows, settings.evaluation.video_episodes, found.worlds, tasks):
         k, world = divmod(number, found.worlds)
@@ -104,10 +105,10 @@ def film(settings: RunSettings, folder: Path, policy: Any, name: str, found: Eva
                 env, policy, seed=found.seeds[k], episodes=count, first_world=first, video=image
             )
         own: Any = played[place : place + 1]
-        films.append(torch.stack(frames[: int(own["length"])]))  # the other tasks' may be longer
+        # Other tasks' episodes may be longer, and their rates higher.
+        films.append(_at_rate(torch.stack(frames[: int(own["length"])]), _slow(arm.config.fps), fps))
         who = policy_name(name) if tasks == 1 else f"{task}, {policy_name(name)}"
         lines.append(ending(own, who, number, arm))
-    fps = _slow(next(iter(arms.values())).config.fps)
     longest = max(map(len, films))  # shorter ones stand still at their ends
     beside = torch.cat(
         [torch.cat([one, one[-1:].expand(longest - len(one), *one.shape[1:])]) for one in films], 1
@@ -177,3 +178,8 @@ def ending(played: TensorDictBase, who: str, number: int, arm: Any) -> str:
 def _slow(fps: float) -> int:
     """Half the frames per second of the arm's."""
     return max(1, round(fps / 2))
+
+
+def _at_rate(frames: torch.Tensor, own: int, fps: int) -> torch.Tensor:
+    """Frames of which ``own`` are a second as ``fps`` of them are, some of them several times."""
+    return frames[torch.arange(-(-len(frames) * fps // own)) * own // fps]
