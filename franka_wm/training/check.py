@@ -429,22 +429,22 @@ def _check_same_actions(arm: FrankaConfig, sources: Named) -> None:
 
 def _check_same_views(run: RunSettings, sources: Named) -> None:
     """What a model that acts has learned to see, the arm's cameras must show; sizes are compared elsewhere."""
-    from franka_wm.data.lerobot.provenance import VIEWS, other_option, read_provenance
+    from franka_wm.data.lerobot.provenance import VIEWS, other_option, other_scene, read_provenance
 
     arm, family = run.env.arm, run.model.family
+    env = {**vars(arm), "urdf_path": run.env.urdf_path}
     looks = {*(run.model.observations or ())} & {*Spaces.of_config(arm).image_sizes}
     if not looks or not (family.has_next or family.has_policy):
         return
-    named = (
-        "image_size",
-        *(("cameras",) if run.dataset.features else ()),
-    )  # those may be chosen for the dataset
+    chosen = ("image_size", *(("cameras",) if run.dataset.features else ()))  # for the dataset
     for option, source in sources:
         sessions = (read_provenance(source.root) or {}).get("sessions", ())
-        changed = other_option(sessions, vars(arm), [name for name in VIEWS if name not in named])
+        changed = other_option(sessions, env, [name for name in VIEWS if name not in chosen])
         if changed is not None:
             name, there = changed
             raise UserError(
-                f"{option}: recorded with env.{name}={there}, this run has {getattr(arm, name)}, so "
+                f"{option}: recorded with env.{name}={there}, this run has {env[name]}, so "
                 f"images show something else; use env.{name}={there}, or env=none to train alone"
             )
+        if other_scene(sessions, env):
+            raise UserError(f"{option}: recorded with another env.scene, so images show something else")

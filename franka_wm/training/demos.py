@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Mapping
-from dataclasses import replace
 from typing import Any
 
 from tensordict import TensorDict
@@ -14,7 +12,6 @@ from franka_wm.data.hindsight import Hindsight
 from franka_wm.data.image_storage import BOUNDARY
 from franka_wm.device import resolve_device
 from franka_wm.envs import Environment
-from franka_wm.envs.scene import Scene
 from franka_wm.envs.simulation.demonstrated import READS
 from franka_wm.errors import UserError
 from franka_wm.training import build
@@ -104,7 +101,7 @@ def check_demonstrations(run: RunSettings) -> None:
             "replay.demos: demonstrations are of one task, env=multitask has several; leave it at null"
         )
     from franka_wm.data.lerobot.opening import read_datasets
-    from franka_wm.data.lerobot.provenance import MEANING, VIEWS, other_option, read_provenance
+    from franka_wm.data.lerobot.provenance import MEANING, VIEWS, other_option, other_scene, read_provenance
 
     arm = run.env.arm if run.is_arm else None
     if arm is not None and share:
@@ -124,29 +121,23 @@ def check_demonstrations(run: RunSettings) -> None:
         )
     if arm is None:
         return
+    env = {**vars(arm), "urdf_path": run.env.urdf_path}
     looks = {*(run.model.observations or ())} & {*Spaces.of_config(arm).image_sizes}
     for source in sources:
         sessions = (read_provenance(source.root) or {}).get("sessions", ())
         for session in sessions if share else ():
             recorded = session.get("config", {}).get("env", {})
             _check_seen(share, "dataset", recorded.get("randomization", {}))
-        changed = other_option(sessions, vars(arm), (*MEANING, *VIEWS) if looks else MEANING)
+        changed = other_option(sessions, env, (*MEANING, *VIEWS) if looks else MEANING)
         if changed is not None:
             name, there = changed
             raise UserError(
-                f"replay.demos={source.root}: recorded with env.{name}={there}, this run has {getattr(arm, name)}"
+                f"replay.demos={source.root}: recorded with env.{name}={there}, this run has {env[name]}"
             )
-        for session in sessions:
-            scene = session.get("config", {}).get("env", {}).get("scene")
-            if _placeless(replace(arm, scene=scene).resolved_scene) != _placeless(arm.resolved_scene):
-                raise UserError(
-                    f"replay.demos={source.root}: recorded with another env.scene, whose objects are other ones"
-                )
-
-
-def _placeless(scene: Scene | None) -> str:
-    """A scene without the folders of its files: a dataset may come from another machine."""
-    return re.sub(r"'[^']*/([^'/]+)'", r"'\1'", repr(scene))
+        if other_scene(sessions, env):
+            raise UserError(
+                f"replay.demos={source.root}: recorded with another env.scene, whose objects are other ones"
+            )
 
 
 def _check_seen(share: float, where: str, drawn: Mapping[str, Any]) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import platform
+import re
 import sys
 from collections.abc import Iterable, Mapping
 from datetime import UTC, datetime
@@ -11,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from franka_wm.data.lerobot.schema import PROVENANCE
+from franka_wm.errors import UserError
 from franka_wm.untrusted import linked_json
 
 _PACKAGES = ("franka-wm", "torch", "torchrl", "newton", "warp-lang", "lerobot", "numpy")
@@ -48,9 +50,9 @@ MEANING = (
 """Those that give actions, rewards and ends their meaning."""
 VIEWS = (
     *("cameras", "camera_distance", "camera_height", "camera_target_height", "camera_target_distance"),
-    *("camera_fov_degrees", "image_size", "show_goal"),
+    *("camera_fov_degrees", "image_size", "show_goal", "robot", "urdf_path"),
 )
-"""Those that give images their meaning."""
+"""Those that give images their meaning, beside the scene: :func:`other_scene`."""
 
 
 def other_option(
@@ -76,7 +78,35 @@ def other_option(
 
 
 def _telling(name: str, value: Any) -> Any:
+    if name == "urdf_path":
+        return value and Path(value).name  # a dataset may come from another machine
     return [*value][:1] if name == "cameras" else value
+
+
+def other_scene(sessions: Iterable[Mapping[str, Any]], env: Mapping[str, Any]) -> bool:
+    """Whether sessions were recorded in another scene than that of ``env``, which has ``task`` and ``scene``.
+
+    Folders of files do not count, and scenes whose files are not here are not compared: a dataset may come from another
+    machine.
+    """
+    for session in sessions:
+        recorded = session.get("config", {}).get("env", {})
+        if "scene" in recorded and "scene" in env:
+            try:
+                there = _scene(recorded["scene"], env["task"])
+            except UserError:
+                continue
+            if there != _scene(env["scene"], env["task"]):
+                return True
+    return False
+
+
+def _scene(given: Any, task: str) -> str:
+    from franka_wm.envs.scene import Scene
+    from franka_wm.envs.tasks import task_class
+
+    scene = task_class(task).scene if given is None else Scene.of(given)
+    return re.sub(r"'[^']*/([^'/]+)'", r"'\1'", repr(scene))
 
 
 def _version(package: str) -> str | None:

@@ -27,7 +27,7 @@ from typing import Any
 import numpy as np
 
 from franka_wm.data.lerobot.episodes import Episode
-from franka_wm.data.lerobot.provenance import MEANING, VIEWS, other_option, read_provenance
+from franka_wm.data.lerobot.provenance import MEANING, VIEWS, other_option, other_scene, read_provenance
 from franka_wm.data.lerobot.schema import Schema
 from franka_wm.data.lerobot.shard import check_episode
 from franka_wm.data.lerobot.shard_workers import (
@@ -231,6 +231,10 @@ class DatasetWriter:
                 raise UserError(
                     f"out={self.out}: what is there was recorded with env.{name}={there}, this has {env[name]}; give "
                     "the same, or another out"
+                )
+            if other and other_scene(other["sessions"], env):
+                raise UserError(
+                    f"out={self.out}: what is there was recorded with another env.scene; give the same, or another out"
                 )
 
     def _save_state(self, **more: Any) -> None:

@@ -79,6 +79,27 @@ def test_images_of_another_camera_are_not_mixed(tmp_path, make_schema, make_epis
             assert writer.resumed == 1
 
 
+def test_scenes_are_not_mixed(tmp_path, make_schema, make_episode) -> None:
+    """However they are written; one whose mesh is on another machine cannot be compared."""
+    schema, cube = make_schema(observations=("state",)), {"name": "cube", "at": [0.5, 0.0]}
+
+    def options(*objects: dict) -> dict:
+        scene = {"objects": list(objects)} if objects else None
+        provenance = describe(policy="p", seed=1, config={"env": {"task": "lift", "scene": scene}})
+        return {"provenance": provenance, "workers": 0, "shard_frames": 1}
+
+    for there in (cube, {**cube, "shape": "mesh", "file": "/elsewhere/cube.obj"}):
+        out = tmp_path / there.get("shape", "box")
+        with DatasetWriter(out, schema, **options(there)) as writer:
+            writer.add([make_episode(schema, 0)])
+        if there is cube:
+            for others in ((), ({**cube, "size": [0.06, 0.06, 0.06]},)):
+                with pytest.raises(UserError, match=r"another env\.scene; give the same, or another out"):
+                    DatasetWriter(out, schema, **options(*others), resume=True)
+        with DatasetWriter(out, schema, **options({**cube, "mass": 0.05}), resume=True) as writer:
+            assert writer.resumed == 1
+
+
 def test_goes_on_with_what_is_finished(tmp_path, make_schema, make_episode, load) -> None:
     schema = make_schema()
     episodes = [make_episode(schema, i) for i in range(6)]
