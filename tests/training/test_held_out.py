@@ -96,6 +96,18 @@ def test_seeds_of_a_whole_run(train, monkeypatch, tmp_path: Path) -> None:
     assert len({5, training, evaluation, *held_out_seeds(3), ROLLOUT_SEED}) == 7
 
 
+def test_held_out_seeds_are_no_seeds_of_training() -> None:
+    """Of other purposes, whatever the run's own seed; published results are of these."""
+    held_out = held_out_seeds(1000)
+    assert held_out[:3] == [1248032192, 2113170484, 117168142]
+    others = {
+        purpose: {derive_seed(purpose, seed) for seed in range(1000)}
+        for purpose in ("training", "evaluation")
+    }
+    assert not any(others[purpose] & set(held_out) for purpose in others)
+    assert not set(range(1000)) & set(held_out)
+
+
 def test_seeds_of_the_worlds_of_a_configuration(cfg: RunSettings) -> None:
     """Also of those that are built alone, to look at a checkpoint."""
     assert build.make_env(cfg, num_envs=1).simulation.tensors.seed[0].item() == derive_seed("training", 5)

@@ -18,6 +18,7 @@ from tensordict import TensorDictBase
 
 from forks import train_in_fork
 from franka_wm.commands.main import main
+from franka_wm.data.lerobot import cache
 from franka_wm.training import build
 from franka_wm.training.checkpoint import Checkpoint, latest_checkpoint, load_checkpoint
 from franka_wm.training.learner import Learner
@@ -288,6 +289,31 @@ def test_recorded_data_go_on_where_they_were(train, made: Counter[str], monkeypa
     assert differing(weights(second), weights(whole)) == []
     states = [(one.extra() or {})["moment"] for one in (whole, second)]
     assert torch.equal(states[0]["windows"], states[1]["windows"])
+
+
+def test_demonstrations_and_hindsight_go_on_where_they_were(
+    train, made: Counter[str], monkeypatch, tmp_path: Path
+) -> None:
+    """Which of them are drawn and how many, episodes that begin along them, goals that were reached later."""
+    from franka_wm.models.tdmpc2 import TDMPC2
+
+    monkeypatch.setattr(cache, "default_cache_dir", lambda: tmp_path / "cache")
+    worlds = ["env=push", "env.substeps=1", "env.episode_length=8", "seed=0", "device=cpu"]
+    root = tmp_path / "push"
+    assert main(["collect", f"out={root}", "policy=expert", "episodes=4", "num_envs=4", *worlds]) == 0
+    shares = ["replay.demo_updates=5", "replay.demo_share_end=0.25", "replay.hindsight=0.5"]
+    starts = ["replay.demo_resets=0.5", "replay.demo_reset_updates=25"]
+    run = [*worlds, f"replay.demos={root}", *shares, *starts, "evaluation.during=[]", "trainer.updates=30"]
+    whole = train(*run, folder=tmp_path / "whole")
+    with monkeypatch.context() as patched:
+        interrupt(patched, 15, TDMPC2)
+        train(*run, folder=tmp_path / "first", status=130)
+    begun = load_checkpoint(latest_checkpoint(tmp_path / "first")).counters["updates"]
+    assert 15 <= begun < 30
+    made.clear()
+    second = train(f"resume={tmp_path}/first", folder=tmp_path / "second")
+    assert made == {"TDMPC2": 30 - begun}
+    assert differing(weights(second), weights(whole)) == []
 
 
 @pytest.fixture(scope="module")
