@@ -33,6 +33,7 @@ def export(source: str, out: str, format: str, workers: int) -> None:
     check_out(out, resumable=False)
     from franka_wm.data.lerobot.export import arm_config, export_replay, tell
     from franka_wm.training.checkpoint import latest_checkpoint, load_checkpoint
+    from franka_wm.training.load import require_same_actions
 
     checkpoint = load_checkpoint(latest_checkpoint(source))
     resolved = checkpoint.config
@@ -42,6 +43,13 @@ def export(source: str, out: str, format: str, workers: int) -> None:
         raise UserError(
             f"export: {checkpoint.folder} was saved without its replay; train with trainer.checkpoint_replay=true"
         )
+<<<<<<< HEAD
+=======
+    resolved = checkpoint.config
+    config = arm_config(resolved)
+    if not data.get("action").is_floating_point():
+        require_same_actions(checkpoint, config)
+>>>>>>> f82cc0e (Discrete actions hold what the fingers hold)
     with announced(f"writing {data.numel()} steps"):
         done = export_replay(
             data,

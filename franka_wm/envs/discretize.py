@@ -13,24 +13,37 @@ from franka_wm.errors import UserError
 from franka_wm.options import check_whole
 
 
-def discrete_action_table(action_dim: int, magnitude: float = 1.0, include_noop: bool = True) -> torch.Tensor:
+def discrete_action_table(
+    action_dim: int, magnitude: float = 1.0, include_noop: bool = True, gripper: bool = False
+) -> torch.Tensor:
     """Actions along one axis each, and the no-op that lets an agent stay where it arrived.
+
+    The fingers' command is a place, not a way to go: left out of a move, it would let go of what is held. So with a
+    gripper all moves of the arm are there twice, with open and with closed fingers.
 
     Args:
         action_dim: Number of axes, A.
-        magnitude: Size of an action, in (0, 1]: actions are clipped there.
-        include_noop: Whether the last row is all zeros.
+        magnitude: Size of an action, in (0, 1]: actions are clipped there. The fingers' are always 1 and −1.
+        include_noop: Whether the last move is all zeros.
+        gripper: Whether the last axis is the fingers'.
 
     Returns:
-        (2·A + 1, A) float32, or (2·A, A) without the no-op. Row 2·i is +magnitude on axis i, row 2·i + 1 is
-        −magnitude, and the **last** row is the no-op: the other indices do not depend on it.
+        (M, A) float32. Without a gripper M = 2·A + 1, or 2·A without the no-op: row 2·i is +magnitude on axis i, row
+        2·i + 1 is −magnitude, and the **last** row is the no-op: the other indices do not depend on it. With one
+        the first half of the rows are these of the A − 1 other axes, with open fingers. The second half are the same,
+        with closed ones.
     """
-    check_whole("action_dim", action_dim)
+    check_whole("action_dim", action_dim, least=1 + gripper)
     if not (math.isfinite(magnitude) and 0.0 < magnitude <= 1.0):
         raise UserError(f"magnitude={magnitude}: must be above 0 and at most 1, where actions are clipped")
-    table = magnitude * torch.eye(action_dim).repeat_interleave(2, 0)
+    table = magnitude * torch.eye(action_dim - gripper).repeat_interleave(2, 0)
     table[1::2] *= -1.0
-    return torch.cat([table, torch.zeros(1, action_dim)]) if include_noop else table
+    if include_noop:
+        table = torch.cat([table, torch.zeros(1, table.shape[1])])
+    if gripper:
+        fingers = torch.tensor([1.0, -1.0]).repeat_interleave(len(table)).unsqueeze(1)
+        table = torch.cat([table.repeat(2, 1), fingers], 1)
+    return table
 
 
 class DiscreteActions(Transform):
@@ -44,7 +57,7 @@ class DiscreteActions(Transform):
 
     Args:
         action_dim: Number of axes, A.
-        magnitude, include_noop: As in :func:`discrete_action_table`.
+        magnitude, include_noop, gripper: As in :func:`discrete_action_table`.
 
     Attributes:
         table: (number of actions, A) float32, a buffer that follows the environment's device.
@@ -57,9 +70,15 @@ class DiscreteActions(Transform):
 
     table: torch.Tensor
 
-    def __init__(self, action_dim: int = NUM_JOINTS, magnitude: float = 1.0, include_noop: bool = True):
+    def __init__(
+        self,
+        action_dim: int = NUM_JOINTS,
+        magnitude: float = 1.0,
+        include_noop: bool = True,
+        gripper: bool = False,
+    ):
         super().__init__(in_keys_inv=["action"], out_keys_inv=["action"])
-        self.register_buffer("table", discrete_action_table(action_dim, magnitude, include_noop))
+        self.register_buffer("table", discrete_action_table(action_dim, magnitude, include_noop, gripper))
 
     @property
     def num_actions(self) -> int:

@@ -83,7 +83,8 @@ def make_env(
         first_world=first_world,
         urdf_path=described.urdf_path,
     )
-    return TransformedFrankaEnv(env, DiscreteActions(config.action_dim)) if run.is_discrete else env
+    moves = DiscreteActions(config.action_dim, gripper=config.has_gripper)
+    return TransformedFrankaEnv(env, moves) if run.is_discrete else env
 
 
 def make_evaluation_env(run: RunSettings, *, num_envs: int | None = None, **changes: Any) -> Environment:

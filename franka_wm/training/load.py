@@ -11,7 +11,7 @@ import torch
 from tensordict.nn import TensorDictModuleBase
 
 from franka_wm.device import resolve_device
-from franka_wm.envs import Environment
+from franka_wm.envs import Environment, FrankaConfig
 from franka_wm.errors import UserError
 from franka_wm.planning.base import Planner
 from franka_wm.planning.mcts import MCTS
@@ -83,6 +83,8 @@ def load_agent(
         raise UserError(
             f"{folder}: was trained on recorded data without an environment; there is nothing to act in"
         )
+    if settings.is_arm and settings.is_discrete:
+        require_same_actions(checkpoint, settings.env.arm)
     changes = dict(env_changes or {})
     if changes and settings.is_arm:
         _require_fit(settings, _saved_spaces(checkpoint), changes)
@@ -122,6 +124,23 @@ def find_checkpoint(folder: str | Path) -> Checkpoint:
 
         folder = download(str(folder).removeprefix(HUB))
     return load_checkpoint(latest_checkpoint(folder))
+
+
+def require_same_actions(checkpoint: Checkpoint, config: FrankaConfig) -> None:
+    """Refuses discrete actions of an earlier version, where every move of the arm let go of what the fingers held.
+
+    Raises:
+        UserError: The arm of ``config`` has another number of them than the checkpoint.
+    """
+    if not config.has_gripper:
+        return
+    saved = _saved_spaces(checkpoint).num_actions
+    here = Spaces.of_config(config, discrete=True).num_actions
+    if saved != here:
+        raise UserError(
+            f"{checkpoint.folder}: has {saved} discrete actions, of an earlier version; with a gripper there are "
+            f"{here} now, each move with open and with closed fingers; train anew"
+        )
 
 
 def _require_fit(settings: RunSettings, saved: Spaces, changes: dict[str, Any]) -> None:

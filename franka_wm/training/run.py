@@ -38,6 +38,7 @@ from franka_wm.training import build
 from franka_wm.training.check import check
 from franka_wm.training.checkpoint import Checkpoint, latest_checkpoint, load_checkpoint
 from franka_wm.training.demos import open_demonstrations, start_along
+from franka_wm.training.load import require_same_actions
 from franka_wm.training.loggers import close_loggers, log_config, log_video, make_loggers
 from franka_wm.training.place import lock_run_dir, make_absolute, occupied
 from franka_wm.training.settings import RunSettings
@@ -263,6 +264,8 @@ def start(cfg: DictConfig) -> Run:
         _require_same(checkpoint)
     make_absolute(cfg)
     settings = RunSettings.of(cfg, saved=checkpoint is not None)
+    if checkpoint is not None and settings.is_arm and settings.is_discrete:
+        require_same_actions(checkpoint, settings.env.arm)
     if settings != _checked:
         check(settings)
     device = resolve_device(settings.device)

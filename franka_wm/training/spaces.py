@@ -114,7 +114,7 @@ class Spaces:
             "objects": config.object_dim,
             "contacts": config.contact_dim,
         }
-        rows = discrete_action_table(config.action_dim).shape[0]
+        rows = discrete_action_table(config.action_dim, gripper=config.has_gripper).shape[0]
         return cls(
             observation_sizes={key: size for key, size in vectors.items() if key in config.observations}
             | {GOAL: 3},

@@ -1,5 +1,7 @@
 """Discrete moves: the table, and the transform under TorchRL's machinery."""
 
+from collections.abc import Callable
+
 import pytest
 import torch
 from torchrl.data import Categorical
@@ -8,6 +10,9 @@ from torchrl.envs import check_env_specs
 from franka_wm.envs import FrankaConfig, FrankaEnv, TransformedFrankaEnv
 from franka_wm.envs.discretize import DiscreteActions, discrete_action_table
 from franka_wm.errors import UserError
+from franka_wm.policies.expert import ExpertPolicy
+from franka_wm.training import build
+from franka_wm.training.spaces import Spaces
 
 CONFIG = FrankaConfig(observations=("state",), substeps=4, gravity_compensation=True, pose_noise=0.1)
 
@@ -38,6 +43,37 @@ def test_table_moves_every_axis_both_ways_once(noop: bool) -> None:
 def test_bad_tables_are_refused(dim: int, magnitude: float) -> None:
     with pytest.raises(UserError):
         discrete_action_table(dim, magnitude)
+
+
+@pytest.mark.parametrize("noop", [True, False])
+@pytest.mark.parametrize("dim", [4, 8])
+def test_with_a_gripper_each_move_is_there_with_open_and_with_closed_fingers(dim: int, noop: bool) -> None:
+    table = discrete_action_table(dim, 0.5, noop, gripper=True)
+    moves = discrete_action_table(dim - 1, 0.5, noop)
+    for half, grip in zip(table.chunk(2), (1.0, -1.0), strict=True):
+        assert torch.equal(half[:, :-1], moves)
+        assert (half[:, -1] == grip).all()
+    with pytest.raises(UserError, match="action_dim=1"):
+        discrete_action_table(1, gripper=True)
+
+
+def test_what_is_held_stays_held_as_the_arm_moves(settled: Callable) -> None:
+    """Each world makes one move over and over: open fingers let go of the cube, closed ones hold it."""
+    run = settled("env=lift", "model=muzero", "planner=gumbel", "device=cpu")
+    tool = Spaces.of_config(run.env.changed(action_mode="ee_delta").arm, discrete=True)
+    assert Spaces.of_config(run.env.arm, discrete=True).num_actions == 30 and tool.num_actions == 14
+    env = build.make_env(run, num_envs=10, seed=1, episode_length=200)
+    assert env.action_spec.n == 30 and torch.equal(env.transform.table[[14, 29], :7], torch.zeros(2, 7))
+    arm = env.base_env
+    expert, observation = ExpertPolicy(arm.simulation.task, arm.kinematics, arm.config), arm.reset()
+    for _ in range(45):
+        observation = arm.step(expert(observation))["next"]
+    assert (observation["objects"][:, 2] > 0.1).all()
+    moves = torch.tensor([2, 5, 8, 11, 14])
+    for _ in range(15):
+        observation = env.step(observation.set("action", torch.cat([moves, 15 + moves])))["next"]
+    away = (observation["objects"][:, :3] - observation["state"][:, 14:17]).norm(dim=-1)
+    assert away[:5].min() > 0.04 and away[5:].max() < 0.02, away
 
 
 @pytest.mark.parametrize("auto_reset", ["native", "standard"])

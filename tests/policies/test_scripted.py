@@ -10,6 +10,7 @@ import torch
 from tensordict import TensorDict
 
 from franka_wm.envs import FrankaConfig, FrankaEnv
+from franka_wm.envs.discretize import discrete_action_table
 from franka_wm.errors import UserError
 from franka_wm.policies.scripted import DiscretePolicy, IKPolicy, NoopPolicy, SmoothRandomPolicy
 from franka_wm.training import build
@@ -112,6 +113,12 @@ def test_ik_with_moves_to_poses_takes_the_best(moving) -> None:
     poses = k.lower + (env.transform.table + 1) / 2 * (k.upper - k.lower)
     distances = (k.forward(poses) - observation["goal"].unsqueeze(1)).norm(dim=-1)
     assert torch.equal(move, distances.argmin(1))
+
+
+def test_doing_nothing_with_discrete_actions_leaves_the_fingers_open() -> None:
+    """Where they begin; a command of half the width lies between the two that there are."""
+    table = discrete_action_table(8, gripper=True)
+    assert DiscretePolicy(NoopPolicy(8), table)(first(2))["action"].tolist() == [14, 14]
 
 
 def test_ik_needs_the_targets() -> None:

@@ -133,7 +133,7 @@ def export_replay(
     schema = schema_for(config, format=format, keys=keys, success="success" in after.keys())  # noqa: SIM118
     discrete = None
     if not data.get("action").is_floating_point():
-        discrete = discrete_action_table(config.action_dim)
+        discrete = discrete_action_table(config.action_dim, gripper=config.has_gripper)
     episodes, partial, lost = cut_replay(
         data,
         schema,

@@ -6,16 +6,26 @@ from pathlib import Path
 from typing import Any
 
 import huggingface_hub
+import numpy as np
 import pytest
 import torch
 from huggingface_hub import constants
+from tensordict import TensorDict
 
 from fake_hub import TOKEN, Hub
 from franka_wm.commands.main import main
 from franka_wm.data.lerobot import export, publish
-from franka_wm.data.lerobot.export import check_export, check_export_place, export_run, written_before
+from franka_wm.data.lerobot.export import (
+    check_export,
+    check_export_place,
+    export_replay,
+    export_run,
+    written_before,
+)
 from franka_wm.data.lerobot.provenance import describe
-from franka_wm.data.lerobot.schema import PROVENANCE
+from franka_wm.data.lerobot.schema import ACTION, PROVENANCE
+from franka_wm.envs import FrankaConfig
+from franka_wm.envs.discretize import discrete_action_table
 from franka_wm.errors import UserError
 from franka_wm.training.checkpoint import save_checkpoint
 
@@ -142,3 +152,19 @@ def test_what_cannot_be_published_is_said_before_the_run(repo_id, offline, token
         check_export(run)
     assert "\n" not in str(refused.value)
     return None
+
+
+def test_discrete_actions_are_stored_with_what_they_tell_the_fingers(tmp_path: Path, load) -> None:
+    config = FrankaConfig(task="push", episode_length=5, observations=("state", "objects"))
+    sizes = {"state": 28, "objects": 13, "goal": 3}
+    seen = {key: torch.zeros(1, 5, size) for key, size in sizes.items()}
+    flag = torch.zeros(1, 5, 1, dtype=torch.bool)
+    after = {**seen, "reward": torch.zeros(1, 5, 1), "terminated": flag}
+    moves = torch.tensor([[3, 14, 18, 29, 0]])
+    starts = torch.tensor([True, False, False, False, False]).view(1, 5, 1)
+    data = TensorDict({**seen, "action": moves, "is_init": starts, "next": after}, batch_size=[1, 5])
+    told: dict[str, Any] = {"seed": 0, "policy": "p", "settings": {}, "workers": 0}
+    dataset = load(export_replay(data, config=config, out=tmp_path / "set", **told).out)
+    stored = np.stack([dataset[k][ACTION].numpy() for k in range(5)])
+    assert np.array_equal(stored, discrete_action_table(8, gripper=True)[moves[0]].numpy())
+    assert stored[:, 7].tolist() == [1.0, 1.0, -1.0, -1.0, 1.0]
