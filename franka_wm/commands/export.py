@@ -43,13 +43,8 @@ def export(source: str, out: str, format: str, workers: int) -> None:
         raise UserError(
             f"export: {checkpoint.folder} was saved without its replay; train with trainer.checkpoint_replay=true"
         )
-<<<<<<< HEAD
-=======
-    resolved = checkpoint.config
-    config = arm_config(resolved)
     if not data.get("action").is_floating_point():
         require_same_actions(checkpoint, config)
->>>>>>> f82cc0e (Discrete actions hold what the fingers hold)
     with announced(f"writing {data.numel()} steps"):
         done = export_replay(
             data,

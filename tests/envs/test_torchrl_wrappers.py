@@ -13,7 +13,13 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModule, TensorDictModuleBase
 from torchrl._utils import seed_generator
-from torchrl.collectors import AsyncCollector, Collector
+from torchrl.collectors import (
+    AsyncCollector,
+    BaseCollector,
+    Collector,
+    MultiAsyncCollector,
+    MultiSyncCollector,
+)
 from torchrl.envs import Compose, EnvBase, ParallelEnv, SerialEnv, TransformedEnv
 from torchrl.envs.transforms import CatFrames, RewardSum, StepCounter, VecNormV2
 from torchrl.envs.utils import check_env_specs, step_mdp
@@ -332,9 +338,8 @@ BATCHED: dict[str, Callable[[str], EnvBase]] = {
 }
 
 
-@pytest.mark.parametrize(
-    ("wrapper", "auto_reset"), [*((name, "native") for name in BATCHED), ("SerialEnv", "standard")]
-)
+@pytest.mark.parametrize("auto_reset", ["native", "standard"])
+@pytest.mark.parametrize("wrapper", list(BATCHED))
 def test_episodes_of_several_environments(plain, wrapper: str, auto_reset: str) -> None:
     env = BATCHED[wrapper](auto_reset)
     seeds = [0, seed_generator(0)]
@@ -366,10 +371,18 @@ def test_a_seed_that_is_given_decides_alone() -> None:
     assert not torch.equal(first["goal"], make(seed=1).reset()["goal"])
 
 
+def modes() -> list[Callable[[], EnvBase]]:
+    """Worlds for two processes, each with its own auto-reset."""
+    return [
+        lambda: TransformedEnv(make("native", seed=None), RewardSum()),
+        lambda: TransformedEnv(make("standard", seed=None), RewardSum()),
+    ]
+
+
 @pytest.mark.slow
 def test_processes(plain) -> None:
     """Workers have episodes of their own; seeded, they are those of plain loops."""
-    env = ParallelEnv(2, lambda: TransformedEnv(make(seed=None), RewardSum()))
+    env = ParallelEnv(2, modes())
     try:
         goal = env.reset()["goal"].clone()
         assert not torch.equal(goal[0], goal[1])
@@ -382,15 +395,19 @@ def test_processes(plain) -> None:
 
 
 @pytest.mark.slow
-def test_a_collector_of_another_process(plain) -> None:
-    collector = AsyncCollector(
-        lambda: TransformedEnv(make(), counters()),
+@pytest.mark.parametrize("kind", [AsyncCollector, MultiSyncCollector, MultiAsyncCollector])
+def test_collectors_of_other_processes(plain, kind: type[BaseCollector]) -> None:
+    workers = [lambda mode=mode: TransformedEnv(make(mode), counters()) for mode in ("native", "standard")]
+    collector = kind(
+        workers[0] if kind is AsyncCollector else workers,
         policy_factory=lambda: Wave(),
-        frames_per_batch=N * T,
-        total_frames=N * T,
+        frames_per_batch=N * T * (2 if kind is MultiSyncCollector else 1),  # of all of them, or of each
+        total_frames=2 * N * T,
     )
     try:
-        check(next(iter(collector)), plain())
+        batch = next(iter(collector))
+        for data in batch if kind is MultiSyncCollector else [batch]:
+            check(data, plain())
     finally:
         collector.shutdown()
 
