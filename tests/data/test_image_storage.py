@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -253,6 +254,39 @@ def test_without_pictures_there_is_nothing_to_stack(played) -> None:
     assert "pixels" not in replay.sample().keys()  # noqa: SIM118
     replay = filled(played.exclude("pixels", ("next", "pixels")), [9], stacked=KEYS)
     assert replay.sample()["pixels_side"].shape == (64, WINDOW, 16, 16, 9)
+
+
+def test_what_lies_on_a_gpu_comes_to_the_host_in_parts(monkeypatch: pytest.MonkeyPatch) -> None:
+    """All worlds, also where there are more of them than times."""
+    worlds, times, asked = 5, 4, []
+    data = synthetic(worlds, times, 0.2, 0)
+    replay = make_replay(capacity=worlds * times, num_envs=worlds, window=2, batch_size=4, device="cpu")
+    replay.extend(data)
+    storage, whole = replay.storage, data.transpose(0, 1)
+    assert (storage.to_host() == whole).all()
+    size = int(2.5e8 * worlds)  # room for two worlds at a time
+    kept = SimpleNamespace(device=torch.device("cuda"), shape=whole.shape, bytes=lambda: size)
+    monkeypatch.setattr(storage, "_storage", kept)
+    monkeypatch.setattr(storage, "get", lambda index: (asked.append(index[1]), whole[index])[1])
+    assert (storage.to_host() == whole).all()
+    assert asked == [slice(0, 2), slice(2, 4), slice(4, 6)]
+
+
+def test_room_that_a_gpu_has_told_of_is_not_asked_for(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Asking waits for the device; what is not there yet is not read."""
+    replay = make_replay(capacity=3 * 12, num_envs=3, window=2, batch_size=4, device="cpu")
+    replay.extend(synthetic(3, 8, 0.2, 0))
+    ends, arrived, begins = replay.storage._ends, [False], torch.zeros(3, 3, dtype=torch.bool)
+    told = torch.tensor(9), SimpleNamespace(query=lambda: arrived[0])
+    monkeypatch.setattr(ends, "_told", told)
+    for free in (0, 5):
+        monkeypatch.setattr(ends, "_surely_free", free)
+        ends._make_room(begins)
+        assert ends._surely_free == (free - len(begins) if free else int(ends.count.min()))
+    arrived[0] = True
+    monkeypatch.setattr(ends, "count", None)
+    ends._make_room(begins)
+    assert ends._surely_free == 9 - len(begins)
 
 
 @pytest.mark.gpu

@@ -266,3 +266,18 @@ def test_a_batch_in_new_memory_is_captured_anew() -> None:
     learner._graph = graph = cast("torch.cuda.CUDAGraph", object())
     assert learner._kept(first, True) is first and learner._graph is graph
     assert learner._kept(second, True) is second and learner._graph is None
+
+
+def test_all_of_a_batch_is_copied_into_the_memory_that_a_capture_reads() -> None:
+    """Also what lies under `next`; what the first batch did not have is no part of it."""
+
+    def steps(value: float) -> TensorDict:
+        after = TensorDict({"x": torch.full((4, 2), value + 0.5)}, [4, 2])
+        return TensorDict({"x": torch.full((4, 2), value), "next": after}, [4, 2])
+
+    learner = Learner(Line())
+    kept = learner._kept(steps(1.0), False)
+    assert learner._kept(steps(2.0).set(("next", "y"), torch.zeros(4, 2)), False) is kept
+    assert (kept == steps(2.0)).all()
+    with pytest.raises(KeyError):  # rather than learned from with what a batch before had
+        learner._kept(steps(3.0).exclude(("next", "x")), False)
