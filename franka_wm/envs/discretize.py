@@ -78,6 +78,7 @@ class DiscreteActions(Transform):
         gripper: bool = False,
     ):
         super().__init__(in_keys_inv=["action"], out_keys_inv=["action"])
+        self.gripper = gripper
         self.register_buffer("table", discrete_action_table(action_dim, magnitude, include_noop, gripper))
 
     @property
@@ -94,6 +95,13 @@ class DiscreteActions(Transform):
             raise UserError(
                 f"DiscreteActions(action_dim={self.table.shape[1]}): the environment's actions have shape "
                 f"{tuple(continuous.shape)}; use action_dim={continuous.shape[-1] if continuous.shape else 1}"
+            )
+        arm = getattr(getattr(self.parent, "base_env", None), "config", None)
+        has = getattr(arm, "has_gripper", self.gripper)
+        if has != self.gripper:
+            raise UserError(
+                f"DiscreteActions(gripper={self.gripper}): the last action of this arm is "
+                f"{'' if has else 'not '}its fingers'; use gripper={has}"
             )
         input_spec["full_action_spec", "action"] = Categorical(
             self.num_actions, shape=continuous.shape[:-1], device=continuous.device, dtype=torch.int64

@@ -175,11 +175,16 @@ class Scene:
         """Corners of what a task may be about [m]: the table as far as the arm reaches, objects where they may start,
         drawers and doors where they may stand, open, and obstacles as far as the arm reaches."""
         top, far, table = self.top, REACH[1], self.table
+
+        def on_table(*point: float) -> list[float]:
+            """The point of the table that is nearest."""
+            return [_within(point[i], table.at[i], 0.5 * table.size[i]) for i in range(2)]
+
         out = []
-        for k in range(32):
-            point = (far * math.cos(math.tau * k / 32), far * math.sin(math.tau * k / 32))
-            x, y = (_within(point[i], table.at[i], 0.5 * table.size[i]) for i in range(2))
-            out.append((x, y, top))
+        if math.hypot(*on_table(0.0, 0.0), top) <= far:
+            for k in range(32):
+                x, y = on_table(far * math.cos(math.tau * k / 32), far * math.sin(math.tau * k / 32))
+                out.append((x, y, top))
         for one in self.objects:
             u, v = (s + one.radius for s in one.spread)
             out += _corners((*one.at, u, v, 1.0, 0.0), top, top + 2 * one.half_height)

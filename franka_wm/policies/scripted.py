@@ -159,7 +159,7 @@ class DiscreteIKPolicy(ScriptedPolicy):
 
     All pairs of actions are tried with the true geometry, on the tool's position where the servo's targets put it. A
     tenth of the distance after the first action counts as well, so that arriving is not put off. How near it
-    comes: `docs/results.md`, MuZero's *inverse kinematics*.
+    comes: `docs/results.md`, MuZero's *search with the same actions*.
 
     Args:
         kinematics: The arm's.

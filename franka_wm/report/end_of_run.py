@@ -70,7 +70,7 @@ def report_run(
         say(f"filming the {policy_name(name)} …")
         frames = film(settings, folder, policies[name], name, found)
         if log_video is not None:
-            log_video(f"eval/{name}", frames, max(_slow(arm.config.fps) for arm in arms.values()))
+            log_video(f"eval/{name}", frames, _film_rate(arms))
     Console(width=120).print(terminal(evaluation_tables(found.policies)[0]))
 
 
@@ -91,7 +91,7 @@ def film(settings: RunSettings, folder: Path, policy: Any, name: str, found: Eva
     env = make_evaluation_env(settings, num_envs=tasks)
     arms = _arms(env)
     size = settings.evaluation.video_size
-    fps = max(_slow(arm.config.fps) for arm in arms.values())
+    fps = _film_rate(arms)
     films, lines = [], []
     for number in _filmed(rows, settings.evaluation.video_episodes, found.worlds, tasks):
         k, world = divmod(number, found.worlds)
@@ -178,6 +178,11 @@ def ending(played: TensorDictBase, who: str, number: int, arm: Any) -> str:
 def _slow(fps: float) -> int:
     """Half the frames per second of the arm's."""
     return max(1, round(fps / 2))
+
+
+def _film_rate(arms: Mapping[str, Any]) -> int:
+    """Frames per second of a film of all of these."""
+    return max(_slow(arm.config.fps) for arm in arms.values())
 
 
 def _at_rate(frames: torch.Tensor, own: int, fps: int) -> torch.Tensor:

@@ -191,7 +191,7 @@ def _searchpath(hydras: Any) -> list[str]:
 
 
 def _preset(typed: Sequence[str], hydras: Any) -> str:
-    if any(one.lstrip("+").startswith("resume=") for one in typed):
+    if any(one.lstrip("+").startswith("resume=") and one[-5:] != "=null" for one in typed):
         return ""  # its environment is that of the run that it goes on with, whatever Hydra chose
     return str(_entry(hydras, "hydra", "runtime", "choices", "env") or "")
 

@@ -49,10 +49,11 @@ def task_of(run: RunFiles) -> str:
         return f"{domain} {task}" if task else str(domain)
     if task and any(one.lstrip("+").startswith("env.task=") for one in run.overrides):
         return str(task)
-    if run.preset:
-        return run.preset if not task or str(task) in run.preset else f"{task} ({run.preset})"
-    typed = [one.removeprefix("env=") for one in run.overrides if one.startswith("env=")]
-    return typed[-1] if typed else str(task or MISSING)
+    if typed := [one.removeprefix("env=") for one in run.overrides if one.startswith("env=")]:
+        return typed[-1]
+    if run.preset and task and str(task) not in run.preset.split("_"):
+        return f"{task} ({run.preset})"
+    return run.preset or str(task or MISSING)
 
 
 def _family(run: RunFiles) -> str:

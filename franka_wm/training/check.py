@@ -439,12 +439,12 @@ def _check_same_views(run: RunSettings, sources: Named) -> None:
     chosen = ("image_size", *(("cameras",) if run.dataset.features else ()))  # for the dataset
     for option, source in sources:
         sessions = (read_provenance(source.root) or {}).get("sessions", ())
-        changed = other_option(sessions, env, [name for name in VIEWS if name not in chosen])
-        if changed is not None:
+        if changed := other_option(sessions, env, [name for name in VIEWS if name not in chosen]):
             name, there = changed
             raise UserError(
                 f"{option}: recorded with env.{name}={there}, this run has {env[name]}, so "
                 f"images show something else; use env.{name}={there}, or env=none to train alone"
             )
         if other_scene(sessions, env):
-            raise UserError(f"{option}: recorded with another env.scene, so images show something else")
+            other = f"{option}: recorded with another env.scene, so images show something else"
+            raise UserError(f"{other}; give the same, or env=none to train alone")

@@ -1,6 +1,7 @@
 """Discrete moves: the table, and the transform under TorchRL's machinery."""
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import pytest
 import torch
@@ -112,8 +113,6 @@ def test_moves_turn_their_joint_and_the_noop_stays() -> None:
 
 def test_greedy_q_values_drive_it_across_episodes() -> None:
     """TorchRL's own Q-value module emits what the environment takes, through an automatic reset."""
-    from dataclasses import replace
-
     from torch import nn
     from torchrl.modules import QValueActor
 
@@ -128,3 +127,10 @@ def test_greedy_q_values_drive_it_across_episodes() -> None:
 def test_a_wrong_action_size_is_an_error_that_says_so() -> None:
     with pytest.raises((UserError, RuntimeError), match="action_dim=7"):
         make(action_dim=3).action_spec  # noqa: B018
+
+
+@pytest.mark.parametrize("has", [True, False])
+def test_fingers_that_are_there_or_not_are_an_error_that_says_so(has: bool) -> None:
+    """Left out they would let go of what is held; without any the last joint would stand in for them."""
+    with pytest.raises((UserError, RuntimeError), match=f"use gripper={has}"):
+        make(config=replace(CONFIG, gripper=has), action_dim=7 + has, gripper=not has).action_spec  # noqa: B018

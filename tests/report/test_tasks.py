@@ -67,8 +67,11 @@ def test_a_task_of_ones_own_is_named_after_itself() -> None:
     [
         ("experiment=images_fixed", "reach_fixed_pixels", "reach_fixed_pixels"),
         ("experiment=of_mine", "push", "reach (push)"),  # which changes the preset's task
+        ("experiment=of_mine", "reachable", "reach (reachable)"),
         ("env=reach env.task=reach", "push", "reach"),
+        ("env=kitchen", "kitchen", "kitchen"),
         ("resume=/before", "push", "reach"),  # Hydra composed the defaults, which the run then left
+        ("resume=null experiment=mine", "reach_fixed_pixels", "reach_fixed_pixels"),
         ("env=reach_fixed", None, "reach_fixed"),
     ],
 )

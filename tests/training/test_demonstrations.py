@@ -295,7 +295,8 @@ def others_features(*given: Any, **options: Any) -> FeatureMap:
     "there",
     [
         *({"camera_height": 0.7}, {"show_goal": True}, {"cameras": ["wrist", "front"]}, {"image_size": 32}),
-        *({"robot": "panda_meshes"}, {"urdf_path": "/elsewhere/arm.urdf"}, {"scene": {"objects": []}}),
+        *({"robot": "panda_meshes"}, {"urdf_path": "/elsewhere/arm.urdf"}, {"asset_name": "another"}),
+        *({"scene": {"objects": []}}, {"scene": None, "task": "lift"}),
     ],
 )
 def test_a_model_that_sees_acts_where_it_sees_the_same(

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import platform
-import re
 import sys
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import fields
 from datetime import UTC, datetime
 from importlib import metadata
 from pathlib import Path
@@ -50,7 +50,15 @@ MEANING = (
 """Those that give actions, rewards and ends their meaning."""
 VIEWS = (
     *("cameras", "camera_distance", "camera_height", "camera_target_height", "camera_target_distance"),
-    *("camera_fov_degrees", "image_size", "show_goal", "robot", "urdf_path"),
+    *(
+        "camera_fov_degrees",
+        "image_size",
+        "show_goal",
+        "robot",
+        "urdf_path",
+        "asset_name",
+        "urdf_relative_path",
+    ),
 )
 """Those that give images their meaning, beside the scene: :func:`other_scene`."""
 
@@ -58,7 +66,8 @@ VIEWS = (
 def other_option(
     sessions: Iterable[Mapping[str, Any]], env: Mapping[str, Any], names: Iterable[str] = MEANING
 ) -> tuple[str, Any] | None:
-    """The first of these options that sessions were recorded with another value of than ``env`` has, and that value.
+    """The first of these options that sessions were recorded with another value of than ``env`` has, and that value as
+    one types it.
 
     Of cameras the first counts: its images have no name that tells it from others.
     """
@@ -73,7 +82,7 @@ def other_option(
                 and name in env
                 and _telling(name, recorded[name]) != _telling(name, env[name])
             ):
-                return name, recorded[name]
+                return name, "null" if recorded[name] is None else recorded[name]
     return None
 
 
@@ -84,29 +93,48 @@ def _telling(name: str, value: Any) -> Any:
 
 
 def other_scene(sessions: Iterable[Mapping[str, Any]], env: Mapping[str, Any]) -> bool:
-    """Whether sessions were recorded in another scene than that of ``env``, which has ``task`` and ``scene``.
+    """Whether sessions were recorded in a scene of other bodies than that of ``env``, which has ``task`` and ``scene``.
 
-    Folders of files do not count, and scenes whose files are not here are not compared: a dataset may come from another
-    machine.
+    What does not show in them does not count, nor do folders of files. Scenes whose files or tasks are not known here
+    are not compared: a dataset may come from another machine.
     """
     for session in sessions:
         recorded = session.get("config", {}).get("env", {})
         if "scene" in recorded and "scene" in env:
             try:
-                there = _scene(recorded["scene"], env["task"])
+                there = _shown(recorded["scene"], recorded.get("task", env["task"]))
             except UserError:
                 continue
-            if there != _scene(env["scene"], env["task"]):
+            if there != _shown(env["scene"], env["task"]):
                 return True
     return False
 
 
-def _scene(given: Any, task: str) -> str:
-    from franka_wm.envs.scene import Scene
+UNSEEN = ("mass", "friction", "joint_friction", "joint_damping", "spread", "turn")
+"""Of a body of a scene: how it moves, and how far its start is drawn at random."""
+
+
+def _shown(given: Any, task: str) -> list[Any]:
+    """What a scene's bodies look like, and where those that stand still stand; as plain values that can be compared."""
+    from franka_wm.envs.scene import Body, Scene
     from franka_wm.envs.tasks import task_class
 
     scene = task_class(task).scene if given is None else Scene.of(given)
-    return re.sub(r"'[^']*/([^'/]+)'", r"'\1'", repr(scene))
+    if scene is None:
+        return []
+    return [
+        (type(one).__name__, {
+            field.name: _plain(getattr(one, field.name)) for field in fields(one)
+            if field.name not in UNSEEN and not (field.name == "at" and isinstance(one, Body))
+        })
+        for one in (scene.table, *scene.objects, *scene.articulated, *scene.obstacles)
+    ]  # fmt: skip
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, str):
+        return Path(value).name
+    return [_plain(one) for one in value] if isinstance(value, Sequence) else value
 
 
 def _version(package: str) -> str | None:

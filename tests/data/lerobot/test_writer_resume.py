@@ -93,10 +93,15 @@ def test_scenes_are_not_mixed(tmp_path, make_schema, make_episode) -> None:
         with DatasetWriter(out, schema, **options(there)) as writer:
             writer.add([make_episode(schema, 0)])
         if there is cube:
-            for others in ((), ({**cube, "size": [0.06, 0.06, 0.06]},)):
+            for others in (
+                ({**cube, "size": [0.06, 0.06, 0.06]},),
+                (cube, {"name": "other", "at": [0.5, 0.2]}),
+            ):
                 with pytest.raises(UserError, match=r"another env\.scene; give the same, or another out"):
                     DatasetWriter(out, schema, **options(*others), resume=True)
-        with DatasetWriter(out, schema, **options({**cube, "mass": 0.05}), resume=True) as writer:
+        with DatasetWriter(
+            out, schema, **options({**cube, "mass": 1, "spread": [0.05, 0.0]}), resume=True
+        ) as writer:
             assert writer.resumed == 1
 
 
