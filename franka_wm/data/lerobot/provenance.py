@@ -111,7 +111,7 @@ def other_scene(sessions: Iterable[Mapping[str, Any]], env: Mapping[str, Any]) -
 
 
 UNSEEN = ("mass", "friction", "joint_friction", "joint_damping", "spread", "turn")
-"""Of a body of a scene: how it moves, and how far its start is drawn at random."""
+"""What no image shows of a body: how it moves, and how far its start is drawn at random."""
 
 
 def _shown(given: Any, task: str) -> list[Any]:
