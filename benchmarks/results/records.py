@@ -78,7 +78,7 @@ def record_benchmark(row: Row, file: Path, *, jobs: int = 1, commit: str | None 
     Args:
         row: The row that it measures.
         file: What it wrote.
-        jobs: How many runs shared the machine, itself included.
+        jobs: How many runs shared the GPU or the cores, itself included.
         commit: Of the code, where the run could not tell.
 
     Raises:

@@ -18,7 +18,7 @@ from franka_wm.errors import UserError
 BEGIN, END = "<!-- results: written by `make results` -->", "<!-- end of results -->"
 LEGEND = (
     "*m of n seeds*: the row declares n, and m were measured with that commit; none was left out for its result. "
-    "*n at a time*: so many runs shared the machine, so each took longer than by itself; *alone (m of n runs)*: "
+    "*n at a time*: so many shared the GPU or the cores, so each took longer than by itself; *alone (m of n runs)*: "
     "times of those that had it to themselves; *beside other work*: none had. Raised numbers: an earlier commit, see "
     "below the tables."
 )

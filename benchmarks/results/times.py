@@ -19,7 +19,7 @@ def seconds(record: Record) -> float:
 
 
 def timed(records: Sequence[Record], *, beside: bool = False) -> Sequence[Record]:
-    """The runs whose times count: those that had the machine to themselves, if there are any.
+    """The runs whose times count: those that had the GPU or the cores to themselves, if there are any.
 
     Args:
         records: of a row.
