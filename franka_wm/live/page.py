@@ -89,6 +89,7 @@ class Page:
         most = max(2, round(HISTORY * arm.config.fps))
         self._history: deque[tuple[float, float, float]] = deque(maxlen=most)
         self._drawn = 0.0
+        self._drawing = threading.RLock()
         self._sliders: dict[str, Any] = {}
         self._build(title)
         session.listen(self.show)
@@ -282,7 +283,11 @@ class Page:
     # -- what is shown -----------------------------------------------------------------------------------
 
     def show(self, frame: Frame) -> None:
-        """Called by the session with every frame."""
+        """Called by the session with every frame, in the thread that made it."""
+        with self._drawing:  # a browser's request shows frames as well, beside the session's thread
+            self._draw(frame)
+
+    def _draw(self, frame: Frame) -> None:
         self.scene.show(frame)
         now = time.perf_counter()
         if frame.stepped:

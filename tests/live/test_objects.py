@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import threading
 import time
 from collections.abc import Callable, Iterator
 from typing import Any
@@ -198,3 +199,26 @@ def test_a_browser_drags_an_object_while_paused_and_sees_contacts(page: Any, sta
                 f"contacts shown: {shown}",
             )
     assert stacking.error is None and not stacking.playing
+
+
+def test_frames_of_several_threads_are_drawn_one_after_the_other(page: Any, stacking: Session) -> None:
+    """Else one removes the nodes that the other has just made, and viser ends the session's thread."""
+    stacking.show_contacts = True
+    frame = stacking.step()
+    assert frame.contacts is not None
+    draw, drawing, most = page.scene.show, [], []
+
+    def slowly(frame: Any) -> None:
+        drawing.append(1)
+        time.sleep(0.01)
+        most.append(len(drawing))
+        draw(frame)
+        drawing.pop()
+
+    page.scene.show = slowly
+    threads = [threading.Thread(target=page.show, args=(frame,)) for _ in range(4)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert most == [1] * 4
