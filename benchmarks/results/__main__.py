@@ -21,7 +21,7 @@ SHOWN = 3
 
 def overview(rows: Mapping[str, Row], place: Path) -> str:
     """A line for each row: its state, how many seeds it has, and why it is not fresh."""
-    lines = []
+    lines, width = [], max(map(len, rows)) + 2
     for name, row in rows.items():
         found = records.read(row, place)
         kind, reasons = state(row, found)
@@ -37,7 +37,7 @@ def overview(rows: Mapping[str, Row], place: Path) -> str:
             *reasons,
             *(f"missed: {wanted}, is {reached}" for wanted, reached, enough in judged if not enough),
         ]
-        lines.append(f"{name:24}{kind:10}{have:7}{'; '.join(more)}".rstrip())
+        lines.append(f"{name:{width}}{kind:11}{have:7}{'; '.join(more)}".rstrip())
     return "\n".join(lines)
 
 

@@ -118,6 +118,7 @@ def test_a_seed_that_is_not_declared_enters_no_mean(tmp_path: Path, capsys, monk
     assert kind == "mixed" and reasons == ["seed 300: seed 300 is none of reach's, 100 – 102"]
     assert "One fixed goal" not in render.readme_tables({"reach": ROW}, tmp_path)
     assert " 2/3 " in overview({"reach": ROW}, tmp_path)
+    assert overview({"r" * 40: ROW}, tmp_path / "empty").split()[:2] == ["r" * 40, "missing"]
     name = next(iter(load_rows()))
     assert main(["run", name, "--seeds", "1", "--results", str(tmp_path)]) == 1
     assert f"--seeds: seed 1 is none of {name}'s, " in capsys.readouterr().err
