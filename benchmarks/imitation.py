@@ -26,9 +26,8 @@ from typing import Any
 import numpy as np
 from common import publish
 
-from franka_wm.data.lerobot_env import recorded_settings
+from franka_wm.data.lerobot.provenance import read_provenance
 from franka_wm.device import resolve_device
-from franka_wm.errors import UserError
 
 ROOT = Path(__file__).resolve().parents[1]
 PLUGIN = "--env.discover_packages_path=franka_wm.data.lerobot_env"
@@ -56,7 +55,7 @@ def run(*command: str) -> float:
     began = time.perf_counter()
     path = os.pathsep.join(filter(None, (str(ROOT), os.environ.get("PYTHONPATH"))))
     environment = os.environ | {"HF_HUB_OFFLINE": "1", "PYTHONPATH": path}
-    command = (sys.executable, "-m", *command)
+    command = (sys.executable, "-P", "-m", *command)  # -P: lerobot is not the file beside this one
     done = subprocess.run(command, capture_output=True, text=True, env=environment)
     if done.returncode:
         raise SystemExit(f"{shlex.join(command)}\n{done.stdout[-2000:]}\n{done.stderr[-4000:]}")
@@ -110,10 +109,12 @@ def main() -> None:
     parser.add_argument("--device", default="auto", choices=["auto", "cpu", "cuda"])
     parser.add_argument("--out", help="JSON file")
     args = parser.parse_args()
-    try:
-        task = recorded_settings(str(args.dataset))["task"]
-    except UserError as error:
-        parser.error(str(error))
+    provenance = read_provenance(args.dataset)
+    if provenance is None:
+        parser.error(
+            f"{args.dataset} was not written by franka-wm: it does not say which arm and task it is of"
+        )
+    task = provenance["sessions"][0]["config"]["env"]["task"]
     device = resolve_device(args.device).type
     rows: list[dict[str, Any]] = []
     for seed in args.seeds:
