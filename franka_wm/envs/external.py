@@ -13,6 +13,7 @@ from typing import Any
 import torch
 from tensordict import TensorDictBase
 from torchrl._utils import seed_generator
+from torchrl.data import Bounded, Categorical
 from torchrl.envs import EnvBase, ParallelEnv, SerialEnv, TransformedEnv
 from torchrl.envs.transforms import (
     ActionScaling,
@@ -47,7 +48,8 @@ class ExternalEnv(TransformedEnv):
         ray: These are Ray actors, also on other hosts.
 
     Raises:
-        UserError: The extra is not installed, there is no such environment or observation, or what Ray says.
+        UserError: The extra is not installed, there is no such environment or observation, no model here can choose its
+            actions, or what Ray says.
     """
 
     device: torch.device
@@ -67,6 +69,7 @@ class ExternalEnv(TransformedEnv):
         make = partial(_make_one, config)
         one = make()
         groups = _groups(config, one)
+        _require_actions(config, one)
         continuous = one.action_spec.dtype.is_floating_point
         one.close()
         transforms = [
@@ -147,7 +150,8 @@ def check_external(config: ExternalConfig) -> tuple[dict[str, int], int, int]:
         there are, or 0.
 
     Raises:
-        UserError: The extra is not installed, or there is no such environment or observation.
+        UserError: The extra is not installed, there is no such environment or observation, or no model here can choose
+            its actions.
     """
     env = _make_one(config)
     try:
@@ -155,6 +159,7 @@ def check_external(config: ExternalConfig) -> tuple[dict[str, int], int, int]:
         sizes = {
             name: sum(spec[key].shape.numel() for key in keys) for name, keys in _groups(config, env).items()
         }
+        _require_actions(config, env)
         action: Any = env.action_spec
         continuous = action.dtype.is_floating_point
         return sizes, action.shape[-1] if continuous else 0, 0 if continuous else int(action.n)
@@ -205,6 +210,10 @@ def _groups(config: ExternalConfig, env: EnvBase) -> dict[str, list[str]]:
         for key, spec in env.observation_spec.items()
         if spec is not None and spec.dtype.is_floating_point and len(spec.shape) <= 1
     ]
+    if not vectors:
+        raise UserError(
+            f"env.name={config.name}: it observes no vector of real numbers, which models here read"
+        )
     if not config.observations:
         return {"state": [str(key) for key in vectors]}
     groups: dict[str, list[str]] = {}
@@ -216,3 +225,16 @@ def _groups(config: ExternalConfig, env: EnvBase) -> dict[str, list[str]]:
                     f"env.observations: no {key!r}; {config.label} has {', '.join(map(str, vectors))}"
                 )
     return groups
+
+
+def _require_actions(config: ExternalConfig, env: EnvBase) -> None:
+    """Refuses actions that are neither a vector that can be scaled to [−1, 1] nor the number of one choice."""
+    spec = env.action_spec
+    if isinstance(spec, Bounded) and len(spec.shape) == 1 and spec.dtype.is_floating_point:
+        if bool((spec.low.isfinite() & spec.high.isfinite()).all()):
+            return
+    elif isinstance(spec, Categorical) and not spec.shape:
+        return
+    raise UserError(
+        f"env.name={config.name}: its actions must be one vector with finite bounds or one discrete number"
+    )

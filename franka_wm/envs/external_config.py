@@ -57,7 +57,9 @@ def external_config(values: Mapping[str, Any]) -> ExternalConfig:
         raise UserError(f"env.{unknown[0]}: no such field; choose from {', '.join(sorted(known))}")
     given: dict[str, Any] = dict(values)
     observations = given.get("observations") or {}
-    if not isinstance(observations, Mapping):
+    if not isinstance(observations, Mapping) or not all(
+        keys and isinstance(keys, str | Sequence) for keys in observations.values()
+    ):
         raise UserError(
             f"env.observations={observations!r}: must be keys with lists of the environment's own, "
             "as in {state: [position, velocity]}"

@@ -4,16 +4,18 @@ from __future__ import annotations
 
 import multiprocessing
 import os
+from typing import Any
 
+import numpy as np
 import pytest
 import torch
 
-from franka_wm.envs.external import ExternalEnv
+from franka_wm.envs.external import ExternalEnv, check_external
 from franka_wm.envs.external_config import ExternalConfig, external_config
 from franka_wm.errors import UserError
 from franka_wm.training.spaces import Spaces
 
-pytest.importorskip("gymnasium")
+gymnasium = pytest.importorskip("gymnasium")
 
 
 def test_moves_and_statistics() -> None:
@@ -73,6 +75,9 @@ def test_observations_by_name() -> None:
     [
         ({"kind": "gym", "name": "Nope-v1"}, "Nope"),
         ({"kind": "gym", "name": "CartPole-v1", "observations": {"state": ["wheel"]}}, "wheel"),
+        ({"kind": "gym", "name": "CartPole-v1", "observations": {"state": []}}, "must be keys with lists"),
+        ({"kind": "gym", "name": "CartPole-v1", "observations": {"state": 3}}, "must be keys with lists"),
+        ({"kind": "gym", "name": "FrozenLake-v1"}, "no vector of real numbers"),
         ({"kind": "gym", "name": "CartPole-v1", "frame_skip": 0}, "frame_skip"),
         ({"kind": "gym", "name": "CartPole-v1", "wheels": 2}, "wheels"),
         ({"kind": "atari", "name": "Pong"}, "atari"),
@@ -82,6 +87,34 @@ def test_refusals(values: dict, named: str) -> None:
     with pytest.raises(UserError) as caught:
         ExternalEnv(external_config(values), num_envs=1)
     assert named in str(caught.value) and "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    "actions",
+    [
+        gymnasium.spaces.Box(-np.inf, np.inf, (2,), np.float32),
+        gymnasium.spaces.Box(-1.0, 1.0, (2, 2), np.float32),
+        gymnasium.spaces.MultiDiscrete([2, 3]),
+        gymnasium.spaces.MultiBinary(3),
+    ],
+    ids=["unbounded", "matrix", "several", "bits"],
+)
+def test_actions_that_no_model_chooses_are_one_line(actions: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Bits were taken for one choice of two, a matrix for a vector of its last side."""
+
+    class Odd(gymnasium.Env):
+        observation_space = gymnasium.spaces.Box(-1.0, 1.0, (3,), np.float32)
+
+        def __init__(self) -> None:
+            self.action_space = actions
+
+    monkeypatch.setitem(
+        gymnasium.registry, "Odd-v0", gymnasium.envs.registration.EnvSpec("Odd-v0", entry_point=Odd)
+    )
+    config = ExternalConfig(kind="gym", name="Odd-v0")
+    for make in (check_external, ExternalEnv):
+        with pytest.raises(UserError, match="its actions must be one vector with finite bounds"):
+            make(config)
 
 
 @pytest.mark.gpu
