@@ -93,8 +93,9 @@ class HighQualityRenderer:
 
         with HighQualityRenderer(env.model, output_path="reach.usd") as renderer:
             renderer.look_at(*env.camera_framing)
+            tensordict = env.reset()
             for _ in range(50):
-                env.step(env.rand_action(env.reset()))
+                tensordict = env.step_and_maybe_reset(env.rand_action(tensordict))[1]
                 renderer.add(env.simulation.newton_state)
     """
 
