@@ -145,7 +145,7 @@ def probe(
         latents: (E, T, D), E ≥ 3 episodes.
         targets: Name → (E, T, K).
         valid: (E, T) bool, which steps to use; all if not given.
-        neighbours: k of the nearest-neighbour probe.
+        neighbours: k of the nearest-neighbour probe; fewer where there are fewer steps to look up.
         seed: Seed of the split of episodes.
 
     Returns:
@@ -165,7 +165,10 @@ def probe(
         y_fit, y_validation, y_test = split(values)
         linear, _ = ridge_probe((x_fit, y_fit), (x_validation, y_validation), x_test)
         near = nearest_neighbours(
-            (known - mean) / std, torch.cat((y_fit, y_validation)), (x_test - mean) / std, k=neighbours
+            (known - mean) / std,
+            torch.cat((y_fit, y_validation)),
+            (x_test - mean) / std,
+            k=min(neighbours, len(known)),
         )
         results[name] = {"ridge": r_squared(y_test, linear), "neighbours": r_squared(y_test, near)}
     return results

@@ -135,3 +135,10 @@ def test_steps_that_do_not_count() -> None:
     target = torch.where(valid.unsqueeze(-1), latents[..., :1], 1e3)
     assert probe(latents, {"x": target}, valid=valid)["x"]["ridge"] > 0.999
     assert probe(latents, {"x": target})["x"]["ridge"] < 0.5
+
+
+def test_a_few_short_episodes_are_measured_by_as_many_neighbours_as_there_are() -> None:
+    """It raised, and `franka-wm evaluate` lost the episodes that it had played before."""
+    torch.manual_seed(0)
+    found = probe(torch.randn(3, 2, 4), {"x": torch.randn(3, 2, 2)})
+    assert found["x"]["neighbours"] is not None
