@@ -197,7 +197,8 @@ def cost_ranks(
 
     Returns:
         ``across``: pairs from anywhere; ``within``: pairs of one episode, which share its goal, as the states that
-        a planner compares do. Each an interval, by :func:`grouped_spearman`: whole episodes are drawn.
+        a planner compares do. Each an interval, by :func:`grouped_spearman`: whole episodes are drawn. NaN where
+        fewer than 4 pairs can be drawn.
     """
     generator = torch.Generator().manual_seed(seed)
     envs, steps = latents.shape[:2]
@@ -206,6 +207,8 @@ def cost_ranks(
 
     def measured(e1: Tensor, t1: Tensor, e2: Tensor, t2: Tensor) -> dict[str, float]:
         use = valid[e1, t1] & valid[e2, t2] & ((e1 != e2) | (t1 != t2))
+        if use.sum() < 4:  # episodes of a step or two
+            return Interval(math.nan, math.nan, math.nan).as_dict()
         e1, t1, e2, t2 = e1[use], t1[use], e2[use], t2[use]
         cost = (embedded[e1, t1] - embedded[e2, t2]).square().sum(-1)
         distance = (positions[e1, t1] - positions[e2, t2]).norm(dim=-1)

@@ -115,6 +115,14 @@ def test_the_true_distance_ranks_perfectly() -> None:
         assert result == {"mean": 1.0, "low": 1.0, "high": 1.0}
 
 
+def test_episodes_of_one_step_have_no_pairs_to_rank() -> None:
+    tool = torch.randn(3, 5, 3, generator=torch.Generator().manual_seed(4))
+    valid = torch.zeros(3, 5, dtype=torch.bool)
+    valid[:, 0] = True
+    result = cost_ranks(tool, tool, valid=valid, pairs=500)
+    assert result["across"]["mean"] == 1.0 and math.isnan(result["within"]["mean"])
+
+
 def test_unrelated_latents_have_no_rank_correlation() -> None:
     generator = torch.Generator().manual_seed(5)
     tool, latents = (torch.randn(10, 60, 3, generator=generator) for _ in range(2))
