@@ -6,8 +6,10 @@ import shlex
 from itertools import product
 from pathlib import Path
 
+import hydra
 import pytest
 import yaml
+from hydra.core.hydra_config import HydraConfig
 from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
@@ -144,3 +146,24 @@ def test_checkpoints_with_former_names_are_read_with_the_present_ones() -> None:
     present = {"name": "muzero", "reanalyze": True, "unroll": 3}
     assert config.model == present and config.whole_run.model == present
     assert config.collector == config.whole_run.collector == {"policy": "ik"}
+
+
+@pytest.mark.parametrize(
+    ("words", "name"),
+    [
+        (("env=dm_control", "env.name=walker", "env.task=walk"), "walker-walk"),
+        (("env=gym", "env.name=ALE/Pong-v5"), "ALE-Pong-v5"),
+        (("env=push", "env.task=pick"), "push"),
+        (("env=none",), "none"),
+    ],
+)
+def test_a_run_s_folder_is_called_by_what_it_simulates(
+    words: tuple[str, ...], name: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """With another library by the name there: all of the DeepMind Control Suite were ``dm_control``."""
+    with hydra.initialize_config_dir(str(FOLDER), version_base="1.3"):
+        cfg = hydra.compose("config", [*words, "seed=4", "hydra.job.num=2"], return_hydra_config=True)
+    monkeypatch.setattr(HydraConfig.instance(), "cfg", None)
+    HydraConfig.instance().set_config(cfg)
+    assert Path(cfg.hydra.run.dir).name[9:] == f"{name}-4"  # behind the time
+    assert cfg.hydra.sweep.subdir == f"2-{name}"

@@ -129,5 +129,12 @@ def run_name(resume: str | None, env: str, seed: Any) -> str:
     return name.strip("/. ") or f"{env}-{seed}"
 
 
-for resolver in (at_scale, at_size, one_each, run_name):
+def env_name(preset: str, *, _root_: DictConfig) -> str:
+    """The environment in the names of folders: the preset; of another library, the name and the task in it."""
+    found = [OmegaConf.select(_root_, key) for key in ("env.name", "env.task")]  # an arm has no name
+    named = "-".join(str(part) for part in found if part is not None) if found[0] is not None else preset
+    return re.sub(r"[^\w.-]+", "-", named)  # Gymnasium has names with slashes
+
+
+for resolver in (at_scale, at_size, one_each, run_name, env_name):
     OmegaConf.register_new_resolver(resolver.__name__, resolver, replace=True)
