@@ -20,7 +20,7 @@ from franka_wm.evaluation.results import FILE, Result, last_row
 from franka_wm.files import atomic_write
 from franka_wm.report.curves import axis, plot_learning_curves
 from franka_wm.report.diagnostics import evaluation_markdown, terminal
-from franka_wm.report.style import policy_name
+from franka_wm.report.style import acting, policy_name
 from franka_wm.report.table import evaluation_tables
 from franka_wm.seeding import drawing_for, seeded
 from franka_wm.training.build import arm_of, make_evaluation_env
@@ -72,11 +72,6 @@ def report_run(
         if log_video is not None:
             log_video(f"eval/{name}", frames, _film_rate(arms))
     Console(width=120).print(terminal(evaluation_tables(found.policies)[0]))
-
-
-def acting(policies: Mapping[str, object]) -> str:
-    """The policy that a run is about: the planner, the policy where there is none, else whatever comes first."""
-    return next((name for name in ("planner", "policy") if name in policies), next(iter(policies)))
 
 
 def film(settings: RunSettings, folder: Path, policy: Any, name: str, found: Evaluation) -> torch.Tensor:

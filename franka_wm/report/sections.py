@@ -10,7 +10,7 @@ import yaml
 from markupsafe import Markup
 
 from franka_wm.console import named_plugins, quoted
-from franka_wm.evaluation.results import COMMAND, END
+from franka_wm.evaluation.results import COMMAND, END, Result
 from franka_wm.report import style
 from franka_wm.report.bars import bars_figure
 from franka_wm.report.calibration import calibration_figure
@@ -75,9 +75,8 @@ def curves(run: RunFiles) -> str:
         )
         for panel in panels(run.rows)
     )
-    end = next((one for one in run.results if one.protocol.get("by") == END), None)
     last = Markup()
-    if end is not None:
+    if (end := _end(run)) is not None:
         fewer = (run.config.get("evaluation") or {}).get("during_episodes") or end.episodes
         fewer = min(int(fewer), end.episodes)
         before = f"; those before are over {fewer} of these" if fewer < end.episodes else ""
@@ -90,8 +89,11 @@ def curves(run: RunFiles) -> str:
 def videos(run: RunFiles) -> str:
     film, still = run.images.get("video.mp4"), run.images.get("last_frame.png")
     if film is not None:
+        end = _end(run)  # which has made the film
+        policies = run.policies if end is None else end.policies
+        who = f" of the {style.policy_name(style.acting(policies))}" if policies else ""
         return card(
-            video(film, "episodes of the planner", poster=still),
+            video(film, f"episodes{who}", poster=still),
             "The worst of the held-out episodes; the ring marks the goal.",
             kind="single",
         )
@@ -336,6 +338,11 @@ def _episodes(run: RunFiles) -> str:
     """As many as it was evaluated over by the command, if it was."""
     episodes = [one.episodes for one in run.results if one.protocol.get("by") == COMMAND]
     return f" episodes={episodes[0]}" if episodes else ""
+
+
+def _end(run: RunFiles) -> Result | None:
+    """What the end of training measured."""
+    return next((one for one in run.results if one.protocol.get("by") == END), None)
 
 
 def _near(folder: Path) -> Path:

@@ -121,6 +121,11 @@ def policy_name(policy: str) -> str:
     return "while collecting" if policy == "train" else RENAMED.get(policy, policy)
 
 
+def acting(policies: Mapping[str, object]) -> str:
+    """The policy that a run is about: the planner, the policy where there is none, else whatever comes first."""
+    return next((name for name in ("planner", "policy") if name in policies), next(iter(policies)))
+
+
 def policy_legend(policies: Iterable[str]) -> str:
     """One line that explains the names of those policies that have a usual one; empty where none has."""
     known = [f"{name}: {POLICY_LEGEND[name]}" for name in map(policy_name, policies) if name in POLICY_LEGEND]

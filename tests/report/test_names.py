@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
+import json
 from typing import Any
 
 import pytest
 
+from franka_wm.evaluation.results import COMMAND, END
 from franka_wm.report.bars import bars_figure
 from franka_wm.report.curves import seeds_figure
 from franka_wm.report.figure import inline_svg
 from franka_wm.report.horizon import horizon_figure
 from franka_wm.report.page import page
-from franka_wm.report.run import RunFiles
-from franka_wm.report.sections import reproduce, what
+from franka_wm.report.run import RunFiles, read_run
+from franka_wm.report.sections import reproduce, videos, what
 from franka_wm.report.spectra import spectrum_figure
 
 NAMES = ("_omitted", "b$x^{$", r"c\$d$")
@@ -63,6 +65,32 @@ def test_a_page_names_only_commands_that_the_run_can_have(
     text = reproduce(run)
     assert tuple(word for word in ("evaluate", "robustness", "view") if word in text) == said
     assert "train" in text and "resume=" in text and "report" in text
+
+
+@pytest.mark.parametrize(
+    ("policies", "label"),
+    [
+        (("noop", "policy", "planner"), "episodes of the planner"),
+        (("noop", "policy"), "episodes of the policy"),
+        (("expert", "noop"), "episodes of the expert"),
+        (("oracle",), "episodes of the ik"),
+        ((), "episodes"),
+    ],
+)
+def test_a_film_is_said_to_be_of_whom_the_end_of_training_filmed(
+    policies: tuple[str, ...], label: str, make_run
+) -> None:
+    """And not of whom ``franka-wm evaluate`` measured later, which makes no film."""
+    run = make_run(pictures=True)
+    measured = {"planner": {"return": 1.0}}
+    (run / "evaluation").mkdir()
+    for folder, by, some in (
+        (run, END, {one: {} for one in policies}),
+        (run / "evaluation", COMMAND, measured),
+    ):
+        (folder / "evaluation.json").write_text(json.dumps({"protocol": {"by": by}, "policies": some}))
+    shown = videos(read_run(run))
+    assert f'aria-label="{label}"' in shown
 
 
 def test_a_configuration_of_others_is_not_parsed(tmp_path: Any) -> None:
