@@ -232,7 +232,7 @@ class Run:
             experience: Gives the replay, oldest step first; called only if something is exported.
         """
         if self.settings.export.kind != "none":
-            export_run(self.settings.values, experience(), folder=self.folder)
+            export_run(self.settings.values, experience(), folder=self.folder, actor=self.settings.actor)
         if processes.is_first():
             write_finished(self.folder)
 

@@ -16,7 +16,7 @@ import torch
 from tensordict import TensorDict
 
 from franka_wm import processes
-from franka_wm.data.lerobot.schema import GOAL, OBJECTS, SUCCESS
+from franka_wm.data.lerobot.schema import GOAL, OBJECTS, PROVENANCE, SUCCESS
 from franka_wm.envs import FrankaEnv
 from franka_wm.errors import UserError
 from franka_wm.training import build, storage_budget
@@ -417,6 +417,8 @@ def test_a_run_that_exports_keeps_what_the_task_says(train, tmp_path: Path, monk
     run = train(*words, f"export.out={tmp_path}/set", folder=tmp_path / "run")
     features = json.loads((tmp_path / "set" / "meta" / "info.json").read_text())["features"]
     assert {SUCCESS, OBJECTS, GOAL} <= features.keys()
+    [session] = json.loads((tmp_path / "set" / PROVENANCE).read_text())["sessions"]
+    assert session["policy"] == "policy in a training run"  # and not collector.policy, which is auto
     assert (replay := run.replay()) is not None and bool(replay["next", "truncated"].any())
     kept = Trainer.kept.fget
     assert kept is not None

@@ -156,7 +156,9 @@ def export_replay(
         return Exported(writer.finish(), whole, frames, partial)
 
 
-def export_run(settings: Mapping[str, Any], data: TensorDictBase | None, *, folder: Path) -> Exported | None:
+def export_run(
+    settings: Mapping[str, Any], data: TensorDictBase | None, *, folder: Path, actor: str
+) -> Exported | None:
     """The end of a training run: what ``export`` in its configuration asks for. Each process of a job calls this.
 
     A run that goes on, and had written its dataset before, does not write it again, nor publish it again.
@@ -166,6 +168,7 @@ def export_run(settings: Mapping[str, Any], data: TensorDictBase | None, *, fold
             ``dataset`` in the run's folder), ``format``, ``workers`` and ``repo_id`` (published there if given).
         data: The replay, oldest step first; ``None`` if there is none.
         folder: Folder of the run.
+        actor: The policy that gathered; ``auto`` in the configuration names none.
 
     Returns:
         What became of it; ``None`` if nothing was written.
@@ -190,7 +193,7 @@ def export_run(settings: Mapping[str, Any], data: TensorDictBase | None, *, fold
             config=arm_config(settings),
             out=out,
             seed=int(settings["seed"]),
-            policy=f"training run, {settings['collector']['policy']}",
+            policy=f"{actor} in a training run",
             settings=settings,
             format=wanted["format"],
             workers=int(wanted["workers"]),

@@ -87,13 +87,13 @@ def test_a_dataset_that_was_published_is_not_published_again(
         provenance=describe(policy="p", seed=0, config=run),
     )
     again = run | {"resume": str(tmp_path)}
-    assert export_run(again, None, folder=tmp_path) is None  # it had died before it published
+    assert export_run(again, None, folder=tmp_path, actor="policy") is None  # it had died before it published
     repo = hub.repos["datasets/user/set"]
     sent, tag = repo["commits"], dict(repo["tags"])
     assert tag and "published:" in capsys.readouterr().out
     for tags in (dict(tag), {}):  # killed after all, and before the tag
         repo["tags"] = tags
-        export_run(again, None, folder=tmp_path)
+        export_run(again, None, folder=tmp_path, actor="policy")
         assert "user/set was published before" in capsys.readouterr().out
         assert repo["commits"] == sent and repo["tags"] == tag
     monkeypatch.setattr(export, "written_before", lambda *_: True)
@@ -102,18 +102,18 @@ def test_a_dataset_that_was_published_is_not_published_again(
         again | {"trainer": {"updates": 8}},
     ):  # from the beginning, and farther: another dataset
         with pytest.raises(UserError, match="user/set exists already"):
-            export_run(other, None, folder=tmp_path)
+            export_run(other, None, folder=tmp_path, actor="policy")
     assert repo["commits"] == sent
     repo["files"][PROVENANCE] = b'{"sessions": [{}]}'
     repo["commits"] += 1
     with pytest.raises(UserError, match=r"user/set.*choose another export\.repo_id"):
-        export_run(again, None, folder=tmp_path)
+        export_run(again, None, folder=tmp_path, actor="policy")
 
 
 def test_a_run_without_experience_says_why(tmp_path: Path) -> None:
     for resume, says in ((None, "that it was trained on"), ("run", r"trainer\.checkpoint_replay=true")):
         with pytest.raises(UserError, match=rf"has gathered nothing.*{says}"):
-            export_run(RUN | {"resume": resume}, None, folder=tmp_path)
+            export_run(RUN | {"resume": resume}, None, folder=tmp_path, actor="policy")
 
 
 @pytest.mark.parametrize(
