@@ -263,6 +263,26 @@ def test_a_search_goes_on_without_the_trial_that_fails(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
+def test_a_search_by_joblib_names_the_trial_that_fails(tmp_path: Path) -> None:
+    """Optuna chooses its trials, and other processes run them: what they left tells."""
+    for plugin in ("optuna_sweeper", "joblib_launcher"):
+        pytest.importorskip(f"hydra_plugins.hydra_{plugin}")
+    command = ["--multirun", "hydra/sweeper=optuna", "hydra.sweeper.direction=maximize", *SMOKE, *SMALL, *FEW]
+    command += ["hydra/launcher=joblib", "hydra.sweeper.n_jobs=2", "hydra.sweeper.n_trials=2"]
+    # Of this seed's trials the second alone breaks.
+    command += ["hydra.sweeper.sampler.seed=21", "trainer.lr=choice(1e30,1e-3)", "seed=choice(0,1)"]
+    command += ["evaluation.during=[]", f"hydra.sweep.dir={tmp_path}/sweep"]
+    done = train_in_fork(*command, cwd=tmp_path)  # its jobs are processes of their own
+    assert done.returncode == 1 and "Traceback" not in done.stderr, done.stderr
+    log = tmp_path / "sweep/1-reach/train.log"
+    failed = [
+        line for line in done.stderr.splitlines() if line.startswith("error: ")
+    ]  # joblib may warn later
+    assert failed[-1].startswith(f"error: 1 of 2 jobs failed: job 1-reach: see {log}; "), done.stderr
+    assert "training broke" in log.read_text() and (tmp_path / "sweep/0-reach/finished.json").is_file()
+
+
+@pytest.mark.slow
 def test_jobs_of_several_processes_are_looked_after_as_well(tmp_path: Path) -> None:
     done = sweep(tmp_path, BREAKS, "gpus=2", *FEW, "evaluation.during=[]")
     assert done.returncode == 1 and "Traceback" not in done.stderr, done.stderr
