@@ -134,9 +134,8 @@ def franka_sequences(
                 "or raise substeps or solver_iterations"
             )
         if ended:
-            remedies.append(
-                f"{ended} ended early: set terminate_on_success=false, or ask for a shorter length"
-            )
+            keep = "set terminate_on_success=false, or " if env.config.terminate_on_success else ""
+            remedies.append(f"{ended} ended early: {keep}ask for a shorter length")
         raise UserError(
             f"{broken + ended} of {tried} sequences were discarded and {missing} of {n_sequences} are still missing: "
             + "; ".join(remedies)

@@ -1,6 +1,7 @@
 """The data set of videos under smooth random actions: what it holds, and what it refuses to hold."""
 
 from dataclasses import replace
+from typing import Any
 
 import pytest
 import torch
@@ -103,6 +104,21 @@ def test_episodes_that_end_inside_are_discarded() -> None:
     with pytest.raises(UserError, match="terminate_on_success=false"):
         franka_sequences(env, 2, 5, max_attempts=1)
     assert franka_sequences(env, 2, 2).batch_size == (2,), "an episode may end at the last frame"
+
+
+def test_ends_of_another_cause_are_not_blamed_on_success(
+    env: FrankaEnv, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    play = env.rollout_actions
+
+    def ended(*args: Any, **kwargs: Any) -> Any:
+        played = play(*args, **kwargs)
+        played["done"][:, 1] = True  # something fell off the table
+        return played
+
+    monkeypatch.setattr(env, "rollout_actions", ended)
+    with pytest.raises(UserError, match="3 ended early: ask for a shorter length"):
+        franka_sequences(env, 3, 7, max_attempts=1)
 
 
 @pytest.mark.parametrize("length", [0, 1, 8, 2.0])
