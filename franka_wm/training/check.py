@@ -11,7 +11,6 @@ import torch
 from franka_wm import models
 from franka_wm.console import say
 from franka_wm.device import missing_to_compile, resolve_device
-from franka_wm.envs import FrankaConfig
 from franka_wm.envs.external import check_external
 from franka_wm.envs.external_config import ExternalConfig
 from franka_wm.envs.external_ray import import_ray
@@ -382,7 +381,7 @@ def _check_dataset(run: RunSettings) -> None:
         if arm is not None:
             _check_same_observations(run, mappings[0])
             named = [(option, source) for (option, _), source in zip(found, sources, strict=True)]
-            _check_same_actions(arm, named)
+            _check_same_actions(run, named)
             _check_same_views(run, named)
 
 
@@ -407,44 +406,44 @@ def _check_same_observations(run: RunSettings, recorded: FeatureMap) -> None:
             )
 
 
-def _check_same_actions(arm: FrankaConfig, sources: Named) -> None:
-    """Actions must mean the same; rewards of another task are said."""
+def _check_same_actions(run: RunSettings, sources: Named) -> None:
+    """Actions must mean the same, of the same robot; rewards of another task are said."""
     from franka_wm.data.lerobot.provenance import ACTIONS, other_option, read_provenance
 
+    env = {**vars(run.env.arm), "urdf_path": run.env.urdf_path}
     for option, source in sources:
         sessions = (read_provenance(source.root) or {}).get("sessions", ())
-        if (changed := other_option(sessions, vars(arm), ACTIONS)) is not None:
+        if (changed := other_option(sessions, env, ACTIONS)) is not None:
             name, there = changed
             raise UserError(
-                f"{option}: recorded with env.{name}={there}, this run has {getattr(arm, name)}, so "
-                f"actions mean something else; use env.{name}={there}"
+                f"{option}: recorded with env.{name}={there}, this run has {env[name]}, so actions "
+                f"mean something else; use env.{name}={there}, or env=none to train alone"
             )
-        if (changed := other_option(sessions, vars(arm))) is not None:
+        if (changed := other_option(sessions, env)) is not None:
             name, there = changed
-            say(
-                f"{option}: recorded with env.{name}={there}, this run has {getattr(arm, name)}; "
-                "its rewards and ends are those of then"
-            )
+            other = f"{option}: recorded with env.{name}={there}, this run has {env[name]}"
+            say(f"{other}; its rewards and ends are those of then")
 
 
 def _check_same_views(run: RunSettings, sources: Named) -> None:
-    """What a model that acts has learned to see, the arm's cameras must show; sizes are compared elsewhere."""
+    """What a model that acts has learned to see, its world must show; sizes are compared elsewhere."""
     from franka_wm.data.lerobot.provenance import VIEWS, other_option, other_scene, read_provenance
 
     arm, family = run.env.arm, run.model.family
     env = {**vars(arm), "urdf_path": run.env.urdf_path}
     looks = {*(run.model.observations or ())} & {*Spaces.of_config(arm).image_sizes}
-    if not looks or not (family.has_next or family.has_policy):
+    if not (family.has_next or family.has_policy):
         return
     chosen = ("image_size", *(("cameras",) if run.dataset.features else ()))  # for the dataset
+    views = [name for name in VIEWS if looks and name not in chosen]
     for option, source in sources:
         sessions = (read_provenance(source.root) or {}).get("sessions", ())
-        if changed := other_option(sessions, env, [name for name in VIEWS if name not in chosen]):
+        if changed := other_option(sessions, env, views):
             name, there = changed
             raise UserError(
                 f"{option}: recorded with env.{name}={there}, this run has {env[name]}, so "
                 f"images show something else; use env.{name}={there}, or env=none to train alone"
             )
         if other_scene(sessions, env):
-            other = f"{option}: recorded with another env.scene, so images show something else"
-            raise UserError(f"{other}; give the same, or env=none to train alone")
+            other = f"{option}: recorded with another env.scene, so {'images' if looks else 'states'} show something"
+            raise UserError(f"{other} else; give the same, or env=none to train alone")

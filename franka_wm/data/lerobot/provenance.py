@@ -41,8 +41,11 @@ def describe(
     }
 
 
-ACTIONS = ("action_mode", "action_scale", "ee_scale")
-"""Options of the arm that give recorded actions their meaning; the last one those of ``ee_delta`` alone."""
+ACTIONS = (
+    *("action_mode", "action_scale", "ee_scale"),
+    *("robot", "urdf_path", "asset_name", "urdf_relative_path"),
+)
+"""Options that give recorded actions and states their meaning; ``ee_scale`` actions of ``ee_delta`` alone."""
 MEANING = (
     *("task", "reward", *ACTIONS, "action_penalty", "success_distance", "drawer_opening"),
     "terminate_on_success",
@@ -50,17 +53,9 @@ MEANING = (
 """Those that give actions, rewards and ends their meaning."""
 VIEWS = (
     *("cameras", "camera_distance", "camera_height", "camera_target_height", "camera_target_distance"),
-    *(
-        "camera_fov_degrees",
-        "image_size",
-        "show_goal",
-        "robot",
-        "urdf_path",
-        "asset_name",
-        "urdf_relative_path",
-    ),
+    *("camera_fov_degrees", "image_size", "show_goal"),
 )
-"""Those that give images their meaning, beside the scene: :func:`other_scene`."""
+"""Those that give images their meaning, beside the robot and the scene: :func:`other_scene`."""
 
 
 def other_option(

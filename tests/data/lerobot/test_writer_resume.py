@@ -62,12 +62,13 @@ def test_actions_that_mean_something_else_are_not_mixed(tmp_path, make_schema, m
 
 
 def test_images_of_another_camera_are_not_mixed(tmp_path, make_schema, make_episode) -> None:
-    """Where there are images; without any, nobody sees the difference."""
+    """Where there are images; without any, nobody sees the difference. Another robot is another one anyhow."""
     for observations in (("pixels", "state"), ("state",)):
         schema, out = make_schema(observations=observations), tmp_path / str(len(observations))
 
-        def options(height: float) -> dict:
-            provenance = describe(policy="p", seed=1, config={"env": {"camera_height": height}})
+        def options(height: float, robot: str = "embedded") -> dict:
+            env = {"camera_height": height, "robot": robot}
+            provenance = describe(policy="p", seed=1, config={"env": env})
             return {"provenance": provenance, "workers": 0, "shard_frames": 1}
 
         with DatasetWriter(out, schema, **options(0.5)) as writer:
@@ -75,6 +76,8 @@ def test_images_of_another_camera_are_not_mixed(tmp_path, make_schema, make_epis
         if schema.images:
             with pytest.raises(UserError, match=r"recorded with env\.camera_height=0\.5, this has 0\.7"):
                 DatasetWriter(out, schema, **options(0.7), resume=True)
+        with pytest.raises(UserError, match=r"recorded with env\.robot=embedded, this has panda_meshes"):
+            DatasetWriter(out, schema, **options(0.5, "panda_meshes"), resume=True)
         with DatasetWriter(out, schema, **options(0.5 if schema.images else 0.7), resume=True) as writer:
             assert writer.resumed == 1
 
