@@ -6,8 +6,10 @@ They run on the CPU, one copy after the other (``SerialEnv``), in several proces
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from functools import partial
+from multiprocessing.process import BaseProcess
 from typing import Any
 
 import torch
@@ -72,6 +74,7 @@ class ExternalEnv(TransformedEnv):
         _require_actions(config, one)
         continuous = one.action_spec.dtype.is_floating_point
         one.close()
+        processes: list[BaseProcess] = []
         transforms = [
             DoubleToFloat(),
             *(CatTensors(in_keys=keys, out_key=name, sort=False) for name, keys in groups.items()),
@@ -89,6 +92,8 @@ class ExternalEnv(TransformedEnv):
             # worker, and with fewer the learner is slower and rounds otherwise.
             keeps = {"daemon": True, "num_threads": torch.get_num_threads()}
             base = ParallelEnv(workers, share, device=device, **keeps)
+            base.start()
+            processes = list(base._workers)
             flat = BatchSizeTransform(reshape_fn=_flat)
             flat.enable_inv_on_reset = True  # masks of a reset, too
             base = TransformedEnv(base, flat)
@@ -97,7 +102,7 @@ class ExternalEnv(TransformedEnv):
         super().__init__(base, Compose(*transforms))
         self.config, self.num_envs = config, num_envs
         self._totals = torch.zeros(3, device=device)
-        self._first_world = 0
+        self._first_world, self._workers = 0, processes
         self.set_seed(seed)
 
     def set_seed(self, seed: int | None = None, static_seed: bool = False) -> int | None:
@@ -105,7 +110,8 @@ class ExternalEnv(TransformedEnv):
         if seed is not None and not static_seed:
             for _ in range(self._first_world):
                 seed = seed_generator(seed)
-        return super().set_seed(seed, static_seed=static_seed)
+        with self._workers_live():
+            return super().set_seed(seed, static_seed=static_seed)
 
     def set_first_world(self, number: int) -> None:
         """From the next :meth:`set_seed` on, these copies play the episodes of those from ``number``."""
@@ -116,11 +122,29 @@ class ExternalEnv(TransformedEnv):
         return EnvBase.rand_action(self, tensordict)
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
-        out = super()._step(tensordict)
+        with self._workers_live():
+            out = super()._step(tensordict)
         done = out.get("done")
         finished = (out.get("episode_reward"), out.get("step_count").float(), torch.ones_like(done).float())
         self._totals += torch.stack([torch.where(done, x, 0.0).sum() for x in finished]).to(self._totals)
         return out
+
+    def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: Any) -> TensorDictBase:
+        with self._workers_live():
+            return super()._reset(tensordict, **kwargs)
+
+    @contextmanager
+    def _workers_live(self) -> Iterator[None]:
+        """Where a worker has died, TorchRL raises whatever the pipe to it or its own patience says."""
+        try:
+            yield
+        except Exception as error:
+            if not any(map(_ended, self._workers)):
+                raise
+            raise UserError(
+                f"collector.workers={len(self._workers)}: a worker has died, perhaps for want of memory; go on from "
+                "the last checkpoint with resume=FOLDER"
+            ) from error
 
     @property
     def terminates(self) -> bool:
@@ -181,6 +205,14 @@ def _worker(starter: int, num_envs: int, make: Callable[[], EnvBase]) -> SerialE
     if os.getpid() != starter:
         os.setsid()
     return SerialEnv(num_envs, make, device="cpu")
+
+
+def _ended(process: BaseProcess) -> bool:
+    try:
+        process.join(0.1)  # its pipe may break before it has ended
+        return process.exitcode is not None
+    except ValueError:  # TorchRL has closed it
+        return True
 
 
 def _make_one(config: ExternalConfig) -> EnvBase:

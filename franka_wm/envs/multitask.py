@@ -19,8 +19,8 @@ from franka_wm.device import resolve_device
 from franka_wm.envs.franka import FLAGS, FrankaEnv, own_seed
 from franka_wm.envs.multitask_config import MultiTaskConfig
 from franka_wm.envs.specs import MARKS
+from franka_wm.envs.start import check_arguments
 from franka_wm.errors import UserError
-from franka_wm.options import check_whole
 from franka_wm.seeding import derive_seed
 
 MEANS = ("return", "length", "success", "success_once")
@@ -53,10 +53,9 @@ class MultiTaskEnv(EnvBase):
         seed: int | None = None,
         first_world: int = 0,
     ):
-        check_whole("num_envs", num_envs)
+        seed = own_seed() if seed is None else seed
+        check_arguments(next(iter(config.tasks.values())), num_envs, seed, first_world)
         num_envs = int(num_envs)
-        if seed is not None:
-            check_whole("seed", seed, least=0, most=2**64 - 1)
         count = len(config.tasks)
         if num_envs < count:
             raise UserError(f"num_envs={num_envs}: {count} tasks need at least as many worlds")
@@ -64,7 +63,6 @@ class MultiTaskEnv(EnvBase):
         device = resolve_device(device)
         super().__init__(device=device, batch_size=torch.Size([num_envs]))
         self.config, self.num_envs = config, num_envs
-        seed = own_seed() if seed is None else seed
         self.envs = {
             name: FrankaEnv(
                 one,

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import multiprocessing
 import os
+import signal
 from typing import Any
 
 import numpy as np
@@ -192,4 +193,20 @@ def test_signals_to_the_whole_group_are_not_for_workers() -> None:
         env.rollout(3)
     finally:
         env.close()
+    assert not multiprocessing.active_children()
+
+
+@pytest.mark.parametrize("asked", ["step", "reset", "set_seed"])
+def test_a_worker_that_is_killed_is_one_line(asked: str) -> None:
+    """Whatever TorchRL notices it by."""
+    env = ExternalEnv(ExternalConfig(kind="gym", name="Pendulum-v1"), num_envs=4, workers=2)
+    tensordict = env.rand_action(env.reset())
+    process = multiprocessing.active_children()[0]
+    assert process.pid is not None
+    os.kill(process.pid, signal.SIGKILL)
+    process.join()
+    with pytest.raises(UserError, match=r"collector\.workers=2: a worker has died, .* resume=FOLDER"):
+        env.set_seed(3) if asked == "set_seed" else env.step(tensordict) if asked == "step" else env.reset()
+    for one in multiprocessing.active_children():
+        one.join(10)
     assert not multiprocessing.active_children()
