@@ -382,7 +382,7 @@ def _line(name: str, found: Mapping[str, Any], explained: int, made: str) -> str
 
 
 def percent(part: int, whole: int) -> str:
-    return f"{100 * part / whole:.0f} %" if whole else "–"
+    return f"{100 * part // whole} %" if whole else "–"  # down: 100 % is all of them
 
 
 def parse(arguments: list[str] | None) -> argparse.Namespace:
