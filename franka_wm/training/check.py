@@ -444,6 +444,6 @@ def _check_same_views(run: RunSettings, sources: Named) -> None:
                 f"{option}: recorded with env.{name}={there}, this run has {env[name]}, so "
                 f"images show something else; use env.{name}={there}, or env=none to train alone"
             )
-        if other_scene(sessions, env):
+        if other_scene(sessions, env, images=bool(looks)):
             other = f"{option}: recorded with another env.scene, so {'images' if looks else 'states'} show something"
             raise UserError(f"{other} else; give the same, or env=none to train alone")

@@ -134,7 +134,7 @@ def check_demonstrations(run: RunSettings) -> None:
             raise UserError(
                 f"replay.demos={source.root}: recorded with env.{name}={there}, this run has {env[name]}"
             )
-        if other_scene(sessions, env):
+        if other_scene(sessions, env, images=bool(looks)):
             raise UserError(
                 f"replay.demos={source.root}: recorded with another env.scene, whose objects are other ones"
             )

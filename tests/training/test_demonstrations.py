@@ -445,3 +445,6 @@ def test_demonstrations_of_another_scene_are_refused(pushes: Path, settled) -> N
     larger = "env.scene={objects: [{name: cube, size: [0.08, 0.08, 0.08], at: [0.45, 0.0]}]}"
     with pytest.raises(UserError, match=r"replay\.demos=\S+: recorded with another env\.scene"):
         check_demonstrations(settled(*words, larger))
+    check_demonstrations(
+        settled(*words, "env.scene={objects: [{name: cube, size: [0.04, 0.04, 0.04], color: [0, 0, 1]}]}")
+    )

@@ -87,29 +87,30 @@ def _telling(name: str, value: Any) -> Any:
     return [*value][:1] if name == "cameras" else value
 
 
-def other_scene(sessions: Iterable[Mapping[str, Any]], env: Mapping[str, Any]) -> bool:
+def other_scene(sessions: Iterable[Mapping[str, Any]], env: Mapping[str, Any], *, images: bool) -> bool:
     """Whether sessions were recorded in a scene of other bodies than that of ``env``, which has ``task`` and ``scene``.
 
-    What does not show in them does not count, nor do folders of files. Scenes whose files or tasks are not known here
-    are not compared: a dataset may come from another machine.
+    What does not show in them does not count, nor do folders of files, nor colours where no images are read. Scenes
+    whose files or tasks are not known here are not compared: a dataset may come from another machine.
     """
     for session in sessions:
         recorded = session.get("config", {}).get("env", {})
         if "scene" in recorded and "scene" in env:
             try:
-                there = _shown(recorded["scene"], recorded.get("task", env["task"]))
+                there = _shown(recorded["scene"], recorded.get("task", env["task"]), images)
             except UserError:
                 continue
-            if there != _shown(env["scene"], env["task"]):
+            if there != _shown(env["scene"], env["task"], images):
                 return True
     return False
 
 
 UNSEEN = ("mass", "friction", "joint_friction", "joint_damping", "spread", "turn")
 """What no image shows of a body: how it moves, and how far its start is drawn at random."""
+COLOURS = ("color", "case_color")
 
 
-def _shown(given: Any, task: str) -> list[Any]:
+def _shown(given: Any, task: str, images: bool) -> list[Any]:
     """What a scene's bodies look like, and where those that stand still stand; as plain values that can be compared."""
     from franka_wm.envs.scene import Body, Scene
     from franka_wm.envs.tasks import task_class
@@ -117,10 +118,11 @@ def _shown(given: Any, task: str) -> list[Any]:
     scene = task_class(task).scene if given is None else Scene.of(given)
     if scene is None:
         return []
+    unseen = UNSEEN if images else UNSEEN + COLOURS
     return [
         (type(one).__name__, {
             field.name: _plain(getattr(one, field.name)) for field in fields(one)
-            if field.name not in UNSEEN and not (field.name == "at" and isinstance(one, Body))
+            if field.name not in unseen and not (field.name == "at" and isinstance(one, Body))
         })
         for one in (scene.table, *scene.objects, *scene.articulated, *scene.obstacles)
     ]  # fmt: skip

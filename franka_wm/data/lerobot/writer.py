@@ -232,7 +232,7 @@ class DatasetWriter:
                     f"out={self.out}: what is there was recorded with env.{name}={there}, this has {env[name]}; give "
                     "the same, or another out"
                 )
-            if other and other_scene(other["sessions"], env):
+            if other and other_scene(other["sessions"], env, images=bool(self.schema.images)):
                 raise UserError(
                     f"out={self.out}: what is there was recorded with another env.scene; give the same, or another out"
                 )
