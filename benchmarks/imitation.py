@@ -4,9 +4,9 @@
     python benchmarks/imitation.py datasets/lift-images
     python benchmarks/imitation.py datasets/lift-images --policy diffusion --steps 30000 --also num_workers=12
 
-The policy sees what the dataset holds: images and the arm's state, no objects. *success* is the share of held-out
-episodes that end in success, *training* all of lerobot-train, with its start. Needs the extra [lerobot-train], and
-diffusion the package diffusers.
+The policy sees what the dataset holds: images, the arm's state, and the goal, no objects. Of lift the goal tells where
+the cube stood. *success* is the share of held-out episodes that end in success, *training* all of lerobot-train, with
+its start. Needs the extra [lerobot-train], and diffusion the package diffusers.
 """
 
 from __future__ import annotations
@@ -33,7 +33,8 @@ ROOT = Path(__file__).resolve().parents[1]
 PLUGIN = "--env.discover_packages_path=franka_wm.data.lerobot_env"
 
 ACT = (
-    "--policy.pretrained_backbone_weights=null",  # from scratch: nothing is downloaded
+    # From scratch: nothing is downloaded. The norms of its ResNet are frozen, and without those weights do nothing.
+    "--policy.pretrained_backbone_weights=null",
     "--policy.chunk_size=20",  # episodes of lift have 60 steps; of the default's 100 most would be padding
     "--policy.n_action_steps=10",
     "--policy.optimizer_lr=1e-4",  # the default, 1e-5, is for pretrained backbones
@@ -42,7 +43,8 @@ ACT = (
 DIFFUSION = (
     "--policy.pretrained_backbone_weights=null",
     "--policy.use_group_norm=true",
-    "--policy.crop_ratio=1.0",
+    "--policy.horizon=16",  # as in the paper; of LeRobot's 64 most would be padding
+    "--policy.n_action_steps=8",
     "--policy.noise_scheduler_type=DDIM",
     "--policy.num_inference_steps=10",
 )
@@ -114,7 +116,8 @@ def main() -> None:
         parser.error(
             f"{args.dataset} was not written by franka-wm: it does not say which arm and task it is of"
         )
-    task = provenance["sessions"][0]["config"]["env"]["task"]
+    sessions = provenance["sessions"]
+    episodes = json.loads((args.dataset / "meta" / "info.json").read_text())["total_episodes"]
     device = resolve_device(args.device).type
     rows: list[dict[str, Any]] = []
     for seed in args.seeds:
@@ -130,7 +133,9 @@ def main() -> None:
         rows.append(
             {
                 "policy": args.policy,
-                "task": task,
+                "task": sessions[0]["config"]["env"]["task"],
+                "dataset": "; ".join(session["command"] for session in sessions),
+                "episodes": episodes,
                 "seed": seed,
                 "updates": args.steps,
                 "batch": args.batch,

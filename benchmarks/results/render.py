@@ -261,10 +261,10 @@ def _each_seed(row: Row, records: Sequence[Record]) -> str:
 
 def _command(row: Row, records: Sequence[Record]) -> str:
     """What to type; for several seeds in a loop."""
-    if row.script is not None:
-        return shlex.join(row.command)
-    seeds = " ".join(str(record["seed"]) for record in records)
     before = f"{row.before}\n" if row.before else ""
+    if row.script is not None:
+        return before + shlex.join(row.command)
+    seeds = " ".join(str(record["seed"]) for record in records)
     if len(records) == 1:
         return f"{before}{shlex.join(row.command)} seed={seeds}"
     return f"{before}for seed in {seeds}; do\n  {shlex.join(row.command)} seed=$seed\ndone"

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from functools import partial
 from multiprocessing.process import BaseProcess
 from typing import Any
@@ -70,10 +70,12 @@ class ExternalEnv(TransformedEnv):
     ):
         make = partial(_make_one, config)
         one = make()
-        groups = _groups(config, one)
-        _require_actions(config, one)
-        continuous = one.action_spec.dtype.is_floating_point
-        one.close()
+        try:
+            groups = _groups(config, one)
+            _require_actions(config, one)
+            continuous = one.action_spec.dtype.is_floating_point
+        finally:
+            one.close()
         processes: list[BaseProcess] = []
         transforms = [
             DoubleToFloat(),
@@ -133,6 +135,12 @@ class ExternalEnv(TransformedEnv):
         with self._workers_live():
             return super()._reset(tensordict, **kwargs)
 
+    def close(self, *, raise_if_closed: bool = True) -> None:
+        """Ends the workers; that one had died is said by what was asked of it before, and here by nothing."""
+        with suppress(UserError), self._workers_live():
+            super().close(raise_if_closed=raise_if_closed)
+        self._workers = []
+
     @contextmanager
     def _workers_live(self) -> Iterator[None]:
         """Where a worker has died, TorchRL raises whatever the pipe to it or its own patience says."""
@@ -142,8 +150,8 @@ class ExternalEnv(TransformedEnv):
             if not any(map(_ended, self._workers)):
                 raise
             raise UserError(
-                f"collector.workers={len(self._workers)}: a worker has died, perhaps for want of memory; go on from "
-                "the last checkpoint with resume=FOLDER"
+                f"collector.workers={len(self._workers)}: a worker has died, by an error of the environment, printed "
+                "above, or killed, perhaps for want of memory; go on from the last checkpoint with resume=FOLDER"
             ) from error
 
     @property
@@ -263,7 +271,7 @@ def _require_actions(config: ExternalConfig, env: EnvBase) -> None:
     """Refuses actions that are neither a vector that can be scaled to [−1, 1] nor the number of one choice."""
     spec = env.action_spec
     if isinstance(spec, Bounded) and len(spec.shape) == 1 and spec.dtype.is_floating_point:
-        if bool((spec.low.isfinite() & spec.high.isfinite()).all()):
+        if bool((spec.high - spec.low).isfinite().all()):
             return
     elif isinstance(spec, Categorical) and not spec.shape:
         return

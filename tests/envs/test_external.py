@@ -207,6 +207,7 @@ def test_a_worker_that_is_killed_is_one_line(asked: str) -> None:
     process.join()
     with pytest.raises(UserError, match=r"collector\.workers=2: a worker has died, .* resume=FOLDER"):
         env.set_seed(3) if asked == "set_seed" else env.step(tensordict) if asked == "step" else env.reset()
+    env.close()  # as collectors do on the way out
     for one in multiprocessing.active_children():
         one.join(10)
     assert not multiprocessing.active_children()

@@ -223,3 +223,5 @@ def test_what_cannot_be_is_one_line(config) -> None:
     for seed in (-1, 1.5, "a"):
         with pytest.raises(UserError, match="seed="):
             MultiTaskEnv(config, num_envs=2, device="cpu", seed=seed)  # type: ignore[arg-type]
+    with pytest.raises(UserError, match=r"first_world=-2: must be"):  # as of one task
+        MultiTaskEnv(config, num_envs=2, device="cpu", first_world=-2)

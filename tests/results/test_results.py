@@ -189,6 +189,8 @@ def test_success_where_a_task_says_what_it_is(measured) -> None:
     row = replace(ROW, wanted={"success": 80}, before="franka-wm collect out=datasets/push episodes=2")
     text = render.page({"reach": row}, place)
     assert "franka-wm collect out=datasets/push episodes=2\nfor seed in 100 101; do" in text
+    script = replace(row, script="benchmarks/of.py", arguments="datasets/push", seeds=())
+    assert render._command(script, []).split("\n")[0] == row.before
     assert "| worst seed ≥ 80 % | 70.0 % | **no** |" in text
     assert "| planner | 80 (70 – 90) | 1 (1 – 1) |" in text
     readme = render.readme_tables({"reach": row}, place)

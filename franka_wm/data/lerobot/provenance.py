@@ -45,7 +45,7 @@ ACTIONS = (
     *("action_mode", "action_scale", "ee_scale"),
     *("robot", "urdf_path", "asset_name", "urdf_relative_path"),
 )
-"""Options that give recorded actions and states their meaning; ``ee_scale`` actions of ``ee_delta`` alone."""
+"""Options that give recorded actions and states their meaning, where they are read."""
 MEANING = (
     *("task", "reward", *ACTIONS, "action_penalty", "success_distance", "drawer_opening"),
     "terminate_on_success",
@@ -66,11 +66,11 @@ def other_option(
 
     Of cameras the first counts: its images have no name that tells it from others.
     """
-    unread = "" if env.get("action_mode") == "ee_delta" else "ee_scale"
     for session in sessions:
         recorded = session.get("config", {}).get("env", {})
+        unread = _unread(recorded) & _unread(env)
         for name in names:
-            if name == unread:
+            if name in unread:
                 continue
             if (
                 name in recorded
@@ -81,7 +81,17 @@ def other_option(
     return None
 
 
+def _unread(env: Mapping[str, Any]) -> set[str]:
+    """Options that do nothing beside others."""
+    unread = set() if env.get("action_mode") == "ee_delta" else {"ee_scale"}
+    if env.get("urdf_path"):
+        return unread | {"robot", "asset_name", "urdf_relative_path"}
+    return unread if env.get("robot") == "newton_asset" else unread | {"asset_name", "urdf_relative_path"}
+
+
 def _telling(name: str, value: Any) -> Any:
+    if name == "robot" and value == "panda_meshes_full":
+        return "panda_meshes"  # the same with every triangle
     if name == "urdf_path":
         return value and Path(value).name  # a dataset may come from another machine
     return [*value][:1] if name == "cameras" else value

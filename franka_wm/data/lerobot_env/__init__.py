@@ -55,6 +55,14 @@ class RecordedView(FrankaVectorEnv):
         self.single_observation_space = spaces.Dict(entries)
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
 
+    def step(
+        self, actions: np.ndarray
+    ) -> tuple[dict[str, Any], np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
+        """As above, with ``is_success`` at the end of an episode alone: LeRobot would count one that did not last."""
+        *stepped, info = super().step(actions)
+        del info["is_success"]
+        return (*stepped, info)
+
     def _to_numpy(self, tensordict: TensorDictBase) -> tuple[dict[str, Any], np.ndarray]:
         out: dict[str, Any] = {}
         if self._images:

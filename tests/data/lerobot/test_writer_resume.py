@@ -20,7 +20,7 @@ import pytest
 from dataset_episodes import check_terminals, compare
 from forks import Fork
 from franka_wm.data.lerobot.merge import merge
-from franka_wm.data.lerobot.provenance import describe, read_provenance
+from franka_wm.data.lerobot.provenance import describe, other_option, read_provenance
 from franka_wm.data.lerobot.schema import EPISODE_KEY
 from franka_wm.data.lerobot.writer import DatasetWriter
 from franka_wm.errors import UserError
@@ -425,3 +425,20 @@ def test_signals_to_the_whole_group_are_not_for_writing_processes(
         writer.add(episodes[2:])
         writer.finish()
     compare(load(tmp_path / "set"), schema, episodes)
+
+
+def test_another_robot_is_one_that_is_simulated() -> None:
+    def told(there: dict, here: dict) -> str | None:
+        changed = other_option([{"config": {"env": there}}], here)
+        return changed and changed[0]
+
+    assert told({"robot": "embedded"}, {"robot": "panda_meshes"}) == "robot"
+    assert told({"robot": "panda_meshes"}, {"robot": "panda_meshes_full"}) is None, "the same, drawn finer"
+    asset = {"robot": "newton_asset", "asset_name": "a"}
+    assert told(asset, {**asset, "asset_name": "b"}) == "asset_name"
+    assert told({"robot": "embedded", "asset_name": "a"}, {"robot": "embedded", "asset_name": "b"}) is None
+    own = {"robot": "embedded", "urdf_path": "/here/arm.urdf"}
+    assert told(own, {"robot": "panda_meshes", "urdf_path": "/there/arm.urdf"}) is None, (
+        "the file goes before"
+    )
+    assert told(own, {"robot": "embedded", "urdf_path": None}) == "urdf_path"

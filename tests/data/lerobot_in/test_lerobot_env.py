@@ -67,6 +67,7 @@ def test_observations_are_those_of_a_dataset(config: FrankaWMEnv) -> None:
     for step in range(3):
         observation, reward, _, truncated, info = env.step(np.zeros((2, 7), np.float32))
         assert (truncated == (step == 2)).all() and (reward <= 0).all()
+        assert "is_success" not in info, "LeRobot counts a success of any step"
     assert info["final_info"]["is_success"].shape == (2,)
     assert info["final_obs"][0]["agent_pos"].shape == (20,)
     assert env.call("_max_episode_steps") == (3, 3)
