@@ -59,9 +59,9 @@ class RecordedView(FrankaVectorEnv):
         self, actions: np.ndarray
     ) -> tuple[dict[str, Any], np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
         """As above, with ``is_success`` at the end of an episode alone: LeRobot would count one that did not last."""
-        *stepped, info = super().step(actions)
+        observations, reward, terminated, truncated, info = super().step(actions)
         del info["is_success"]
-        return (*stepped, info)
+        return observations, reward, terminated, truncated, info
 
     def _to_numpy(self, tensordict: TensorDictBase) -> tuple[dict[str, Any], np.ndarray]:
         out: dict[str, Any] = {}
