@@ -213,10 +213,10 @@ class TwoHotSymlog(nn.Module):
     def loss(self, logits: Tensor, target: Tensor) -> Tensor:
         """Soft cross-entropy: logits (..., bins), target scalars (..., 1) -> (..., 1), broadcasting.
 
-        The target is a constant: no gradient passes through it. In the support's precision, as `decode`.
+        The target is a constant: no gradient passes through it.
         """
         probabilities = self.encode(target.detach())
-        return -(probabilities * logits.log_softmax(-1, dtype=self.support.dtype)).sum(-1, keepdim=True)
+        return -(probabilities * logits.log_softmax(-1)).sum(-1, keepdim=True)
 
 
 class Ensemble(nn.Module):

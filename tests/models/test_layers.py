@@ -57,13 +57,12 @@ def test_two_hot_round_trip_over_the_whole_range():
 
 
 def test_two_hot_values_are_exact_under_autocast():
-    """And losses. CUDA computes a softmax in float32 there, a CPU in bfloat16."""
+    """CUDA computes a softmax in float32 there, a CPU in bfloat16."""
     code, x = TwoHotSymlog(), torch.tensor([[50.0], [-37.0], [900.0]])
     logits = (code.encode(x) + 1e-30).log().to(torch.bfloat16)  # as a head returns them
     with torch.autocast("cpu", torch.bfloat16):
-        found, loss = code.decode(logits), code.loss(logits, x + 1)
+        found = code.decode(logits)
     assert found.dtype == torch.float32
-    assert torch.equal(loss, code.loss(logits.float(), x + 1))
     torch.testing.assert_close(found, code.decode(logits.float()), rtol=1e-5, atol=1e-5)
     wide = TwoHotSymlog().double()
     assert wide.decode(logits.double()).dtype == torch.float64
