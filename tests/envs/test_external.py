@@ -94,11 +94,12 @@ def test_refusals(values: dict, named: str) -> None:
     "actions",
     [
         gymnasium.spaces.Box(-np.inf, np.inf, (2,), np.float32),
+        gymnasium.spaces.Box(-3e38, 3e38, (2,), np.float32),  # finite, but not how wide it is
         gymnasium.spaces.Box(-1.0, 1.0, (2, 2), np.float32),
         gymnasium.spaces.MultiDiscrete([2, 3]),
         gymnasium.spaces.MultiBinary(3),
     ],
-    ids=["unbounded", "matrix", "several", "bits"],
+    ids=["unbounded", "wide", "matrix", "several", "bits"],
 )
 def test_actions_that_no_model_chooses_are_one_line(actions: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     """Bits were taken for one choice of two, a matrix for a vector of its last side."""
