@@ -48,7 +48,7 @@ def nearest_neighbours(x_train: Tensor, y_train: Tensor, x: Tensor, k: int = NEI
         k: From 1 to n.
 
     Returns:
-        (m, T) float64.
+        (m, T) float64; NaN where a point is not a number, or its neighbours are not.
 
     Raises:
         ValueError: ``k`` out of range.
@@ -58,8 +58,10 @@ def nearest_neighbours(x_train: Tensor, y_train: Tensor, x: Tensor, k: int = NEI
     y = y_train.double()
     rows = []
     for part in x.double().split(1024):
-        nearest = torch.cdist(part, x_train.double()).topk(k, largest=False).indices
-        rows.append(y[nearest].mean(1))
+        nearest = torch.cdist(part, x_train.double()).topk(k, largest=False)
+        # What is not a number has no neighbours; topk would give it some.
+        lost = nearest.values.isnan().any(1, keepdim=True)
+        rows.append(torch.where(lost, torch.nan, y[nearest.indices].mean(1)))
     return torch.cat(rows)
 
 

@@ -61,7 +61,8 @@ def plot_learning_curves(
 
     A row holds what was logged at one moment; rows need not hold the same keys. Drawn are `…/final_distance`
     [m] or `…/return`, `…/success` [0 … 1] (`eval/planner/…`, `eval/policy/…`, `train/…`) and every `loss_…` or
-    `…/loss_…`. Values that are not finite leave a gap. A panel without data says so.
+    `…/loss_…`. Values that are not finite leave a gap. Success has no panel where no row has it; another panel without
+    data says so.
 
     Args:
         rows: in any order.
@@ -79,13 +80,13 @@ def plot_learning_curves(
     """
     check_format(path)
     placed = _placed(rows, x)
-    figure, (first_axes, success, losses) = new_figure(
-        columns=3, width=4.0, height=3.8, theme=theme, sharex=True
-    )
     first = "final_distance" if _keys(placed, "final_distance") or not _keys(placed, "return") else "return"
-    _draw_quantity(first_axes, placed, x, first, success_distance, theme)
-    _draw_quantity(success, placed, x, "success", None, theme)
-    _draw_values(losses, placed, x, _loss_keys(placed), "losses", theme)
+    # Not every simulator tells success; every run has losses and one of the others.
+    quantities = [first, "success"] if _keys(placed, "success") else [first]
+    figure, axes = new_figure(columns=len(quantities) + 1, width=4.0, height=3.8, theme=theme, sharex=True)
+    for one, quantity in zip(axes, quantities, strict=False):
+        _draw_quantity(one, placed, x, quantity, success_distance, theme)
+    _draw_values(axes[-1], placed, x, _loss_keys(placed), "losses", theme)
     title_figure(figure, title, theme=theme)
     return save_figure(figure, path)
 

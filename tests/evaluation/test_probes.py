@@ -60,6 +60,15 @@ def test_neighbours_cannot_be_more_than_there_are(data) -> None:
         nearest_neighbours(data[0][:60], data[1][:60], data[0], 61)
 
 
+def test_a_point_that_is_not_a_number_has_no_neighbours(data) -> None:
+    x, y = data
+    lost = x[60:].clone()
+    lost[1, 0] = torch.nan
+    found, whole = nearest_neighbours(x[:60], y[:60], lost), nearest_neighbours(x[:60], y[:60], x[60:])
+    assert found[1].isnan().all()
+    torch.testing.assert_close(found[[0, 2]], whole[[0, 2]])
+
+
 def test_r_squared_is_that_of_scikit_learn(data) -> None:
     y = data[1].double()
     guess = y + torch.randn(80, 3, generator=torch.Generator().manual_seed(1))

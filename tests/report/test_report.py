@@ -163,6 +163,16 @@ def test_curves_show_the_values_in_the_units_they_name(tmp_path: Path, monkeypat
     assert drawn["3:2:policy"][1][0] == pytest.approx(-0.1)
 
 
+def test_success_has_no_panel_where_nothing_tells_it(tmp_path: Path, monkeypatch) -> None:
+    from franka_wm.report import curves
+
+    drawn = []
+    monkeypatch.setattr(curves, "save_figure", lambda figure, path: drawn.append(figure))
+    rows = [{"env_steps": 100.0 * k, "eval/planner/return": float(k), "loss_value": 1.0} for k in range(3)]
+    plot_learning_curves(rows, tmp_path / "a.png")
+    assert [axes.get_title() for axes in drawn[0].axes] == ["return of an episode", "losses"]
+
+
 def test_curves_can_be_drawn_before_anything_but_time_was_logged(tmp_path: Path) -> None:
     assert plot_learning_curves([{"time_s": 1.0}], tmp_path / "a.png", x="time_s").stat().st_size > 1000
 
