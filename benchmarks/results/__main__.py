@@ -75,7 +75,10 @@ def parse(arguments: list[str] | None) -> argparse.Namespace:
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     verbs = parser.add_subparsers(dest="verb")
-    verbs.add_parser("list", help="which rows are fresh, stale, missing")
+    verbs.add_parser(
+        "list",
+        help="which rows are fresh, begun (part), stale, confirmed (stale, but a short run gives the same), missing",
+    )
     verbs.add_parser("render", help="write docs/results.md and README's tables")
     one = verbs.add_parser("run", help="run the seeds of rows")
     one.add_argument("rows", nargs="+", metavar="row")

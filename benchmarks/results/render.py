@@ -17,10 +17,10 @@ from franka_wm.errors import UserError
 
 BEGIN, END = "<!-- results: written by `make results` -->", "<!-- end of results -->"
 LEGEND = (
-    "*m of n seeds*: the row declares n, and m were measured with that commit; none was left out for its result. "
-    "*n at a time*: so many shared the GPU or the cores, so each took longer than by itself; *alone (m of n runs)*: "
-    "times of those that had it to themselves; *beside other work*: none had. Raised numbers: an earlier commit, see "
-    "below the tables."
+    "*m of n seeds*: the row declares n, and m were measured with that commit. *n at a time*: n runs at once, on one GPU, "
+    "or each on a core of its own on one machine; *alone (m of n runs)*: times of those that were alone; *beside other "
+    "work*: something else ran on that machine meanwhile, on the same GPU or elsewhere: the row's text says what. Raised "
+    "numbers: an earlier commit, see below the tables."
 )
 """What README says of its tables' words."""
 HEAD = """# Results
@@ -31,7 +31,13 @@ is typed by hand. `benchmarks/results/rows.yaml` declares the rows. `make result
 `a (b – c)` over several seeds is their mean, lowest and highest. For one seed `b – c` is the 95 % interval over its
 episodes: bootstrap for distances and returns, Wilson for rates. Episodes are held out: training never sees their seeds.
 *Doing nothing* and *random smooth* motion are what a policy must beat; *inverse kinematics* knows the true geometry.
-Where actions are discrete, a *search with the same actions* takes its place: the best pair of them by true geometry.
+Where actions are discrete, a *search with the same actions* takes its place: the best pair of them by true geometry,
+where the distance after the first counts a tenth.
+
+*n at a time*: n runs at once, on one GPU, or each on a core of its own on one machine. *beside other work*: something
+else ran on that machine meanwhile, on the same GPU or elsewhere: the row's text says what. A commit with a `+` had changes
+that were not committed. Where code has changed since, a short run on a CPU, with a small model and nothing compiled, was
+made with both versions; *bit for bit* is said where it gave the same. What only a GPU or a long run shows, it does not see.
 """
 POLICIES = {
     "planner": "planner",
@@ -140,7 +146,9 @@ def page(rows: Mapping[str, Row], place: Path = PLACE) -> str:
             parts += [f"## {section.title}\n", *([section.text + "\n"] if section.text else [])]
             parts += [part(rows[name], measured[name], states[name], place) for name in here]
     if single:
-        parts.append("## Single seeds\n\nOne run each: another seed may end elsewhere.\n")
+        parts.append(
+            "## Single seeds\n\nOne run each, also of rows that were only begun: another seed may end elsewhere, and the *worst* is the only one.\n"
+        )
         parts += [part(rows[name], measured[name], states[name], place) for name in single]
     missing = [row for name, row in rows.items() if not measured[name]]
     if missing:
@@ -244,8 +252,9 @@ def _one_seed(record: Record, policy: str, metric: Metric) -> str:
 
 
 def _commit(record: Record) -> str:
-    """As long as it needs to be to be found."""
-    return str(record["commit"])[:12]
+    """As long as it needs to be to be found, with the `+` of code that was not committed."""
+    commit = str(record["commit"])
+    return commit.rstrip("+")[:12] + "+" * commit.endswith("+")
 
 
 def _each_seed(row: Row, records: Sequence[Record]) -> str:
