@@ -17,10 +17,10 @@ from franka_wm.errors import UserError
 
 BEGIN, END = "<!-- results: written by `make results` -->", "<!-- end of results -->"
 LEGEND = (
-    "*m of n seeds*: the row declares n, and m were measured with that commit. *n at a time*: n runs at once, on one GPU, "
-    "or each on a core of its own on one machine; *alone (m of n runs)*: times of those that were alone; *beside other "
-    "work*: something else ran on that machine meanwhile, on the same GPU or elsewhere: the row's text says what. Raised "
-    "numbers: an earlier commit, see below the tables."
+    "*m of n seeds*: the row declares n, and m were measured with that commit. *n at a time*: n runs at once, on one "
+    "GPU, or each on a core of its own on one machine; *alone (m of n runs)*: times of those that were alone; *beside "
+    "other work*: something else ran on that machine meanwhile, on the same GPU or elsewhere, as the row's text says. "
+    "Raised numbers: an earlier commit, see below the tables."
 )
 """What README says of its tables' words."""
 HEAD = """# Results
@@ -34,10 +34,11 @@ episodes: bootstrap for distances and returns, Wilson for rates. Episodes are he
 Where actions are discrete, a *search with the same actions* takes its place: the best pair of them by true geometry,
 where the distance after the first counts a tenth.
 
-*n at a time*: n runs at once, on one GPU, or each on a core of its own on one machine. *beside other work*: something
-else ran on that machine meanwhile, on the same GPU or elsewhere: the row's text says what. A commit with a `+` had changes
-that were not committed. Where code has changed since, a short run on a CPU, with a small model and nothing compiled, was
-made with both versions; *bit for bit* is said where it gave the same. What only a GPU or a long run shows, it does not see.
+*n at a time*: n runs at once, on one GPU, or each on a core of its own on one machine. *beside other work*:
+something else ran on that machine meanwhile, on the same GPU or elsewhere: the row's text says what. A commit with
+a `+` had changes that were not committed. Where code has changed since, a short run on a CPU, with a small model and
+nothing compiled, was made with both versions; *bit for bit* is said where it gave the same. What only a GPU or a long
+run shows, it does not see.
 """
 POLICIES = {
     "planner": "planner",
@@ -146,9 +147,10 @@ def page(rows: Mapping[str, Row], place: Path = PLACE) -> str:
             parts += [f"## {section.title}\n", *([section.text + "\n"] if section.text else [])]
             parts += [part(rows[name], measured[name], states[name], place) for name in here]
     if single:
-        parts.append(
-            "## Single seeds\n\nOne run each, also of rows that were only begun: another seed may end elsewhere, and the *worst* is the only one.\n"
+        alone = (
+            "One run each, also of rows only begun: another seed may end elsewhere, the *worst* is this one."
         )
+        parts.append(f"## Single seeds\n\n{alone}\n")
         parts += [part(rows[name], measured[name], states[name], place) for name in single]
     missing = [row for name, row in rows.items() if not measured[name]]
     if missing:

@@ -69,10 +69,15 @@ def test_no_run_was_alone_where_a_row_says_that_other_work_ran(tmp_path: Path) -
     page, readme = render.page({"reach": row}, tmp_path), render.readme_tables({"reach": row}, tmp_path)
     assert f"training 30 (30 – 31) s{said}, the whole command" in page
     assert "p, 2 threads: 1 run at 1 a time, 1 at 2 a time, beside other work; torch" in page
-    assert f"| 30 s{said} | 0.7 min |" in readme and "*beside other work*: none had" in readme
+    assert f"| 30 s{said} | 0.7 min |" in readme and "*beside other work*: something else ran" in readme
     assert "alone (1" not in page and "alone (1" not in readme
     assert times.company(found[:1], beside=True) == times.BESIDE_OTHERS
     assert times.grouped(found[:1], beside=True) == "p, 2 threads, beside other work"
+
+
+def test_the_page_says_which_code_was_not_committed(tmp_path: Path) -> None:
+    place(tmp_path, *({**record(seed), "commit": "0123456789abcdef+"} for seed in (100, 101, 102)))
+    assert "commit 0123456789ab+, 2026-01-02" in render.page({"reach": ROW}, tmp_path)
 
 
 def test_rows_whose_text_tells_of_other_work_declare_it() -> None:
