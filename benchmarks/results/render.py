@@ -422,10 +422,8 @@ def readme_tables(rows: Mapping[str, Row], place: Path = PLACE) -> str:
         parts += ["¹ Measured before changes of the code; docs/results.md names them.", ""]
     if alike:
         text = "gave the same weights and episodes, bit for bit, with that code and with today's"
-        parts += [
-            f"² Measured with an earlier commit; a short run on a CPU {text}; it cannot see what only a GPU or a long run shows.",
-            "",
-        ]
+        unseen = "it cannot see what only a GPU or a long run shows"
+        parts += [f"² Measured with an earlier commit; a short run on a CPU {text}; {unseen}.", ""]
     return "\n".join(parts or ["Not measured yet.", ""])
 
 
