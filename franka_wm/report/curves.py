@@ -84,7 +84,7 @@ def plot_learning_curves(
     # Not every simulator tells success; every run has losses and one of the others.
     quantities = [first, "success"] if _keys(placed, "success") else [first]
     figure, axes = new_figure(columns=len(quantities) + 1, width=4.0, height=3.8, theme=theme, sharex=True)
-    for one, quantity in zip(axes, quantities, strict=False):
+    for one, quantity in zip(axes[:-1], quantities, strict=True):
         _draw_quantity(one, placed, x, quantity, success_distance, theme)
     _draw_values(axes[-1], placed, x, _loss_keys(placed), "losses", theme)
     title_figure(figure, title, theme=theme)
