@@ -214,14 +214,24 @@ def handle_name(name: str) -> str:
     return f"/objects/{name}"
 
 
-def _aim(client: viser.ClientHandle) -> None:
-    """Moves the camera of a phone, so that the arm is above the controls."""
-    camera = client.camera
-    if camera.aspect < PORTRAIT:
-        eye, look_at = portrait_view(camera.aspect)
+async def _aim(client: viser.ClientHandle) -> None:
+    """Moves the camera of a phone held upright, so that the arm is above the controls; back when it is turned.
+
+    A browser's first message may be of a picture that has not its size yet, so later ones are looked at, too.
+    """
+    upright = False
+
+    async def look(camera: viser.CameraHandle) -> None:  # async: viser then keeps the order of messages
+        nonlocal upright
+        before, upright = upright, camera.aspect < PORTRAIT
+        if upright is before:
+            return
+        eye, look_at = portrait_view(camera.aspect) if upright else (EYE, LOOK_AT)
         with client.atomic():
             camera.position = eye  # moves look_at along
             camera.look_at = look_at
+
+    client.camera.on_update(look)
 
 
 def portrait_view(aspect: float) -> tuple[np.ndarray, np.ndarray]:

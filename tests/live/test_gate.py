@@ -25,6 +25,7 @@ from franka_wm.errors import UserError  # noqa: E402
 from franka_wm.live.gate import LEFT, Gate, decoded, foreign, short  # noqa: E402
 from franka_wm.live.page import PENDING, Page  # noqa: E402
 from franka_wm.live.session import BUDGET  # noqa: E402
+from franka_wm.live.viser_scene import EYE, LOOK_AT  # noqa: E402
 
 GOAL = (0.45, 0.05, 0.45)
 POSE = {"wxyz": [1.0, 0.0, 0.0, 0.0], "position": [0.4, 0.2, 0.5]}
@@ -122,6 +123,28 @@ def test_what_the_page_sends_is_admitted_and_nothing_else(page: Page) -> None:
     assert all(page.gate.admits(message) for message in good)
     for message in hostile(page):
         assert not page.gate.admits(message), message
+
+
+def test_the_camera_follows_a_phone_that_is_turned(page: Page) -> None:
+    """Its first message may be of a picture of no size yet; only what turns it moves the camera, not what it sees."""
+    before = set(page.server.get_clients())
+
+    def sees(browser: Any, width: int, height: int, look_at: tuple[float, ...] = LOOK_AT) -> None:
+        message = CAMERA | {"image_width": width, "image_height": height, "look_at": look_at}
+        browser.send(msgspec.msgpack.encode(message))
+
+    with client(page) as browser:
+        sees(browser, 300, 150)
+        wait(lambda: set(page.server.get_clients()) - before, "not connected")
+        camera = page.server.get_clients()[max(page.server.get_clients())].camera
+        np.testing.assert_array_equal(camera.look_at, LOOK_AT)
+        sees(browser, 360, 640)
+        wait(lambda: camera.look_at[2] < 0, "upright: the arm is not above the controls")
+        sees(browser, 360, 640, (0.0, 0.0, 7.0))
+        wait(lambda: camera.look_at[2] == 7.0, "what a finger did to the camera is undone")
+        sees(browser, 640, 360)
+        wait(lambda: np.allclose(camera.look_at, LOOK_AT), "turned back: not the view of a wide window")
+        np.testing.assert_allclose(camera.position, EYE)
 
 
 def test_hostile_messages_change_nothing_and_good_ones_still_arrive(page: Page) -> None:
