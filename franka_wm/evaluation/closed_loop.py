@@ -26,7 +26,7 @@ Policy = Callable[[TensorDictBase], TensorDictBase]
 def success_distance(env: Environment) -> float | None:
     """Distance to the goal that counts as success [m]; ``None`` where success is no distance, or not of the arm."""
     arm = arm_of(env)
-    return None if arm is None or not arm.simulation.task.goal_distance else arm.config.success_distance
+    return None if arm is None else arm.simulation.task.success_distance
 
 
 def begin(env: Environment, seed: int, first_world: int | None = None) -> TensorDictBase:
@@ -90,7 +90,7 @@ def play_episodes(
         ``task_success`` by task, NaN in the worlds of others. Of the arm also:
 
         * ``success`` at the end and ``success_once`` at any step, as the task judges, 0 or 1;
-        * ``final_distance`` and ``closest_distance``, tool to goal [m], where success is to be near the goal;
+        * ``final_distance`` and ``closest_distance``, tool to goal [m], where the task is to be near the goal;
         * ``measures``, by name, at the end: the task's own (:meth:`~franka_wm.envs.tasks.Task.measures`);
         * ``path_length`` of the tool [m];
         * ``action_change``: mean over steps and components of the squared change of the action as commanded (before
@@ -227,13 +227,13 @@ def summarize(episodes: TensorDictBase, *, thresholds: Sequence[float] = THRESHO
 
     Args:
         episodes: As :func:`play_episodes` gives them, or some of their entries.
-        thresholds: Distances that count as success [m], where there are distances.
+        thresholds: Distances that count as success [m]; none where the task judges otherwise.
 
     Returns:
         What there is: ``final_distance`` [m]; ``success`` at the end and ``success_once`` at any step, by threshold
-        where there are distances, else one rate each, as the task judges; ``task_success`` by task; ``return``;
-        ``measures`` of the task's own, by name; ``path_length``, ``action_change``, ``jerk``, ``length``, each with its
-        interval; and ``episodes``, the count.
+        where there are distances and thresholds, else one rate each, as the task judges; ``task_success`` by task;
+        ``return``; ``measures`` of the task's own, by name; ``path_length``, ``action_change``, ``jerk``, ``length``,
+        each with its interval; and ``episodes``, the count.
     """
     present = {str(name): episodes.get(name).cpu() for name in episodes.keys()}  # noqa: SIM118
     count = episodes.numel()
@@ -242,7 +242,7 @@ def summarize(episodes: TensorDictBase, *, thresholds: Sequence[float] = THRESHO
         return {name: bootstrap_mean(present[name]).as_dict() for name in names if name in present}
 
     def rates(name: str, distance: str) -> dict[str, Any]:
-        if distance in present:
+        if thresholds and distance in present:
             within = {f"{t:g}": int((present[distance] < t).sum()) for t in thresholds}
             return {name: {t: wilson(hits, count).as_dict() for t, hits in within.items()}}
         return {name: wilson(int(present[name].sum()), count).as_dict()} if name in present else {}

@@ -10,7 +10,7 @@ import torch
 from tensordict import TensorDict
 from torch import Tensor
 
-from franka_wm.evaluation.closed_loop import begin, success_distance
+from franka_wm.evaluation.closed_loop import begin
 from franka_wm.evaluation.decoder import (
     SIZES,
     Decoder,
@@ -46,6 +46,7 @@ from franka_wm.seeding import derive_seed, seeded
 from franka_wm.training.build import arm_of
 
 if TYPE_CHECKING:
+    from franka_wm.envs import Environment
     from franka_wm.models.base import WorldModel
     from franka_wm.training.load import Agent
 
@@ -94,7 +95,13 @@ def hold_out(agent: Agent, *, images: bool = True, seed: int = ROLLOUT_SEED) -> 
     episodes = cast(TensorDict, episodes[:EPISODES])
     with torch.no_grad():
         latents = encode_episodes(model, episodes)
-    return Held(episodes, latents, encoded_validly(episodes), seen, success_distance(env) is not None)
+    return Held(episodes, latents, encoded_validly(episodes), seen, _reaches(env))
+
+
+def _reaches(env: Environment) -> bool:
+    """Whether the tool is to come near a goal."""
+    arm = arm_of(env)
+    return arm is not None and arm.simulation.task.goal_distance
 
 
 def image_size(model: WorldModel) -> int:
@@ -191,7 +198,7 @@ def calibration(agent: Agent, *, episodes: int = 32) -> dict[str, Any]:
         latents = encode_episodes(model, played)[:, :length]
         values = model.value(latents)
     result = value_calibration(values[use].squeeze(-1), returns[use].squeeze(-1))
-    if success_distance(env) is not None:
+    if _reaches(env):
         distance = played.get("physical")[:, :length, 17:20].norm(dim=-1)[use].cpu()
         episode = torch.arange(use.shape[0], device=use.device).unsqueeze(1).expand_as(use)[use].cpu()
         groups = torch.stack((episode, episode), -1)

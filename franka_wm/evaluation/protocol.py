@@ -200,7 +200,7 @@ def protocol(
 
 
 def thresholds(env: Environment) -> list[float]:
-    """Distances that count as success [m]: those of every table, and the environment's own; none without a goal."""
+    """Distances that count as success [m]: those of every table, and the task's own; none where it judges otherwise."""
     distance = success_distance(env)
     return [] if distance is None else sorted({*THRESHOLDS, float(distance)}, reverse=True)
 
@@ -228,10 +228,11 @@ def numbers_to_log(
 
 def describe(name: str, summary: Mapping[str, Any]) -> str:
     """One line about a policy as its numbers come."""
+    success = summary.get("success") or {}
+    own = f"success {100 * success['mean']:.0f} %, " if "mean" in success else ""
     if "final_distance" in summary:
-        return f"  {name}: final distance {100 * summary['final_distance']['mean']:.2f} cm"
-    success = f"success {100 * summary['success']['mean']:.0f} %, " if "success" in summary else ""
-    return f"  {name}: {success}return {summary['return']['mean']:.2f}"
+        return f"  {name}: {own}final distance {100 * summary['final_distance']['mean']:.2f} cm"
+    return f"  {name}: {own}return {summary['return']['mean']:.2f}"
 
 
 def during_training(

@@ -144,8 +144,8 @@ class Session:
             self._place_goal(point)
             self._pinned = point
             self._distance = float(self.arm.goal_distance()[0])
-            if self.arm.simulation.task.goal_distance:
-                self._success = self._distance < self.arm.config.success_distance
+            if (within := self.arm.simulation.task.success_distance) is not None:
+                self._success = self._distance < within
             frame = self._frame()
         return self._tell(frame)
 

@@ -103,7 +103,7 @@ def film(settings: RunSettings, folder: Path, policy: Any, name: str, found: Eva
         # Other tasks' episodes may be longer, and their rates higher.
         films.append(_at_rate(torch.stack(frames[: int(own["length"])]), _slow(arm.config.fps), fps))
         who = policy_name(name) if tasks == 1 else f"{task}, {policy_name(name)}"
-        lines.append(ending(own, who, number, arm))
+        lines.append(ending(own, who, number))
     longest = max(map(len, films))  # shorter ones stand still at their ends
     beside = torch.cat(
         [torch.cat([one, one[-1:].expand(longest - len(one), *one.shape[1:])]) for one in films], 1
@@ -154,20 +154,16 @@ def worst(episodes: TensorDictBase, count: int) -> list[int]:
     return order[episodes["success"][order].argsort(stable=True)][:count].tolist()
 
 
-def ending(played: TensorDictBase, who: str, number: int, arm: Any) -> str:
+def ending(played: TensorDictBase, who: str, number: int) -> str:
     """One line: policy, final distance where there is a goal, success, and which of the episodes it is, from 1.
 
     Args:
         played: As :func:`~franka_wm.evaluation.closed_loop.play_episodes` gives it, of one episode.
     """
     distance = played.get("final_distance", None)
-    parts = [who]
-    if distance is None:
-        success = bool(played["success"])
-    else:
-        success = float(distance) < arm.config.success_distance
-        parts.append(f"{100 * float(distance):.1f} cm")
-    return ", ".join([*parts, "success" if success else "no success", f"episode {number + 1}"])
+    parts = [who, *([] if distance is None else [f"{100 * float(distance):.1f} cm"])]
+    success = "success" if bool(played["success"]) else "no success"
+    return ", ".join([*parts, success, f"episode {number + 1}"])
 
 
 def _slow(fps: float) -> int:

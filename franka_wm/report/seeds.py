@@ -94,14 +94,14 @@ def _columns(summary: Mapping[str, Any]) -> list[tuple[str, tuple[str, ...], flo
     Distances, and success within them, where the task has them, else success as it judges, return, its own measures.
     """
     success = summary.get("success") or {}
-    if "final_distance" in summary:
+    distance = [("final distance [cm]", ("final_distance",), 100.0, 2)] if "final_distance" in summary else []
+    if distance and "mean" not in success:
         within = sorted(success, key=float, reverse=True)
-        rates = [(f"within {centimetres(d)} [%]", ("success", d), 100.0, 0) for d in within]
-        return [("final distance [cm]", ("final_distance",), 100.0, 2), *rates]
+        return [*distance, *((f"within {centimetres(d)} [%]", ("success", d), 100.0, 0) for d in within)]
     rates = [("success [%]", ("success",), 100.0, 0)] if success else []
     rates += [(f"{name} [%]", ("task_success", name), 100.0, 0) for name in summary.get("task_success") or {}]
     own = [(name, ("measures", name), 1.0, 3) for name in summary.get("measures") or {}]
-    return [*rates, ("return", ("return",), 1.0, 2), *own]
+    return [*distance, *rates, ("return", ("return",), 1.0, 2), *own]
 
 
 def _mean(summary: Any, path: Sequence[str]) -> float:

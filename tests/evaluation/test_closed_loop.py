@@ -102,7 +102,7 @@ def test_a_part_of_the_worlds_plays_the_same_episodes(env: FrankaEnv, small_env)
 
 def test_where_success_is_a_distance(env: FrankaEnv, monkeypatch) -> None:
     assert success_distance(env) == env.config.success_distance
-    monkeypatch.setattr(type(env.simulation.task), "goal_distance", False)
+    monkeypatch.setattr(type(env.simulation.task), "success_distance", None)
     assert success_distance(env) is None
 
 

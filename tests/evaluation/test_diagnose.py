@@ -61,7 +61,7 @@ def test_values_are_held_against_returns_of_the_models_own_discount(
     compared: list[torch.Tensor] = []
     monkeypatch.setattr(build, "make_evaluation_env", lambda *a, **k: None)
     monkeypatch.setattr(diagnose, "gather_episodes", lambda *a, **k: (played, None))
-    monkeypatch.setattr(diagnose, "success_distance", lambda env: None)
+    monkeypatch.setattr(diagnose, "arm_of", lambda env: None)
     monkeypatch.setattr(diagnose, "value_calibration", lambda *pair: compared.extend(pair) or {})
     env = SimpleNamespace(config=SimpleNamespace(episode_length=LENGTH), num_envs=2)
     agent: Any = SimpleNamespace(env=env, settings=None, policies={"policy": None}, model=Exact(discount))

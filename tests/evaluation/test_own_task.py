@@ -11,11 +11,18 @@ import torch
 
 from franka_wm.commands.main import main
 from franka_wm.envs import FrankaConfig, FrankaEnv
-from franka_wm.envs.tasks import Reach, Track
+from franka_wm.envs.tasks import Reach, TorchTask, Track
 from franka_wm.errors import UserError
 from franka_wm.evaluation.closed_loop import play_episodes, success_distance
-from franka_wm.evaluation.protocol import Evaluation, describe, evaluate_policies, numbers_to_log, thresholds
-from franka_wm.evaluation.results import END, last_row
+from franka_wm.evaluation.protocol import (
+    Evaluation,
+    describe,
+    evaluate_policies,
+    numbers_to_log,
+    protocol,
+    thresholds,
+)
+from franka_wm.evaluation.results import END, last_row, score
 from franka_wm.evaluation.robustness import verdict_of_success
 from franka_wm.policies.scripted import IKPolicy, NoopPolicy, SmoothRandomPolicy
 from franka_wm.report.compare import compare_page
@@ -87,6 +94,55 @@ def test_a_subclass_of_reach_that_judges_otherwise_is_judged_by_itself(example: 
     config = FrankaConfig()
     assert Reach(config).goal_distance and Track(config).goal_distance and Near(config).goal_distance
     assert not (Otherwise(config).goal_distance or example.RaiseTool(config).goal_distance)
+    assert Reach(config).success_distance == Track(config).success_distance == config.success_distance
+    assert Otherwise(config).success_distance is Near(config).success_distance is None
+
+
+class Never(TorchTask):
+    """A goal that is reached at once, and never counts."""
+
+    goal_distance = True
+
+    def goal(self, draws: torch.Tensor) -> torch.Tensor:
+        return torch.zeros_like(draws[:, :3]) + draws.new_full((3,), 0.4)
+
+    def reward(self, state: torch.Tensor, action: torch.Tensor) -> torch.Tensor:
+        return -state[..., 17:20].norm(dim=-1)
+
+    def success(self, state: torch.Tensor) -> torch.Tensor:
+        return torch.zeros_like(state[..., 0], dtype=torch.bool)
+
+
+def test_a_task_about_a_distance_that_judges_otherwise_shows_both(settled, tmp_path) -> None:
+    """How near the tool came, and the task's own success: not how many came within 5 cm."""
+    config = FrankaConfig(**SMALL, episode_length=40)
+    env = FrankaEnv(config, num_envs=4, device="cpu", task=Never(config))
+    found = evaluate_policies(env, {"planner": IKPolicy(env.kinematics, env.config), "noop": NoopPolicy()})
+    planner = found.policies["planner"]
+    assert planner["final_distance"]["mean"] < 0.02, "inverse kinematics would be counted within 5 cm"
+    assert planner["success"]["mean"] == planner["success_once"]["mean"] == 0.0
+    assert "success 0 %, final distance" in describe("planner", planner)
+    assert evaluation_markdown(found).startswith("| policy | final distance [cm] | success [%] | return |")
+    assert numbers_to_log(env, {"noop": NoopPolicy()})["eval/noop/success"] == 0.0
+    assert score(found.policies) == 0.0
+    table = seeds_table([found.policies])
+    assert "final distance [cm] | success [%]" in table and "within" not in table
+    run = tmp_path / "run"
+    run.mkdir()
+    (run / "config.yaml").write_text("env: {success_distance: 0.05}\nevaluation: {during: [planner]}\n")
+    told = protocol(settled("scale=smoke", "env=reach"), env, found, by=END, counters={"updates": 9})
+    (run / "evaluation.json").write_text(json.dumps({"protocol": told, "policies": found.policies}))
+    text = page(read_run(run))
+    assert "success at" not in text and "success: 5 cm" not in text and "as the task judges" in text
+
+
+def test_a_goal_set_by_hand_on_the_live_page_is_judged_by_the_task() -> None:
+    from franka_wm.live.session import Session
+
+    config = FrankaConfig(**SMALL)
+    env = FrankaEnv(config, num_envs=1, device="cpu", task=Never(config))
+    session = Session(env, {"noop": NoopPolicy()}, policy="noop")
+    assert not session.set_goal(tuple(session.frame().tool.tolist())).success
 
 
 def test_no_distance_is_shown_anywhere(env: FrankaEnv, found: Evaluation) -> None:

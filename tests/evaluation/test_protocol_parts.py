@@ -117,7 +117,7 @@ def test_alone_dividing_changes_nothing(env: FrankaEnv, settled, monkeypatch) ->
 
 def test_thresholds_are_those_of_the_table_and_the_task_s_own(env: FrankaEnv, monkeypatch) -> None:
     assert thresholds(env) == [0.4, 0.05, 0.025, 0.01]
-    monkeypatch.setattr(type(env.simulation.task), "goal_distance", False)
+    monkeypatch.setattr(type(env.simulation.task), "success_distance", None)
     assert thresholds(env) == []
 
 
@@ -132,7 +132,7 @@ def test_how_it_was_measured(env: FrankaEnv, settled, monkeypatch) -> None:
         "seeds": ", ".join(map(str, held_out_seeds(2))), "success_distance": pytest.approx(0.4), "device": "cpu",
     }  # fmt: skip
     assert {name: told.get(name) for name in expected} == expected
-    monkeypatch.setattr(type(env.simulation.task), "goal_distance", False)
+    monkeypatch.setattr(type(env.simulation.task), "success_distance", None)
     less = protocol(settings, env, evaluate_policies(env, {"noop": NoopPolicy()}), by=END, counters={})
     lacks = {"planner", "updates", "env_steps", "training_seconds", "success_distance"}
     assert set(less) == set(told) - lacks

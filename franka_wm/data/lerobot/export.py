@@ -127,8 +127,9 @@ def export_replay(
             state = part.get("state")
             part.set("goal", state[..., 14:17] - state[..., 17:20])
         keys.append("goal")
-    if "state" in keys and "success" not in after.keys() and make_task(config).goal_distance:  # noqa: SIM118
-        after.set("success", goal_distance(after.get("state")).unsqueeze(-1) < config.success_distance)
+    within = make_task(config).success_distance
+    if within is not None and "state" in keys and "success" not in after.keys():  # noqa: SIM118
+        after.set("success", goal_distance(after.get("state")).unsqueeze(-1) < within)
     data.set("next", after)
     schema = schema_for(config, format=format, keys=keys, success="success" in after.keys())  # noqa: SIM118
     discrete = None

@@ -77,12 +77,19 @@ class Task:
 
     @property
     def goal_distance(self) -> bool:
-        """Whether success is to have the tool near ``task_goal``.
+        """Whether the task is to bring the tool near ``task_goal``: then evaluation reports the distance as well.
 
-        Then evaluation reports the distance, and success within several distances, and else the task's own success.
         A class attribute is enough: ``goal_distance = True``.
         """
         return False
+
+    @property
+    def success_distance(self) -> float | None:
+        """Where success is nothing but the tool's distance to ``task_goal``: below this [m].
+
+        Then evaluation shows success within several distances; else, as the task judges.
+        """
+        return None
 
     @classmethod
     def check(cls, config: FrankaConfig) -> None:

@@ -193,6 +193,15 @@ class Reach(Task):
         """Not where a subclass has another success."""
         return type(self).reward_and_success is Reach.reward_and_success
 
+    @property
+    def success_distance(self) -> float | None:
+        """The config's; ``None`` where a subclass has another success."""
+        return (
+            self.config.success_distance
+            if type(self).reward_and_success is Reach.reward_and_success
+            else None
+        )
+
     def reset(self, sim: "Simulation", mask: wp.array) -> None:
         self.choose(sim, mask, sim.warp.task_goal)
 
