@@ -269,6 +269,8 @@ def start(cfg: DictConfig) -> Run:
     if settings != _checked:
         check(settings)
     device = resolve_device(settings.device)
+    if settings.trainer.capture and device.type != "cuda":
+        raise UserError("trainer.capture=true: needs device=cuda; null captures where it is possible")
     logging.getLogger("torchrl").setLevel(logging.WARNING)
     torch.manual_seed(derive_seed("weights", settings.seed))
     if device.type == "cuda":

@@ -403,8 +403,8 @@ class Trainer:
             broken = [] if bool(finite) else ["weights"]
         if not broken:
             return
-        latest = self.folder / "checkpoints" / "latest"
-        saved = "no checkpoint was written"
+        latest, before = self.folder / "checkpoints" / "latest", self.settings.resume
+        saved = "no checkpoint was written" + f"; what it went on from is whole: {before}" * bool(before)
         if latest.exists():
             saved = f"the last checkpoint before is whole: {latest}"
         own = "whole_run" in self.settings.values and self.settings.trainer.lr is None  # of a first stage

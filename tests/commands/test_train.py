@@ -319,6 +319,12 @@ def test_a_learning_rate_that_breaks_the_run(refuse, tmp_path: Path) -> None:
     assert not (tmp_path / "run" / "checkpoints").exists()
 
 
+def test_a_run_that_goes_on_and_breaks_names_what_it_went_on_from(run, refuse) -> None:
+    said = refuse(f"resume={run[0]}", "trainer.lr=1e30", "trainer.updates=100")
+    assert f"; no checkpoint was written; what it went on from is whole: {run[0]}\n" in said
+    assert "needs device=cuda" in refuse("device=cpu", "trainer.capture=true")
+
+
 def test_the_folder_of_another_run(run, refuse) -> None:
     """Its weights stay what they are; to go on with them one has to say so."""
     everything = {path: path.stat().st_mtime_ns for path in run[0].rglob("*")}
@@ -398,6 +404,7 @@ TYPOS = [
     ("--fast", "unrecognized arguments: --fast"),
     ("model=nope", "model=nope: must be one of action_world_model"),
     ("trainer.updates=-1", "trainer.updates=-1: must be a whole number of at least 0"),
+    ("+trianer.updates=3", "trianer: there is no such option; did you mean trainer?"),
     ("scale=auto trainer.lr=abc", "trainer.lr='abc': must be a finite number above 0"),
     ("env=gym model.name=nope", "model.name='nope': must be one of tdmpc2"),
     ("env=gym env.frame_skip=0", "env.frame_skip=0: must be a whole number"),

@@ -16,7 +16,7 @@ from franka_wm.errors import UserError
 from franka_wm.planning import registry
 from franka_wm.training.build import make_planner
 from franka_wm.training.settings import RunSettings
-from franka_wm.training.settings.run import GROUPS
+from franka_wm.training.settings.run import GROUPS, KNOWN, plain
 
 OUT_OF_RANGE = {
     "seed": [-1],
@@ -163,6 +163,17 @@ def test_a_configuration_of_something_else_is_one_line() -> None:
 def test_an_option_that_does_not_exist_names_the_nearest() -> None:
     said = refused("collector.num_env", 3)
     assert said.startswith("collector.num_env: there is no such option") and "collector.num_envs" in said
+
+
+def test_what_stands_at_the_top_of_a_configuration() -> None:
+    """All of conf/config.yaml, and nothing else; a checkpoint may hold more, of another version."""
+    values = plain(compose("scale=smoke"))
+    assert set(values) <= KNOWN
+    with pytest.raises(UserError, match=r"trianer: there is no such option; did you mean trainer\?"):
+        RunSettings.of({**values, "trianer": {}})
+    RunSettings.of({**values, "trianer": {}}, saved=True)
+    with pytest.raises(UserError, match=r"seed=\d+: must be .* below 2\*\*63"):
+        RunSettings.of({**values, "seed": 2**63})
 
 
 def test_what_a_saved_run_says_of_old_options(capsys) -> None:

@@ -47,6 +47,21 @@ GROUPS = {
     "dataset": DatasetSettings,
     "pretrain": PretrainSettings,
 }
+KNOWN = {
+    *GROUPS,
+    "env",
+    "model",
+    "planner",
+    "logger",
+    "seed",
+    "scale",
+    "size",
+    "device",
+    "gpus",
+    "plugins",
+    "resume",
+}
+"""All that stands at the top of a configuration."""
 
 
 @dataclass(frozen=True)
@@ -111,6 +126,8 @@ class RunSettings:
         missing = [name for name in ("seed", "device", "env", "model", "planner") if name not in values]
         if missing:
             raise UserError(f"the configuration has no {missing[0]}; it is not one of a run of this package")
+        if not saved and (strange := [name for name in values if name not in KNOWN]):
+            raise UserError(unknown(strange[0], sorted(KNOWN)))
         for name in (*GROUPS, "env", "model", "planner", "logger"):
             if not isinstance(values.get(name, {}), Mapping):
                 raise UserError(f"{name}={values[name]!r}: must be a group of options")
@@ -124,7 +141,7 @@ class RunSettings:
                 given = values[name] = _without_unknown(given, group, name)
             groups[name] = read(group, given, name)
         if not is_whole(values["seed"]) or values["seed"] < 0:
-            raise UserError(f"seed={values['seed']!r}: must be a whole number of at least 0")
+            raise UserError(f"seed={values['seed']!r}: must be a whole number of at least 0 and below 2**63")
         loggers = dict(values.get("logger", {}))
         names = loggers.pop("names", ())
         if not isinstance(names, list | tuple):
