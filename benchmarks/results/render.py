@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import shlex
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from benchmarks.results.confirm import confirmed
+from benchmarks.results.metrics import DISTANCE, RETURN, SUCCESS, WITHIN, Metric, columns, mean, verdicts
 from benchmarks.results.records import BESIDE, PLACE, read
 from benchmarks.results.rows import Row
 from benchmarks.results.state import Record, apart, numbers, state, unmeasured
@@ -49,86 +49,6 @@ POLICIES = {
     "expert": "the task's expert",
 }
 DISCRETE_ORACLE = "search with the same actions"
-
-
-@dataclass(frozen=True)
-class Metric:
-    """A column: its title, where a policy's summary holds it, and how it is printed."""
-
-    title: str
-    find: Callable[[Mapping[str, Any]], Mapping[str, float]]
-    factor: float
-    digits: int
-
-    def of(self, record: Record, policy: str, bound: str = "mean") -> float:
-        return self.factor * self.find(record["policies"][policy])[bound]
-
-    def show(self, *values: float) -> str:
-        first, *others = (f"{value:.{self.digits}f}" for value in values)
-        return f"{first} ({' – '.join(others)})" if others else first
-
-
-def _within(distance: str) -> Callable[[Mapping[str, Any]], Mapping[str, float]]:
-    return lambda summary: summary["success"][distance]
-
-
-DISTANCE = Metric("final distance [cm]", lambda summary: summary["final_distance"], 100, 2)
-WITHIN = {
-    cm: Metric(f"within {cm} cm [%]", _within(m), 100, 0)
-    for cm, m in (("5", "0.05"), ("2.5", "0.025"), ("1", "0.01"))
-}
-SUCCESS = Metric("success [%]", lambda summary: summary["success"], 100, 0)
-RETURN = Metric("return", lambda summary: summary["return"], 1, 0)
-
-
-def columns(records: Sequence[Record]) -> list[Metric]:
-    """Distances of the arm, success of tasks that say what it is, returns of other environments."""
-    summaries = [summary for record in records for summary in record["policies"].values()]
-    if all("final_distance" in summary for summary in summaries):
-        return [DISTANCE, *WITHIN.values()]
-    return [SUCCESS, RETURN] if all("success" in summary for summary in summaries) else [RETURN]
-
-
-# -- what was wanted ----------------------------------------------------------------------------------------
-
-
-def verdicts(row: Row, records: Sequence[Record]) -> list[tuple[str, str, bool]]:
-    """For each thing wanted: what, what was reached, and whether that is enough."""
-    found = []
-    for name, wanted in row.wanted.items():
-        policy = row.acting(records[0]["policies"])
-        if name == "minutes":
-            slowest = max(map(seconds, timed(records, beside=row.beside)))
-            reached = duration(slowest) + company(records, beside=row.beside)
-            found.append((f"≤ {wanted:g} min of training", reached, slowest <= 60 * wanted))
-        elif name == "distance_cm":
-            mean = _mean([DISTANCE.of(record, policy) for record in records])
-            found.append((f"≤ {wanted:g} cm on average", f"{mean:.2f} cm", mean <= wanted))
-        elif name == "return":
-            mean = _mean([RETURN.of(record, policy) for record in records])
-            found.append((f"return ≥ {wanted:g} on average", f"{mean:.0f}", mean >= wanted))
-        elif name == "success":
-            worst = min(SUCCESS.of(record, policy) for record in records)
-            found.append((f"worst seed ≥ {wanted:g} %", f"{worst:.1f} %", worst >= wanted - 1e-9))
-        elif name == "planner_no_worse":
-            pairs = {r["seed"]: (DISTANCE.of(r, "planner"), DISTANCE.of(r, "policy")) for r in records}
-            worse = [
-                f"{seed} ({ours:.2f}, policy {alone:.2f} cm)"
-                for seed, (ours, alone) in pairs.items()
-                if ours > alone
-            ]
-            paid = sum(RETURN.of(r, "planner") >= RETURN.of(r, "policy") for r in records)
-            reached = f"{len(pairs) - len(worse)} of {len(pairs)} seeds"
-            reached += f"; worse on {', '.join(worse)}" if worse else ""
-            reached += f"; its return is no lower on {paid}"
-            found.append(("planner no worse than policy, each seed", reached, not worse))
-        else:
-            cm = name.removeprefix("within_").removesuffix("cm")
-            worst = min(WITHIN[cm].of(record, policy) for record in records)
-            found.append(
-                (f"worst seed ≥ {wanted:g} % within {cm} cm", f"{worst:.1f} %", worst >= wanted - 1e-9)
-            )
-    return found
 
 
 # -- the page -----------------------------------------------------------------------------------------------
@@ -184,7 +104,8 @@ def part(row: Row, records: Sequence[Record], judged: tuple[str, list[str]], pla
         shown = [f"![{row.title}](results/{row.picture})", ""] if row.plot else []
         return "\n".join([*lines, *shown, table(list(records[0]["rows"][0]), _cells(records[0]["rows"])), ""])
     if judgement := verdicts(row, records):
-        cells = [[wanted, reached, "yes" if enough else "**no**"] for wanted, reached, enough in judgement]
+        so_far = "so far" if missing else "yes"
+        cells = [[wanted, reached, so_far if enough else "**no**"] for wanted, reached, enough in judgement]
         lines += [table(["wanted", "measured", "reached"], cells), ""]
     lines += [_over_seeds(records), ""]
     if len(records) > 1:
@@ -234,7 +155,7 @@ def _over_seeds(records: Sequence[Record]) -> str:
                 line.append(_one_seed(records[0], policy, metric))
             else:
                 each = [metric.of(record, policy) for record in records]
-                line.append(metric.show(_mean(each), min(each), max(each)))
+                line.append(metric.show(mean(each), min(each), max(each)))
         cells.append(line)
     return table(["policy", *(metric.title for metric in columns(records))], cells)
 
@@ -297,8 +218,8 @@ def _provenance(row: Row, records: Sequence[Record]) -> str:
     timing = timed(records, beside=row.beside)
     times = [seconds(record) for record in timing]
     commands = [record["training"]["command_seconds"] for record in timing]
-    spread = (_mean(times), min(times), max(times)) if len(times) > 1 else (times[0],)
-    whole = duration(_mean(commands))
+    spread = (mean(times), min(times), max(times)) if len(times) > 1 else (times[0],)
+    whole = duration(mean(commands))
     training = records[0]["training"]
     episodes = next(iter(records[0]["policies"].values()))["episodes"]
     seeds = numbers([record["seed"] for record in records])
@@ -338,10 +259,6 @@ def _cells(rows: Sequence[Mapping[str, Any]], names: Sequence[str] | None = None
     return [[cell(row[name]) for name in names or row] for row in rows]
 
 
-def _mean(values: Sequence[float]) -> float:
-    return sum(values) / len(values)
-
-
 # -- README -------------------------------------------------------------------------------------------------
 
 
@@ -368,34 +285,33 @@ def readme_tables(rows: Mapping[str, Row], place: Path = PLACE) -> str:
         of = f" of {len(row.seeds)}" if unmeasured(row, records) else ""
         where, runs = cores(row, records), f"{len(records)}{of} seeds"
         who = f"{row.title}{mark}"
+        missed = "; ".join(what for what, _, enough in verdicts(row, records) if not enough) or "–"
         if columns(records) == [RETURN]:
             values = [RETURN.of(record, policy) for record in records]
-            reached = RETURN.show(_mean(values), min(values), max(values))
-            wanted = row.wanted.get("return")
-            missed = wanted is not None and _mean(values) < wanted
-            wanted = "–" if wanted is None else f"{wanted:g}, **missed**" if missed else f"{wanted:g}"
-            others.append([who, row.model, f"{where}, {runs}", reached, wanted])
+            reached = RETURN.show(mean(values), min(values), max(values))
+            wanted = f"{row.wanted['return']:g}" if "return" in row.wanted else "–"
+            others.append([who, row.model, f"{where}, {runs}", reached, wanted, missed])
             continue
         timing = timed(records, beside=row.beside)
-        times = _mean([seconds(record) for record in timing])
-        command = _mean([record["training"]["command_seconds"] for record in timing])
+        times = mean([seconds(record) for record in timing])
+        command = mean([record["training"]["command_seconds"] for record in timing])
         took = [duration(times) + company(records, beside=row.beside), f"{command / 60:.1f} min"]
         if columns(records) == [SUCCESS, RETURN]:
             values = [SUCCESS.of(record, policy) for record in records]
-            expert = _mean([SUCCESS.of(record, "expert") for record in records])
-            found = [SUCCESS.show(_mean(values)), SUCCESS.show(min(values)), SUCCESS.show(expert)]
-            manipulation.append([who, row.model, f"{where}, {runs}", *took, *found])
+            expert = mean([SUCCESS.of(record, "expert") for record in records])
+            found = [SUCCESS.show(mean(values)), SUCCESS.show(min(values)), SUCCESS.show(expert)]
+            manipulation.append([who, row.model, f"{where}, {runs}", *took, *found, missed])
             continue
         episodes |= {summary["episodes"] for record in records for summary in record["policies"].values()}
-        distance = _mean([DISTANCE.of(record, policy) for record in records])
+        distance = mean([DISTANCE.of(record, policy) for record in records])
         worst = min(WITHIN["5"].of(record, policy) for record in records)
-        nothing = _mean([DISTANCE.of(record, "noop") for record in records])
+        nothing = mean([DISTANCE.of(record, "noop") for record in records])
         found = [*took, f"{distance:.1f} cm", f"{worst:.0f} %", f"{nothing:.0f} cm"]
-        arm.append([who, row.model, f"{where}, {runs}", *found])
+        arm.append([who, row.model, f"{where}, {runs}", *found, missed])
     parts = []
     if arm:
         titles = ["task", "model, planner", "machine", "training", "whole command", "final distance"]
-        parts += [table([*titles, "within 5 cm, worst seed", "doing nothing"], arm), ""]
+        parts += [table([*titles, "within 5 cm, worst seed", "doing nothing", "wanted and missed"], arm), ""]
         many = " or ".join(map(str, sorted(episodes)))
         parts += [
             f"*Whole command*: start, training, and the evaluation of each policy on {many} episodes, without a film.",
@@ -403,9 +319,15 @@ def readme_tables(rows: Mapping[str, Row], place: Path = PLACE) -> str:
         ]
     if manipulation:
         titles = ["task", "model, planner", "machine", "training", "whole command", "success [%]"]
-        parts += [table([*titles, "worst seed", "the task's expert"], manipulation), ""]
+        parts += [table([*titles, "worst seed", "the task's expert", "wanted and missed"], manipulation), ""]
     if others:
-        parts += [table(["other environments", "model, planner", "machine", "return", "wanted"], others), ""]
+        parts += [
+            table(
+                ["other environments", "model, planner", "machine", "return", "wanted", "wanted and missed"],
+                others,
+            ),
+            "",
+        ]
         parts += [
             "*Wanted*: of the control suite the mean of three seeds that TD-MPC2's authors published.",
             "",

@@ -21,7 +21,6 @@ WANTED = (
     "within_1cm",
     "success",
     "return",
-    "planner_no_worse",
 )
 
 

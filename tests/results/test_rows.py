@@ -2,8 +2,42 @@
 
 from __future__ import annotations
 
-from benchmarks.results import render
+from dataclasses import replace
+
+import pytest
+
+from benchmarks.results.metrics import verdicts
 from benchmarks.results.rows import Row, Section, load_rows
+
+
+@pytest.mark.parametrize(
+    ("ours", "alone", "said"),
+    [
+        (
+            {"success": 0.9, "return": 5.0},
+            {"success": 0.8, "return": 6.0},
+            "1 of 1 seeds; its return is no lower on 0",
+        ),
+        (
+            {"success": 0.8, "return": 7.0},
+            {"success": 0.9, "return": 6.0},
+            "0 of 1 seeds; worse on 3 (80, policy 90 %); its return is no lower on 1",
+        ),
+        ({"return": 7.0}, {"return": 6.0}, "1 of 1 seeds"),
+        ({"return": 610.0}, {"return": 975.0}, "0 of 1 seeds; worse on 3 (610, policy 975)"),
+    ],
+)
+def test_planning_that_does_harm_is_told_by_success_or_return(ours, alone, said) -> None:
+    """Without a distance; of every row that evaluated both, and was to be about the planner."""
+    policies = {
+        name: {key: {"mean": value} for key, value in found.items()}
+        for name, found in (("planner", ours), ("policy", alone))
+    }
+    row = Row(name="walker", section=Section(title="One GPU"), title="Walker", wanted={})
+    records = [{"seed": 3, "policies": policies}]
+    ((_, reached, enough),) = verdicts(row, records)
+    assert reached == said and enough is ("worse" not in said)
+    assert verdicts(replace(row, policy="policy"), records) == []
 
 
 def test_a_row_may_be_about_the_policy_alone() -> None:
@@ -13,7 +47,7 @@ def test_a_row_may_be_about_the_policy_alone() -> None:
     for policy, reached in (("", "950"), ("policy", "100")):
         row = Row(name="walker", section=section, title="Walker", policy=policy, wanted={"return": 900})
         verdict = "return ≥ 900 on average", reached, reached == "950"
-        assert render.verdicts(row, [{"policies": policies}]) == [verdict]
+        assert verdicts(row, [{"seed": 0, "policies": policies}])[0] == verdict
     assert {
         name for name, row in load_rows().items() if "its actor" in row.model and row.policy != "policy"
     } == set()

@@ -1,0 +1,101 @@
+"""What is read off the runs of a row, and whether it is what was wanted."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from benchmarks.results.rows import Row
+from benchmarks.results.state import Record
+from benchmarks.results.times import company, duration, seconds, timed
+
+
+@dataclass(frozen=True)
+class Metric:
+    """A column: its title, where a policy's summary holds it, and how it is printed."""
+
+    title: str
+    find: Callable[[Mapping[str, Any]], Mapping[str, float]]
+    factor: float
+    digits: int
+
+    def of(self, record: Record, policy: str, bound: str = "mean") -> float:
+        return self.factor * self.find(record["policies"][policy])[bound]
+
+    def show(self, *values: float) -> str:
+        first, *others = (f"{value:.{self.digits}f}" for value in values)
+        return f"{first} ({' – '.join(others)})" if others else first
+
+
+def _within(distance: str) -> Callable[[Mapping[str, Any]], Mapping[str, float]]:
+    return lambda summary: summary["success"][distance]
+
+
+DISTANCE = Metric("final distance [cm]", lambda summary: summary["final_distance"], 100, 2)
+WITHIN = {
+    cm: Metric(f"within {cm} cm [%]", _within(m), 100, 0)
+    for cm, m in (("5", "0.05"), ("2.5", "0.025"), ("1", "0.01"))
+}
+SUCCESS = Metric("success [%]", lambda summary: summary["success"], 100, 0)
+RETURN = Metric("return", lambda summary: summary["return"], 1, 0)
+
+
+def columns(records: Sequence[Record]) -> list[Metric]:
+    """Distances of the arm, success of tasks that say what it is, returns of other environments."""
+    summaries = [summary for record in records for summary in record["policies"].values()]
+    if all("final_distance" in summary for summary in summaries):
+        return [DISTANCE, *WITHIN.values()]
+    return [SUCCESS, RETURN] if all("success" in summary for summary in summaries) else [RETURN]
+
+
+def mean(values: Sequence[float]) -> float:
+    return sum(values) / len(values)
+
+
+def verdicts(row: Row, records: Sequence[Record]) -> list[tuple[str, str, bool]]:
+    """For each thing wanted: what, what was reached, and whether that is enough."""
+    found = []
+    for name, wanted in row.wanted.items():
+        policy = row.acting(records[0]["policies"])
+        if name == "minutes":
+            slowest = max(map(seconds, timed(records, beside=row.beside)))
+            reached = duration(slowest) + company(records, beside=row.beside)
+            found.append((f"≤ {wanted:g} min of training", reached, slowest <= 60 * wanted))
+        elif name == "distance_cm":
+            average = mean([DISTANCE.of(record, policy) for record in records])
+            found.append((f"≤ {wanted:g} cm on average", f"{average:.2f} cm", average <= wanted))
+        elif name == "return":
+            average = mean([RETURN.of(record, policy) for record in records])
+            found.append((f"return ≥ {wanted:g} on average", f"{average:.0f}", average >= wanted))
+        elif name == "success":
+            worst = min(SUCCESS.of(record, policy) for record in records)
+            found.append((f"worst seed ≥ {wanted:g} %", f"{worst:.1f} %", worst >= wanted - 1e-9))
+        else:
+            cm = name.removeprefix("within_").removesuffix("cm")
+            worst = min(WITHIN[cm].of(record, policy) for record in records)
+            found.append(
+                (f"worst seed ≥ {wanted:g} % within {cm} cm", f"{worst:.1f} %", worst >= wanted - 1e-9)
+            )
+    there = records[0]["policies"]
+    if row.acting(there) == "planner" and "policy" in there:
+        found.append(_planner_against_policy(records))
+    return found
+
+
+def _planner_against_policy(records: Sequence[Record]) -> tuple[str, str, bool]:
+    """Whether planning does harm on some seed: by distance, else success, else return."""
+    metric = columns(records)[0]
+    sign, unit = {DISTANCE: (1, " cm"), SUCCESS: (-1, " %")}.get(metric, (-1, ""))
+    pairs = {r["seed"]: (metric.of(r, "planner"), metric.of(r, "policy")) for r in records}
+    worse = [
+        f"{seed} ({metric.show(ours)}, policy {metric.show(alone)}{unit})"
+        for seed, (ours, alone) in pairs.items()
+        if sign * ours > sign * alone
+    ]
+    reached = f"{len(pairs) - len(worse)} of {len(pairs)} seeds"
+    reached += f"; worse on {', '.join(worse)}" if worse else ""
+    if metric is not RETURN:
+        paid = sum(RETURN.of(r, "planner") >= RETURN.of(r, "policy") for r in records)
+        reached += f"; its return is no lower on {paid}"
+    return "planner no worse than policy, each seed", reached, not worse
