@@ -9,6 +9,7 @@ import copy
 import itertools
 import logging
 import multiprocessing
+import os
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -40,13 +41,12 @@ _unseeded = itertools.count()
 
 
 def own_seed() -> int:
-    """A seed for an environment that is given none: of its number among those of this process.
+    """A seed for one that is given none: of its number in this process; the same when the program is run again.
 
-    The workers of a ``ParallelEnv`` or of a collector count alike. So the place of the process among its parent's
-    children, (), (2,) or (2, 1), counts, too. The same program has the same seeds when it is run again.
-    """
-    place = getattr(multiprocessing.current_process(), "_identity", ())
-    return derive_seed("worlds", next(_unseeded), *place)
+    Workers of a ``ParallelEnv`` or of a collector count alike, and torchrun's processes do. So the place among the
+    parent's children, (), (2,) or (2, 1), and the rank are parts of it."""
+    place, rank = getattr(multiprocessing.current_process(), "_identity", ()), os.environ.get("RANK", "0")
+    return derive_seed("worlds", next(_unseeded), *place, *([] if rank == "0" else [f"rank {rank}"]))
 
 
 class FrankaEnv(EnvBase):

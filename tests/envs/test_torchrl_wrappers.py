@@ -363,6 +363,10 @@ def test_environments_without_a_seed_play_their_own_episodes(monkeypatch) -> Non
     assert not torch.equal(first, goals())
     monkeypatch.setattr(franka, "_unseeded", count())  # as when the program is run again
     assert torch.equal(first, goals())
+    for rank in ("0", "1"):  # torchrun's processes count alike, and are no children
+        monkeypatch.setattr(franka, "_unseeded", count())
+        monkeypatch.setenv("RANK", rank)
+        assert torch.equal(first, goals()) is (rank == "0")
 
 
 def test_a_seed_that_is_given_decides_alone() -> None:
