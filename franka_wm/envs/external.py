@@ -151,7 +151,7 @@ class ExternalEnv(TransformedEnv):
                 raise
             raise UserError(
                 f"collector.workers={len(self._workers)}: a worker has died, by an error of the environment, printed "
-                "above, or killed, perhaps for want of memory; go on from the last checkpoint with resume=FOLDER"
+                "above, or killed, perhaps for want of memory; resume=FOLDER goes on from a checkpoint"
             ) from error
 
     @property

@@ -45,6 +45,10 @@ class ExternalConfig:
         return self.name if self.task is None else f"{self.name} {self.task}"
 
 
+OTHERS = ("action", "reward", "done", "terminated", "truncated", "next", "is_init", "success")
+"""What else a step holds."""
+
+
 def external_config(values: Mapping[str, Any]) -> ExternalConfig:
     """From a plain mapping.
 
@@ -64,6 +68,12 @@ def external_config(values: Mapping[str, Any]) -> ExternalConfig:
             f"env.observations={observations!r}: must be keys with lists of the environment's own, "
             "as in {state: [position, velocity]}"
         )
+    for key in observations:
+        if not str(key).isidentifier() or key in OTHERS:
+            raise UserError(
+                f"env.observations: an observation cannot be called {key!r}; take a word that is none of "
+                f"{', '.join(OTHERS)}"
+            )
     if not {"kind", "name"} <= given.keys():
         raise UserError("env.kind and env.name: both are needed, as in env=gym env.name=Pendulum-v1")
     given["observations"] = dict(observations)

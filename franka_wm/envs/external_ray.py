@@ -137,8 +137,8 @@ class RayEnv(EnvBase):
             ) from error
         except ray.exceptions.RayActorError as error:
             raise UserError(
-                f"collector=ray: an actor has died ({str(error).splitlines()[0]}); go on from the last checkpoint with "
-                "resume=FOLDER"
+                f"collector=ray: an actor has died ({str(error).splitlines()[0]}); resume=FOLDER goes on from "
+                "a checkpoint"
             ) from error
         except ray.exceptions.RayTaskError as error:
             if isinstance(error.cause, UserError):

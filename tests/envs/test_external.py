@@ -78,6 +78,11 @@ def test_observations_by_name() -> None:
         ({"kind": "gym", "name": "CartPole-v1", "observations": {"state": ["wheel"]}}, "wheel"),
         ({"kind": "gym", "name": "CartPole-v1", "observations": {"state": []}}, "must be keys with lists"),
         ({"kind": "gym", "name": "CartPole-v1", "observations": {"state": 3}}, "must be keys with lists"),
+        (
+            {"kind": "gym", "name": "CartPole-v1", "observations": {"reward": ["observation"]}},
+            "called 'reward'",
+        ),
+        ({"kind": "gym", "name": "CartPole-v1", "observations": {"a.b": ["observation"]}}, "called 'a.b'"),
         ({"kind": "gym", "name": "FrozenLake-v1"}, "no vector of real numbers"),
         ({"kind": "gym", "name": "CartPole-v1", "frame_skip": 0}, "frame_skip"),
         ({"kind": "gym", "name": "CartPole-v1", "wheels": 2}, "wheels"),
