@@ -77,8 +77,8 @@ def verdicts(row: Row, records: Sequence[Record]) -> list[tuple[str, str, bool]]
             found.append(
                 (f"worst seed ≥ {wanted:g} % within {cm} cm", f"{worst:.1f} %", worst >= wanted - 1e-9)
             )
-    there = records[0]["policies"]
-    if row.acting(there) == "planner" and "policy" in there:
+    there = records[0].get("policies", {})  # none of a benchmark
+    if "policy" in there and row.acting(there) == "planner":
         found.append(_planner_against_policy(records))
     return found
 

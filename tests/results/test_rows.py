@@ -38,6 +38,7 @@ def test_planning_that_does_harm_is_told_by_success_or_return(ours, alone, said)
     ((_, reached, enough),) = verdicts(row, records)
     assert reached == said and enough is ("worse" not in said)
     assert verdicts(replace(row, policy="policy"), records) == []
+    assert verdicts(replace(row, script="benchmarks/env.py"), [{"rows": [{"worlds": 8}]}]) == []
 
 
 def test_a_row_may_be_about_the_policy_alone() -> None:
