@@ -20,6 +20,7 @@ LEGEND = (
     "*m of n seeds*: the row declares n, and m were measured with that commit. *n at a time*: n runs at once, on one "
     "GPU, or each on a core of its own on one machine; *alone (m of n runs)*: times of those that were alone; *beside "
     "other work*: something else ran on that machine meanwhile, on the same GPU or elsewhere, as the row's text says. "
+    "*missed*: what was wanted and is not reached, see docs/results.md. "
     "Raised numbers: an earlier commit, see below the tables."
 )
 """What README says of its tables' words."""
@@ -311,7 +312,7 @@ def readme_tables(rows: Mapping[str, Row], place: Path = PLACE) -> str:
     parts = []
     if arm:
         titles = ["task", "model, planner", "machine", "training", "whole command", "final distance"]
-        parts += [table([*titles, "within 5 cm, worst seed", "doing nothing", "wanted and missed"], arm), ""]
+        parts += [table([*titles, "within 5 cm, worst seed", "doing nothing", "missed"], arm), ""]
         many = " or ".join(map(str, sorted(episodes)))
         parts += [
             f"*Whole command*: start, training, and the evaluation of each policy on {many} episodes, without a film.",
@@ -319,11 +320,11 @@ def readme_tables(rows: Mapping[str, Row], place: Path = PLACE) -> str:
         ]
     if manipulation:
         titles = ["task", "model, planner", "machine", "training", "whole command", "success [%]"]
-        parts += [table([*titles, "worst seed", "the task's expert", "wanted and missed"], manipulation), ""]
+        parts += [table([*titles, "worst seed", "the task's expert", "missed"], manipulation), ""]
     if others:
         parts += [
             table(
-                ["other environments", "model, planner", "machine", "return", "wanted", "wanted and missed"],
+                ["other environments", "model, planner", "machine", "return", "wanted", "missed"],
                 others,
             ),
             "",

@@ -7,7 +7,7 @@ the top of a checkout is this one.
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -15,12 +15,19 @@ from typing import Any
 from omegaconf import DictConfig, OmegaConf, open_dict
 
 from franka_wm.errors import UserError
+from franka_wm.options import unknown
 
 FOLDER = Path(__file__).resolve().parent
 
 SCALES = ("smoke", "laptop", "gpu")
 """The columns of ``${at_scale:…}`` and ``${at_size:…}``."""
 
+
+KNOWN = (
+    "env", "model", "planner", "objective", "collector", "replay", "trainer", "evaluation", "logger", "dataset",
+    "export", "pretrain", "scale", "size", "seed", "device", "gpus", "plugins", "resume",
+)  # fmt: skip
+"""All that stands at the top of a configuration."""
 
 RENAMED = {"model.fresh_values": "model.reanalyze", "collector.acts": "collector.policy"}
 """Former names of options -> their present names."""
@@ -38,11 +45,22 @@ def use_present_names(config: DictConfig) -> None:
                 del OmegaConf.select(one, group)[name]
 
 
+def refuse_unknown(names: Iterable[Any]) -> None:
+    """Refuses what a ``+`` adds to the top of a configuration, where nothing reads it.
+
+    Raises:
+        UserError: One line that names the nearest.
+    """
+    for name in names:
+        if name not in KNOWN:
+            raise UserError(unknown(str(name), KNOWN))
+
+
 def compose(*overrides: str) -> DictConfig:
     """The configuration that ``python train.py OVERRIDE …`` runs with.
 
     Raises:
-        UserError: An option by a former name, or a scale that a file sets as a value.
+        UserError: An option by a former name, a group that does not exist, or a scale that a file sets as a value.
         HydraException, OmegaConfBaseException: An override that cannot be.
     """
     import hydra
@@ -56,6 +74,7 @@ def compose(*overrides: str) -> DictConfig:
     chosen = cfg.hydra.runtime.choices.get("scale")
     with open_dict(cfg):
         del cfg["hydra"]
+    refuse_unknown(cfg)
     if chosen in SCALES and (value := cfg.get("scale")) != chosen:
         raise UserError(
             f"scale: is the value {value} beside the numbers of scale={chosen}; in a file, choose it among the "

@@ -71,7 +71,7 @@ def external_config(values: Mapping[str, Any]) -> ExternalConfig:
     for key in observations:
         if not str(key).isidentifier() or key in OTHERS:
             raise UserError(
-                f"env.observations: an observation cannot be called {key!r}; take a word that is none of "
+                f"env.observations: an observation cannot be called {key!r}; take letters, digits and _, and none of "
                 f"{', '.join(OTHERS)}"
             )
     if not {"kind", "name"} <= given.keys():

@@ -41,11 +41,11 @@ _unseeded = itertools.count()
 
 
 def own_seed() -> int:
-    """A seed for one that is given none: of its number in this process; the same when the program is run again.
+    """An environment's seed where none is given: of its number in this process; the same when it is run again.
 
     Workers of a ``ParallelEnv`` or of a collector count alike, and torchrun's processes do. So the place among the
     parent's children, (), (2,) or (2, 1), and the rank are parts of it."""
-    place, rank = getattr(multiprocessing.current_process(), "_identity", ()), os.environ.get("RANK", "0")
+    place, rank = getattr(multiprocessing.current_process(), "_identity", ()), os.environ.get("RANK") or "0"
     return derive_seed("worlds", next(_unseeded), *place, *([] if rank == "0" else [f"rank {rank}"]))
 
 

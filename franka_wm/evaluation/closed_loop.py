@@ -26,7 +26,9 @@ Policy = Callable[[TensorDictBase], TensorDictBase]
 def success_distance(env: Environment) -> float | None:
     """Distance to the goal that counts as success [m]; ``None`` where success is no distance, or not of the arm."""
     arm = arm_of(env)
-    return None if arm is None else arm.simulation.task.success_distance
+    return (
+        None if arm is None or not arm.simulation.task.goal_distance else arm.simulation.task.success_distance
+    )
 
 
 def begin(env: Environment, seed: int, first_world: int | None = None) -> TensorDictBase:

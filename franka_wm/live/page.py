@@ -76,7 +76,7 @@ class Page:
             self.server,
             arm_shapes(arm.model),
             bodies=len(first.bodies),
-            success_distance=arm.config.success_distance,
+            success_distance=arm.simulation.task.success_distance,
             floor=FLOOR if arm.config.resolved_scene else 0.0,
             on_goal=session.ask_goal,
             objects=rows(arm),

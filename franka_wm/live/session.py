@@ -134,7 +134,7 @@ class Session:
     def set_goal(self, goal: Sequence[float]) -> Frame:
         """Moves the goal to a point (x, y, z) [m].
 
-        Distance and success are judged anew, also while paused.
+        The distance is judged anew, also while paused, and success where it is nothing else.
 
         Raises:
             UserError: Not three finite numbers, or farther away than `FARTHEST`.

@@ -42,7 +42,7 @@ class ViserScene:
         server: Where to draw.
         shapes: The arm's, by :func:`~franka_wm.live.shapes.arm_shapes`.
         bodies: Number of moving links.
-        success_distance: Radius of the goal's outer sphere [m].
+        success_distance: Radius of the goal's outer sphere [m]; ``None``: success is no distance, and there is none.
         floor: Height of the ground [m].
         on_goal: Called with (x, y, z) [m] while the goal is dragged in a browser; must return at once.
         objects: Name → row of the body poses of what can be dragged as well.
@@ -55,7 +55,7 @@ class ViserScene:
         shapes: Sequence[Shape],
         *,
         bodies: int,
-        success_distance: float,
+        success_distance: float | None,
         floor: float = 0.0,
         on_goal: Callable[[tuple[float, float, float]], None],
         objects: Mapping[str, int] = MappingProxyType({}),
@@ -85,12 +85,13 @@ class ViserScene:
         self._ball = server.scene.add_icosphere("/goal/ball", radius=0.018, color=GOAL, subdivisions=4)
         self._halo = server.scene.add_icosphere(
             "/goal/success",
-            radius=success_distance,
+            radius=success_distance or 0.05,
             color=GOAL,
             opacity=0.16,
             subdivisions=4,
             cast_shadow=False,
             receive_shadow=False,
+            visible=success_distance is not None,
         )
         self.goal.on_update(self._drag)
         self.objects = {}
@@ -223,6 +224,8 @@ async def _aim(client: viser.ClientHandle) -> None:
 
     async def look(camera: viser.CameraHandle) -> None:  # async: viser then keeps the order of messages
         nonlocal upright
+        if not camera.image_width or not camera.image_height:
+            return
         before, upright = upright, camera.aspect < PORTRAIT
         if upright is before:
             return

@@ -404,7 +404,7 @@ class Trainer:
         if not broken:
             return
         latest, before = self.folder / "checkpoints" / "latest", self.settings.resume
-        saved = "no checkpoint was written" + f"; what it went on from is whole: {before}" * bool(before)
+        saved = "no checkpoint was written" + (f"; what it went on from is whole: {before}" if before else "")
         if latest.exists():
             saved = f"the last checkpoint before is whole: {latest}"
         own = "whole_run" in self.settings.values and self.settings.trainer.lr is None  # of a first stage

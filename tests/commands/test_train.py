@@ -308,6 +308,7 @@ def test_going_on_with_another_model(run, refuse) -> None:
 
 def test_going_on_with_an_unknown_option(run, refuse) -> None:
     assert "updatez" in refuse(f"resume={run[0]}", "trainer.updatez=3")
+    assert "did you mean trainer" in refuse(f"resume={run[0]}", "+trianer.updates=3")
 
 
 def test_a_learning_rate_that_breaks_the_run(refuse, tmp_path: Path) -> None:
@@ -322,7 +323,7 @@ def test_a_learning_rate_that_breaks_the_run(refuse, tmp_path: Path) -> None:
 def test_a_run_that_goes_on_and_breaks_names_what_it_went_on_from(run, refuse) -> None:
     said = refuse(f"resume={run[0]}", "trainer.lr=1e30", "trainer.updates=100")
     assert f"; no checkpoint was written; what it went on from is whole: {run[0]}\n" in said
-    assert "needs device=cuda" in refuse("device=cpu", "trainer.capture=true")
+    assert "trainer.capture=true: needs" in refuse("device=cpu", "trainer.capture=true")
 
 
 def test_the_folder_of_another_run(run, refuse) -> None:

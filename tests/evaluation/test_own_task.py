@@ -13,6 +13,7 @@ from franka_wm.commands.main import main
 from franka_wm.envs import FrankaConfig, FrankaEnv
 from franka_wm.envs.tasks import Reach, TorchTask, Track
 from franka_wm.errors import UserError
+from franka_wm.evaluation import diagnose, robustness
 from franka_wm.evaluation.closed_loop import play_episodes, success_distance
 from franka_wm.evaluation.protocol import (
     Evaluation,
@@ -133,7 +134,21 @@ def test_a_task_about_a_distance_that_judges_otherwise_shows_both(settled, tmp_p
     told = protocol(settled("scale=smoke", "env=reach"), env, found, by=END, counters={"updates": 9})
     (run / "evaluation.json").write_text(json.dumps({"protocol": told, "policies": found.policies}))
     text = page(read_run(run))
-    assert "success at" not in text and "success: 5 cm" not in text and "as the task judges" in text
+    assert "success at" not in text and "as the task judges" in text
+    assert diagnose._reaches(env)
+    episodes = found.episodes["planner"]
+    compared = robustness._compared(episodes, episodes, success_distance(env))
+    assert set(compared) == {"return", "success", "return_change", "verdict"}
+
+
+@pytest.mark.parametrize(("task", "marked"), [("reach", True), ("box", False)])
+def test_a_run_that_is_not_evaluated_marks_the_distance_of_reach_alone(task, marked, tmp_path) -> None:
+    (tmp_path / "config.yaml").write_text(f"env: {{task: {task}, success_distance: 0.05}}\n")
+    logged = tmp_path / "csv" / "scalars" / "eval" / "planner" / "final_distance.csv"
+    logged.parent.mkdir(parents=True)
+    logged.write_text("100,0.3\n200,0.2\n")
+    text = page(read_run(tmp_path))
+    assert "final distance to the goal" in text and ("success: 5 cm" in text) is marked
 
 
 def test_a_goal_set_by_hand_on_the_live_page_is_judged_by_the_task() -> None:

@@ -134,7 +134,8 @@ def test_the_camera_follows_a_phone_that_is_turned(page: Page) -> None:
         browser.send(msgspec.msgpack.encode(message))
 
     with client(page) as browser:
-        sees(browser, 300, 150)
+        for size in ((0, 0), (0, 640), (300, 0), (300, 150)):
+            sees(browser, *size)
         wait(lambda: set(page.server.get_clients()) - before, "not connected")
         camera = page.server.get_clients()[max(page.server.get_clients())].camera
         np.testing.assert_array_equal(camera.look_at, LOOK_AT)

@@ -162,6 +162,7 @@ def test_a_browser_drags_an_object_while_paused_and_sees_contacts(page: Any, sta
     import viser
     from websockets.sync.client import connect
 
+    assert not page.scene._halo.visible, "a success that is no distance of the tool has no sphere"
     name = "/objects/cube"
     drag = {"type": "TransformControlsUpdateMessage", "name": name, "wxyz": [1.0, 0.0, 0.0, 0.0]}
     before = rest(stacking)

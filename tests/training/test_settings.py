@@ -11,12 +11,12 @@ from typing import Any
 import pytest
 from omegaconf import OmegaConf
 
-from franka_wm.conf import FOLDER, compose
+from franka_wm.conf import FOLDER, KNOWN, compose
 from franka_wm.errors import UserError
 from franka_wm.planning import registry
 from franka_wm.training.build import make_planner
 from franka_wm.training.settings import RunSettings
-from franka_wm.training.settings.run import GROUPS, KNOWN, plain
+from franka_wm.training.settings.run import GROUPS, plain
 
 OUT_OF_RANGE = {
     "seed": [-1],
@@ -168,10 +168,12 @@ def test_an_option_that_does_not_exist_names_the_nearest() -> None:
 def test_what_stands_at_the_top_of_a_configuration() -> None:
     """All of conf/config.yaml, and nothing else; a checkpoint may hold more, of another version."""
     values = plain(compose("scale=smoke"))
-    assert set(values) <= KNOWN
+    assert set(values) == set(KNOWN)
     with pytest.raises(UserError, match=r"trianer: there is no such option; did you mean trainer\?"):
         RunSettings.of({**values, "trianer": {}})
     RunSettings.of({**values, "trianer": {}}, saved=True)
+    with pytest.raises(UserError, match="did you mean trainer"):  # collect, view
+        compose("+trianer.updates=3")
     with pytest.raises(UserError, match=r"seed=\d+: must be .* below 2\*\*63"):
         RunSettings.of({**values, "seed": 2**63})
 

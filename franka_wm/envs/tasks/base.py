@@ -77,17 +77,19 @@ class Task:
 
     @property
     def goal_distance(self) -> bool:
-        """Whether the task is to bring the tool near ``task_goal``: then evaluation reports the distance as well.
+        """Whether the task is to bring the tool near ``task_goal``.
 
-        A class attribute is enough: ``goal_distance = True``.
+        Then evaluation reports the distance as well, and a :class:`TorchTask` takes goals in hindsight. A class
+        attribute is enough: ``goal_distance = True``.
         """
         return False
 
     @property
     def success_distance(self) -> float | None:
-        """Where success is nothing but the tool's distance to ``task_goal``: below this [m].
+        """Below which distance of the tool to ``task_goal`` [m] it is a success, where nothing else decides.
 
-        Then evaluation shows success within several distances; else, as the task judges.
+        With ``goal_distance`` evaluation then shows success within several distances; else as the task judges. A class
+        attribute is enough: ``success_distance = 0.03``.
         """
         return None
 

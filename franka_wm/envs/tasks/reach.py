@@ -179,9 +179,14 @@ class Reach(Task):
             )
 
     @property
+    def _judges(self) -> bool:
+        """Whether no subclass pays and judges otherwise."""
+        return type(self).reward_and_success is Reach.reward_and_success
+
+    @property
     def reward_bounds(self) -> tuple[float, float] | None:
         """Bounds of :func:`reach_reward`; ``None`` where a subclass pays otherwise."""
-        if type(self).reward_and_success is not Reach.reward_and_success:
+        if not self._judges:
             return None
         least, largest = {"dense": (-1.0, 0.0), "sparse": (0.0, 1.0), "normalized": (-1.0, 1.0)}[
             self.config.reward
@@ -191,16 +196,12 @@ class Reach(Task):
     @property
     def goal_distance(self) -> bool:
         """Not where a subclass has another success."""
-        return type(self).reward_and_success is Reach.reward_and_success
+        return self._judges
 
     @property
     def success_distance(self) -> float | None:
         """The config's; ``None`` where a subclass has another success."""
-        return (
-            self.config.success_distance
-            if type(self).reward_and_success is Reach.reward_and_success
-            else None
-        )
+        return self.config.success_distance if self._judges else None
 
     def reset(self, sim: "Simulation", mask: wp.array) -> None:
         self.choose(sim, mask, sim.warp.task_goal)
@@ -266,7 +267,7 @@ class Reach(Task):
         return out
 
     def present_reward(self, sim: "Simulation", action: torch.Tensor) -> torch.Tensor:
-        if type(self).reward_and_success is not Reach.reward_and_success:
+        if not self._judges:
             return super().present_reward(sim, action)
         return reach_reward(
             sim.tensors.true_state,

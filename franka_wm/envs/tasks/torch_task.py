@@ -70,7 +70,7 @@ class TorchTask(Task):
 
     @classmethod
     def relabels(cls) -> bool:
-        """Where success is a distance to the goal: else a place that the tool reached is no goal of the task."""
+        """Where the task is to come near a goal: else a place that the tool reached is no goal of it."""
         return cls.goal_distance is True and super().relabels()
 
     def _write_goal(self, sim: Simulation) -> None:

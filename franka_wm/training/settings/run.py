@@ -10,6 +10,7 @@ from typing import Any, Literal
 
 from omegaconf import DictConfig, OmegaConf
 
+from franka_wm.conf import refuse_unknown
 from franka_wm.console import say
 from franka_wm.envs.multitask_config import MultiTaskConfig
 from franka_wm.errors import UserError
@@ -47,21 +48,6 @@ GROUPS = {
     "dataset": DatasetSettings,
     "pretrain": PretrainSettings,
 }
-KNOWN = {
-    *GROUPS,
-    "env",
-    "model",
-    "planner",
-    "logger",
-    "seed",
-    "scale",
-    "size",
-    "device",
-    "gpus",
-    "plugins",
-    "resume",
-}
-"""All that stands at the top of a configuration."""
 
 
 @dataclass(frozen=True)
@@ -126,8 +112,8 @@ class RunSettings:
         missing = [name for name in ("seed", "device", "env", "model", "planner") if name not in values]
         if missing:
             raise UserError(f"the configuration has no {missing[0]}; it is not one of a run of this package")
-        if not saved and (strange := [name for name in values if name not in KNOWN]):
-            raise UserError(unknown(strange[0], sorted(KNOWN)))
+        if not saved:
+            refuse_unknown(values)
         for name in (*GROUPS, "env", "model", "planner", "logger"):
             if not isinstance(values.get(name, {}), Mapping):
                 raise UserError(f"{name}={values[name]!r}: must be a group of options")
