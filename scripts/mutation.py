@@ -35,6 +35,7 @@ sys.path.insert(0, str(ROOT))
 
 from franka_wm.errors import UserError  # noqa: E402
 from franka_wm.files import atomic_write  # noqa: E402
+from franka_wm.source import code_hash  # noqa: E402
 from franka_wm.versions import versions  # noqa: E402
 
 DECLARED = ROOT / "scripts" / "mutation.yaml"
@@ -77,6 +78,11 @@ class Target:
     @property
     def code(self) -> str:
         return (ROOT / self.path).read_text()
+
+    @property
+    def hash(self) -> str:
+        """Of what the file does, without comments and docstrings."""
+        return code_hash(self.path, self.code.encode())
 
 
 @dataclass(frozen=True)
@@ -314,6 +320,7 @@ def measure(target: Target, *, sample: int | None, seed: int, at_once: int) -> d
         "sample_seed": seed if len(chosen) < len(everything) else None,
         **outcomes,
         "survivors": sorted(survivors, key=lambda one: (one["line"], one["operator"])),
+        "hash": target.hash,
         "commit": versions().get("commit"),
         "date": datetime.now(UTC).date().isoformat(),
     }
@@ -335,6 +342,7 @@ make mutation ARGS="--only seeding masks --sample 40 --jobs 2"  # some files, 40
 
 *Score* is what tests noticed, those that never ended included; *without explained* leaves out survivors that change
 nothing, or nothing on a CPU, each with its reason below. A drawn sample is the same for everybody (`--seed 0`).
+*Changed since*: the file does something else than when its mutants were run.
 """
 
 
@@ -359,7 +367,8 @@ def page(targets: Sequence[Target], results: Mapping[str, Any]) -> str:
             lines.append(f"| `{target.path}` |" + " |" * 6 + " not run yet |")
             continue
         same = sum(one["change"] in target.explained for one in found["survivors"])
-        lines.append(_line(f"`{target.path}`", found, same, f"{found['commit']}, {found['date']}"))
+        since = "" if found["hash"] == target.hash else ", changed since"
+        lines.append(_line(f"`{target.path}`", found, same, f"{found['commit']}, {found['date']}{since}"))
         total = {name: total[name] + found[name] for name in total}
         explained += same
         rest += [(target, one) for one in found["survivors"]]

@@ -63,16 +63,22 @@ def test_mutants_are_one_mistake_each() -> None:
 
 def test_the_page_counts_and_explains() -> None:
     target = Target(SEEDING, [], explained={"a → b": "b is a"})
+    older = Target("franka_wm/console.py", [])
     survivors = [
         {"line": 1, "operator": "AddNot", "change": "a → b"},
         {"line": 2, "operator": "AddNot", "change": "c → d"},
     ]
     measured = {
         "mutants": 20, "tested": 10, "killed": 7, "timeout": 1, "survived": 2,
-        "survivors": survivors, "commit": "abc", "date": "2026-01-02",
+        "survivors": survivors, "hash": target.hash, "commit": "abc", "date": "2026-01-02",
     }  # fmt: skip
-    text = page([target, Target("franka_wm/errors.py", [])], {SEEDING: measured})
-    assert "| together, 1 of 2 files not run | 10 of 20 | 7 | 1 | 2 | 80 % | 88 % |  |" in text
+    results = {SEEDING: measured, older.path: {**measured, "survivors": [], "hash": "another"}}
+    text = page([target, Target("franka_wm/errors.py", []), older], results)
+    assert "| together, 1 of 3 files not run | 20 of 40 | 14 | 2 | 4 | 80 % | 84 % |  |" in text
+    assert (
+        "| `franka_wm/console.py` | 10 of 20 | 7 | 1 | 2 | 80 % | 80 % | abc, 2026-01-02, changed since |"
+        in text
+    )
     assert f"| `{SEEDING}` | 10 of 20 | 7 | 1 | 2 | 80 % | 88 % | abc, 2026-01-02 |" in text
     assert "| `franka_wm/errors.py` | | | | | | | not run yet |" in text
     assert "`a` → `b`: b is a" in text and "`c` → `d`: **no test notices it**" in text
