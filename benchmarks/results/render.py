@@ -34,6 +34,7 @@ episodes: bootstrap for distances and returns, Wilson for rates. Episodes are he
 *Doing nothing* and *random smooth* motion are what a policy must beat; *inverse kinematics* knows the true geometry.
 Where actions are discrete, a *search with the same actions* takes its place: the best pair of them by true geometry,
 where the distance after the first counts a tenth.
+*Planner no worse than policy*: on no seed is its mean beyond the policy's 95 % interval, on the worse side.
 
 *n at a time*: n runs at once, on one GPU, or each on a core of its own on one machine. *beside other work*:
 something else ran on that machine meanwhile, on the same GPU or elsewhere: the row's text says what. A commit with
