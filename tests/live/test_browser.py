@@ -126,6 +126,7 @@ def on_screen(page: Page, point: np.ndarray) -> tuple[int, int]:
 def test_the_page_shows_the_arm_and_its_controls(page: Page, browser) -> None:
     for name in ("/arm/base/000", "/arm/link7/012", "/goal/ball", "/ground"):
         assert page.server.scene.get_handle_by_name(name) is not None
+    assert page.scene._halo.visible, "how near is a success"
     text = browser.find_element(By.TAG_NAME, "body").text
     for word in ("Play", "New episode", "distance to the goal", "reward", "Planner", "horizon"):
         assert word in text

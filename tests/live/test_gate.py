@@ -134,7 +134,7 @@ def test_the_camera_follows_a_phone_that_is_turned(page: Page) -> None:
         browser.send(msgspec.msgpack.encode(message))
 
     with client(page) as browser:
-        for size in ((0, 0), (0, 640), (300, 0), (300, 150)):
+        for size in ((300, 150), (0, 0), (300, 0), (0, 640)):
             sees(browser, *size)
         wait(lambda: set(page.server.get_clients()) - before, "not connected")
         camera = page.server.get_clients()[max(page.server.get_clients())].camera
