@@ -227,11 +227,16 @@ def read_json(file: Path) -> dict[str, Any] | None:
 
 
 def prune(place: Path = PLACE) -> None:
-    """Removes the code that no record names any more; a confirmation's are those of its records."""
+    """Removes the code that no record names any more, and confirmations of records that are gone."""
     kept = [path for path in place.glob("*/*.json") if path.parent.name not in (CODE, CONFIRMED)]
     named = {(read_json(path) or {}).get("code") for path in kept}
     for path in (place / CODE).glob("*.json"):
         if path.stem not in named:
+            path.unlink()
+    for path in (place / CONFIRMED).glob("*.json"):
+        records = [read_json(one) or {} for one in (place / path.stem).glob("*.json")]
+        commits = {str(record.get("commit")).removesuffix("+") for record in records}
+        if (read_json(path) or {}).get("measured") not in commits:
             path.unlink()
 
 

@@ -20,14 +20,16 @@ LEGEND = (
     "*m of n seeds*: the row declares n, and m were measured with that commit. *n at a time*: n runs at once, on one "
     "GPU, or each on a core of its own on one machine; *alone (m of n runs)*: times of those that were alone; *beside "
     "other work*: something else ran on that machine meanwhile, on the same GPU or elsewhere, as the row's text says. "
-    "*missed*: what was wanted and is not reached, see docs/results.md. "
+    "*missed*: what was wanted and is not reached, see docs/results.md; limits of time are of training, without start and "
+    "evaluations, and a planner is worse than its policy where its mean lies beyond the policy's 95 % interval. *Other "
+    "seeds*: five to ten by which nothing was chosen. "
     "Raised numbers: an earlier commit, see below the tables."
 )
 """What README says of its tables' words."""
 HEAD = """# Results
 
-Written by `make results` from the files in [results/](results), which the runs wrote themselves; no number in a table
-is typed by hand. `benchmarks/results/rows.yaml` declares the rows. `make results ROW=name` measures one again.
+Written by `make results` from the files in [results/](results), which the runs wrote themselves; no measured
+number is typed by hand. `benchmarks/results/rows.yaml` declares the rows and what is wanted. `make results ROW=name` measures one again.
 
 `a (b – c)` over several seeds is their mean, lowest and highest. For one seed `b – c` is the 95 % interval over its
 episodes: bootstrap for distances and returns, Wilson for rates. Episodes are held out: training never sees their seeds.
@@ -39,8 +41,8 @@ where the distance after the first counts a tenth.
 *n at a time*: n runs at once, on one GPU, or each on a core of its own on one machine. *beside other work*:
 something else ran on that machine meanwhile, on the same GPU or elsewhere: the row's text says what. A commit with
 a `+` had changes that were not committed. Where code has changed since, a short run on a CPU, with a small model and
-nothing compiled, was made with both versions; *bit for bit* is said where it gave the same. What only a GPU or a long
-run shows, it does not see.
+updates that are not compiled, was made with both versions; *bit for bit* is said where it gave the same. What only a GPU or a long
+run shows, it does not see; times are those of the commit that is named.
 """
 POLICIES = {
     "planner": "planner",
@@ -268,7 +270,7 @@ def readme_tables(rows: Mapping[str, Row], place: Path = PLACE) -> str:
     """README's part: the arm, other environments, speed; rows of several seeds that belong together."""
     arm, manipulation, others, speed = [], [], [], []
     episodes: set[int] = set()
-    aged = alike = False
+    aged = alike = chosen = False
     for row in rows.values():
         records = read(row, place) if row.readme else []
         kind, _ = state(row, records)
@@ -279,15 +281,16 @@ def readme_tables(rows: Mapping[str, Row], place: Path = PLACE) -> str:
         aged, alike = aged or mark == "¹", alike or mark == "²"
         if isinstance(row.readme, list):
             titles = ["machine", *row.readme]
-            who = machine(records[0]) + company(records, beside=row.beside) + mark
+            who = f"{machine(records[0])}{company(records, beside=row.beside)}, {records[0]['date']}{mark}"
             cells = [[who, *line] for line in _cells(records[0]["rows"], row.readme)]
             speed += [table(titles, cells), ""]
             continue
         policy = row.acting(records[0]["policies"])
         of = f" of {len(row.seeds)}" if unmeasured(row, records) else ""
         where, runs = cores(row, records), f"{len(records)}{of} seeds"
-        who = f"{row.title}{mark}"
-        missed = "; ".join(what for what, _, enough in verdicts(row, records) if not enough) or "–"
+        who = f"{row.title}{mark}{'³' * row.chosen}"
+        chosen = chosen or row.chosen
+        missed = "; ".join(_missed(row, records) + _missed_by_others(rows, row, place)) or "–"
         if columns(records) == [RETURN]:
             values = [RETURN.of(record, policy) for record in records]
             reached = RETURN.show(mean(values), min(values), max(values))
@@ -347,8 +350,26 @@ def readme_tables(rows: Mapping[str, Row], place: Path = PLACE) -> str:
     if alike:
         text = "gave the same weights and episodes, bit for bit, with that code and with today's"
         unseen = "it cannot see what only a GPU or a long run shows"
-        parts += [f"² Measured with an earlier commit; a short run on a CPU {text}; {unseen}.", ""]
+        parts += [f"² Measured with an earlier commit, times too; a short run on a CPU {text}; {unseen}.", ""]
+    if chosen:
+        parts += ["³ A setting was chosen after runs of these seeds; docs/results.md says which.", ""]
     return "\n".join(parts or ["Not measured yet.", ""])
+
+
+def _missed(row: Row, records: Sequence[Record]) -> list[str]:
+    return [what for what, _, enough in verdicts(row, records) if not enough]
+
+
+def _missed_by_others(rows: Mapping[str, Row], row: Row, place: Path) -> list[str]:
+    """What the row of other seeds misses: README's table shows one row of the two, and must not show the better one."""
+    others = rows.get(f"{row.name}-others")
+    records = read(others, place) if others else []
+    if others is None or state(others, records)[0] in ("missing", "mixed"):
+        return []
+    judged = verdicts(others, records)
+    return [
+        f"other seeds: {what}, is {reached.split(';')[0]}" for what, reached, enough in judged if not enough
+    ]
 
 
 def with_tables(readme: str, tables: str) -> str:

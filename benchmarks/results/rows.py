@@ -59,6 +59,7 @@ class Row:
     readme: bool | list[str] = False
     plot: Mapping[str, str] | None = None
     beside: bool = False
+    chosen: bool = False
 
     @property
     def words(self) -> list[str]:

@@ -19,7 +19,7 @@ from franka_wm.training import build
 from franka_wm.video import draw_labels
 
 
-@pytest.mark.parametrize("during", [["policy"], []])
+@pytest.mark.parametrize("during", [["planner", "policy"], ["policy"], []])
 def test_the_table_is_the_curves_last_point(
     during: list[str], small_env, settled, tmp_path: Path, monkeypatch
 ) -> None:
@@ -27,6 +27,7 @@ def test_the_table_is_the_curves_last_point(
     shown = f"evaluation.during=[{','.join(during)}]"
     cfg = settled("seed=7", shown, "evaluation.video_episodes=0")
     before = {"eval/policy/final_distance": 0.9, "eval/policy/success": 0.1, "env_steps": 50, "updates": 5}
+    before |= {"eval/planner/final_distance": 0.9, "eval/planner/success": 0.1}
     drawn: dict[tuple[int, str], tuple[list[float], list[float]]] = {}
     plot, logged = Axes.plot, []
 
@@ -36,23 +37,25 @@ def test_the_table_is_the_curves_last_point(
 
     monkeypatch.setattr(Axes, "plot", record)
     counters = {"updates": 9, "env_steps": 120, "seconds": 3.5}
-    policies = {"policy": NoopPolicy(), "noop": NoopPolicy()}
+    policies = {"planner": NoopPolicy(), "policy": NoopPolicy(), "noop": NoopPolicy()}
     results = evaluate_run(cfg, tmp_path, env, policies, counters=counters, say=lambda text: None)
     report_run(cfg, tmp_path, env, policies, results, rows=[before], log=logged.append)
     found = read_result(tmp_path / "evaluation.json")
     assert json.loads((tmp_path / "evaluation.json").read_text())["policies"] == results.policies
     assert found.told == f"{END}, 3 episodes after 9 updates" and found.protocol["seed"] == 7
     assert [found.protocol[k] for k in ("updates", "env_steps", "training_seconds")] == [9, 120, 3.5]
-    table = found.policies["policy"]
-    distance, success = table["final_distance"]["mean"], table["success"]["0.4"]["mean"]
-    assert 0 < success < 1
-    if during:
-        assert drawn[0, "policy"] == ([50, 120], pytest.approx([90.0, 100 * distance]))
-        assert drawn[1, "policy"] == ([50, 120], pytest.approx([10.0, 100 * success]))
-        numbers = {"final_distance": distance, "success": success, "return": table["return"]["mean"]}
-        assert logged == [{f"eval/policy/{name}": value for name, value in numbers.items()}]
-    else:  # no curve was asked for
-        assert drawn[0, "policy"][0] == [50] and logged == []
+    numbers = {}
+    for policy in during:
+        table = found.policies[policy]
+        distance, success = table["final_distance"]["mean"], table["success"]["0.4"]["mean"]
+        assert 0 < success < 1
+        assert drawn[0, policy] == ([50, 120], pytest.approx([90.0, 100 * distance]))
+        assert drawn[1, policy] == ([50, 120], pytest.approx([10.0, 100 * success]))
+        of = {"final_distance": distance, "success": success, "return": table["return"]["mean"]}
+        numbers |= {f"eval/{policy}/{name}": value for name, value in of.items()}
+    assert logged == ([numbers] if during else [])
+    for policy in {"planner", "policy"} - {*during}:  # no curve was asked for
+        assert drawn[0, policy][0] == [50]
 
 
 def test_the_video_shows_the_worst_episodes_again(settled, tmp_path: Path, monkeypatch, capsys) -> None:

@@ -104,7 +104,9 @@ def test_what_runs_beside_a_benchmark_is_recorded(tmp_path: Path, monkeypatch: p
     assert running.run([(SPEED, [])], machine, out=tmp_path / "out", place=tmp_path / "place") == []
     (found,) = records.read(SPEED, tmp_path / "place")
     assert found["machine"]["jobs"] == 3
-    assert "| p, 2 threads, 3 at a time | 32 |" in render.readme_tables({"speed": SPEED}, tmp_path / "place")
+    assert "| p, 2 threads, 3 at a time, 2026-01-02 | 32 |" in render.readme_tables(
+        {"speed": SPEED}, tmp_path / "place"
+    )
     assert "p, 2 threads, 3 runs at a time; torch" in render.page({"speed": SPEED}, tmp_path / "place")
     (file,) = (tmp_path / "out").glob("speed/*/run.json")
     monkeypatch.setattr("benchmarks.results.__main__.load_rows", lambda: {"speed": SPEED})
@@ -204,3 +206,26 @@ def test_a_return_below_what_was_wanted_is_marked(tmp_path: Path, reached: float
         records.write(found, tmp_path)
     readme = render.readme_tables({"reach": row}, tmp_path)
     assert said in readme
+
+
+def test_readme_tells_what_the_row_of_other_seeds_misses(tmp_path: Path) -> None:
+    """One of two rows is shown there: it must not be the one that was lucky. And which seeds had a part in choices."""
+    row = replace(ROW, seeds=(100, 101), wanted={"return": 475}, chosen=True)
+    others = replace(row, name="reach-others", seeds=(900, 901), readme=False, chosen=False)
+    for made, reached in ((row, 500.0), (others, 400.0)):
+        for seed in made.seeds:
+            of = {"mean": reached, "low": reached, "high": reached}
+            records.write(
+                record(seed) | {"row": made.name, "policies": {"planner": {"return": of, "episodes": 9}}},
+                tmp_path,
+            )
+    alone = render.readme_tables({"reach": row}, tmp_path)
+    assert (
+        "| 500 (500 – 500) | 475 | – |" in alone
+        and "One fixed goal³ |" in alone
+        and "³ A setting was" in alone
+    )
+    both = render.readme_tables({"reach": row, others.name: others}, tmp_path)
+    assert "| 475 | other seeds: return ≥ 475 on average, is 400 |" in both
+    without = render.readme_tables({"reach": replace(row, chosen=False)}, tmp_path)
+    assert "³" not in without

@@ -76,6 +76,7 @@ def test_equal_runs_are_written_down_and_hold(measured: Path, monkeypatch: pytes
     same = confirm.confirmed(ROW, found, measured)
     assert same is not None and same["measured"] == "abc1234"
     records.prune(measured)  # a confirmation names code, but is no record
+    assert path.exists()
     assert {one.stem for one in (measured / "code").iterdir()} == {*same["code"]}
     assert confirm.confirmed(ROW, [{**found[0], "code": {"files": {}, "config": {}}}], measured) is None
     assert confirm.confirmed(ROW, [{**found[0], "commit": "other12"}], measured) is None
@@ -84,6 +85,15 @@ def test_equal_runs_are_written_down_and_hold(measured: Path, monkeypatch: pytes
         path.write_text(json.dumps(kept | change))
         assert confirm.confirmed(ROW, found, measured) is None, change
         path.write_text(json.dumps(kept))
+
+
+def test_a_confirmation_of_what_was_measured_again_is_removed(measured: Path, monkeypatch) -> None:
+    play(monkeypatch, torch.ones(3), torch.ones(3))
+    path = confirm.confirm(ROW, measured)
+    (record,) = records.read(ROW, measured)
+    records.write(record | {"commit": "def5678"}, measured)
+    records.prune(measured)
+    assert not path.exists()
 
 
 def test_one_bit_of_difference_is_refused(measured: Path, monkeypatch: pytest.MonkeyPatch) -> None:

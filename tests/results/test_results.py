@@ -371,7 +371,7 @@ def test_a_benchmark(tmp_path) -> None:
     assert render.page({"speed": row}, tmp_path) == text
     assert "python benchmarks/learner.py --precision float32" in text
     assert "| 32 | 1,234 | – |" in text and "commit abc" in text
-    assert "| p, 2 threads | 32 | 1,234 |" in render.readme_tables({"speed": row}, tmp_path)
+    assert "| p, 2 threads, 2026-01-02 | 32 | 1,234 |" in render.readme_tables({"speed": row}, tmp_path)
     file.write_text("{}")
     with pytest.raises(UserError, match="not what a benchmark wrote"):
         records.record_benchmark(row, file)
