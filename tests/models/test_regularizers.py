@@ -68,6 +68,17 @@ def test_sigreg_against_its_integral():
     assert SIGReg(directions=3)(x).item() == pytest.approx(expected.item(), rel=0.01)
 
 
+def test_sigreg_is_the_trapezoid_on_its_knots():
+    x, sigreg = torch.randn(50, 1) + 1.0, SIGReg(directions=3, knots=5, limit=2.0)
+    t = torch.linspace(-2, 2, 9)
+    error = (torch.exp(1j * t * x).mean(0) - torch.exp(-0.5 * t**2)).abs() ** 2
+    expected = 50 * torch.trapezoid(error * torch.exp(-0.5 * t**2), t)
+    assert sigreg(x).item() == pytest.approx(expected.item(), rel=1e-4)
+    for nothing in ({"limit": 0.0}, {"knots": 1}, {"directions": 0}):
+        with pytest.raises(ValueError, match="directions >= 1, knots >= 2 and limit > 0"):
+            SIGReg(**nothing)  # type: ignore[arg-type]
+
+
 def test_sigreg_takes_each_set_by_itself_in_float32():
     sigreg = SIGReg(directions=32)
     x = torch.randn(3, 100, 5)
@@ -136,6 +147,9 @@ def test_info_nce_rewards_the_match():
     assert matched < 0.1 < 3.0 < info_nce(x, x.roll(1, 0))
     with pytest.raises(ValueError, match="temperature"):
         info_nce(x, x, temperature=0.0)
+    with torch.autocast("cpu", dtype=torch.bfloat16):
+        half = info_nce(x, x.roll(1, 0))
+    assert torch.equal(half, info_nce(x, x.roll(1, 0)))
 
 
 def test_collapse_is_seen():
@@ -144,6 +158,8 @@ def test_collapse_is_seen():
     assert participation_ratio(ball) > 7.9 and participation_ratio(line) == pytest.approx(1.0, abs=1e-3)
     assert participation_ratio(point) == 0
     assert effective_rank(ball) > 7.9 and effective_rank(line) == pytest.approx(1.0, abs=0.05)
+    for measure in (feature_std, participation_ratio, effective_rank):
+        assert measure(ball.view(64, 64, 8)).item() == pytest.approx(measure(ball).item(), rel=1e-5)
 
 
 def test_guards():
@@ -152,6 +168,9 @@ def test_guards():
     for kind in ("sigreg", "vicreg"):
         assert CollapseGuard(kind)(x) > 5 * CollapseGuard(kind)(100 * x)
         assert CollapseGuard(kind, coef=0.0)(x) == 0
+    guard = CollapseGuard("sigreg")  # LeJEPA's
+    assert guard.coef == 0.05 and guard.sigreg is not None and guard.sigreg.directions == 1024
+    assert [CollapseGuard(kind).coef for kind in ("vicreg", "ema", "none")] == [1.0, 0.0, 0.0]
     with pytest.raises(ValueError, match="vicreg"):
         CollapseGuard("hope")
     with pytest.raises(ValueError, match="negative"):

@@ -41,6 +41,23 @@ def test_settings_that_cannot_work_are_refused(overrides):
         small(**overrides)
 
 
+def test_the_encoder_has_so_many_layers():
+    def layers(count: int, **overrides) -> int:
+        encoder = small(encoder_layers=count, **overrides).encoder
+        return sum(name.endswith("weight") and p.ndim == 2 for name, p in encoder.named_parameters())
+
+    assert [layers(count) for count in (1, 2, 3)] == [1, 2, 3]
+    seen = {"image_sizes": {"pixels": (64, 64, 3)}}  # vectors beside images have a layer at least
+    assert layers(1, **seen) == layers(2, **seen) == layers(3, **seen) - 1
+
+
+def test_images_are_standardised_if_asked_for():
+    seen = {"image_sizes": {"pixels": (64, 64, 3)}}
+    for asked, keys in ((True, ["pixels"]), (False, [])):
+        assert list(small(standardize_images=asked, **seen).standardized_images) == keys
+    assert not small(standardize_images=True).standardized_images
+
+
 @pytest.mark.parametrize("leading", [(), (4,), (2, 3, 4)])
 def test_every_part_takes_any_leading_dimensions(leading):
     model = small()

@@ -177,6 +177,8 @@ def test_schedule() -> None:
     assert learner.rate(110) == pytest.approx(0.0)
     shortest = Learner(Line(), lr=0.1, schedule="cosine", warmup=2, total_updates=3)
     assert shortest.rate(2) == pytest.approx(1.0) and shortest.rate(3) == pytest.approx(0.0)
+    only_warm = Learner(Line(), lr=0.1, schedule="cosine", warmup=2, total_updates=2)
+    assert only_warm.rate(2) == pytest.approx(1.0)
     for _ in range(5):
         learner.update(batch(1.0))
     assert learner.optimizer.param_groups[0]["lr"] == pytest.approx(0.1 * 0.5)

@@ -98,6 +98,29 @@ def test_cutting_does_not_depend_on_the_batches(sizes, make_schema) -> None:
     assert cutter.waiting == open_steps
 
 
+def test_an_episode_whose_start_was_not_seen_is_left_out(make_schema) -> None:
+    ends = np.zeros((2, 12), bool)
+    ends[:, [3, 9]] = True
+    data = stream(ends)
+    data["is_init"][0, 0] = False
+    cutter = EpisodeCutter(make_schema(), seed=0)
+    assert cutter.waiting == 0
+    lengths = [len(episode.rows[STATE]) for episode in cutter.push(data)]
+    assert lengths == [4, 6, 6] and cutter.waiting == 4 and cutter.lost == 0
+
+
+def test_what_is_lost_counts_for_its_own_episode_alone(make_schema) -> None:
+    ends = np.zeros((1, 12), bool)
+    ends[0, [3, 9]] = True
+    for step, whole in ((3, [6]), (4, [4])):
+        data = stream(ends)
+        data["next", "overflow"] = torch.zeros(1, 12, 1, dtype=torch.bool)
+        data["next", "overflow"][0, step] = True
+        cutter = EpisodeCutter(make_schema(), seed=0)
+        assert [len(episode.rows[STATE]) for episode in cutter.push(data)] == whole
+        assert cutter.lost == 1
+
+
 def test_keys_differ_even_where_numbers_agree(make_schema) -> None:
     data = stream(rng_bool((1, STEPS), 3, 0.2)).expand(3, STEPS)
     episodes = EpisodeCutter(make_schema(), seed=0).push(data.contiguous())
