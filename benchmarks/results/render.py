@@ -20,16 +20,17 @@ LEGEND = (
     "*m of n seeds*: the row declares n, and m were measured with that commit. *n at a time*: n runs at once, on one "
     "GPU, or each on a core of its own on one machine; *alone (m of n runs)*: times of those that were alone; *beside "
     "other work*: something else ran on that machine meanwhile, on the same GPU or elsewhere, as the row's text says. "
-    "*missed*: what was wanted and is not reached, see docs/results.md; limits of time are of training, without start and "
-    "evaluations, and a planner is worse than its policy where its mean lies beyond the policy's 95 % interval. *Other "
-    "seeds*: five to ten by which nothing was chosen. "
+    "*missed*: what was wanted and is not reached, see docs/results.md; limits of time are of training, without start "
+    "and evaluations, and a planner is worse than its policy where its mean lies beyond the policy's 95 % interval. "
+    "*Other seeds*: five to ten by which nothing was chosen. "
     "Raised numbers: an earlier commit, see below the tables."
 )
 """What README says of its tables' words."""
 HEAD = """# Results
 
 Written by `make results` from the files in [results/](results), which the runs wrote themselves; no measured
-number is typed by hand. `benchmarks/results/rows.yaml` declares the rows and what is wanted. `make results ROW=name` measures one again.
+number is typed by hand. `benchmarks/results/rows.yaml` declares the rows and what is wanted. `make results ROW=name`
+measures one again.
 
 `a (b – c)` over several seeds is their mean, lowest and highest. For one seed `b – c` is the 95 % interval over its
 episodes: bootstrap for distances and returns, Wilson for rates. Episodes are held out: training never sees their seeds.
@@ -41,8 +42,8 @@ where the distance after the first counts a tenth.
 *n at a time*: n runs at once, on one GPU, or each on a core of its own on one machine. *beside other work*:
 something else ran on that machine meanwhile, on the same GPU or elsewhere: the row's text says what. A commit with
 a `+` had changes that were not committed. Where code has changed since, a short run on a CPU, with a small model and
-updates that are not compiled, was made with both versions; *bit for bit* is said where it gave the same. What only a GPU or a long
-run shows, it does not see; times are those of the commit that is named.
+updates that are not compiled, was made with both versions; *bit for bit* is said where it gave the same. What only a
+GPU or a long run shows, it does not see; times are those of the commit that is named.
 """
 POLICIES = {
     "planner": "planner",
@@ -288,7 +289,7 @@ def readme_tables(rows: Mapping[str, Row], place: Path = PLACE) -> str:
         policy = row.acting(records[0]["policies"])
         of = f" of {len(row.seeds)}" if unmeasured(row, records) else ""
         where, runs = cores(row, records), f"{len(records)}{of} seeds"
-        who = f"{row.title}{mark}{'³' * row.chosen}"
+        who = row.title + " ".join([*mark, *"³" * row.chosen])
         chosen = chosen or row.chosen
         missed = "; ".join(_missed(row, records) + _missed_by_others(rows, row, place)) or "–"
         if columns(records) == [RETURN]:
