@@ -21,7 +21,8 @@ LEGEND = (
     "GPU, or each on a core of its own on one machine; *alone (m of n runs)*: times of those that were alone; *beside "
     "other work*: something else ran on that machine meanwhile, on the same GPU or elsewhere, as the row's text says. "
     "*missed*: what was wanted and is not reached, see docs/results.md; limits of time are of training, without start "
-    "and evaluations, and a planner is worse than its policy where its mean lies beyond the policy's 95 % interval. "
+    "and evaluations, and of the slowest run, where the tables show the mean; a planner is worse than its policy where "
+    "its mean lies beyond the policy's 95 % interval. "
     "*Other seeds*: five to ten by which nothing was chosen. "
     "Raised numbers: an earlier commit, see below the tables."
 )

@@ -139,6 +139,16 @@ def test_evaluating_the_loss_leaves_the_scale_alone():
     assert model.scale.value > 1.0
 
 
+def test_the_scale_is_that_of_encoded_latents_not_of_imagined_ones(monkeypatch):
+    """As published: imagined latents follow other actions, and their values drift with the model."""
+    model, seen = small().train(), []
+    z = model.encode(windows(6, 3)).transpose(0, 1).detach()
+    monkeypatch.setattr(model, "q", lambda z, action, **options: z[..., :1])
+    monkeypatch.setattr(model.scale, "update", seen.append)
+    model._policy_loss(z, torch.ones(len(z), 1, 1))
+    assert len(seen) == 1 and torch.equal(seen[0], z[0, :, :1])
+
+
 def test_parameter_groups_hold_every_parameter_once():
     model = small()
     groups = model.parameter_groups(1e-3)

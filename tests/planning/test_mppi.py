@@ -51,6 +51,14 @@ def test_settings_that_cannot_work_are_refused(bad):
         planner(**bad)
 
 
+def test_the_defaults_are_the_published_ones():
+    """TD-MPC2, table 8; temperature and bounds of the deviation as in its code."""
+    own = MPPI(action_dim=2)
+    assert (own.horizon, own.iterations, own.num_samples) == (3, 6, 512)
+    assert (own.num_elites, own.num_policy_samples) == (64, 24)
+    assert (own.min_std, own.max_std, own.temperature) == (0.05, 2.0, 0.5)
+
+
 def test_every_environment_reaches_its_own_goal():
     z = torch.randn(5, 2)
     goal = z + 0.9 * (torch.rand(5, 2) * 2 - 1)  # one step away
@@ -103,6 +111,18 @@ class _Spy:
     def __call__(self, trajectory, actions):
         self.actions = actions if self.actions is None else self.actions
         return torch.zeros(actions.shape[:2])
+
+
+def test_exploration_has_the_deviation_of_the_action_that_is_done():
+    """Here only the first action matters: the plan is sure of it, and not of those after it."""
+    z = torch.zeros(256, 2)
+    search = planner(num_samples=64, num_elites=8, temperature=0.01)
+    result = search.plan(
+        z, step, lambda trajectory, a: -a[:, :, 0].square().sum(-1), explore=True, generator=seeded()
+    )
+    assert result["std"][:, 1:].mean() > 10 * result["std"][:, 0].mean()
+    noise = (result["action"] - result["plan"][:, 0]) / result["std"][:, 0]
+    assert 0.8 < noise.std() < 1.2
 
 
 def test_the_warm_start_is_shifted_and_cleared_where_an_episode_begins():

@@ -1,5 +1,7 @@
 # pyright: reportArgumentType=false, reportCallIssue=false
 import copy
+import math
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -262,3 +264,11 @@ def test_the_penalty_of_a_policy_towards_goals_is_that_of_the_decision_s_goal() 
         penalty(trajectory, actions)
     with pytest.raises(ValueError, match="PolicyPenalty"):
         GoalPolicyPenalty(lambda z, goal: z, reader, -1.0)
+
+
+@pytest.mark.parametrize("lacking", ["reward", "value", "discount"])
+def test_a_model_that_lacks_a_part_of_returns_is_told_which(lacking: str) -> None:
+    has = {"has_reward": lacking != "reward", "has_value": lacking != "value"}
+    model = SimpleNamespace(discount=math.nan if lacking == "discount" else 0.0, **has)
+    with pytest.raises(ValueError, match=f"SimpleNamespace has no {lacking}$"):
+        RewardPlusValue.of(model)  # type: ignore[arg-type]

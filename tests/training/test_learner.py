@@ -179,6 +179,7 @@ def test_schedule() -> None:
     assert shortest.rate(2) == pytest.approx(1.0) and shortest.rate(3) == pytest.approx(0.0)
     only_warm = Learner(Line(), lr=0.1, schedule="cosine", warmup=2, total_updates=2)
     assert only_warm.rate(2) == pytest.approx(1.0)
+    assert Learner(Line(), lr=0.1).rate(0) == 1.0
     for _ in range(5):
         learner.update(batch(1.0))
     assert learner.optimizer.param_groups[0]["lr"] == pytest.approx(0.1 * 0.5)
