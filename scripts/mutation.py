@@ -358,8 +358,8 @@ def page(targets: Sequence[Target], results: Mapping[str, Any]) -> str:
         "without explained",
         "at commit",
     ]
-    lines = [HEAD, "| " + " | ".join(titles) + " |", "|---|" + "---:|" * 6 + "---|"]
-    total = dict.fromkeys(("mutants", "tested", "killed", "timeout", "survived"), 0)
+    lines = ["| " + " | ".join(titles) + " |", "|---|" + "---:|" * 6 + "---|"]
+    changed, total = 0, dict.fromkeys(("mutants", "tested", "killed", "timeout", "survived"), 0)
     explained, rest = 0, []
     for target in targets:
         found = results.get(target.path)
@@ -368,6 +368,7 @@ def page(targets: Sequence[Target], results: Mapping[str, Any]) -> str:
             continue
         same = sum(one["change"] in target.explained for one in found["survivors"])
         since = "" if found["hash"] == target.hash else ", changed since"
+        changed += bool(since)
         lines.append(_line(f"`{target.path}`", found, same, f"{found['commit']}, {found['date']}{since}"))
         total = {name: total[name] + found[name] for name in total}
         explained += same
@@ -380,7 +381,10 @@ def page(targets: Sequence[Target], results: Mapping[str, Any]) -> str:
         reason = target.explained.get(one["change"], "**no test notices it**")
         before, after = one["change"].split(" → ", 1)
         lines.append(f"- `{target.path}`, line {one['line']}: `{before}` → `{after}`: {reason}")
-    return "\n".join([*lines, ""])
+    part = ", a sample" if total["tested"] < total["mutants"] else ""
+    tried = f"**{total['tested']} of {total['mutants']} mistakes were tried**{part}"
+    aged = f"; {changed} of {len(targets) - missing} files have changed since theirs were."
+    return "\n".join([HEAD, tried + (aged if changed else "."), "", *lines, ""])
 
 
 def _line(name: str, found: Mapping[str, Any], explained: int, made: str) -> str:

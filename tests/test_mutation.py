@@ -74,6 +74,12 @@ def test_the_page_counts_and_explains() -> None:
     }  # fmt: skip
     results = {SEEDING: measured, older.path: {**measured, "survivors": [], "hash": "another"}}
     text = page([target, Target("franka_wm/errors.py", []), older], results)
+    assert (
+        "**20 of 40 mistakes were tried**, a sample; 1 of 2 files have changed since theirs were.\n\n|"
+        in text
+    )
+    whole = {SEEDING: {**measured, "mutants": 10}}
+    assert "**10 of 10 mistakes were tried**.\n" in page([target], whole)
     assert "| together, 1 of 3 files not run | 20 of 40 | 14 | 2 | 4 | 80 % | 84 % |  |" in text
     assert (
         "| `franka_wm/console.py` | 10 of 20 | 7 | 1 | 2 | 80 % | 80 % | abc, 2026-01-02, changed since |"
