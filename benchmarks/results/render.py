@@ -24,7 +24,7 @@ LEGEND = (
     "and evaluations, and of the slowest run, where the tables show the mean; a planner is worse than its policy where "
     "its mean lies beyond the policy's 95 % interval. "
     "*Other seeds*: five to ten by which nothing was chosen. "
-    "Raised numbers: an earlier commit, see below the tables."
+    "Raised numbers: see below the tables."
 )
 """What README says of its tables' words."""
 HEAD = """# Results

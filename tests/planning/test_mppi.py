@@ -52,7 +52,7 @@ def test_settings_that_cannot_work_are_refused(bad):
 
 
 def test_the_defaults_are_the_published_ones():
-    """TD-MPC2, table 8; temperature and bounds of the deviation as in its code."""
+    """Those of TD-MPC2's code."""
     own = MPPI(action_dim=2)
     assert (own.horizon, own.iterations, own.num_samples) == (3, 6, 512)
     assert (own.num_elites, own.num_policy_samples) == (64, 24)
