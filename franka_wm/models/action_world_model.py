@@ -294,7 +294,7 @@ class ActionWorldModel(HistoryWorldModel):
         rolled, rolled_state = self._rollout_loss(frames, targets, action)
         # On what is predicted: on a projection of it, the guard would not see it collapse.
         guard = self.guard(self._pooled(frames).transpose(0, 1))
-        goals = self.goal_losses(encoded[..., : self.feature_dim], batch)
+        goals = self.goal_losses(encoded, batch)
         total = summed(prediction, state, rolled, rolled_state, guard, *goals.values())
         with torch.no_grad():
             unchanged, _ = self._distance(before, after)

@@ -62,7 +62,15 @@ class HistoryWorldModel(WorldModel):
         pushed = self.history.push(previous_z, action, frame)
         return torch.where(is_init, self.history.start(frame), pushed)
 
-    def learn_goals(self, embed_dim: int, *, policy: float, steps: float, episode_length: int | None) -> None:
+    def learn_goals(
+        self,
+        embed_dim: int,
+        *,
+        policy: float,
+        steps: float,
+        episode_length: int | None,
+        gradient: bool = False,
+    ) -> None:
         """Adds the heads of `GoalHeads`, with these weights in the loss; 0: without. The last of a constructor."""
         self.has_goal_policy, self.has_goal_steps = policy > 0, steps > 0
         self._goal_coefs = (policy, steps)
@@ -70,14 +78,20 @@ class HistoryWorldModel(WorldModel):
         if policy or steps:
             size = self.history.action_dim
             self.goal_heads = GoalHeads(
-                embed_dim, size, policy=policy > 0, distance=steps > 0, episode_length=episode_length
+                embed_dim,
+                size,
+                policy=policy > 0,
+                distance=steps > 0,
+                frame_dim=self.history.frame_dim,
+                gradient=gradient,
+                episode_length=episode_length,
             )
 
     def goal_policy(self, z: Tensor, goal: Tensor, deterministic: bool = False) -> Tensor:
         """Actions (..., A) that lead from z (..., latent_dim) towards goals (..., D), of a model that learns them."""
         if not self.has_goal_policy or self.goal_heads is None:
             raise self._lacks("goal_policy")
-        return self.goal_heads.act(self.embed(z), goal, deterministic=deterministic)
+        return self.goal_heads.act(self.history.last(z), goal, deterministic=deterministic)
 
     def goal_steps(self, embedded: Tensor, goal: Tensor) -> Tensor:
         """Learned distance (...) in [0, 1] of embeddings (..., D) to goals (..., D); 1: a window or more (with
@@ -86,17 +100,17 @@ class HistoryWorldModel(WorldModel):
             raise self._lacks("goal_steps")
         return self.goal_heads.steps(embedded, goal)
 
-    def goal_losses(self, embedded: Tensor, batch: TensorDictBase) -> dict[str, Tensor]:
-        """Weighted losses of these heads, of embeddings (B, H+1, D) of a batch's windows, or (B, H+2, D) with a frame
-        that was reached later behind them (`with_future`).
+    def goal_losses(self, frames: Tensor, batch: TensorDictBase) -> dict[str, Tensor]:
+        """Weighted losses of these heads, of frames (B, H+1, F) of a batch's windows, or (B, H+2, F) with one that was
+        reached later behind them (`with_future`).
         """
         if self.goal_heads is None:
             return {}
         action, steps = batch.get("action"), batch.get(("future", "steps"), None)
         count = action.shape[1] + 1
-        later = None if steps is None else embedded[:, count:]
+        later = None if steps is None else frames[:, count:]
         found = zip(("loss_goal_policy", "loss_goal_steps"), self._goal_coefs, strict=True)
-        losses = self.goal_heads.losses(embedded[:, :count], action, later, steps)
+        losses = self.goal_heads.losses(frames[:, :count], action, later, steps)
         pairs = zip(found, losses, strict=True)
         return {name: coef * loss for (name, coef), loss in pairs if loss is not None}
 

@@ -13,7 +13,13 @@ from torch.nn import functional as F
 from franka_wm.errors import UserError
 from franka_wm.models.groups import ParameterGroup, decay_groups
 from franka_wm.models.history import FrameHistory, HistoryWorldModel
-from franka_wm.models.images import ImageSize, check_image_sizes, shared_image_size, stack_cameras
+from franka_wm.models.images import (
+    ImageSize,
+    RandomShift,
+    check_image_sizes,
+    shared_image_size,
+    stack_cameras,
+)
 from franka_wm.models.layers import TwoHotSymlog, initialize, mlp, unit_gain, zero_head
 from franka_wm.models.normalizer import ObservationNormalizer
 from franka_wm.models.regularizers import (
@@ -79,6 +85,8 @@ class LeWorldModel(HistoryWorldModel):
             Windows must then be at least `history` transitions long.
         goal_policy_coef, goal_steps_coef: weights of a policy towards goals and of a distance to them in steps, see
             `franka_wm.models.goal_heads.GoalHeads`.
+        goal_policy_gradient: whether that policy shapes the embeddings, too.
+        random_shift: pixels by which images are shifted at most in training, in each direction, all of a window alike.
         reward_head: learn the reward as a probe of z whose gradient stops there, for planners that need it;
             the batch must then hold rewards.
         discount: discount of the rewards per step, for planning for return.
@@ -101,6 +109,7 @@ class LeWorldModel(HistoryWorldModel):
         **dict.fromkeys(("predictor_head_dim", "predictor_mlp", "sigreg_directions", "rollout"), POSITIVE),
         **dict.fromkeys(_COEFS, COEFFICIENT),
         "discount": FRACTION,
+        "random_shift": Bounds(least=0),
         "dropout": Bounds(least=0, below=1),
         **dict.fromkeys(("encoder_depth", "predictor_depth"), DEPTH),
     }
@@ -121,6 +130,7 @@ class LeWorldModel(HistoryWorldModel):
         encoder_depth: int | None = None,
         encoder_heads: int | None = None,
         patch_size: int = 8,
+        random_shift: int = 0,
         projector_hidden: int = 2048,
         predictor_width: int | None = None,
         predictor_depth: int = 6,
@@ -134,6 +144,7 @@ class LeWorldModel(HistoryWorldModel):
         infonce_coef: float = 0.0,
         inverse_coef: float = 0.0,
         goal_policy_coef: float = 0.0,
+        goal_policy_gradient: bool = False,
         goal_steps_coef: float = 0.0,
         reward_head: bool = False,
         discount: float = 0.99,
@@ -146,6 +157,7 @@ class LeWorldModel(HistoryWorldModel):
         self.vectors = ObservationNormalizer(observation_sizes)
         self.observation_sizes, self.action_dim = self.vectors.sizes, action_dim
         self.image_sizes = check_image_sizes(image_sizes)
+        self.random_shift = RandomShift(random_shift)
         self.sigreg_coef, self.infonce_coef, self.rollout = sigreg_coef, infonce_coef, rollout
         self.inverse_coef = inverse_coef
         self.weight_decay, self.discount = weight_decay, discount
@@ -196,7 +208,7 @@ class LeWorldModel(HistoryWorldModel):
         if reward_head:
             self.two_hot = TwoHotSymlog()
             self.reward_probe = zero_head(self.latent_dim + action_dim, (256, 256), self.two_hot.bins)
-        goals = {"policy": goal_policy_coef, "steps": goal_steps_coef}
+        goals = {"policy": goal_policy_coef, "steps": goal_steps_coef, "gradient": goal_policy_gradient}
         self.learn_goals(self.image_part or frame, **goals, episode_length=episode_length)
 
     @classmethod
@@ -260,6 +272,8 @@ class LeWorldModel(HistoryWorldModel):
         window = window_of(batch, self.observation_keys)
         if self.goal_heads is not None:
             window = with_future(window, batch)
+        for key in self.image_sizes:
+            window.set(key, self.random_shift(window.get(key)))
         encoded = self.encode_frame(window, batch_statistics=self.training).float()
         frames = encoded[:, : action.shape[1] + 1]  # (B, H+1, F)
 
@@ -282,7 +296,7 @@ class LeWorldModel(HistoryWorldModel):
             z = self.history.gather(frames[:, :-1].detach(), action)
             logits = self.reward_probe(torch.cat((z, action.to(z.dtype)), dim=-1))
             extra["loss_reward"] = self.two_hot.loss(logits.float(), batch.get(("next", "reward"))).mean()
-        extra |= self.goal_losses(self._comparable(encoded), batch)
+        extra |= self.goal_losses(encoded, batch)
         for value in extra.values():
             total = total + value
         with torch.no_grad():

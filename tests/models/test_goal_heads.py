@@ -132,6 +132,36 @@ def test_a_model_without_them_does_not_read_frames_reached_later(name: str) -> N
     assert torch.equal(*found)
 
 
+def test_all_images_of_a_window_and_of_its_goal_are_shifted_alike(monkeypatch: pytest.MonkeyPatch) -> None:
+    model, batch = small("lewm", random_shift=2, goal_policy_coef=1.0), windows(16, 3)
+    later = batch["pixels"][:, :1].expand(16, 3, 16, 16, 3)  # the goal shows what the first frame shows
+    batch["future"] = TensorDict({"pixels": later, "steps": torch.full((16, 3, 1), 9)}, [16, 3])
+    seen: list[Tensor] = []
+    encode = model.encode_frame
+
+    def watched(observation: TensorDict, **options: Any) -> Tensor:
+        seen.append(observation["pixels"])
+        return encode(observation, **options)
+
+    monkeypatch.setattr(model, "encode_frame", watched)
+    model.loss(batch)
+    model.eval().loss(batch)
+    [shifted, plain] = seen
+    assert torch.equal(plain[:, :3], batch["pixels"])
+    assert torch.equal(shifted[:, 0], shifted[:, -1])
+    moved = (shifted != plain).flatten(1).any(1)
+    assert moved.sum() >= 8 and len({one.numpy().tobytes() for one in shifted}) == 16
+    middle = shifted[:, :, 4:-4, 4:-4]
+    for one, whole in zip(middle, plain, strict=True):
+        ways = [
+            (r, c)
+            for r in range(2, 7)
+            for c in range(2, 7)
+            if torch.equal(whole[:, r : r + 8, c : c + 8], one)
+        ]
+        assert len(ways) == 1
+
+
 class Captured(TorchDispatchMode):
     """Refuses to ask the device for a number, as the capture of a CUDA graph does."""
 
@@ -156,12 +186,48 @@ def test_the_distance_shapes_embeddings_and_the_policy_does_not(name: str) -> No
     for options, shapes in (({"goal_policy_coef": 1.0}, False), ({"goal_steps_coef": 1.0}, True)):
         model = small(name, **options)
         torch.nn.init.normal_(model.goal_heads.ruler[-1].weight) if shapes else None
-        losses = model.goal_losses(model.embed(model.history.start(frames(model, batch))), batch)
+        losses = model.goal_losses(frames(model, batch), batch)
         [(_, loss)] = losses.items()
         loss.backward()
         reached = [p.grad is not None and bool(p.grad.any()) for p in model.encoder.parameters()]
         assert any(reached) == shapes
         assert all(p.grad is not None for p in model.goal_heads.parameters())
+
+
+def test_if_asked_the_policy_shapes_embeddings_of_frames_and_of_goals() -> None:
+    model = small("lewm", goal_policy_coef=1.0, goal_policy_gradient=True)
+    seen = frames(model, windows(8, 4)).detach().requires_grad_()
+    later = seen[:, -1:].detach().clone().requires_grad_()
+    action = torch.rand(8, 4, 2)
+    policy, _ = model.goal_heads.losses(seen, action, later, torch.full((8, 4, 1), 9.0))
+    policy.backward()
+    assert seen.grad is not None and seen.grad[:, 0].any() and seen.grad[:, -1].any()
+    assert later.grad is not None and later.grad.any()
+
+
+@pytest.mark.parametrize("name", SMALL)
+def test_the_policy_reads_the_robots_own_state_and_the_goals_image_alone(name: str) -> None:
+    model = small(
+        name, observation_sizes={"state": 3}, goal_policy_coef=1.0, goal_steps_coef=1.0, episode_length=20
+    ).eval()
+    frame, goal = torch.randn(5, model.history.frame_dim), torch.randn(5, model.goal_heads.embed_dim)
+    assert model.history.frame_dim > model.goal_heads.embed_dim
+    other = frame.clone()
+    other[:, model.goal_heads.embed_dim :] += 1.0
+    one, two = (model.goal_policy(model.history.start(x), goal, deterministic=True) for x in (frame, other))
+    assert (one - two).abs().max() > 1e-3
+
+    # Neither a later state is a goal, nor is a distance told by it.
+    seen, action = torch.randn(8, 5, model.history.frame_dim), torch.rand(8, 4, 2)
+    found = []
+    for shift in (0.0, 1.0):
+        frames = seen.clone()
+        frames[:, -1, model.goal_heads.embed_dim :] += shift  # a window's last frame is a goal alone
+        torch.manual_seed(1)
+        found.append(
+            torch.stack(model.goal_heads.losses(frames, action, frames[:, -1:], torch.ones(8, 4, 1)))
+        )
+    assert torch.equal(*found)
 
 
 def frames(model: Any, batch: TensorDict) -> Tensor:
