@@ -211,7 +211,7 @@ class ActionWorldModel(HistoryWorldModel):
         )
         self.adapter = ProjectionMLP(self.token_dim, self.token_dim) if self.guard.acts else None
         self.target_encoder = frozen_copy(self.encoder) if self.guard.kind == "ema" else None
-        goals = {"policy": goal_policy_coef, "steps": goal_steps_coef}
+        goals: Any = {"policy": goal_policy_coef, "steps": goal_steps_coef}
         self.learn_goals(self.feature_dim, **goals, episode_length=episode_length)
 
     def train(self, mode: bool = True) -> ActionWorldModel:

@@ -208,7 +208,7 @@ class LeWorldModel(HistoryWorldModel):
         if reward_head:
             self.two_hot = TwoHotSymlog()
             self.reward_probe = zero_head(self.latent_dim + action_dim, (256, 256), self.two_hot.bins)
-        goals = {"policy": goal_policy_coef, "steps": goal_steps_coef, "gradient": goal_policy_gradient}
+        goals: Any = {"policy": goal_policy_coef, "steps": goal_steps_coef, "gradient": goal_policy_gradient}
         self.learn_goals(self.image_part or frame, **goals, episode_length=episode_length)
 
     @classmethod

@@ -2,16 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from pathlib import Path
 from typing import Any
 
 from tensordict import TensorDict
+from torch.nn import functional as F
 
 from franka_wm.data.demonstrations import Demonstrations
 from franka_wm.data.hindsight import Hindsight
 from franka_wm.data.image_storage import BOUNDARY
 from franka_wm.device import resolve_device
 from franka_wm.envs import Environment
+from franka_wm.envs.config import FrankaConfig
+from franka_wm.envs.multitask_config import MultiTaskConfig
 from franka_wm.envs.simulation.demonstrated import READS
 from franka_wm.errors import UserError
 from franka_wm.training import build
@@ -35,22 +40,41 @@ def open_demonstrations(
     """
     if run.replay.demos is None:
         return None
-    from franka_wm.data.lerobot import open_dataset
-
     read = spaces.only(run.model.observations, f"model={run.model.name}")
     vectors = {*read.observation_sizes, *(() if hindsight is None else hindsight.reads)}
     wanted: dict[str, Any] = {key: spaces.observation_sizes[key] for key in sorted(vectors)} | dict(
         read.image_sizes
     )
+    starts = READS if run.replay.demo_resets else ()
+    if isinstance(run.env.config, MultiTaskConfig):
+        steps = _of_tasks(run, run.env.config, wanted, spaces.action_dim)
+    else:
+        steps = _recorded(run, run.replay.demos, wanted, spaces.action_dim, starts)
+    most = max(run.demo_windows(update) for update in (0, run.replay.demo_updates, run.trainer.updates))
+    return Demonstrations(
+        steps.exclude(*starts) if starts else steps,
+        window=run.window,
+        most=most,
+        hindsight=hindsight,
+        states=steps.select(*starts).squeeze(1) if starts else None,
+    )
+
+
+def _recorded(
+    run: RunSettings, roots: Any, wanted: Mapping[str, Any], action_dim: int, starts: Sequence[str] = ()
+) -> Any:
+    """Transitions (T, 1) of these datasets, on the run's device: what is `wanted`, key -> size, and `starts`."""
+    from franka_wm.data.lerobot import open_dataset
+
     recorded = open_dataset(
-        run.replay.demos,
+        roots,
         window=1,
         batch_size=1,
         device=resolve_device(run.device),
         validation_fraction=0.0,
-        keys=list({**wanted, **dict.fromkeys(READS if run.replay.demo_resets else ())}),
+        keys=list({**wanted, **dict.fromkeys(starts)}),
         frame_stack=run.env.frame_stack,
-        action_dim=spaces.action_dim,
+        action_dim=action_dim,
     )
     there = {**recorded.observation_sizes, **recorded.image_sizes}
     for key, size in wanted.items():
@@ -62,16 +86,52 @@ def open_demonstrations(
     if recorded.reward_bounds is None:
         raise UserError("replay.demos: these episodes have no rewards; record them with franka-wm collect")
     keys = [*wanted, "action", "is_init", *(("next", key) for key in (*wanted, "reward", "terminated"))]
-    starts = READS if run.replay.demo_resets else ()
-    steps: Any = TensorDict.cat([one.select(*keys, *starts) for one in recorded.batches(4096)])
-    most = max(run.demo_windows(update) for update in (0, run.replay.demo_updates, run.trainer.updates))
-    return Demonstrations(
-        steps.select(*keys),
-        window=run.window,
-        most=most,
-        hindsight=hindsight,
-        states=steps.select(*starts).squeeze(1) if starts else None,
-    )
+    return TensorDict.cat([one.select(*keys, *starts) for one in recorded.batches(4096)])
+
+
+def _of_tasks(run: RunSettings, config: MultiTaskConfig, wanted: Mapping[str, int], action_dim: int) -> Any:
+    """Transitions (T, 1) of several tasks, as :class:`~franka_wm.envs.multitask.MultiTaskEnv` shows them: with zeros
+    where a task has less, and `task` one-hot."""
+    parts = []
+    names = list(config.tasks)
+    for name, roots in _by_task(run, config).items():
+        own = Spaces.of_config(config.tasks[name])
+        has = {key: own.observation_sizes[key] for key in wanted if key in own.observation_sizes}
+        steps = _recorded(run, roots, has, own.action_dim)
+        one_hot = steps["action"].new_zeros(*steps.batch_size, len(names))
+        one_hot[..., names.index(name)] = 1.0
+        for part in (steps, steps["next"]):
+            for key, size in wanted.items():
+                there = one_hot if key == "task" else part.get(key, one_hot[..., :0])
+                part.set(key, F.pad(there, (0, size - there.shape[-1])))
+        parts.append(steps.set("action", F.pad(steps["action"], (0, action_dim - own.action_dim))))
+    return TensorDict.cat(parts)
+
+
+def _by_task(run: RunSettings, config: MultiTaskConfig) -> dict[str, list[str]]:
+    """Task -> the datasets of ``run.replay.demos`` that were recorded in it.
+
+    Raises:
+        UserError: One was recorded in none of them.
+    """
+    from franka_wm.data.lerobot.provenance import read_provenance
+    from franka_wm.data.lerobot.source import read_source
+
+    demos, found = run.replay.demos, {}
+    for root in (demos,) if isinstance(demos, str) else demos or ():
+        with _as_demos():
+            read_source(Path(root))
+        sessions = (read_provenance(Path(root)) or {}).get("sessions", ())
+        tasks = {session.get("config", {}).get("env", {}).get("task") for session in sessions}
+        name = next((name for name, one in config.tasks.items() if tasks == {one.task}), None)
+        if name is None:
+            what = f"env.task={tasks.pop()}" if len(tasks) == 1 else "no single task of this package"
+            raise UserError(
+                f"replay.demos={root}: was recorded in {what}; with env=multitask give datasets of its tasks, one or "
+                f"more for each that shall have some: {', '.join(config.tasks)}"
+            )
+        found.setdefault(name, []).append(root)
+    return found
 
 
 def start_along(env: Environment, shown: Demonstrations, share: float) -> None:
@@ -96,22 +156,25 @@ def check_demonstrations(run: RunSettings) -> None:
         raise UserError(
             f"replay.demo_resets={share}: is for tasks with a gripper, such as env=stack; leave it at 0"
         )
-    if run.env.kind == "multitask":
-        raise UserError(
-            "replay.demos: demonstrations are of one task, env=multitask has several; leave it at null"
-        )
+    if isinstance(run.env.config, MultiTaskConfig):
+        for name, roots in _by_task(run, run.env.config).items():
+            _check_recorded(run, roots, run.env.config.tasks[name], f"env.tasks.{name}")
+    else:
+        _check_recorded(run, run.replay.demos, run.env.arm if run.is_arm else None, "this run")
+
+
+def _check_recorded(run: RunSettings, roots: Any, arm: FrankaConfig | None, whose: str) -> None:
+    """The same of datasets of one task, that of `arm`; `whose` it is, for what is refused."""
     from franka_wm.data.lerobot.opening import read_datasets
     from franka_wm.data.lerobot.provenance import MEANING, VIEWS, other_option, other_scene, read_provenance
 
-    arm = run.env.arm if run.is_arm else None
+    share = run.replay.demo_resets
     if arm is not None and share:
         _check_seen(share, "run", vars(arm.randomization))
-    try:
+    with _as_demos():
         sources, mappings = read_datasets(
-            run.replay.demos, normalize_actions=False, fps=arm and arm.fps, action_dim=arm and arm.action_dim
+            roots, normalize_actions=False, fps=arm and arm.fps, action_dim=arm and arm.action_dim
         )
-    except UserError as error:
-        raise UserError(str(error).replace("dataset.root=", "replay.demos=")) from error
     if not all(one.ours for one in mappings):
         others = next(s.root for s, one in zip(sources, mappings, strict=True) if not one.ours)
         raise UserError(
@@ -132,12 +195,21 @@ def check_demonstrations(run: RunSettings) -> None:
         if changed is not None:
             name, there = changed
             raise UserError(
-                f"replay.demos={source.root}: recorded with env.{name}={there}, this run has {env[name]}"
+                f"replay.demos={source.root}: recorded with env.{name}={there}, {whose} has {env[name]}"
             )
         if other_scene(sessions, env, images=bool(looks)):
             raise UserError(
                 f"replay.demos={source.root}: recorded with another env.scene, whose objects are other ones"
             )
+
+
+@contextmanager
+def _as_demos() -> Iterator[None]:
+    """Lines about a dataset inside name the option that these were given by."""
+    try:
+        yield
+    except UserError as error:
+        raise UserError(str(error).replace("dataset.root=", "replay.demos=")) from error
 
 
 def _check_seen(share: float, where: str, drawn: Mapping[str, Any]) -> None:

@@ -62,7 +62,7 @@ class Learner:
             raise UserError(f"precision={precision!r}: must be one of {', '.join(PRECISIONS)}")
         if schedule not in SCHEDULES:
             raise UserError(f"schedule={schedule!r}: must be one of {', '.join(SCHEDULES)}")
-        if schedule == "cosine" and not total_updates:
+        if schedule == "cosine" and total_updates is None:
             raise UserError("schedule=cosine needs total_updates, at whose end the learning rate is zero")
         if not lr > 0 or not grad_clip > 0:
             raise UserError(f"lr={lr}, grad_clip={grad_clip}: both must be above 0")

@@ -22,7 +22,6 @@ from tensordict import TensorDictBase
 from torchrl.record.loggers import Logger
 
 from franka_wm import processes
-from franka_wm.conf import refuse_unknown
 from franka_wm.console import announced, log_to, resuming, say
 from franka_wm.data.demonstrations import Demonstrations
 from franka_wm.data.hindsight import Hindsight
@@ -374,7 +373,6 @@ def resumed(cfg: DictConfig, overrides: list[str]) -> tuple[Checkpoint, DictConf
             raise FrankaError(
                 f"{override}: a run that resumes keeps all its options; change their values (GROUP.key=…)"
             )
-        refuse_unknown([name.split(".", 1)[0]])
         same = name in ("scale", "size", "seed") and str(cfg[name]) == str(saved.get(name))
         if "." not in name and not same and name not in ("device", "gpus"):
             raise FrankaError(

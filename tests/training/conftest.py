@@ -46,7 +46,7 @@ def train(root: Path, tmp_path: Path, monkeypatch) -> Train:
 
     def train(*arguments: str, folder: Path = tmp_path / "run", status: int | None = None) -> Checkpoint:
         given = {argument.split("=", 1)[0] for argument in arguments}
-        if {"env=gym", "env=none"} & {*arguments}:  # options of the arm are none of theirs
+        if {"env=gym", "env=none", "env=multitask"} & {*arguments}:  # options of the arm are none of theirs
             given |= {one.split("=", 1)[0] for one in TINY if one.startswith("env.")}
         sizes = [] if "resume" in given else [one for one in TINY if one.split("=", 1)[0] not in given]
         monkeypatch.chdir(tmp_path)

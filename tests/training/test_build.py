@@ -57,8 +57,6 @@ def test_several_tasks_at_once_need_a_world_each(settled) -> None:
     assert "peg" not in fewer.env.config.tasks and fewer.env.config.tasks["push"].episode_length == 33
     longer = cfg.env.changed(episode_length=200).config
     assert {one.episode_length for one in longer.tasks.values()} == {200}
-    with pytest.raises(UserError, match="demonstrations are of one task"):
-        check(settled("env=multitask", "replay.demos=anywhere"))
     for option in ("collector.num_envs", "evaluation.episodes", "evaluation.during_episodes"):
         with pytest.raises(UserError, match=f"{option}=7: env=multitask has 8 tasks"):
             check(settled("env=multitask", f"{option}=7"))

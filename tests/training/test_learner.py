@@ -179,6 +179,9 @@ def test_schedule() -> None:
     assert shortest.rate(2) == pytest.approx(1.0) and shortest.rate(3) == pytest.approx(0.0)
     only_warm = Learner(Line(), lr=0.1, schedule="cosine", warmup=2, total_updates=2)
     assert only_warm.rate(2) == pytest.approx(1.0)
+    assert (
+        Learner(Line(), lr=0.1, schedule="cosine", total_updates=0).rate(0) == 1.0
+    )  # a run that trains nothing
     assert Learner(Line(), lr=0.1).rate(0) == 1.0
     for _ in range(5):
         learner.update(batch(1.0))
