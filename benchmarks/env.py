@@ -181,6 +181,8 @@ def measure(name: str, worlds: int, device: str, seconds: float, contacts: str) 
     through = collector(env, 16 if on_gpu else 8, seconds, actions)
     seen = env.statistics()
     del env
+    if on_gpu:  # torch keeps the memory of the Collector's batches, which Warp cannot have then
+        torch.cuda.empty_cache()
     raw = raw_newton(config, worlds, device, seconds, actions)
     return {
         "case": name,

@@ -199,7 +199,7 @@ def _each_seed(row: Row, records: Sequence[Record]) -> str:
 
 def _command(row: Row, records: Sequence[Record]) -> str:
     """What to type; for several seeds in a loop."""
-    before = f"{row.before}\n" if row.before else ""
+    before = f"{row.before.rstrip()}\n" if row.before else ""
     if row.script is not None:
         return before + shlex.join(row.command)
     seeds = " ".join(str(record["seed"]) for record in records)

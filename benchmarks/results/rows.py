@@ -82,15 +82,16 @@ class Row:
         return f"{self.name}/plot.svg"
 
     @property
-    def prepares(self) -> tuple[list[str], str] | None:
-        """The arguments of ``franka-wm`` that make what the runs read, and the folder that they make; or ``None``."""
-        if not self.before:
-            return None
-        words = shlex.split(self.before)
-        made = [word.removeprefix("out=") for word in words if word.startswith("out=")]
-        if words[0] != "franka-wm" or len(made) != 1:
-            raise UserError(f"row {self.name}: before must be a command of franka-wm with out=FOLDER")
-        return words[1:], made[0]
+    def prepares(self) -> list[tuple[list[str], str]]:
+        """The arguments of each ``franka-wm`` that makes what the runs read, and the folder that it makes."""
+        found = []
+        for line in self.before.splitlines():
+            words = shlex.split(line)
+            made = [word.removeprefix("out=") for word in words if word.startswith("out=")]
+            if words[:1] != ["franka-wm"] or len(made) != 1:
+                raise UserError(f"row {self.name}: before must be commands of franka-wm with out=FOLDER")
+            found.append((words[1:], made[0]))
+        return found
 
 
 def load_rows(path: Path = DECLARED) -> dict[str, Row]:

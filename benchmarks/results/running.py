@@ -172,16 +172,18 @@ def _benchmark(row: Row, slot: Slot, folder: Path, place: Path, jobs: int) -> li
 
 def prepare(row: Row, top: Path, place: Path, **environment: str) -> str | None:
     """Makes what the row's runs read, at ``place`` by the code at ``top``, unless it is there; what failed."""
-    if row.prepares is None or (place / row.prepares[1]).exists():
-        return None
-    command = [sys.executable, "-m", "franka_wm", *row.prepares[0]]
     environment = {"PYTHONPATH": os.pathsep.join([str(top), os.environ.get("PYTHONPATH", "")])} | environment
-    done = subprocess.run(
-        command, cwd=place, env=os.environ | environment, capture_output=True, text=True, check=False
-    )
-    if done.returncode == 0:
-        return None
-    return f"{shlex.join(command)}: {((done.stderr or done.stdout).strip().splitlines() or ['nothing printed'])[-1]}"
+    for words, made in row.prepares:
+        if (place / made).exists():
+            continue
+        command = [sys.executable, "-m", "franka_wm", *words]
+        done = subprocess.run(
+            command, cwd=place, env=os.environ | environment, capture_output=True, text=True, check=False
+        )
+        if done.returncode:
+            last = ((done.stderr or done.stdout).strip().splitlines() or ["nothing printed"])[-1]
+            return f"{shlex.join(command)}: {last}"
+    return None
 
 
 def _call(command: Sequence[str], environment: dict[str, str], log: Path) -> str | None:

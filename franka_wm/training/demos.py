@@ -52,7 +52,7 @@ def open_demonstrations(
         steps = _recorded(run, run.replay.demos, wanted, spaces.action_dim, starts)
     most = max(run.demo_windows(update) for update in (0, run.replay.demo_updates, run.trainer.updates))
     return Demonstrations(
-        steps.exclude(*starts) if starts else steps,
+        steps.exclude(*(key for key in starts if key not in wanted)),
         window=run.window,
         most=most,
         hindsight=hindsight,

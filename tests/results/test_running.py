@@ -73,9 +73,15 @@ def test_a_run_that_fails_is_told_and_leaves_no_file(tmp_path) -> None:
 
 
 @pytest.mark.parametrize(
-    "before", ["franka-wm collect", "python x.py out=a", "franka-wm collect out=a out=b"]
+    "before",
+    [
+        "franka-wm collect",
+        "python x.py out=a",
+        "franka-wm collect out=a out=b",
+        "franka-wm collect out=a\nls",
+    ],
 )
-def test_what_a_row_needs_first_is_one_command_and_one_folder(before) -> None:
+def test_what_a_row_needs_first_is_a_folder_of_each_command(before) -> None:
     with pytest.raises(UserError, match="before must be"):
         _ = replace(ROW, before=before).prepares
 
@@ -96,6 +102,9 @@ def test_what_a_row_needs_first_is_made_once(tmp_path, monkeypatch) -> None:
     (tmp_path / "push").mkdir()
     assert running.prepare(row, tmp_path, tmp_path) is None and len(called) == 2
     assert running.prepare(ROW, tmp_path, tmp_path) is None
+    two = replace(row, before=row.before + "\nfranka-wm collect out=lift\n")
+    assert "the disk is full" in (running.prepare(two, tmp_path, tmp_path) or "")
+    assert called[2:] == [["-m", "franka_wm", "collect", "out=lift"]]
 
 
 def test_what_runs_beside_is_recorded_with_the_times(tmp_path, monkeypatch) -> None:
