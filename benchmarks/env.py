@@ -12,6 +12,7 @@ there is something to touch they play an episode of the expert's, over and over.
 from __future__ import annotations
 
 import argparse
+import gc
 import time
 from collections.abc import Callable
 from dataclasses import replace
@@ -182,6 +183,7 @@ def measure(name: str, worlds: int, device: str, seconds: float, contacts: str) 
     seen = env.statistics()
     del env
     if on_gpu:  # torch keeps the memory of the Collector's batches, which Warp cannot have then
+        gc.collect()
         torch.cuda.empty_cache()
     raw = raw_newton(config, worlds, device, seconds, actions)
     return {

@@ -20,7 +20,7 @@ class GoalHeads(nn.Module):
     frames that were reached later (`replay.future`), half of the goals are these.
 
     - *Policy*: an inverse-dynamics policy (GC-IDM, arXiv:2605.08732): a Gaussian over the action that was taken, its
-      mean within [-1, 1]. It reads a whole frame, the robot's own state where the model has it, and the embedding of
+      mean within [-1, 1]. It reads a whole frame, with the vectors where the model reads any, and the embedding of
       the goal. Without `gradient` none reaches these: actions that were taken are no property of the scene.
     - *Distance*: what share of a window lies between the two (with frames reached later: of an episode); 1 between
       embeddings of different windows (reachability, RC-aux, arXiv:2605.07278). Its gradient shapes the embeddings, so

@@ -58,8 +58,8 @@ class LeWorldModel(HistoryWorldModel):
     that of the state alone. With images, goals are compared by the image's part.
 
     Deliberate differences: rotary positions in the predictor instead of learned ones, so that a history which
-    is still short predicts as in training; `rollout`, InfoNCE, inverse dynamics, heads for goals and the reward
-    probe, off by default.
+    is still short predicts as in training; `rollout`, InfoNCE, inverse dynamics, heads for goals, shifted images
+    and the reward probe, off by default.
 
     Args:
         image_sizes: image key -> (height, width, channels); several of one size share the encoder.
@@ -86,7 +86,8 @@ class LeWorldModel(HistoryWorldModel):
         goal_policy_coef, goal_steps_coef: weights of a policy towards goals and of a distance to them in steps, see
             `franka_wm.models.goal_heads.GoalHeads`.
         goal_policy_gradient: whether that policy shapes the embeddings, too.
-        random_shift: pixels by which images are shifted at most in training, in each direction, all of a window alike.
+        random_shift: pixels by which images are shifted at most in training, in each direction, a
+            camera's of a window alike.
         reward_head: learn the reward as a probe of z whose gradient stops there, for planners that need it;
             the batch must then hold rewards.
         discount: discount of the rewards per step, for planning for return.
@@ -215,6 +216,10 @@ class LeWorldModel(HistoryWorldModel):
     def validate(cls, options: Mapping[str, Any], *, window: int | None = None) -> None:
         super().validate(options, window=window)
         given = with_defaults(cls, options)
+        if given["goal_policy_gradient"] and not given["goal_policy_coef"]:
+            raise UserError(
+                "model.goal_policy_gradient=true: there is no policy towards goals; set model.goal_policy_coef above 0"
+            )
         inverse, history = given["inverse_coef"], given["history"]
         if inverse and window is not None and window < history:
             raise UserError(

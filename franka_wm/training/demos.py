@@ -98,6 +98,12 @@ def _of_tasks(run: RunSettings, config: MultiTaskConfig, wanted: Mapping[str, in
         own = Spaces.of_config(config.tasks[name])
         has = {key: own.observation_sizes[key] for key in wanted if key in own.observation_sizes}
         steps = _recorded(run, roots, has, own.action_dim)
+        begins = steps[BOUNDARY].flatten().nonzero().flatten()
+        longest = int(begins.diff(append=begins.new_tensor([len(steps)])).max())
+        if longest < run.window:
+            raise UserError(
+                f"replay.demos: no demonstration of {name} has {run.window} steps, as the windows of this run"
+            )
         one_hot = steps["action"].new_zeros(*steps.batch_size, len(names))
         one_hot[..., names.index(name)] = 1.0
         for part in (steps, steps["next"]):
@@ -114,23 +120,27 @@ def _by_task(run: RunSettings, config: MultiTaskConfig) -> dict[str, list[str]]:
     Raises:
         UserError: One was recorded in none of them.
     """
-    from franka_wm.data.lerobot.provenance import read_provenance
+    from franka_wm.data.lerobot.provenance import MEANING, other_option, read_provenance
     from franka_wm.data.lerobot.source import read_source
 
     demos, found = run.replay.demos, {}
     for root in (demos,) if isinstance(demos, str) else demos or ():
         with _as_demos():
-            read_source(Path(root))
-        sessions = (read_provenance(Path(root)) or {}).get("sessions", ())
-        tasks = {session.get("config", {}).get("env", {}).get("task") for session in sessions}
-        name = next((name for name, one in config.tasks.items() if tasks == {one.task}), None)
-        if name is None:
+            source = read_source(Path(root))
+        sessions = (read_provenance(source.root) or {}).get("sessions", ())
+        tasks = {session.get("config", {}).get("env", {}).get("task") for session in sessions} - {None}
+        fitting = [name for name, one in config.tasks.items() if tasks == {one.task}]
+        if not fitting:
             what = f"env.task={tasks.pop()}" if len(tasks) == 1 else "no single task of this package"
             raise UserError(
                 f"replay.demos={root}: was recorded in {what}; with env=multitask give datasets of its tasks, one or "
                 f"more for each that shall have some: {', '.join(config.tasks)}"
             )
-        found.setdefault(name, []).append(root)
+        # Of several entries with this task the one whose options it was recorded with; what is refused names the first.
+        alike = [
+            name for name in fitting if other_option(sessions, vars(config.tasks[name]), MEANING) is None
+        ]
+        found.setdefault((alike or fitting)[0], []).append(root)
     return found
 
 
@@ -152,6 +162,10 @@ def check_demonstrations(run: RunSettings) -> None:
     share = run.replay.demo_resets
     if run.replay.demos is None:
         return
+    if share and run.env.kind == "multitask":
+        raise UserError(
+            f"replay.demo_resets={share}: episodes of env=multitask do not begin along demonstrations; leave it at 0"
+        )
     if share and not (run.is_arm and run.env.arm.has_gripper):
         raise UserError(
             f"replay.demo_resets={share}: is for tasks with a gripper, such as env=stack; leave it at 0"

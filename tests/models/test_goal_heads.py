@@ -151,7 +151,7 @@ def test_all_images_of_a_window_and_of_its_goal_are_shifted_alike(monkeypatch: p
     assert torch.equal(shifted[:, 0], shifted[:, -1])
     moved = (shifted != plain).flatten(1).any(1)
     assert moved.sum() >= 8 and len({one.numpy().tobytes() for one in shifted}) == 16
-    middle = shifted[:, :, 4:-4, 4:-4]
+    middle, found = shifted[:, :, 4:-4, 4:-4], set()
     for one, whole in zip(middle, plain, strict=True):
         ways = [
             (r, c)
@@ -160,6 +160,8 @@ def test_all_images_of_a_window_and_of_its_goal_are_shifted_alike(monkeypatch: p
             if torch.equal(whole[:, r : r + 8, c : c + 8], one)
         ]
         assert len(ways) == 1
+        found.add(ways[0])
+    assert len(found) > 4  # each window has its own
 
 
 class Captured(TorchDispatchMode):

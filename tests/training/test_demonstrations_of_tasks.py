@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -108,6 +109,25 @@ def test_a_run_learns_from_them(roots: dict[str, Path], train, monkeypatch) -> N
     assert total[0] > 20 and total[1] == 0 and total[2] > 20
 
 
+def test_a_dataset_is_of_the_entry_with_its_options(roots: dict[str, Path], settled, monkeypatch) -> None:
+    """Of two entries with one task; its folder may be given from one's home."""
+    monkeypatch.setenv("HOME", str(roots["reach"].parent))
+    other = ("env.tasks.reach.action_scale=0.05", 'replay.demos="~/reach"')
+    run = settled("scale=smoke", *MANY, *other)
+    tasks = run.env.config.tasks
+    tasks = {**tasks, "near": replace(tasks["reach"], action_scale=0.085)}
+    run = replace(run, env=replace(run.env, config=replace(run.env.config, tasks=tasks)))
+    check(run)
+    shown = open_demonstrations(run, Spaces.of_tasks(run.env.config), None)
+    assert shown is not None and (shown.transitions["task"][..., -1] == 1.0).all()
+
+
+def test_a_task_whose_demonstrations_are_too_short_is_told(roots: dict[str, Path], settled) -> None:
+    run = settled("scale=smoke", *MANY, demos_of(*roots.values()), "replay.window=9")
+    with pytest.raises(UserError, match="no demonstration of reach has 9 steps"):
+        open_demonstrations(run, Spaces.of_tasks(run.env.config), None)
+
+
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
@@ -121,7 +141,7 @@ def test_a_run_learns_from_them(roots: dict[str, Path], train, monkeypatch) -> N
         ),
         (("env.tasks.reach.reward=sparse",), r"with env\.reward=dense, env\.tasks\.reach has sparse"),
         (("replay.demos=nowhere",), r"^replay\.demos=nowhere: no such folder"),
-        (("replay.demo_resets=0.5",), "is for tasks with a gripper"),
+        (("replay.demo_resets=0.5",), "episodes of env=multitask do not begin along"),
     ],
 )
 def test_what_cannot_be_is_refused(roots: dict[str, Path], settled, changes, message) -> None:
