@@ -218,7 +218,8 @@ def handle_name(name: str) -> str:
 async def _aim(client: viser.ClientHandle) -> None:
     """Moves the camera of a phone held upright, so that the arm is above the controls; back when it is turned.
 
-    A browser's first message may be of a picture that has not its size yet, so later ones are looked at, too.
+    A browser's first message may be of a picture that has not its size yet, so later ones are looked at, too. And a
+    slow one takes the page's first view after it was told to move, as "Reset View" does later: it is told again.
     """
     upright = False
 
@@ -227,7 +228,10 @@ async def _aim(client: viser.ClientHandle) -> None:
         if not camera.image_width or not camera.image_height:
             return
         before, upright = upright, camera.aspect < PORTRAIT
-        if upright is before:
+        as_opened = np.allclose(camera.position, EYE, atol=1e-3) and np.allclose(
+            camera.look_at, LOOK_AT, atol=1e-3
+        )
+        if upright is before and not (upright and as_opened):
             return
         eye, look_at = portrait_view(camera.aspect) if upright else (EYE, LOOK_AT)
         with client.atomic():

@@ -129,9 +129,9 @@ def test_the_camera_follows_a_phone_that_is_turned(page: Page) -> None:
     """Its first message may be of a picture of no size yet; only what turns it moves the camera, not what it sees."""
     before = set(page.server.get_clients())
 
-    def sees(browser: Any, width: int, height: int, look_at: tuple[float, ...] = LOOK_AT) -> None:
-        message = CAMERA | {"image_width": width, "image_height": height, "look_at": look_at}
-        browser.send(msgspec.msgpack.encode(message))
+    def sees(browser: Any, width: int, height: int, look_at: Any = LOOK_AT, eye: Any = (1, 1, 1)) -> None:
+        size = {"image_width": width, "image_height": height}
+        browser.send(msgspec.msgpack.encode(CAMERA | size | {"look_at": look_at, "position": eye}))
 
     with client(page) as browser:
         for size in ((300, 150), (0, 0), (300, 0), (0, 640)):
@@ -143,6 +143,11 @@ def test_the_camera_follows_a_phone_that_is_turned(page: Page) -> None:
         wait(lambda: camera.look_at[2] < 0, "upright: the arm is not above the controls")
         sees(browser, 360, 640, (0.0, 0.0, 7.0))
         wait(lambda: camera.look_at[2] == 7.0, "what a finger did to the camera is undone")
+        sees(browser, 360, 640, LOOK_AT, EYE)
+        wait(
+            lambda: camera.look_at[2] < 0,
+            "a phone that took the page's first view late, or again, stays there",
+        )
         sees(browser, 640, 360)
         wait(lambda: np.allclose(camera.look_at, LOOK_AT), "turned back: not the view of a wide window")
         np.testing.assert_allclose(camera.position, EYE)
