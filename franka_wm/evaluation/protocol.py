@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -183,7 +184,7 @@ def protocol(
         "by": by,
         "task": settings.env.label,
         "model": settings.model.name,
-        **({"planner": settings.planner.name} if "planner" in evaluation.policies else {}),
+        **({"planner": settings.planner.label} if "planner" in evaluation.policies else {}),
         "seed": settings.seed,
         **{name: counters[name] for name in ("updates", "env_steps") if name in counters},
         **({"training_seconds": counters["seconds"]} if "seconds" in counters else {}),
@@ -272,7 +273,14 @@ def evaluate_run(
     """
     worlds = all_worlds(settings.evaluation, env)
     say(f"evaluating over {worlds} held-out episodes …")
-    found = evaluate_policies(env, policies, together=worlds, report=lambda name, r: say(describe(name, r)))
+    begun = time.perf_counter()
+
+    def report(name: str, summary: Mapping[str, Any]) -> None:
+        nonlocal begun
+        before, begun = begun, time.perf_counter()
+        say(f"{describe(name, summary)}   ({begun - before:.1f} s)")
+
+    found = evaluate_policies(env, policies, together=worlds, report=report)
     found.protocol = protocol(settings, env, found, by=END, counters=counters)
     if processes.is_first():
         with atomic_write(folder / FILE) as path:

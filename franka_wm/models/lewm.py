@@ -220,6 +220,10 @@ class LeWorldModel(HistoryWorldModel):
             raise UserError(
                 "model.goal_policy_gradient=true: there is no policy towards goals; set model.goal_policy_coef above 0"
             )
+        if given["random_shift"] and "image_sizes" in options and not options["image_sizes"]:
+            raise UserError(
+                f"model.random_shift={given['random_shift']}: shifts images, and model.observations names none"
+            )
         inverse, history = given["inverse_coef"], given["history"]
         if inverse and window is not None and window < history:
             raise UserError(

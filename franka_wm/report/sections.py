@@ -267,7 +267,7 @@ def what(run: RunFiles) -> str:
     rows: list[tuple[str, Any]] = [
         ("environment", run.environment if config else None),
         ("model", (config.get("model") or {}).get("name")),
-        ("planner", planner.get("name")),
+        ("planner", planner.get("variant", planner.get("name"))),
         ("worlds", collector.get("num_envs")),
         ("seed", run.seed),
         ("device", config.get("device")),

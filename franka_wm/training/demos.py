@@ -76,15 +76,14 @@ def _recorded(
         frame_stack=run.env.frame_stack,
         action_dim=action_dim,
     )
-    there = {**recorded.observation_sizes, **recorded.image_sizes}
+    there, given = {**recorded.observation_sizes, **recorded.image_sizes}, f"replay.demos={roots}"
     for key, size in wanted.items():
         if there[key] != size:
             raise UserError(
-                f"replay.demos: {key} has size {there[key]} there, {size} in this environment; record them with its "
-                "options"
+                f"{given}: {key} has size {there[key]} there, {size} in this environment; record it with its options"
             )
     if recorded.reward_bounds is None:
-        raise UserError("replay.demos: these episodes have no rewards; record them with franka-wm collect")
+        raise UserError(f"{given}: these episodes have no rewards; record them with franka-wm collect")
     keys = [*wanted, "action", "is_init", *(("next", key) for key in (*wanted, "reward", "terminated"))]
     return TensorDict.cat([one.select(*keys, *starts) for one in recorded.batches(4096)])
 

@@ -292,8 +292,8 @@ def start(cfg: DictConfig) -> Run:
     say(f"device {device}   seed {settings.seed}   results in {folder}")
     if checkpoint is not None:
         done, wanted = int(checkpoint.counters.get("updates", 0)), settings.trainer.updates
-        nothing = f"; trainer.updates={wanted} are made, a larger number trains on" if done >= wanted else ""
-        say(f"going on from update {done} of {checkpoint.folder}{nothing}")
+        nothing = f"; trainer.updates={wanted} are made: only the run's end is done again, a larger number trains on"
+        say(f"going on from update {done} of {checkpoint.folder}{nothing if done >= wanted else ''}")
     run = Run(settings, folder, checkpoint, open_loggers(settings, folder))
     if _begun is not None:
         _begun = (folder, _files(folder), run.loggers)

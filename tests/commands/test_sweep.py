@@ -90,7 +90,10 @@ def test_the_same_sweep_again_runs_what_is_missing(swept) -> None:
     assert done.returncode == 1 and "error: 1 of 2 jobs failed: job 0" in done.stderr
     assert (job / "finished.json").is_file()
     assert load_checkpoint(latest_checkpoint(job)).config["resume"] == str(job)
-    assert "are made, a larger number trains on" in (job / "train.log").read_text()
+    assert (
+        "are made: only the run's end is done again, a larger number trains on"
+        in (job / "train.log").read_text()
+    )
     weights = state(job / "checkpoints")
     done = sweep(place, BREAKS)
     assert f"job 1 (trainer.lr=0.001) was finished before: {job}" in done.stdout, done.stdout + done.stderr

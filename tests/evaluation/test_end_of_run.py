@@ -43,6 +43,7 @@ def test_the_table_is_the_curves_last_point(
     found = read_result(tmp_path / "evaluation.json")
     assert json.loads((tmp_path / "evaluation.json").read_text())["policies"] == results.policies
     assert found.told == f"{END}, 3 episodes after 9 updates" and found.protocol["seed"] == 7
+    assert found.protocol["planner"] == cfg.planner.label
     assert [found.protocol[k] for k in ("updates", "env_steps", "training_seconds")] == [9, 120, 3.5]
     numbers = {}
     for policy in during:

@@ -436,6 +436,7 @@ def test_settings_that_cannot_work_are_refused(dots):
         (dict(predictor_head_dim=3), "even"),
         (dict(dropout=1.0), "dropout"),
         (dict(random_shift=-1), "random_shift"),
+        (dict(random_shift=2, image_sizes=None, observation_sizes={"x": 3}), "shifts images"),
         (dict(goal_policy_gradient=True), "no policy towards goals"),
         (dict(encoder_size="huge"), "tiny"),
         (dict(image_sizes={"a": (16, 16, 3), "b": (8, 8, 3)}), "one size"),

@@ -392,7 +392,7 @@ def test_train_accepts_every_declared_command(monkeypatch: pytest.MonkeyPatch) -
             assert (source.ROOT / row.script).is_file()
             continue
         # what `before` makes is not there: tests/training/test_demonstrations.py has such runs
-        gone = ("replay.", "model.imitation_coef=") if row.before else ()
+        gone = ("replay.demo", "model.imitation_coef=") if row.before else ()
         config = composed(tuple(word for word in row.words if not word.startswith(gone)))
         assert isinstance(config, dict), f"{row.name}: {config}"
         check(RunSettings.of(config | {"seed": 0, "device": "cpu", "resume": None}))

@@ -198,7 +198,9 @@ def test_observations_of_another_size_are_refused(demos: Path, settled) -> None:
     run = settled("scale=smoke", *ARM, f"replay.demos={demos}")
     spaces = Spaces.of_config(run.env.arm)
     larger = {key: size + (key == "state") for key, size in spaces.observation_sizes.items()}
-    with pytest.raises(UserError, match="state has size 20 there, 21 in this environment"):
+    with pytest.raises(
+        UserError, match=r"replay\.demos=\S+: state has size 20 there, 21 in this environment"
+    ):
         open_demonstrations(run, replace(spaces, observation_sizes=larger), None)
 
 
@@ -207,7 +209,7 @@ def test_episodes_without_rewards_are_refused(demos: Path, settled, monkeypatch)
 
     monkeypatch.setattr(RecordedWindows, "reward_bounds", None)
     run = settled("scale=smoke", *ARM, f"replay.demos={demos}")
-    with pytest.raises(UserError, match="no rewards"):
+    with pytest.raises(UserError, match=r"replay\.demos=\S+: these episodes have no rewards"):
         open_demonstrations(run, Spaces.of_config(run.env.arm), None)
 
 
@@ -218,8 +220,8 @@ def test_episodes_without_rewards_are_refused(demos: Path, settled, monkeypatch)
         (("env.task=track",), "recorded with env.task=reach, this run has track"),
         (("env.reward=sparse",), "recorded with env.reward=dense, this run has sparse"),
         (("env.action_scale=0.05",), "recorded with env.action_scale=0.085, this run has 0.05"),
-        (("env.fps=20",), "the dataset has 30 frames per second, the environment 20"),
-        (("env=lift",), "the dataset's actions have 7 numbers, the environment's 8"),
+        (("env.fps=20",), r"/\S+ has 30 frames per second, the environment 20"),
+        (("env=lift",), r"/\S+: its actions have 7 numbers, the environment's 8"),
         (("model=muzero", "planner=gumbel"), "learns from its own search"),
         (("replay.demo_updates=31",), "must be at most trainer.updates=30"),
         (("replay.demos={demos}/nowhere",), r"replay\.demos=\S*/nowhere: no such folder"),
@@ -422,8 +424,8 @@ def test_other_rewards_and_other_images_are_refused(
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        (("env=lift",), "the dataset's actions have 7 numbers, the environment's 8"),
-        (("env.fps=20",), "the dataset has 30 frames per second, the environment 20"),
+        (("env=lift",), r"/\S+: its actions have 7 numbers, the environment's 8"),
+        (("env.fps=20",), r"/\S+ has 30 frames per second, the environment 20"),
         (("model.observations=[nothing]",), "gives no 'nothing'"),
     ],
 )

@@ -230,6 +230,12 @@ def test_a_tree_search_has_one_precision() -> None:
         make_planner(run, 2)
 
 
+def test_a_tree_search_is_called_by_its_kind() -> None:
+    for name, label in [("gumbel", "gumbel"), ("mcts", "puct"), ("mppi", "mppi"), ("cem", "cem")]:
+        family = "muzero" if label in ("gumbel", "puct") else "tdmpc2"
+        assert RunSettings.of(compose(f"model={family}", f"planner={name}")).planner.label == label
+
+
 def test_a_bound_of_a_count_has_all_its_digits() -> None:
     with pytest.raises(UserError, match=r"planner\.num_samples=2000000: .* and of at most 1000000$"):
         registry.validate("mppi", {"num_samples": 2_000_000})

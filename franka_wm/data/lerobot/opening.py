@@ -189,12 +189,12 @@ def read_datasets(
     there, size = sources[0].fps, mappings[0].action[1]
     if fps is not None and abs(fps - there) > 1e-6 * there:
         raise UserError(
-            f"the dataset has {there:g} frames per second, the environment {fps:g}; a step would mean something "
+            f"{roots[0]} has {there:g} frames per second, the environment {fps:g}; a step would mean something "
             f"else. Use env.fps={there:g}"
         )
     if action_dim is not None and not mappings[0].discrete and action_dim != size:
         raise UserError(
-            f"the dataset's actions have {size} numbers, the environment's {action_dim}; "
+            f"{roots[0]}: its actions have {size} numbers, the environment's {action_dim}; "
             "choose the env that it was recorded in (or its env.action_mode), or another dataset"
         )
     if action_dim is not None and _scales(mappings, normalize_actions):

@@ -233,6 +233,11 @@ class PlannerSettings:
     compile: bool
     options: Mapping[str, Any]
 
+    @property
+    def label(self) -> str:
+        """What a result says it was planned by: of a tree search, which one."""
+        return str(self.options.get("variant", self.name))
+
     @classmethod
     def of(cls, values: Mapping[str, Any]) -> PlannerSettings:
         """Reads one; the planner's own options are checked where it is built."""
