@@ -96,8 +96,11 @@ class Randomizer:
             array[start : start + n * shapes].reshape((n, shapes))
             for array in (model.shape_scale, model.shape_transform)
         ]
-        self._sized = [*touched, *seen]
-        self._plain_sizes = [wp.clone(array)[0] for array in touched] + [wp.clone(array) for array in seen]
+        coms = model.body_com.reshape((n, -1))
+        self._sized = [*touched, *seen, coms]
+        self._plain_sizes = [wp.clone(array)[0] for array in touched] + [
+            wp.clone(array) for array in (*seen, coms)
+        ]
 
     def _note_table(self) -> None:
         """Where table and obstacles are."""
@@ -177,7 +180,7 @@ class Randomizer:
         if self.ranges.table_height:
             self._raise_table()
         if self.ranges.object_size:
-            inputs = [sim.warp.sizes, self._parts, *self._plain_sizes, *self._sized]
+            inputs = [sim.warp.sizes, self._parts, *self._plain_sizes, self._first_object, *self._sized]
             wp.launch(kernels.resize, (sim.num_envs, len(self._parts)), inputs, device=sim.device)
         if self.ranges.dynamics:
             flags = ModelFlags.JOINT_DOF_PROPERTIES

@@ -158,10 +158,15 @@ class Scene:
                     f"randomization.object_size={width:g}: objects of {factor:g} times their size: {error}"
                 ) from error
 
-    def blocked(self) -> list[tuple[float, ...]]:
-        """What obstacles take of the table: (x, y, half sides, cosine and sine of the angle, radius around these)."""
+    def blocked(self, grown: float = 1.0) -> list[tuple[float, ...]]:
+        """What obstacles take of the table: (x, y, half sides, cosine and sine of the angle, radius around these).
+
+        Args:
+            grown: How many times their size objects may have; then taller ones reach what hangs above.
+        """
         out = []
-        heights = [2 * one.half_height for one in self.objects] + [one.size[2] for one in self.articulated]
+        heights = [2 * grown * one.half_height for one in self.objects]
+        heights += [one.size[2] for one in self.articulated]
         tallest = max([0.2, *heights])
         for one in self.obstacles:
             if self.top - one.half_height < one.at[2] < self.top + tallest + one.half_height:

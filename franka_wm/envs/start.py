@@ -18,7 +18,7 @@ from franka_wm.envs.config import FrankaConfig
 from franka_wm.envs.constants import MOST_OPEN
 from franka_wm.envs.kinematics import Kinematics
 from franka_wm.envs.robots import Robot, gripper, links, load_robot
-from franka_wm.envs.scene import Scene, Solid
+from franka_wm.envs.scene import FLOOR, Scene, Solid
 from franka_wm.envs.tasks import Task
 from franka_wm.errors import UserError
 from franka_wm.options import check_whole
@@ -76,13 +76,21 @@ def _check_goal(config: FrankaConfig, robot: Robot) -> None:
         raise UserError(
             f"goal={config.goal} m: out of the arm's reach; it reaches about 0.85 m from (0, 0, 0.333)"
         )
+    scene = config.resolved_scene
+    for one in (scene.table, *scene.obstacles) if scene else ():
+        place, half = _standing(one, scene)
+        inside = wp.transform_point(wp.transform_inverse(place), wp.vec3(*config.goal))
+        if one.shape != "mesh" and all(abs(float(x)) < h for x, h in zip(inside, half, strict=True)):
+            where = "under it" if one is scene.table else "in it"
+            raise UserError(f"goal={config.goal} m: lies {where}: scene.{one.name}; move one of them")
 
 
 def check_start(config: FrankaConfig, robot: Robot) -> None:
     """Refuses a start beyond the joints' limits, a scene that hand or arm would start in, and objects out of reach.
 
-    Of round things counts the box inside them, and meshes are not looked at, since the box around one may be mostly
-    empty. Nor are arms and hands that are not Franka's.
+    Objects may be as large, and the table as high, as randomization makes them. Of round things counts the box inside
+    them, and meshes are not looked at, since the box around one may be mostly empty. Nor are arms and hands that are
+    not Franka's.
 
     Raises:
         UserError: One line, with the name of what is in the way.
@@ -100,12 +108,15 @@ def check_start(config: FrankaConfig, robot: Robot) -> None:
     frames = _link_frames(config, robot)
     hand = list(_hand(frames[-1] * wp.transform(*robot.tool_frame)))
     arm = list(_arm(frames)) if config.collisions != "hand" else []
+    grown, raised = (
+        1.0 + config.randomization.object_size,
+        np.array([0.0, 0.0, config.randomization.table_height]),
+    )
     for one in (scene.table, *scene.obstacles):
         if one.shape == "mesh":
             continue
-        under = one.half_height if one is scene.table else 0.0  # a table's place is that of its top
-        turn = wp.quat_from_axis_angle(wp.vec3(0.0, 0.0, 1.0), one.angle)
-        box = _box(wp.transform(wp.vec3(*one.at[:2], one.at[2] - under), turn), _filled(one))
+        place, half = _standing(one, scene)
+        box = _box(place, half + raised)
         touched = {"hand": hand} if one is scene.table else {"hand": hand, "arm": arm}
         for what, boxes in touched.items():
             if any(_overlap(box, other) for other in boxes):
@@ -115,13 +126,29 @@ def check_start(config: FrankaConfig, robot: Robot) -> None:
     for one in scene.objects:
         if one.shape == "mesh":
             continue
-        half = np.array([*one.spread, 0.0]) + _filled(one)
-        box = _box(wp.transform(wp.vec3(*one.at, scene.top + one.half_height), wp.quat_identity()), half)
-        if any(_overlap(box, other) for other in hand):
+        half = np.array([*one.spread, 0.0]) + grown * _filled(one) + raised
+        place = wp.vec3(*one.at, scene.top + grown * one.half_height)
+        if any(_overlap(_box(wp.transform(place, wp.quat_identity()), half), other) for other in hand):
+            drawn = [
+                f"randomization.{name}"
+                for name in ("object_size", "table_height")
+                if getattr(config.randomization, name)
+            ]
+            lower = f"make it lower ({', '.join(['size', *drawn])})"
             raise UserError(
-                f"scene.{one.name}: {2 * one.half_height:g} m high, it may start in the hand; make it lower (size), or "
-                "move it (at, spread)"
+                f"scene.{one.name}: {2 * one.half_height:g} m high, it may start in the hand; {lower}, or move it "
+                "(at, spread)"
             )
+
+
+def _standing(one: Solid, scene: Scene) -> tuple[wp.transform, np.ndarray]:
+    """Place and half sides (3,) of the box that a table or an obstacle fills [m]; a table's reaches to the floor."""
+    half, height = _filled(one), one.at[2]
+    if one is scene.table:  # its place is that of its top
+        half[2] = 0.5 * max(2.0 * half[2], height - FLOOR)
+        height -= half[2]
+    turn = wp.quat_from_axis_angle(wp.vec3(0.0, 0.0, 1.0), one.angle)
+    return wp.transform(wp.vec3(*one.at[:2], height), turn), half
 
 
 def _filled(one: Solid) -> np.ndarray:

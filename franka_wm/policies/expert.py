@@ -13,7 +13,7 @@ from franka_wm.envs.constants import MOST_OPEN, NUM_JOINTS
 from franka_wm.envs.kinematics import Kinematics
 from franka_wm.envs.multitask import MultiTaskEnv
 from franka_wm.envs.tasks import Task
-from franka_wm.envs.tasks.manipulation import Aim, Sight
+from franka_wm.envs.tasks.experts import Aim, Sight
 from franka_wm.errors import UserError
 from franka_wm.policies.scripted import DrawingPolicy, ScriptedPolicy
 from franka_wm.seeding import of_worlds

@@ -50,7 +50,7 @@ def show(env: FrankaEnv, tensordict: TensorDictBase, steps: int) -> list[TensorD
 @pytest.mark.parametrize("name", [*NAMES, "lift_pixels", "lift_goal_image"])
 def test_no_step_with_contacts_waits(name: str, preset) -> None:
     """Over grasps, ends of episodes and resets, the expert's decisions included."""
-    env = FrankaEnv(replace(preset(name), episode_length=20), num_envs=N, device="cuda")
+    env = FrankaEnv(replace(preset(name), episode_length=40), num_envs=N, device="cuda")
     first = env.reset(seed=3)
     if name in NAMES:
         show(env, first, 3)
@@ -59,7 +59,7 @@ def test_no_step_with_contacts_waits(name: str, preset) -> None:
     torch.cuda.synchronize()
     torch.cuda.set_sync_debug_mode("error")
     try:
-        for _ in range(45):
+        for _ in range(85):
             chosen = policy(first) if name in NAMES else first.set("action", action)
             _, first = env.step_and_maybe_reset(chosen)
             first.pop("next", None)

@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from franka_wm.envs import FrankaConfig, FrankaEnv
-from franka_wm.envs.scene import Body, Scene
+from franka_wm.envs.scene import Body, Obstacle, Scene
 from franka_wm.errors import UserError
 from franka_wm.evaluation.closed_loop import play_episodes
 from franka_wm.policies.expert import ExpertPolicy
@@ -96,6 +96,10 @@ def test_geometry_mass_and_inertia_follow(sized: FrankaEnv) -> None:
             / make(1, size=0.0).simulation.solver.mjw_model.geom_size.numpy()[0, -5:]
         )
         np.testing.assert_allclose(block, float(sizes[world, 3]), rtol=1e-5)
+        low = make(1, size=0.0).simulation.solver.mjw_model.body_ipos.numpy()[0, -1]
+        assert abs(low[2]) > 1e-4, "a socket's plate makes it heavier below"
+        centre = got.body_ipos.numpy()[world, -1]
+        np.testing.assert_allclose(centre, low * float(sizes[world, 3]), rtol=1e-4, atol=1e-8)
 
 
 def test_they_start_on_the_table_apart_and_stay(sized: FrankaEnv) -> None:
@@ -147,6 +151,17 @@ def test_a_world_is_the_same_whatever_their_number() -> None:
             out.append(torch.cat([step["next", "objects"][0], env.simulation.tensors.sizes[0]]))
         runs.append(torch.stack(out))
     assert torch.equal(*runs)
+
+
+def test_a_grown_object_does_not_start_in_what_hangs_above_a_plain_one() -> None:
+    """A shelf 2 cm above a tower of 30 cm, which may be 36 cm high."""
+    tower = Body(name="tower", size=(0.05, 0.05, 0.3), at=(0.5, 0.25), spread=(0.12, 0.2))
+    shelf = Obstacle(name="shelf", size=(0.06, 0.06, 0.04), at=(0.5, 0.25, 0.34))
+    env = make(64, size=0.2, task="reach", gripper=True, scene=Scene(objects=(tower,), obstacles=(shelf,)))
+    root = env.reset()
+    away = (root["objects"][:, :2] - torch.tensor([0.5, 0.25])).abs().amax(1)
+    assert away.min() > 0.03 + 0.025 and away.max() > 0.1
+    assert still(env, root, 3)["objects"][:, 7:10].abs().max() < 1e-3, "none is pushed out of the shelf"
 
 
 def test_cameras_see_the_size() -> None:

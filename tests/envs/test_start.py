@@ -50,6 +50,37 @@ def test_objects_stand_apart_where_some_draws_leave_no_room() -> None:
         assert (torch.cdist(places, places) + torch.eye(4)).min() > 0.04 * 2**0.5  # circles around 4 cm boxes
 
 
+@pytest.mark.parametrize(("name", "width", "high"), [("object_size", 0.3, 0.2), ("table_height", 0.1, 0.15)])
+def test_an_object_that_only_some_draws_put_into_the_hand_is_refused(
+    name: str, width: float, high: float
+) -> None:
+    scene = {"objects": [{"name": "tall", "size": [0.05, 0.05, high], "at": [0.5, 0.0]}]}
+    check_robot(configured(scene=scene))
+    check_robot(configured(scene=scene, randomization={name: 0.01}))
+    with pytest.raises(UserError, match=rf"scene\.tall: .*make it lower \(size, randomization\.{name}\)"):
+        check_robot(configured(scene=scene, randomization={name: width}))
+
+
+@pytest.mark.parametrize(
+    ("goal", "said"),
+    [
+        ((0.5, 0.0, -0.2), "lies under it: scene.table"),
+        ((0.5, 0.28, 0.1), "lies in it: scene.wall"),
+        ((0.5, 0.25, 0.36), "lies in it: scene.ball"),
+        ((0.5, 0.0, 0.1), None),
+        ((0.5, 0.1, 0.25), None),
+    ],
+)
+def test_a_goal_in_what_stands_there_is_refused(goal: tuple[float, ...], said: str | None) -> None:
+    turned = wall([0.3, 0.2, 0.2], [0.5, 0.2, 0.1]) | {"angle": 1.57}
+    scene = {"objects": [CUBE | {"at": [0.4, -0.2]}], "obstacles": [turned, BALL | {"at": [0.5, 0.25, 0.36]}]}
+    config = configured("reach", gripper=True, goal=goal, goal_sampling="fixed", scene=scene)
+    if said is None:
+        return check_robot(config)
+    with pytest.raises(UserError, match=said):
+        check_robot(config)
+
+
 @pytest.mark.parametrize(
     ("said", "changes"),
     [
@@ -59,6 +90,7 @@ def test_objects_stand_apart_where_some_draws_leave_no_room() -> None:
         ("scene.ball: stands in the hand", {"obstacles": [BALL | {"at": [0.5, 0.15, 0.36]}]}),
         ("scene.wall: stands in the arm", {"obstacles": [wall([0.1, 0.1, 0.3], [0.1, 0.0, 0.5])]}),
         ("scene.table: stands in the hand", {"table": {"at": [0.35, 0.0, 0.3]}}),
+        ("scene.table: stands in the hand", {"table": {"at": [0.5, 0.0, 0.6]}}),
         ("scene.table.at: with its top at -0.6 m, cube may start", {"table": {"at": [0.35, 0.0, -0.6]}}),
     ],
 )  # fmt: skip

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import platform
+import shlex
 import sys
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import fields
@@ -31,7 +32,7 @@ def describe(
         more: Anything else, plain values.
     """
     return {
-        "command": " ".join([Path(sys.argv[0]).name, *sys.argv[1:]]) if command is None else command,
+        "command": _typed() if command is None else command,
         "policy": policy,
         "seed": seed,
         "date": datetime.now(UTC).isoformat(timespec="seconds"),
@@ -39,6 +40,12 @@ def describe(
         "config": dict(config),
         **more,
     }
+
+
+def _typed() -> str:
+    """The command line of this process; as one of several on GPUs it is ``python -m franka_wm``."""
+    name = Path(sys.argv[0]).name
+    return shlex.join(["franka-wm" if name == "__main__.py" else name, *sys.argv[1:]])
 
 
 ACTIONS = (

@@ -13,6 +13,7 @@ from franka_wm.envs.kernels.functions import JOINTS, episode_rng
 def end_step(
     reward: wp.array2d[float],
     broken: wp.array[wp.bool],
+    overflow: wp.array[int],
     cut: wp.array[wp.bool],
     episode_length: int,
     terminate_on_success: bool,
@@ -32,7 +33,8 @@ def end_step(
     """Ends episodes and keeps their statistics.
 
     A broken world is truncated, not terminated: where rewards are negative, as reach's are, an end worth 0 would
-    pay an agent for breaking the simulation. Nor has it succeeded, wherever it was before. A world that is ``cut``
+    pay an agent for breaking the simulation. Nor has it succeeded, wherever it was before, and neither has one whose
+    contacts were lost (``overflow``): what it did is not known. A world that is ``cut``
     short is truncated, too: what comes then has no reward of its own, but is not worth 0 either. A world that is
     stepped on after its end, without a reset, stays done by time or success, and is not counted again.
     """
@@ -42,7 +44,7 @@ def end_step(
     step_count[world, 0] = count
     total = episode_return[world, 0] + reward[world, 0]
     episode_return[world, 0] = total
-    if broken[world]:
+    if broken[world] or overflow[world] != 0:
         success[world, 0] = False
     solved = success[world, 0] and not over
     once = episode_success[world, 0] or solved

@@ -147,6 +147,8 @@ def resize(
     plain_place: wp.array[wp.vec3f],
     plain_scale: wp.array2d[wp.vec3f],
     plain_frame: wp.array2d[wp.transformf],
+    plain_com: wp.array2d[wp.vec3f],
+    first: int,
     # outputs
     size: wp.array2d[wp.vec3f],
     bounds: wp.array3d[wp.vec3f],
@@ -154,9 +156,12 @@ def resize(
     place: wp.array2d[wp.vec3f],
     scale: wp.array2d[wp.vec3f],
     frame: wp.array2d[wp.transformf],
+    com: wp.array2d[wp.vec3f],
 ):
-    """What MuJoCo touches and what cameras see of the objects. dim = (worlds, parts); a part is MuJoCo's geom, Newton's
-    shape, both counted in a world, and the object."""
+    """What MuJoCo touches and what cameras see of the objects, bodies ``first`` and on, and their centres of mass.
+
+    dim = (worlds, parts); a part is MuJoCo's geom, Newton's shape, both counted in a world, and the object.
+    """
     world, k = wp.tid()  # pyright: ignore
     geom = parts[k][0]
     shape = parts[k][1]
@@ -169,6 +174,8 @@ def resize(
     scale[world, shape] = plain_scale[world, shape] * f
     at = plain_frame[world, shape]
     frame[world, shape] = wp.transformf(wp.transform_get_translation(at) * f, wp.transform_get_rotation(at))
+    body = first + parts[k][2]
+    com[world, body] = plain_com[world, body] * f
 
 
 @wp.kernel(enable_backward=False)

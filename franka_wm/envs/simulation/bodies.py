@@ -18,8 +18,9 @@ from franka_wm.envs.simulation.arrays import STATISTICS
 if TYPE_CHECKING:
     from franka_wm.envs.simulation.simulator import Simulation
 
-CAPACITY = 1 | 2 | 4 | 8 | 16 | 1 << 16 | 1 << 17
-"""Bits of MuJoCo's overflow that mean lost contacts; the others say that iterations were used up."""
+CAPACITY = 1 | 2 | 4 | 8 | 16 | 1 << 8 | 1 << 16 | 1 << 17
+"""Bits of MuJoCo's overflow that mean lost contacts, the last two Newton's; the others are of iterations that were used
+up, and of what no scene has."""
 
 RESTING = 5e-5
 """How deep an object presses into the table under its own weight [m]: it starts at rest, not in a small fall."""
@@ -65,7 +66,7 @@ class Bodies:
 
         cases = scene.articulated if scene else ()
         self._count, self._joints = count, joints = len(objects), len(cases)
-        blocked = scene.blocked() if scene else []
+        blocked = scene.blocked(1.0 + config.randomization.object_size) if scene else []
         footprints = numbers([one.footprint for one in cases], joints, 4)
         obstacles = numbers(blocked, len(blocked), 7)
         space = scene.space if scene else 0.0

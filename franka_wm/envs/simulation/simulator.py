@@ -263,7 +263,7 @@ class Simulation:
         self.task.reward_and_success(self)
         self._launch(
             episodes.end_step,
-            w.reward, w.broken, w.cut, cfg.episode_length, cfg.terminate_on_success, w.success,
+            w.reward, w.broken, w.overflow, w.cut, cfg.episode_length, cfg.terminate_on_success, w.success,
             w.step_count, w.episode_return, w.episode_success, w.ended, w.statistics,
             w.terminated, w.truncated, w.done, w.reset_mask,
         )  # fmt: skip

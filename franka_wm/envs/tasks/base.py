@@ -17,7 +17,7 @@ from franka_wm.errors import UserError
 if TYPE_CHECKING:
     from franka_wm.envs.config import FrankaConfig
     from franka_wm.envs.simulation import Simulation
-    from franka_wm.envs.tasks.manipulation import Aim, Sight
+    from franka_wm.envs.tasks.experts import Aim, Sight
 
 
 class Task:

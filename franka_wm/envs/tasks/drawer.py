@@ -10,18 +10,8 @@ import warp as wp
 
 from franka_wm.envs.kernels import goals
 from franka_wm.envs.scene import Articulated, ArticulatedFile, Scene, Table
-from franka_wm.envs.tasks.manipulation import (
-    Aim,
-    GripperTask,
-    Sight,
-    effort,
-    fetch,
-    holds,
-    moved,
-    nearness,
-    place_of,
-    tool_of,
-)
+from franka_wm.envs.tasks.experts import Aim, Sight, fetch, moved
+from franka_wm.envs.tasks.manipulation import GripperTask, effort, holds, nearness, place_of, tool_of
 from franka_wm.errors import UserError
 
 if TYPE_CHECKING:

@@ -10,18 +10,8 @@ import torch
 import warp as wp
 
 from franka_wm.envs.scene import Body, Scene
-from franka_wm.envs.tasks.manipulation import (
-    Aim,
-    GripperTask,
-    Sight,
-    effort,
-    fetch,
-    holds,
-    moved,
-    nearness,
-    place_of,
-    tool_of,
-)
+from franka_wm.envs.tasks.experts import Aim, Sight, fetch, grasp_of, moved
+from franka_wm.envs.tasks.manipulation import GripperTask, effort, holds, nearness, place_of, tool_of
 
 if TYPE_CHECKING:
     from franka_wm.envs.simulation import Simulation
@@ -84,4 +74,4 @@ class Lift(GripperTask):
 
     def expert(self, sight: Sight) -> Aim:
         """Grasp the cube from above and bring it a little higher than the goal."""
-        return fetch(sight, 0, moved(sight.goal, z=0.03))[0]
+        return fetch(sight, 0, moved(sight.goal, z=0.03), **grasp_of(self.objects[0]))[0]

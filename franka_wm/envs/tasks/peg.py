@@ -11,16 +11,13 @@ import warp as wp
 
 from franka_wm.envs.scene import Body, Scene
 from franka_wm.envs.solids import PLATE
+from franka_wm.envs.tasks.experts import Aim, Sight, fetch, quarter_turn
 from franka_wm.envs.tasks.manipulation import (
-    Aim,
     GripperTask,
-    Sight,
     effort,
-    fetch,
     holds,
     nearness,
     place_of,
-    quarter_turn,
     rotation_of,
     tool_of,
 )

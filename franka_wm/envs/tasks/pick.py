@@ -11,13 +11,11 @@ import warp as wp
 from tensordict import TensorDictBase
 
 from franka_wm.envs.scene import Body, Scene
+from franka_wm.envs.tasks.experts import Aim, Sight, fetch, grasp_of
 from franka_wm.envs.tasks.manipulation import (
-    Aim,
     GripperTask,
-    Sight,
     effort,
     fastest_joint,
-    fetch,
     held_in_torch,
     holds,
     near_in_torch,
@@ -143,4 +141,4 @@ class Pick(GripperTask):
 
     def expert(self, sight: Sight) -> Aim:
         """Grasp the cube from above and bring it to the goal."""
-        return fetch(sight, 0, sight.goal)[0]
+        return fetch(sight, 0, sight.goal, **grasp_of(self.objects[0]))[0]

@@ -11,12 +11,10 @@ import warp as wp
 from tensordict import TensorDictBase
 
 from franka_wm.envs.scene import REACH, Body, Scene
+from franka_wm.envs.tasks.experts import Aim, Sight, moved
 from franka_wm.envs.tasks.manipulation import (
-    Aim,
     GripperTask,
-    Sight,
     effort,
-    moved,
     near_in_torch,
     nearness,
     place_of,

@@ -11,14 +11,11 @@ import warp as wp
 
 from franka_wm.envs.constants import MOST_OPEN
 from franka_wm.envs.scene import Body, Scene
+from franka_wm.envs.tasks.experts import Aim, Sight, fetch, grasp_of, moved
 from franka_wm.envs.tasks.manipulation import (
-    Aim,
     GripperTask,
-    Sight,
     effort,
-    fetch,
     holds,
-    moved,
     nearness,
     place_of,
     speed_of,
@@ -140,7 +137,7 @@ class Stack(GripperTask):
         high = cube[:, 2] > spot[:, 2] + 0.025
         to = torch.where((aside < 0.008)[:, None], spot, moved(spot, z=0.05))
         to[:, :2] = torch.where((high | (aside < 0.008))[:, None], spot[:, :2], cube[:, :2])
-        aim, _ = fetch(sight, 0, to)
+        aim, _ = fetch(sight, 0, to, **grasp_of(self.objects[0]))
         placed = (aside < 0.012) & ((cube - spot)[:, 2].abs() < 0.004)
         up = sight.target.clone()
         free = (sight.opening > 0.03) & (sight.tool[:, 2] < cube[:, 2] + 0.10)
