@@ -5,8 +5,9 @@
     python benchmarks/env.py --cases lift stack --contacts mujoco newton      who finds contacts, and what it costs
 
 *raw Newton* is physics (and rendering) alone in one graph, without task, reset or TorchRL: the ceiling.
-Worlds are diverged in all three: each is at another point of its episode, so that resets happen in every step. Where
-there is something to touch they play an episode of the expert's, over and over.
+Worlds are diverged in all three: each is at another point of its episode. Then raw worlds hold the set points that they
+have, while the others go on, with resets in every step; where there is something to touch they play an episode of the
+expert's, over and over. *memory* is what Warp and torch have allocated for the environment, by their own count.
 """
 
 from __future__ import annotations
@@ -18,6 +19,7 @@ from collections.abc import Callable
 from dataclasses import replace
 
 import torch
+import warp as wp
 from common import publish, rate
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
@@ -163,19 +165,23 @@ def collector(env: FrankaEnv, steps: int, seconds: float, actions: Actions) -> f
     return result
 
 
+def allocated(device: str) -> int:
+    """Bytes that Warp and torch have allocated on a GPU; what they keep in reserve changes with what ran before."""
+    torch.cuda.synchronize(device)
+    return wp.get_mempool_used_mem_current(device) + torch.cuda.memory_allocated(device)
+
+
 def measure(name: str, worlds: int, device: str, seconds: float, contacts: str) -> dict:
     config = CASES[name]
     if contacts != "mujoco":
         config, name = replace(config, collision_pipeline=contacts), f"{name}, contacts of {contacts}"
     on_gpu = device.startswith("cuda")
-    if on_gpu:
-        torch.cuda.empty_cache()
-        free = torch.cuda.mem_get_info()[0]
+    before = allocated(device) if on_gpu else float("nan")
     started = time.perf_counter()
     env = FrankaEnv(config, num_envs=worlds, device=device)
     env.step_and_maybe_reset(env.rand_action(env.reset()))
     startup = time.perf_counter() - started
-    memory = (free - torch.cuda.mem_get_info()[0]) / worlds / 2**10 if on_gpu else float("nan")
+    memory = (allocated(device) - before) / worlds / 2**10 if on_gpu else float("nan")
     actions = experts(config, device) if config.has_gripper else uniform
     diverge(env.simulation, actions)
     step = captured_step(env, seconds, actions)

@@ -36,7 +36,10 @@ class Stage:
     """
 
     def __init__(self, task: str, seed: int = 1):
-        cfg = conf.compose(f"env={task}", "env.enable_shadows=true", "env.episode_length=1000000")
+        changes = ["env.enable_shadows=true", "env.episode_length=1000000"]
+        if task in ("push", "pick"):  # else one cannot see what is asked
+            changes += ["env.show_goal=true", "env.observations=[pixels,state,joint_target,objects]"]
+        cfg = conf.compose(f"env={task}", *changes)
         values = {str(name): value for name, value in cfg.env.items() if name not in ("kind", "urdf_path")}
         config = FrankaConfig.from_mapping(values | {"camera_fov_degrees": 45.0})
         self.env = FrankaEnv(config, num_envs=1, device="cpu", seed=seed)

@@ -6,9 +6,10 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from benchmarks.results.rows import Row
+from benchmarks.results.rows import Row, is_bound
 from benchmarks.results.state import Record
 from benchmarks.results.times import company, duration, seconds, timed
+from franka_wm.errors import UserError
 
 
 @dataclass(frozen=True)
@@ -51,6 +52,34 @@ def columns(records: Sequence[Record]) -> list[Metric]:
 
 def mean(values: Sequence[float]) -> float:
     return sum(values) / len(values)
+
+
+def goals_met(row: Row, lines: Sequence[Mapping[str, Any]]) -> list[tuple[str, str, bool]]:
+    """The same of a benchmark's lines: of those that a goal names, the worst.
+
+    Raises:
+        UserError: A goal names no line, or a column that has no numbers.
+    """
+    found = []
+    for goal in row.goals:
+        bounds = {column: value for column, value in goal.items() if is_bound(value)}
+        named = {column: value for column, value in goal.items() if column not in bounds}
+        chosen = [line for line in lines if all(line.get(column) == value for column, value in named.items())]
+        for column, bound in bounds.items():
+            values = [line.get(column) for line in chosen]
+            if not values or not all(isinstance(value, int | float) for value in values):
+                raise UserError(f"row {row.name}: no line has {named} and a number in {column!r}")
+            least, wanted = bound[0] == "≥", float(bound[1:])
+            worst = min(values) if least else max(values)
+            which = ", ".join(f"{name} {value}".strip() for name, value in named.items())
+            told = f"{which}: {column} {bound[0]} {number(wanted)}".removeprefix(": ")
+            found.append((told, number(worst), worst >= wanted if least else worst <= wanted))
+    return found
+
+
+def number(value: float) -> str:
+    """As tables of benchmarks show it."""
+    return f"{value:,.0f}" if abs(value) >= 100 else f"{value:.3g}"
 
 
 def verdicts(row: Row, records: Sequence[Record]) -> list[tuple[str, str, bool]]:

@@ -8,7 +8,18 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks.results.confirm import confirmed
-from benchmarks.results.metrics import DISTANCE, RETURN, SUCCESS, WITHIN, Metric, columns, mean, verdicts
+from benchmarks.results.metrics import (
+    DISTANCE,
+    RETURN,
+    SUCCESS,
+    WITHIN,
+    Metric,
+    columns,
+    goals_met,
+    mean,
+    number,
+    verdicts,
+)
 from benchmarks.results.records import BESIDE, PLACE, read
 from benchmarks.results.rows import Row
 from benchmarks.results.state import Record, apart, numbers, state, unmeasured
@@ -108,16 +119,22 @@ def part(row: Row, records: Sequence[Record], judged: tuple[str, list[str]], pla
         ]
     if row.script is not None:
         shown = [f"![{row.title}](results/{row.picture})", ""] if row.plot else []
-        return "\n".join([*lines, *shown, table(list(records[0]["rows"][0]), _cells(records[0]["rows"])), ""])
+        lines += [*shown, table(list(records[0]["rows"][0]), _cells(records[0]["rows"])), ""]
+        if judgement := goals_met(row, records[0]["rows"]):
+            lines += [_judged(judgement), ""]
+        return "\n".join(lines)
     if judgement := verdicts(row, records):
-        so_far = "so far" if missing else "yes"
-        cells = [[wanted, reached, so_far if enough else "**no**"] for wanted, reached, enough in judgement]
-        lines += [table(["wanted", "measured", "reached"], cells), ""]
+        lines += [_judged(judgement, "so far" if missing else "yes"), ""]
     lines += [_over_seeds(records), ""]
     if len(records) > 1:
         seeds = _each_seed(row, records)
         lines += ["<details><summary>Every seed</summary>", "", seeds, "", "</details>", ""]
     return "\n".join(lines)
+
+
+def _judged(judgement: Sequence[tuple[str, str, bool]], yes: str = "yes") -> str:
+    cells = [[wanted, reached, yes if enough else "**no**"] for wanted, reached, enough in judgement]
+    return table(["wanted", "measured", "reached"], cells)
 
 
 def _since(reasons: Sequence[str], same: Record | None) -> str:
@@ -259,7 +276,7 @@ def _cells(rows: Sequence[Mapping[str, Any]], names: Sequence[str] | None = None
         if value is None or value != value:  # files of earlier versions hold NaN
             return "–"
         if isinstance(value, float):
-            return f"{value:,.0f}" if abs(value) >= 100 else f"{value:.3g}"
+            return number(value)
         return str(value)
 
     return [[cell(row[name]) for name in names or row] for row in rows]

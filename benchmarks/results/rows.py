@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import shlex
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
@@ -54,6 +55,7 @@ class Row:
     policy: str = ""
     seeds: tuple[int, ...] = ()
     wanted: Mapping[str, Any] = field(default_factory=dict)
+    goals: list[dict[str, Any]] = field(default_factory=list)
     script: str | None = None
     text: str = ""
     readme: bool | list[str] = False
@@ -115,6 +117,11 @@ def load_rows(path: Path = DECLARED) -> dict[str, Row]:
             raise UserError(
                 f"{where}: wanted has no {', '.join(sorted(unknown))}; it has {', '.join(WANTED)}"
             )
+        for goal in entry.get("goals", ()):
+            if "script" not in entry or not isinstance(goal, dict) or not any(map(is_bound, goal.values())):
+                raise UserError(
+                    f"{where}: goals are of a benchmark, each columns of its lines and COLUMN: ≥ N or ≤ N, not {goal}"
+                )
         if ("script" in entry) == ("seeds" in entry):
             raise UserError(f"{where}: needs either seeds, of train.py, or the script of a benchmark")
         first, last = entry.pop("seeds", (0, -1))
@@ -122,6 +129,11 @@ def load_rows(path: Path = DECLARED) -> dict[str, Row]:
         rows[name] = Row(name=name, section=section, seeds=tuple(range(first, last + 1)), **entry)
     place = {id(section): k for k, section in enumerate(sections.values())}
     return dict(sorted(rows.items(), key=lambda item: place[id(item[1].section)]))
+
+
+def is_bound(value: object) -> bool:
+    """Whether a goal's entry says what is to be reached: ``≥ N`` or ``≤ N``."""
+    return isinstance(value, str) and re.fullmatch(r"[≥≤] \d+(\.\d+)?", value) is not None
 
 
 def choose(rows: Mapping[str, Row], name: str) -> Row:

@@ -414,8 +414,8 @@ class FrankaConfig:
             )
         if "objects" in self.observations and not self.object_dim:
             raise UserError(
-                f"observations: task={self.task} has no objects; leave objects out, give a scene, or name a task "
-                "that has one"
+                f"observations: task={self.task} has no objects here; leave objects out, give a scene with some (it "
+                "takes the place of the task's whole one), or name a task that has them"
             )
         for name, there, what in (
             ("contact_friction", self.resolved_scene, "a scene"),

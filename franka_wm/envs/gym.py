@@ -60,7 +60,7 @@ class FrankaVectorEnv(gymnasium.vector.VectorEnv):
     key                      shape, dtype                  meaning
     =======================  ============================  ======================================
     ``pixels``/``front``     (N, H, W, 3) uint8            the camera; absent without ``pixels``
-    ``agent_pos``            (N, 7) float32                joint angles [rad]
+    ``agent_pos``            (N, 7) float32                joint angles [rad]; with a gripper (N, 28), all of ``state``
     ``environment_state``    (N, 3) float32                the goal [m]
     =======================  ============================  ======================================
 
@@ -130,7 +130,8 @@ class FrankaVectorEnv(gymnasium.vector.VectorEnv):
                 {CAMERA: spaces.Box(0, 255, (side, side, 3 * env.config.frame_stack), np.uint8)}
             )
         # Joints may overshoot their limits a little, so the box is open.
-        entries["agent_pos"] = spaces.Box(-np.inf, np.inf, (NUM_JOINTS,), np.float32)
+        self._arm = env.config.state_dim if env.config.has_gripper else NUM_JOINTS
+        entries["agent_pos"] = spaces.Box(-np.inf, np.inf, (self._arm,), np.float32)
         entries["environment_state"] = spaces.Box(-np.inf, np.inf, (3,), np.float32)
         self._others = [key for key in env.observation_spec if key not in RENAMED]
         for key in self._others:
@@ -260,7 +261,7 @@ class FrankaVectorEnv(gymnasium.vector.VectorEnv):
         out: dict[str, Any] = {}
         if "pixels" in self.env.config.observations:
             out["pixels"] = {CAMERA: tensordict.get("pixels").contiguous().cpu().numpy()}
-        out["agent_pos"] = tensordict.get("state")[:, :NUM_JOINTS].contiguous().cpu().numpy()
+        out["agent_pos"] = tensordict.get("state")[:, : self._arm].contiguous().cpu().numpy()
         out["environment_state"] = tensordict.get("goal").contiguous().cpu().numpy()
         out |= {key: tensordict.get(key).contiguous().cpu().numpy() for key in self._others}
         return out, _host(tensordict.get("success"))
@@ -283,9 +284,9 @@ class FrankaGymEnv(gymnasium.Env):
     """One arm behind Gymnasium's interface: a :class:`FrankaVectorEnv` of one world, without its leading dimension.
 
     Observations are those of the vector environment: ``pixels``/``front`` (H, W, 3) uint8, ``agent_pos`` (7,)
-    [rad], ``environment_state`` (3,) [m], and what else was asked for. Actions are (A,) float32 in [−1, 1]; A is
-    7, or 3 with ``action_mode="ee_delta"``. ``info["is_success"]`` belongs to the observation returned. A finished
-    episode goes on until :meth:`reset`, still finished.
+    [rad] or (28,), ``environment_state`` (3,) [m], and what else was asked for. Actions are (A,) float32 in [−1, 1]; A
+    is 7, or 3 with ``action_mode="ee_delta"``; one more with a gripper. ``info["is_success"]`` belongs to the
+    observation returned. A finished episode goes on until :meth:`reset`, still finished.
 
     Args:
         device: Where it simulates; the GPU where there is one.

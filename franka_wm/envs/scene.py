@@ -117,7 +117,7 @@ class Scene:
         """Contacts per world: the least with which everything stands still, and enough for what may happen.
 
         The hand rammed into a table and a cube makes 14. All worlds share one pool of this many each, so a crowded
-        world takes from others' share before anything is lost.
+        world may take from others' share, up to four times its own.
 
         Args:
             collisions: What of the robot touches the scene, as in the environment's config.

@@ -75,6 +75,7 @@ def test_what_else_was_asked_for_is_observed() -> None:
     assert set(one.observation_space) == others | {"pixels", "agent_pos", "environment_state"}
     observation = one.reset(seed=0)[0]
     present = FrankaEnv(one.env.config, num_envs=1, device="cpu").reset(seed=0)
+    assert np.array_equal(observation["agent_pos"], present["state"][0].numpy()), "fingers and tool, too"
     kept = {key: observation[key].copy() for key in others}
     moved = one.step(np.ones(8, np.float32))[0]
     for each in (observation, moved):

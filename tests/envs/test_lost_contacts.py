@@ -63,3 +63,14 @@ def test_a_heap_that_fills_the_room_of_all_ends_all_and_none_has_succeeded(ends:
     assert after["overflow"].all() and after["truncated"].all()
     assert not after["success"].any() and not after["terminated"].any()
     assert env.statistics()["success"] == (0.5 if ends else 0.0), "two ended well before, if they could"
+
+
+def test_there_is_the_room_that_was_asked_for(recwarn: pytest.WarningsRecorder) -> None:
+    """Also where objects that may start anywhere in a region would be drawn into one another before the first reset."""
+    crowd = tuple(
+        Body(name=f"cube{k}", size=(0.03,) * 3, at=(0.5, 0.0), spread=(0.15, 0.25)) for k in range(8)
+    )
+    config = FrankaConfig(gripper=True, scene=Scene(objects=crowd), max_contacts=48, observations=("state",))
+    env = FrankaEnv(config, num_envs=2, device="cpu")
+    assert env.simulation.solver.mjw_data.naconmax == 2 * 48  # pyright: ignore[reportAttributeAccessIssue]
+    assert not [one for one in recwarn if "nconmax" in str(one.message)]

@@ -405,6 +405,8 @@ def test_train_accepts_every_declared_command(monkeypatch: pytest.MonkeyPatch) -
         ("{section: a, title: t, seed: 0}", "no entry seed"),
         ("{section: a, title: t}", "needs either seeds"),
         ("{section: a, title: t, seeds: [0, 1], wanted: {speed: 3}}", "wanted has no speed"),
+        ("{section: a, title: t, seeds: [0, 1], goals: [{x: ≥ 1}]}", "goals are of a benchmark"),
+        ("{section: a, title: t, script: b.py, goals: [{x: 1}]}", "COLUMN: ≥ N or ≤ N, not"),
     ],
 )
 def test_a_wrong_declaration_is_one_line(tmp_path, entry, says) -> None:

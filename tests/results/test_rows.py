@@ -6,8 +6,9 @@ from dataclasses import replace
 
 import pytest
 
-from benchmarks.results.metrics import verdicts
+from benchmarks.results.metrics import goals_met, verdicts
 from benchmarks.results.rows import Row, Section, load_rows
+from franka_wm.errors import UserError
 
 
 @pytest.mark.parametrize(
@@ -61,3 +62,36 @@ def test_a_row_may_be_about_the_policy_alone() -> None:
     assert {
         name for name, row in load_rows().items() if "its actor" in row.model and row.policy != "policy"
     } == set()
+
+
+LINES = [
+    {"case": "lift", "worlds": 16, "speed": 2800.0, "start [s]": 3.0},
+    {"case": "lift", "worlds": 64, "speed": 900.0, "start [s]": 5.5},
+    {"case": "push", "worlds": 16, "speed": None, "start [s]": 1.0},
+]
+
+
+@pytest.mark.parametrize(
+    ("goal", "told"),
+    [
+        (
+            {"case": "lift", "worlds": 16, "speed": "≥ 2700"},
+            ("case lift, worlds 16: speed ≥ 2,700", "2,800", True),
+        ),
+        ({"case": "lift", "speed": "≥ 900.5"}, ("case lift: speed ≥ 900", "900", False)),
+        ({"start [s]": "≤ 5.5"}, ("start [s] ≤ 5.5", "5.5", True)),
+        ({"case": "lift", "start [s]": "≤ 5"}, ("case lift: start [s] ≤ 5", "5.5", False)),
+    ],
+)
+def test_a_benchmark_is_judged_by_its_worst_line(goal, told) -> None:
+    row = Row(name="env", section=Section(title="A GPU"), title="", script="x.py", goals=[goal])
+    assert goals_met(row, LINES) == [told]
+
+
+@pytest.mark.parametrize(
+    "goal", [{"case": "none", "speed": "≥ 1"}, {"case": "push", "speed": "≥ 1"}, {"x": "≤ 1"}]
+)
+def test_a_goal_of_no_line_or_number_is_refused(goal) -> None:
+    row = Row(name="env", section=Section(title="A GPU"), title="", script="x.py", goals=[goal])
+    with pytest.raises(UserError, match="row env: no line has"):
+        goals_met(row, LINES)

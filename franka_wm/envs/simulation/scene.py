@@ -46,9 +46,13 @@ def add_scene(builder: newton.ModelBuilder, scene: Scene, tool_body: int, cell: 
             z -= one.half_height
         turn = wp.quat_from_axis_angle(wp.vec3(0.0, 0.0, 1.0), one.angle)
         still += _add_shape(builder, -1, one, density=0.0, at=wp.transform(wp.vec3(x, y, z), turn), cell=cell)
+    height = scene.top + 2.0
     for one in scene.objects:
-        at = wp.transform(wp.vec3(*one.at, scene.top + one.half_height), wp.quat_identity())
-        body = builder.add_body(xform=at, label=one.name)
+        # A reset places them. Until then they are in the air and apart: MuJoCo wants room for contacts that it sees.
+        height += one.radius + 2.0 * one.half_height
+        body = builder.add_body(
+            xform=wp.transform(wp.vec3(*one.at, height), wp.quat_identity()), label=one.name
+        )
         _add_shape(builder, body, one, density=one.mass / one.volume, at=wp.transform_identity(), cell=cell)
     for one in scene.articulated:
         for shape in _add_articulated(builder, one, scene.top, cell):

@@ -168,3 +168,11 @@ def test_discrete_actions_are_stored_with_what_they_tell_the_fingers(tmp_path: P
     stored = np.stack([dataset[k][ACTION].numpy() for k in range(5)])
     assert np.array_equal(stored, discrete_action_table(8, gripper=True)[moves[0]].numpy())
     assert stored[:, 7].tolist() == [1.0, 1.0, -1.0, -1.0, 1.0]
+
+
+def test_the_command_of_one_of_several_processes_can_be_typed(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("sys.argv", ["/site/franka_wm/__main__.py", "collect", "env.cameras=[front, wrist]"])
+    assert (
+        describe(policy="p", seed=1, config={})["command"] == "franka-wm collect 'env.cameras=[front, wrist]'"
+    )
+    assert describe(policy="p", seed=1, config={}, command="mine")["command"] == "mine"
