@@ -120,7 +120,7 @@ def _first_comment(file: Path) -> str:
 
 def tasks() -> dict[str, str]:
     """The tasks: files in ``envs/tasks``, whose names ``env.task`` takes, with their first line."""
-    bases = ("__init__", "base", "manipulation", "torch_task")
+    bases = ("__init__", "base", "experts", "manipulation", "torch_task")
     files = sorted(file for file in (PACKAGE / "envs" / "tasks").glob("*.py") if file.stem not in bases)
     return {file.stem: _first_line(file.read_text(encoding="utf-8")) for file in files}
 
