@@ -19,6 +19,7 @@ from franka_wm.envs.constants import MOST_OPEN
 from franka_wm.envs.kinematics import Kinematics
 from franka_wm.envs.robots import Robot, gripper, links, load_robot
 from franka_wm.envs.scene import FLOOR, Scene, Solid
+from franka_wm.envs.solids import Obstacle, Table
 from franka_wm.envs.tasks import Task
 from franka_wm.errors import UserError
 from franka_wm.options import check_whole
@@ -78,10 +79,10 @@ def _check_goal(config: FrankaConfig, robot: Robot) -> None:
         )
     scene = config.resolved_scene
     for one in (scene.table, *scene.obstacles) if scene else ():
-        place, half = _standing(one, scene)
+        place, half = _standing(one)
         inside = wp.transform_point(wp.transform_inverse(place), wp.vec3(*config.goal))
         if one.shape != "mesh" and all(abs(float(x)) < h for x, h in zip(inside, half, strict=True)):
-            where = "under it" if one is scene.table else "in it"
+            where = "under it" if isinstance(one, Table) else "in it"
             raise UserError(f"goal={config.goal} m: lies {where}: scene.{one.name}; move one of them")
 
 
@@ -115,7 +116,7 @@ def check_start(config: FrankaConfig, robot: Robot) -> None:
     for one in (scene.table, *scene.obstacles):
         if one.shape == "mesh":
             continue
-        place, half = _standing(one, scene)
+        place, half = _standing(one)
         box = _box(place, half + raised)
         touched = {"hand": hand} if one is scene.table else {"hand": hand, "arm": arm}
         for what, boxes in touched.items():
@@ -141,10 +142,10 @@ def check_start(config: FrankaConfig, robot: Robot) -> None:
             )
 
 
-def _standing(one: Solid, scene: Scene) -> tuple[wp.transform, np.ndarray]:
+def _standing(one: Obstacle) -> tuple[wp.transform, np.ndarray]:
     """Place and half sides (3,) of the box that a table or an obstacle fills [m]; a table's reaches to the floor."""
     half, height = _filled(one), one.at[2]
-    if one is scene.table:  # its place is that of its top
+    if isinstance(one, Table):  # its place is that of its top
         half[2] = 0.5 * max(2.0 * half[2], height - FLOOR)
         height -= half[2]
     turn = wp.quat_from_axis_angle(wp.vec3(0.0, 0.0, 1.0), one.angle)
