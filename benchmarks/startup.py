@@ -4,7 +4,7 @@
     python benchmarks/startup.py --scale gpu env=lift     other arguments of train.py
 
 Each start is a process of its own. The first one finds an empty folder for Warp's compiled kernels, the others what it
-left there.
+left there. Python keeps its bytecode, even where the environment forbids it: without, every start would compile torch.
 """
 
 from __future__ import annotations
@@ -32,7 +32,8 @@ def start(arguments: list[str], kernels: Path, out: Path) -> dict[str, float]:
         SystemExit: It failed; with the end of what it said.
     """
     command = [sys.executable, str(ROOT / "train.py"), *arguments, f"hydra.run.dir={out}"]
-    environment = {**os.environ, "WARP_CACHE_PATH": str(kernels), "PYTHONUNBUFFERED": "1"}
+    own = {"WARP_CACHE_PATH": str(kernels), "PYTHONUNBUFFERED": "1", "PYTHONDONTWRITEBYTECODE": ""}
+    environment = {**os.environ, **own}
     begun, seen, said = time.perf_counter(), {}, []
     with subprocess.Popen(
         command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, cwd=ROOT, env=environment
