@@ -3,26 +3,17 @@
 from __future__ import annotations
 
 import math
-from typing import Any
+from dataclasses import replace
 
 import pytest
 
-from franka_wm.envs import FrankaConfig, FrankaEnv
+from franka_wm.envs import FrankaEnv
 from franka_wm.envs.scene import Body, Scene
 from franka_wm.envs.solids import Solid
 from franka_wm.envs.tasks.experts import grasp_of
 from franka_wm.evaluation.closed_loop import play_episodes
 from franka_wm.policies.expert import ExpertPolicy
-
-PRESET: dict[str, Any] = {
-    "observations": ("state", "joint_target", "objects"),
-    "substeps": 4,
-    "pose_noise": 0.02,
-    "action_scale": 0.085,
-    "limit_velocity": True,
-    "gravity_compensation": True,
-    "episode_length": 60,
-}
+from franka_wm.training.settings import RunSettings
 
 
 @pytest.mark.parametrize(
@@ -35,9 +26,9 @@ PRESET: dict[str, Any] = {
         ("box", (0.12, 0.02, 0.03)),
     ],
 )
-def test_it_lifts_what_fits_between_the_fingers(shape: str, size: tuple[float, ...]) -> None:
+def test_it_lifts_what_fits_between_the_fingers(shape: str, size: tuple[float, ...], composed) -> None:
     thing = Body(name="thing", shape=shape, size=size, at=(0.5, 0.0), spread=(0.1, 0.15), turn=math.pi / 4)
-    config = FrankaConfig(task="lift", scene=Scene(objects=(thing,)), **PRESET)
+    config = replace(RunSettings.of(composed("env=lift")).env.arm, scene=Scene(objects=(thing,)))
     env = FrankaEnv(config, num_envs=8, device="cpu")
     played = play_episodes(env, ExpertPolicy(env.simulation.task, env.kinematics, config), seed=1)
     assert played["success"].float().mean() >= 7 / 8

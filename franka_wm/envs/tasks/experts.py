@@ -159,9 +159,8 @@ def grasp_of(solid: Solid) -> dict[str, Any]:
         ``grip``, and for what fits only one way ``step`` and ``turn``.
     """
     grip = max(0.0, solid.half_height - PALM_ABOVE, TIPS_BELOW - solid.half_height)
-    along, across = (
-        width < 2 * MOST_OPEN for width in solid.widths
-    )  # at turn 0 the fingers move along its y
+    along, across = (width < 2 * MOST_OPEN for width in solid.widths)
     if solid.shape == "mesh" or along == across:
         return {"grip": grip}
+    # At turn 0 the fingers move along its y.
     return {"grip": grip, "step": math.pi, "turn": 0.0 if across else 0.5 * math.pi}
