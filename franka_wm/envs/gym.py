@@ -14,6 +14,7 @@ environment is made.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -217,8 +218,12 @@ class FrankaVectorEnv(gymnasium.vector.VectorEnv):
         """N frames, (256, 256, 3) uint8; ``None`` without ``render_mode="rgb_array"``."""
         if self.render_mode is None:
             return None
-        config = whole_arm(self.env.config, self.env.kinematics)
-        return tuple(self.env.render(256, samples=2, config=config).cpu().numpy())
+        return tuple(self.env.render(256, samples=2, config=self._camera).cpu().numpy())
+
+    @cached_property
+    def _camera(self) -> FrankaConfig:
+        """Where the frames' camera stands."""
+        return whole_arm(self.env.config, self.env.kinematics)
 
     def call(self, name: str, *args: Any, **kwargs: Any) -> tuple[Any, ...]:
         """``name`` of each world, as ``SyncVectorEnv.call`` has it; called if it can be.

@@ -14,6 +14,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from franka_wm import processes
+from franka_wm.models import fused
 from franka_wm.seeding import normal_like
 
 WEIGHT_STD = 0.02  # truncated-normal initialisation of every linear weight, as published
@@ -57,6 +58,8 @@ class Linear(nn.Linear):
     """`nn.Linear`, whose product is padded with zeros on CUDA where its sizes do not suit tensor cores."""
 
     def forward(self, input: Tensor) -> Tensor:
+        if fused.applies():
+            return fused.linear(input, self.weight, self.bias)
         more, beyond = _missing(self.in_features, input), _missing(self.out_features, input)
         if not (more or beyond):
             return super().forward(input)
@@ -114,7 +117,16 @@ class NormedLinear(nn.Module):
         x = self.linear(x)
         if self.dropout:
             x = F.dropout(x, self.dropout, self.training)
+        if fused.applies() and (group := self._fuses) is not None:
+            return fused.normed(x, self.norm.weight, self.norm.bias, group_size=group, eps=self.norm.eps)
         return self.activation(self.norm(x))
+
+    @property
+    def _fuses(self) -> int | None:
+        """What `fused.normed` is asked for: the size of the activation's groups, 0 for Mish; None: it cannot."""
+        if isinstance(self.activation, SimNorm):
+            return self.activation.group_size if fused.suits(self.activation.group_size) else None
+        return 0 if isinstance(self.activation, nn.Mish) else None
 
 
 def mlp(
@@ -207,6 +219,8 @@ class TwoHotSymlog(nn.Module):
 
         In the support's precision, also under autocast: bfloat16's probabilities are too coarse for values of tens.
         """
+        if fused.applies():
+            return fused.expectation(logits, self.support)
         probabilities = logits.softmax(-1, dtype=self.support.dtype)
         return symexp((probabilities * self.support).sum(-1, keepdim=True))
 
@@ -298,6 +312,12 @@ class Ensemble(nn.Module):
         leading = x.shape[:-1]
         if isinstance(members, int) and not 1 <= members <= self.members:
             raise ValueError(f"members must be from 1 to {self.members}, got {members}")
+        if fused.applies() and not dropout:
+            layers = [(parameter(f"weight_{i}"), parameter(f"bias_{i}")) for i in range(self.depth)]
+            norms = [
+                (parameter(f"norm_scale_{i}"), parameter(f"norm_shift_{i}")) for i in range(self.depth - 1)
+            ]
+            return fused.ensemble(x, layers, norms)
         count = members if isinstance(members, int) else self.members if members is None else members.shape[0]
         h = x.reshape(-1, x.shape[-1]).expand(count, -1, -1)
         for i in range(self.depth):

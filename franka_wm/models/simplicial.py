@@ -11,6 +11,7 @@ from tensordict import TensorDictBase
 from torch import Tensor, nn
 
 from franka_wm.errors import UserError
+from franka_wm.models import fused
 from franka_wm.models.base import WorldModel
 from franka_wm.models.image_encoder import ImageEncoder
 from franka_wm.models.images import ImageSize, RandomShift, check_image_sizes, check_images
@@ -183,7 +184,8 @@ class SimplicialWorldModel(WorldModel):
 
     def joined(self, z: Tensor, action: Tensor) -> Tensor:
         """What networks over both read: the features of z and the action, masked."""
-        return torch.cat((self.features(z), self.masked(z, action)), dim=-1)
+        parts = (self.features(z), self.masked(z, action))
+        return fused.joined(*parts) if fused.applies() else torch.cat(parts, dim=-1)
 
     def following(self, z: Tensor, features: Tensor) -> Tensor:
         """The next z: new features (..., latent_dim), and the mask of z."""

@@ -31,6 +31,7 @@ def rollout(z: Tensor, actions: Tensor, next: Callable[[Tensor, Tensor], Tensor]
     latents = [repeated(z, actions.shape[1])]
     for t in range(actions.shape[2]):
         latents.append(next(latents[-1], actions[:, :, t]))
+    latents[0] = latents[0].to(latents[-1].dtype)  # predicted latents may be coarser
     return torch.stack(latents, dim=2)
 
 

@@ -15,14 +15,19 @@ from tensordict.nn import InteractionType, TensorDictModuleBase
 from tensordict.nn.probabilistic import interaction_type
 from torch import Tensor, nn
 
+from franka_wm.models import fused
 from franka_wm.models.base import WorldModel
 from franka_wm.options import PRECISIONS
 from franka_wm.planning.base import Planner, Prior
 from franka_wm.planning.objectives import (
+    ActionPenalty,
     GoalImage,
     Objective,
+    PolicyPenalty,
     RewardPlusValue,
     Score,
+    Smoothness,
+    Sum,
     as_objective,
     goal_images,
 )
@@ -128,6 +133,13 @@ def captures(wanted: bool | None, observation: Tensor) -> bool:
     return observation.is_cuda if wanted is None else wanted
 
 
+def by_networks(objective: Objective) -> bool:
+    """Whether an objective scores latents by the model's networks alone, and measures no distances between them."""
+    if isinstance(objective, Sum):
+        return all(by_networks(term) for _, term in objective.terms)
+    return isinstance(objective, RewardPlusValue | ActionPenalty | PolicyPenalty | Smoothness)
+
+
 def _guide(model: WorldModel, objective: Objective) -> Prior | GoalGuide | None:
     if model.has_policy:
         return Guide(model).act
@@ -174,6 +186,7 @@ class PlannerPolicy(TensorDictModuleBase):
             not closures, and leave `compile`: compiled functions cannot be sent to another process.
         capture: replay decisions as CUDA graphs; None: where the observations are on CUDA.
         precision: `float32`, or `bfloat16`: the model computes under autocast; plans and actions stay float32.
+            On CUDA, in both, with the kernels of `franka_wm.models.fused` where nothing is compiled.
         compile: `torch.compile` what the planner calls thousands of times: `next`, `prior`, and an objective
             that has `compiled`. Takes a minute at the first decisions of each batch size.
 
@@ -316,7 +329,8 @@ class PlannerPolicy(TensorDictModuleBase):
         is_init = tensordict.get("is_init", None)
         low = self.precision == "bfloat16"
         # No cache of cast weights: it would hold tensors of one captured decision into the next.
-        with torch.autocast(tensordict.get(self.in_keys[0]).device.type, torch.bfloat16, low, False):
+        kind = tensordict.get(self.in_keys[0]).device.type
+        with torch.autocast(kind, torch.bfloat16, low, False), fused.kernels(fused.ready(kind)):
             z = latent_of(tensordict, self.encode, self.observe)
             z = z.float() if low else z
             result = self.planner.plan(
@@ -334,7 +348,9 @@ class PlannerPolicy(TensorDictModuleBase):
         return decision
 
     def _next_in_float32(self, z: Tensor, action: Tensor) -> Tensor:
-        return self.next(z, action).float()
+        """Latents as plans are scored by: in float32, but where all that reads them would round them anyway."""
+        after = self.next(z, action)
+        return after if fused.applies() and by_networks(self.objective) else after.float()
 
 
 class ModelPolicy(TensorDictModuleBase):

@@ -11,7 +11,7 @@ import torch
 from tensordict import TensorDictBase
 
 from franka_wm.console import say
-from franka_wm.envs import FrankaEnv, MultiTaskEnv
+from franka_wm.envs import FrankaConfig, FrankaEnv, MultiTaskEnv
 from franka_wm.envs.camera import project, whole_arm
 from franka_wm.envs.multitask_config import MultiTaskConfig
 from franka_wm.evaluation.closed_loop import play_episodes, success_distance
@@ -87,6 +87,7 @@ def film(settings: RunSettings, folder: Path, policy: Any, name: str, found: Eva
     arms = _arms(env)
     size = settings.evaluation.video_size
     fps = _film_rate(arms)
+    views = {task: whole_arm(arm.config, arm.kinematics) for task, arm in arms.items()}
     films, lines = [], []
     for number in _filmed(rows, settings.evaluation.video_episodes, found.worlds, tasks):
         k, world = divmod(number, found.worlds)
@@ -94,7 +95,7 @@ def film(settings: RunSettings, folder: Path, policy: Any, name: str, found: Eva
         first, together = world - place, min(len(rows) - k * found.worlds, found.worlds)
         task, arm = list(arms.items())[place]
         frames, count = [], min(tasks, together - first)
-        image = partial(_image, arm, size, frames)
+        image = partial(_image, arm, views[task], size, frames)
         with seeded(found.seeds[k], policy), drawing_for(first, count, together):
             played = play_episodes(
                 env, policy, seed=found.seeds[k], episodes=count, first_world=first, video=image
@@ -123,11 +124,10 @@ def _arms(env: Any) -> dict[str, FrankaEnv]:
     return {} if arm is None else {arm.config.task: arm}
 
 
-def _image(arm: FrankaEnv, size: int, frames: list[torch.Tensor]) -> None:
-    """Adds what the first world shows now, (1, size, size, 3), to the frames."""
-    whole = whole_arm(arm.config, arm.kinematics)
-    view = arm.render(size, samples=2, config=whole)
-    marks = project(arm.goal, whole, size)
+def _image(arm: FrankaEnv, camera: FrankaConfig, size: int, frames: list[torch.Tensor]) -> None:
+    """Adds what a camera shows of the first world now, (1, size, size, 3), to the frames."""
+    view = arm.render(size, samples=2, config=camera)
+    marks = project(arm.goal, camera, size)
     frames.append(draw_marker(view.cpu(), marks.cpu(), radius=size / 32))
 
 

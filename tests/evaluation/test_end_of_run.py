@@ -68,9 +68,12 @@ def test_the_video_shows_the_worst_episodes_again(settled, tmp_path: Path, monke
     policies = {"policy": SmoothRandomPolicy(7, generator=generator), "noop": NoopPolicy(7)}
     results = evaluate_run(cfg, tmp_path, env, policies, counters={}, say=lambda text: None)
     said: list[str] = []
+    placed, place = [], end_of_run.whole_arm
+    monkeypatch.setattr(end_of_run, "whole_arm", lambda *of: (placed.append(of), place(*of))[1])
     monkeypatch.setattr(end_of_run, "draw_labels", lambda frames, lines: said.extend(lines) or frames)
     report_run(cfg, tmp_path, env, policies, results, rows=[])
     assert "filming the policy …" in capsys.readouterr().out
+    assert len(placed) == 1  # it takes longer than an image does
     distances = results.episodes["policy"]["final_distance"]
     order = distances.argsort(descending=True)[:2].tolist()
     assert said == [f"policy, {100 * float(distances[k]):.1f} cm, no success, episode {k + 1}" for k in order]

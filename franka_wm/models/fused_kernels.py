@@ -1,0 +1,100 @@
+"""The Triton kernels of :mod:`franka_wm.models.fused`; imported when the first of them is called."""
+
+# pyright: reportIndexIssue=false, reportArgumentType=false, reportAttributeAccessIssue=false, reportCallIssue=false
+
+import torch
+import triton
+import triton.language as tl
+from torch import Tensor
+
+MANY_ROWS = 8192
+"""From so many rows on, each program takes several."""
+
+
+@triton.jit
+def _norm_and_activation(
+    x,
+    y,
+    scale,
+    shift,
+    rows,
+    per,
+    stride,
+    eps,
+    D: tl.constexpr,
+    BLOCK: tl.constexpr,
+    R: tl.constexpr,
+    GROUP: tl.constexpr,
+):
+    row = tl.program_id(0).to(tl.int64) * R + tl.arange(0, R)
+    column = tl.arange(0, BLOCK)
+    real = (column < D)[None, :]
+    there = (row < rows)[:, None] & real
+    h = tl.load(x + row[:, None] * stride + column[None, :], mask=there, other=0.0).to(tl.float32)
+    apart = tl.where(real, h - (tl.sum(h, 1) / D)[:, None], 0.0)
+    h = apart * tl.rsqrt(tl.sum(apart * apart, 1) / D + eps)[:, None]
+    own = (row // per)[:, None] * D + column[None, :]  # of its member
+    h = h * tl.load(scale + own, mask=there, other=0.0).to(tl.float32)
+    h += tl.load(shift + own, mask=there, other=0.0).to(tl.float32)
+    if GROUP == 0:
+        # mish(h) = h · tanh(log(1 + e^h)) = h · (e^2h + 2 e^h) / (e^2h + 2 e^h + 2), which is h from 20 on
+        e = tl.exp(tl.minimum(h, 20.0))
+        part = e * (e + 2.0)
+        h = h * part / (part + 2.0)
+    else:
+        groups = tl.reshape(h, (R, BLOCK // GROUP, GROUP))
+        groups = tl.exp(groups - tl.max(groups, 2)[:, :, None])
+        h = tl.reshape(groups / tl.sum(groups, 2)[:, :, None], (R, BLOCK))
+    tl.store(y + row[:, None] * D + column[None, :], h.to(y.dtype.element_ty), mask=there)
+
+
+@triton.jit
+def _symexp_of_mean(
+    logits, support, y, rows, stride, BINS: tl.constexpr, BLOCK: tl.constexpr, R: tl.constexpr
+):
+    row = tl.program_id(0).to(tl.int64) * R + tl.arange(0, R)
+    column = tl.arange(0, BLOCK)
+    real = (column < BINS)[None, :]
+    there = (row < rows)[:, None] & real
+    h = tl.load(logits + row[:, None] * stride + column[None, :], mask=there, other=0.0).to(tl.float32)
+    h = tl.where(real, h, -float("inf"))
+    e = tl.exp(h - tl.max(h, 1)[:, None])
+    points = tl.load(support + column, mask=column < BINS, other=0.0).to(tl.float32)
+    mean = tl.sum(e * points[None, :], 1) / tl.sum(e, 1)
+    size = tl.abs(mean)
+    # e^size - 1 loses what is small: there by its series.
+    series = size * (1.0 + size * (0.5 + size * (1.0 / 6.0 + size * (1.0 / 24.0))))
+    size = tl.where(size < 0.05, series, tl.exp(size) - 1.0)
+    tl.store(y + row, tl.where(mean < 0.0, -size, size), mask=row < rows)
+
+
+def _rows(x: Tensor) -> Tensor:
+    """The same numbers as (rows, D), without a copy where rows lie at equal distances."""
+    return x.reshape(-1, x.shape[-1]) if x.stride(-1) == 1 else x.contiguous().view(-1, x.shape[-1])
+
+
+def norm_and_activation(x: Tensor, scale: Tensor, shift: Tensor, group_size: int, eps: float) -> Tensor:
+    """See :func:`franka_wm.models.fused.normed`."""
+    flat, size = _rows(x), x.shape[-1]
+    rows, members = flat.shape[0], scale.numel() // size
+    y = torch.empty(x.shape, device=x.device, dtype=x.dtype)
+    together = 4 if rows >= MANY_ROWS else 1
+    block = triton.next_power_of_2(size)
+    _norm_and_activation[(triton.cdiv(rows, together),)](
+        flat, y, scale.contiguous(), shift.contiguous(), rows, rows // members, flat.stride(0), eps,
+        D=size, BLOCK=block, R=together, GROUP=group_size, num_warps=4,
+    )  # fmt: skip
+    return y
+
+
+def symexp_of_mean(logits: Tensor, support: Tensor) -> Tensor:
+    """See :func:`franka_wm.models.fused.expectation`."""
+    flat = _rows(logits)
+    rows, bins = flat.shape
+    y = torch.empty((*logits.shape[:-1], 1), device=logits.device)
+    together = 8 if rows >= MANY_ROWS else 1
+    _symexp_of_mean[(triton.cdiv(rows, together),)](
+        flat, support, y, rows, flat.stride(0),
+        BINS=bins, BLOCK=triton.next_power_of_2(bins), R=together, num_warps=4 if together > 1 else 1,
+    )  # fmt: skip
+    return y
