@@ -9,10 +9,11 @@ does the same by itself.
 from __future__ import annotations
 
 import threading
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from functools import cache
 from importlib.util import find_spec
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -25,10 +26,17 @@ PIECE = 8
 """Rows of so many numbers suit tensor cores: 16 bytes of bfloat16."""
 
 
-class _Decision(threading.local):
-    """Weights of the present decision, cast and padded once, by where they lie; None outside of one."""
+class Joined(NamedTuple):
+    """Input of a network over features (..., D) and actions (..., A) that lie apart: joining them would copy both."""
 
-    weights: dict[tuple[int, tuple[int, ...], torch.dtype], tuple[Tensor, Tensor]] | None = None
+    features: Tensor
+    action: Tensor
+
+
+class _Decision(threading.local):
+    """What was made of the weights for the present decision, by where they lie and what for; None outside of one."""
+
+    made: dict[tuple[int, tuple[int, ...], str, torch.dtype], tuple[Tensor, Tensor]] | None = None
 
 
 _decision = _Decision()
@@ -50,16 +58,21 @@ def ready(kind: str) -> bool:
 @contextmanager
 def kernels(on: bool = True) -> Iterator[None]:
     """Layers inside use the kernels, if `on`. Weights must not change inside."""
-    before, _decision.weights = _decision.weights, {} if on else None
+    before, _decision.made = _decision.made, {} if on else None
     try:
         yield
     finally:
-        _decision.weights = before
+        _decision.made = before
 
 
 def applies() -> bool:
     """Whether layers use the kernels now."""
-    return _decision.weights is not None and not torch.is_grad_enabled() and not torch.compiler.is_compiling()
+    return _decision.made is not None and not torch.is_grad_enabled() and not torch.compiler.is_compiling()
+
+
+def suits(group_size: int) -> bool:
+    """Whether there is a kernel for a softmax in groups of this size."""
+    return group_size & (group_size - 1) == 0
 
 
 def _precision(x: Tensor) -> torch.dtype:
@@ -67,41 +80,68 @@ def _precision(x: Tensor) -> torch.dtype:
     return torch.get_autocast_dtype(kind) if torch.is_autocast_enabled(kind) else x.dtype
 
 
-def _prepared(weight: Tensor, padding: tuple[int, ...], dtype: torch.dtype) -> Tensor:
-    """The weight, cast, with zeros at its ends as `F.pad` puts them; made once per decision."""
-    assert _decision.weights is not None
-    key = (weight.data_ptr(), (*weight.shape, *padding), dtype)
-    if key not in _decision.weights:
-        made = weight.to(dtype)
-        # The weight itself is kept, too: while it is, nothing else lies where it does.
-        _decision.weights[key] = weight, F.pad(made, padding) if any(padding) else made
-    return _decision.weights[key][1]
+def _prepared(weight: Tensor, what: str, dtype: torch.dtype, make: Callable[[Tensor], Tensor]) -> Tensor:
+    """What `make` makes of a weight in this precision, once per decision."""
+    assert _decision.made is not None
+    key = (weight.data_ptr(), tuple(weight.shape), what, dtype)
+    if key not in _decision.made:
+        # The weight is kept, too: while it is, nothing else lies where it does.
+        _decision.made[key] = weight, make(weight).to(dtype).contiguous()
+    return _decision.made[key][1]
 
 
-def joined(*parts: Tensor) -> Tensor:
-    """Parts (..., Dk) of one input side by side, in the precision of products, with zeros up to a whole piece."""
-    dtype, width = _precision(parts[0]), sum(part.shape[-1] for part in parts)
-    zeros = parts[0].new_zeros((), dtype=dtype).expand(*parts[0].shape[:-1], -width % PIECE)
-    return torch.cat([*(part.to(dtype) for part in parts), zeros], dim=-1)
+def _pieces(x: Tensor, dim: int) -> Tensor:
+    """With zeros at the end of a dimension, up to a whole piece."""
+    lacking = -x.shape[dim] % PIECE
+    return F.pad(x, (0, 0) * (-dim - 1) + (0, lacking)) if lacking else x
 
 
-def _padded(x: Tensor, width: int) -> Tensor:
-    """Inputs (..., D), which `joined` may have made wider, in the precision of products: (..., whole pieces)."""
-    x, beyond = x.to(_precision(x)), width + -width % PIECE - x.shape[-1]
-    return F.pad(x, (0, beyond)) if beyond else x
+def _product(x: Tensor, weight: Tensor, bias: Tensor | None = None) -> Tensor:
+    """x (..., D) with the first D columns of a weight (out, in), or (K, rows, D) of K members with (K, out, in).
+
+    Returns:
+        (..., out), a view where out is no whole piece. Weights lie so that the product reads rows of both.
+    """
+    out, width = weight.shape[-2], x.shape[-1]
+    x = _pieces(x.to(_precision(x)), -1)
+    weight = _prepared(weight, f"first {width}", x.dtype, lambda w: _pieces(_pieces(w[..., :width], -1), -2))
+    bias = None if bias is None else _prepared(bias, "bias", x.dtype, lambda b: _pieces(b, -1))
+    return (F.linear(x, weight, bias) if weight.dim() == 2 else x @ weight.mT)[..., :out]
 
 
-def linear(x: Tensor, weight: Tensor, bias: Tensor | None) -> Tensor:
-    """`F.linear` with padded sizes: (..., in or as `joined` makes it) -> (..., out), a view where out is padded."""
-    out, width = weight.shape
-    x = _padded(x, width)
-    weight = _prepared(weight, (0, -width % PIECE, 0, -out % PIECE), x.dtype)
-    bias = None if bias is None else _prepared(bias, (0, -out % PIECE), x.dtype)
-    return F.linear(x, weight, bias)[..., :out]
+def _as_stored(x: Tensor) -> tuple[Tensor, list[int]]:
+    """x (..., D) with its leading dimensions in the order of memory, and that order."""
+    order = sorted(range(x.dim() - 1), key=lambda k: -x.stride(k))
+    return x.permute(*order, -1), order
+
+
+def linear(x: Tensor | Joined, weight: Tensor, bias: Tensor | None) -> Tensor:
+    """`F.linear`: (..., in) -> (..., out)."""
+    return _product(torch.cat((x.features, x.action), -1) if isinstance(x, Joined) else x, weight, bias)
+
+
+def normed_linear(
+    x: Tensor | Joined,
+    weight: Tensor,
+    bias: Tensor,
+    scale: Tensor,
+    shift: Tensor,
+    *,
+    group_size: int,
+    eps: float,
+) -> Tensor:
+    """Linear, LayerNorm, and Mish or a softmax in groups of `group_size`, 0 for Mish: (..., in) -> (..., out)."""
+    features, action = x if isinstance(x, Joined) else (x, None)
+    features, order = _as_stored(features)
+    action = None if action is None else action.permute(*order, -1)
+    y = _normed(
+        _product(features, weight), weight, bias, scale, shift, action, group_size=group_size, eps=eps
+    )
+    return y.permute(*(order.index(k) for k in range(len(order))), -1)
 
 
 def ensemble(
-    x: Tensor, layers: Sequence[tuple[Tensor, Tensor]], norms: Sequence[tuple[Tensor, Tensor]]
+    x: Tensor | Joined, layers: Sequence[tuple[Tensor, Tensor]], norms: Sequence[tuple[Tensor, Tensor]]
 ) -> Tensor:
     """`Ensemble.forward` without dropout.
 
@@ -113,34 +153,34 @@ def ensemble(
     Returns:
         (K, ..., out).
     """
-    leading, (members, width, _) = x.shape[:-1], layers[0][0].shape
-    h = _padded(x, width).reshape(leading.numel(), -1).expand(members, -1, -1)
-    for i, (weight, bias) in enumerate(layers):
-        width, out = weight.shape[1:]
-        h = _padded(h, width)
-        weight = _prepared(weight, (0, -out % PIECE, 0, -width % PIECE), h.dtype)
-        h = torch.baddbmm(_prepared(bias, (0, -out % PIECE), h.dtype), h, weight)[..., :out]
-        if i < len(norms):
-            h = normed(h, *norms[i])
-    return h.unflatten(1, leading)
+    features, action = x if isinstance(x, Joined) else (x, None)
+    h = features.reshape(-1, features.shape[-1]).expand(layers[0][0].shape[0], -1, -1)
+    for (weight, bias), (scale, shift) in zip(layers[:-1], norms, strict=True):
+        h = _normed(_product(h, weight.mT), weight.mT, bias, scale, shift, action)
+        action = None  # the first layer's alone
+    weight, bias = layers[-1]
+    return (_product(h, weight.mT) + bias.to(h.dtype)).unflatten(1, features.shape[:-1])
 
 
-def suits(group_size: int) -> bool:
-    """Whether there is a kernel for a softmax in groups of this size."""
-    return group_size & (group_size - 1) == 0
+def _normed(
+    x: Tensor,
+    weight: Tensor,
+    bias: Tensor,
+    scale: Tensor,
+    shift: Tensor,
+    action: Tensor | None,
+    *,
+    group_size: int = 0,
+    eps: float = 1e-5,
+) -> Tensor:
+    """What follows the product of features: bias and the part of actions, LayerNorm, activation; of x's shape."""
+    from franka_wm.models.fused_kernels import bias_norm_activation
 
-
-def normed(x: Tensor, scale: Tensor, shift: Tensor, *, group_size: int = 0, eps: float = 1e-5) -> Tensor:
-    """LayerNorm over the last dimension, then Mish, or a softmax in groups: of x's shape and precision.
-
-    Args:
-        x: (..., D), or (K, rows, D) of K members.
-        scale, shift: (D,), or (K, 1, D).
-        group_size: of consecutive features, a power of two; 0: Mish.
-    """
-    from franka_wm.models.fused_kernels import norm_and_activation
-
-    return norm_and_activation(x, scale, shift, group_size, eps)
+    own = None
+    if action is not None:
+        action, count = action.reshape(-1, action.shape[-1]), action.shape[-1]
+        own = _prepared(weight, f"last {count}", torch.float32, lambda w: w[..., -count:].mT)
+    return bias_norm_activation(x, bias, scale, shift, action, own, group_size, eps)
 
 
 def expectation(logits: Tensor, support: Tensor) -> Tensor:

@@ -1,6 +1,6 @@
 """The Triton kernels of :mod:`franka_wm.models.fused`; imported when the first of them is called."""
 
-# pyright: reportIndexIssue=false, reportArgumentType=false, reportAttributeAccessIssue=false, reportCallIssue=false
+# pyright: reportIndexIssue=false, reportArgumentType=false, reportAttributeAccessIssue=false, reportCallIssue=false, reportGeneralTypeIssues=false
 
 import torch
 import triton
@@ -12,30 +12,41 @@ MANY_ROWS = 8192
 
 
 @triton.jit
-def _norm_and_activation(
+def _bias_norm_activation(
     x,
     y,
+    bias,
     scale,
     shift,
+    action,
+    own,
     rows,
     per,
     stride,
+    action_stride,
     eps,
     D: tl.constexpr,
+    A: tl.constexpr,
     BLOCK: tl.constexpr,
     R: tl.constexpr,
     GROUP: tl.constexpr,
 ):
-    row = tl.program_id(0).to(tl.int64) * R + tl.arange(0, R)
+    first = tl.program_id(0).to(tl.int64) * R
+    member = first // per  # of an ensemble; R divides its rows
+    row = first + tl.arange(0, R)
     column = tl.arange(0, BLOCK)
-    real = (column < D)[None, :]
-    there = (row < rows)[:, None] & real
+    real = column < D
+    there = (row < rows)[:, None] & real[None, :]
     h = tl.load(x + row[:, None] * stride + column[None, :], mask=there, other=0.0).to(tl.float32)
-    apart = tl.where(real, h - (tl.sum(h, 1) / D)[:, None], 0.0)
+    h += tl.load(bias + member * D + column, mask=real, other=0.0).to(tl.float32)[None, :]
+    for k in tl.static_range(A):
+        a = tl.load(action + (row - member * per) * action_stride + k, mask=row < rows, other=0.0)
+        weight = tl.load(own + (member * A + k) * D + column, mask=real, other=0.0)
+        h += a.to(tl.float32)[:, None] * weight[None, :]
+    apart = tl.where(real[None, :], h - (tl.sum(h, 1) / D)[:, None], 0.0)
     h = apart * tl.rsqrt(tl.sum(apart * apart, 1) / D + eps)[:, None]
-    own = (row // per)[:, None] * D + column[None, :]  # of its member
-    h = h * tl.load(scale + own, mask=there, other=0.0).to(tl.float32)
-    h += tl.load(shift + own, mask=there, other=0.0).to(tl.float32)
+    h = h * tl.load(scale + member * D + column, mask=real, other=0.0).to(tl.float32)[None, :]
+    h += tl.load(shift + member * D + column, mask=real, other=0.0).to(tl.float32)[None, :]
     if GROUP == 0:
         # mish(h) = h · tanh(log(1 + e^h)) = h · (e^2h + 2 e^h) / (e^2h + 2 e^h + 2), which is h from 20 on
         e = tl.exp(tl.minimum(h, 20.0))
@@ -73,16 +84,32 @@ def _rows(x: Tensor) -> Tensor:
     return x.reshape(-1, x.shape[-1]) if x.stride(-1) == 1 else x.contiguous().view(-1, x.shape[-1])
 
 
-def norm_and_activation(x: Tensor, scale: Tensor, shift: Tensor, group_size: int, eps: float) -> Tensor:
-    """See :func:`franka_wm.models.fused.normed`."""
+def bias_norm_activation(
+    x: Tensor,
+    bias: Tensor,
+    scale: Tensor,
+    shift: Tensor,
+    action: Tensor | None,
+    own: Tensor | None,
+    group_size: int,
+    eps: float,
+) -> Tensor:
+    """Of x's shape and precision, which are a product's; of an ensemble's K members (K, rows, D).
+
+    Args:
+        bias, scale, shift: (D,), or (K, 1, D).
+        action, own: (rows, A) and its weights (A, D) or (K, A, D), which are added; None: nothing is.
+        group_size: of consecutive features, for a softmax in each; 0: Mish.
+    """
     flat, size = _rows(x), x.shape[-1]
-    rows, members = flat.shape[0], scale.numel() // size
+    rows, per = flat.shape[0], flat.shape[0] // (bias.numel() // size)
     y = torch.empty(x.shape, device=x.device, dtype=x.dtype)
-    together = 4 if rows >= MANY_ROWS else 1
-    block = triton.next_power_of_2(size)
-    _norm_and_activation[(triton.cdiv(rows, together),)](
-        flat, y, scale.contiguous(), shift.contiguous(), rows, rows // members, flat.stride(0), eps,
-        D=size, BLOCK=block, R=together, GROUP=group_size, num_warps=4,
+    together = 4 if rows >= MANY_ROWS and per % 4 == 0 else 1
+    action = flat[:, :0] if action is None else action
+    _bias_norm_activation[(triton.cdiv(rows, together),)](
+        flat, y, bias.contiguous(), scale.contiguous(), shift.contiguous(), action, flat if own is None else own,
+        rows, per, flat.stride(0), action.stride(0), eps,
+        D=size, A=action.shape[1], BLOCK=triton.next_power_of_2(size), R=together, GROUP=group_size, num_warps=4,
     )  # fmt: skip
     return y
 

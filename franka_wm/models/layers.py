@@ -114,16 +114,19 @@ class NormedLinear(nn.Module):
         self.dropout = dropout
 
     def forward(self, x: Tensor) -> Tensor:
+        if fused.applies() and (group := self._fuses) is not None:
+            own = (self.linear.weight, self.linear.bias, self.norm.weight, self.norm.bias)
+            return fused.normed_linear(x, *own, group_size=group, eps=self.norm.eps)
         x = self.linear(x)
         if self.dropout:
             x = F.dropout(x, self.dropout, self.training)
-        if fused.applies() and (group := self._fuses) is not None:
-            return fused.normed(x, self.norm.weight, self.norm.bias, group_size=group, eps=self.norm.eps)
         return self.activation(self.norm(x))
 
     @property
     def _fuses(self) -> int | None:
-        """What `fused.normed` is asked for: the size of the activation's groups, 0 for Mish; None: it cannot."""
+        """What `fused.normed_linear` is told: the size of the groups, 0 for Mish; None: it cannot do it."""
+        if self.dropout and self.training:
+            return None
         if isinstance(self.activation, SimNorm):
             return self.activation.group_size if fused.suits(self.activation.group_size) else None
         return 0 if isinstance(self.activation, nn.Mish) else None
@@ -309,7 +312,6 @@ class Ensemble(nn.Module):
                 return value
             return value[:members] if isinstance(members, int) else value.index_select(0, members)
 
-        leading = x.shape[:-1]
         if isinstance(members, int) and not 1 <= members <= self.members:
             raise ValueError(f"members must be from 1 to {self.members}, got {members}")
         if fused.applies() and not dropout:
@@ -318,6 +320,7 @@ class Ensemble(nn.Module):
                 (parameter(f"norm_scale_{i}"), parameter(f"norm_shift_{i}")) for i in range(self.depth - 1)
             ]
             return fused.ensemble(x, layers, norms)
+        leading = x.shape[:-1]
         count = members if isinstance(members, int) else self.members if members is None else members.shape[0]
         h = x.reshape(-1, x.shape[-1]).expand(count, -1, -1)
         for i in range(self.depth):

@@ -182,10 +182,10 @@ class SimplicialWorldModel(WorldModel):
         """Actions (..., A) with 0 in the entries that the task of z has not."""
         return action if self.action_masks is None else action * z[..., self.latent_dim :]
 
-    def joined(self, z: Tensor, action: Tensor) -> Tensor:
+    def joined(self, z: Tensor, action: Tensor) -> Tensor | fused.Joined:
         """What networks over both read: the features of z and the action, masked."""
         parts = (self.features(z), self.masked(z, action))
-        return fused.joined(*parts) if fused.applies() else torch.cat(parts, dim=-1)
+        return fused.Joined(*parts) if fused.applies() else torch.cat(parts, dim=-1)
 
     def following(self, z: Tensor, features: Tensor) -> Tensor:
         """The next z: new features (..., latent_dim), and the mask of z."""

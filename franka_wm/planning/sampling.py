@@ -32,7 +32,8 @@ def rollout(z: Tensor, actions: Tensor, next: Callable[[Tensor, Tensor], Tensor]
     for t in range(actions.shape[2]):
         latents.append(next(latents[-1], actions[:, :, t]))
     latents[0] = latents[0].to(latents[-1].dtype)  # predicted latents may be coarser
-    return torch.stack(latents, dim=2)
+    # On a GPU one step lies behind the other: whole pieces are copied, and read again.
+    return torch.stack(latents).movedim(0, 2) if z.is_cuda else torch.stack(latents, dim=2)
 
 
 def gaussian_candidates(

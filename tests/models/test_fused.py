@@ -42,7 +42,7 @@ def seeded():
 def calls(monkeypatch):
     """Names of the kernels' functions, as they are called."""
     seen = []
-    for name in ("linear", "normed", "expectation", "ensemble", "joined"):
+    for name in ("linear", "normed_linear", "expectation", "ensemble"):
         plain = getattr(fused, name)
         monkeypatch.setattr(fused, name, lambda *a, _f=plain, _n=name, **k: (seen.append(_n), _f(*a, **k))[1])
     return seen
@@ -81,7 +81,24 @@ def test_a_network_is_the_same(rows, output, calls, monkeypatch):
     plain = network(x)
     with fused.kernels():
         torch.testing.assert_close(network(x), plain, rtol=1e-5, atol=1e-5)
-    assert calls.count("normed") == 2 + (output is not None) and calls.count("linear") == 3
+    assert calls.count("normed_linear") == 2 + (output is not None) and calls.count("linear") == (
+        output is None
+    )
+
+
+@runs_kernels
+@torch.no_grad()
+def test_steps_that_lie_one_behind_another_are_read_as_they_lie():
+    whole = model()
+    trajectory = torch.rand(3, 2, 4, 24).movedim(0, 2)  # as `rollout` leaves it on a GPU: (E, S, H, D)
+    action = torch.rand(2, 4, 3, 3)
+    plain = whole.reward(trajectory, action)
+    with fused.kernels():
+        torch.testing.assert_close(whole.reward(trajectory, action), plain, rtol=1e-4, atol=1e-5)
+        stored = fused._as_stored(trajectory)[0]
+        network = shaken(mlp(24, (20,), 5))
+        assert network(trajectory).shape == (2, 4, 3, 5)
+    assert stored.is_contiguous() and stored.data_ptr() == trajectory.data_ptr()
 
 
 @runs_kernels
@@ -162,9 +179,10 @@ def test_weights_are_prepared_once_in_a_decision_and_anew_in_the_next():
     x = torch.randn(3, 13)
     with fused.kernels():
         network(x)
-        held = len(fused._decision.weights)
+        held = {key: id(made) for key, (_, made) in fused._decision.made.items()}
         network(x)
-        assert len(fused._decision.weights) == held == 4  # two weights, two biases
+        assert {key: id(made) for key, (_, made) in fused._decision.made.items()} == held
+        assert len(held) == 3  # two weights, one bias
     network[0].linear.weight.mul_(2)
     plain = network(x)
     with fused.kernels():
@@ -197,7 +215,7 @@ def test_a_plan_is_the_same(monkeypatch, calls):
     plain = decided(False)
     assert not calls
     torch.testing.assert_close(decided(True), plain, rtol=1e-4, atol=1e-4)
-    assert {*calls} == {"linear", "normed", "expectation", "ensemble", "joined"}
+    assert {*calls} == {"linear", "normed_linear", "expectation", "ensemble"}
 
 
 @pytest.mark.parametrize("precision", ["float32", "bfloat16"])
@@ -221,6 +239,7 @@ def test_what_lacks_for_the_kernels_is_said_once(monkeypatch, capsys):
     fused.ready.cache_clear()
 
 
+@runs_kernels
 def test_latents_stay_exact_where_distances_between_them_count():
     whole = model()
     by_return, far = RewardPlusValue.of(whole), GoalDistance(torch.zeros(24))
