@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import argparse
 from functools import partial
+from itertools import product
 from typing import Any
 
 import torch
@@ -32,12 +33,14 @@ SIZES = {  # latent, encoder, hidden
 }
 
 
-def make_planner(name: str) -> Any:
-    """The planner as `planner=NAME scale=gpu` sets it up."""
+def make_planner(name: str, layers: str = "fused") -> Any:
+    """The planner as `planner=NAME scale=gpu` sets it up; `layers`: `plain`, as with `planner.kernels=false`."""
     cfg = compose(f"planner={name}", "scale=gpu")
     settings = dict(OmegaConf.to_container(cfg.planner, resolve=True))  # type: ignore[arg-type]
     for key in ("name", "precision", "compile"):
         settings.pop(key)
+    if layers == "plain" and "kernels" in settings:
+        settings["kernels"] = False
     return PLANNERS[name](action_dim=7, **settings)
 
 
@@ -90,6 +93,7 @@ def main() -> None:
     parser.add_argument("--seconds", type=float, default=3.0, help="of each of three measurements")
     parser.add_argument("--compile", action="store_true", help="torch.compile what the planner calls")
     parser.add_argument("--precision", choices=["float32", "bfloat16"], default="float32")
+    parser.add_argument("--layers", nargs="+", choices=["fused", "plain"], default=["fused"], help="on CUDA")
     parser.add_argument("--launched", nargs="+", choices=["eager", "captured"], help="default: both on CUDA")
     parser.add_argument("--out", help="JSON file to write")
     arguments = parser.parse_args()
@@ -103,10 +107,11 @@ def main() -> None:
         for name in arguments.planners:
             # Rewards plus value, or the distance to the goal's image.
             objective = None if model.has_value else GoalImage(model.encode_goal, embed=model.embed)
-            for launched in arguments.launched or (["eager", "captured"] if cuda else ["eager"]):
+            launches = arguments.launched or (["eager", "captured"] if cuda else ["eager"])
+            for layers, launched in product(arguments.layers, launches):
                 policy = PlannerPolicy.for_model(
                     model,
-                    make_planner(name),
+                    make_planner(name, layers),
                     objective=objective,
                     capture=launched == "captured",
                     precision=arguments.precision,
@@ -120,6 +125,7 @@ def main() -> None:
                         {
                             "planner": name,
                             "model": SIZES[size][0],
+                            "layers": layers,
                             "launched": launched,
                             "environments": envs,
                             "model steps per decision": steps,

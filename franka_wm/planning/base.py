@@ -191,9 +191,12 @@ class ElitePlanner(ContinuousPlanner):
 
     Args:
         num_elites: how many candidates the Gaussian is refitted to.
+        kernels: False: the model's layers are called as they are; True or None: on CUDA, where nothing is compiled, a
+            `PlannerPolicy` calls their kernels (`franka_wm.models.fused`), which compute the same but for rounding.
     """
 
     num_elites: int
+    kernels: bool | None = None
 
     ranges: ClassVar[Mapping[str, Bounds]] = {**ContinuousPlanner.ranges, "num_elites": POSITIVE}
 

@@ -186,7 +186,6 @@ class PlannerPolicy(TensorDictModuleBase):
             not closures, and leave `compile`: compiled functions cannot be sent to another process.
         capture: replay decisions as CUDA graphs; None: where the observations are on CUDA.
         precision: `float32`, or `bfloat16`: the model computes under autocast; plans and actions stay float32.
-            On CUDA, in both, with the kernels of `franka_wm.models.fused` where nothing is compiled.
         compile: `torch.compile` what the planner calls thousands of times: `next`, `prior`, and an objective
             that has `compiled`. Takes a minute at the first decisions of each batch size.
 
@@ -330,7 +329,10 @@ class PlannerPolicy(TensorDictModuleBase):
         low = self.precision == "bfloat16"
         # No cache of cast weights: it would hold tensors of one captured decision into the next.
         kind = tensordict.get(self.in_keys[0]).device.type
-        with torch.autocast(kind, torch.bfloat16, low, False), fused.kernels(fused.ready(kind)):
+        with (
+            torch.autocast(kind, torch.bfloat16, low, False),
+            fused.kernels(self._kernels and fused.ready(kind)),
+        ):
             z = latent_of(tensordict, self.encode, self.observe)
             z = z.float() if low else z
             result = self.planner.plan(
@@ -346,6 +348,11 @@ class PlannerPolicy(TensorDictModuleBase):
         if self.observe is not None:
             decision.set("context", z).set("context_action", result.get("action"))
         return decision
+
+    @property
+    def _kernels(self) -> bool:
+        """Whether the planner has the option, and leaves it on."""
+        return getattr(self.planner, "kernels", False) is not False
 
     def _next_in_float32(self, z: Tensor, action: Tensor) -> Tensor:
         """Latents as plans are scored by: in float32, but where all that reads them would round them anyway."""
