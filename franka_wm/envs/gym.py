@@ -222,7 +222,7 @@ class FrankaVectorEnv(gymnasium.vector.VectorEnv):
 
     @cached_property
     def _camera(self) -> FrankaConfig:
-        """Where the frames' camera stands."""
+        """Where the frames' camera stands; the configuration of an environment never changes."""
         return whole_arm(self.env.config, self.env.kinematics)
 
     def call(self, name: str, *args: Any, **kwargs: Any) -> tuple[Any, ...]:

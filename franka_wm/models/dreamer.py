@@ -15,9 +15,9 @@ from franka_wm.models.base import WorldModel
 from franka_wm.models.ema import ema_update, frozen_copy
 from franka_wm.models.groups import ParameterGroup
 from franka_wm.models.images import ImageSize, check_image_sizes, check_images
-from franka_wm.models.layers import RunningScale, TwoHotSymlog, symlog
+from franka_wm.models.layers import TwoHotSymlog, symlog
 from franka_wm.models.normalizer import ObservationNormalizer
-from franka_wm.models.returns import discount_per_step, lambda_returns, value_range
+from franka_wm.models.returns import RunningScale, discount_per_step, lambda_returns, value_range
 from franka_wm.models.rssm import RSSM, divergence, network
 from franka_wm.models.vision import ConvDecoder, ConvEncoder
 from franka_wm.models.windows import check_windows, window_of

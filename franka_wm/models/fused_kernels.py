@@ -91,37 +91,47 @@ def bias_norm_activation(
     shift: Tensor,
     action: Tensor | None,
     own: Tensor | None,
-    group_size: int,
-    eps: float,
+    *,
+    group_size: int = 0,
+    eps: float = 1e-5,
+    dtype: torch.dtype | None = None,
 ) -> Tensor:
-    """Of x's shape and precision, which are a product's; of an ensemble's K members (K, rows, D).
+    """What follows the product x of features: (..., D), or (K, rows, D) of an ensemble's K members.
 
     Args:
         bias, scale, shift: (D,), or (K, 1, D).
-        action, own: (rows, A) and its weights (A, D) or (K, A, D), which are added; None: nothing is.
-        group_size: of consecutive features, for a softmax in each; 0: Mish.
+        action, own: (rows, A) without gaps and their weights (A, D) or (K, A, D), which are added; None: nothing is.
+        group_size: of consecutive features, a power of two, for a softmax in each; 0: Mish.
+        dtype: of the result; None: x's.
+
+    Raises:
+        ValueError: features that make no whole groups.
     """
     flat, size = _rows(x), x.shape[-1]
+    if group_size and size % group_size:
+        raise ValueError(f"{size} features make no whole groups of {group_size}")
     rows, per = flat.shape[0], flat.shape[0] // (bias.numel() // size)
-    y = torch.empty(x.shape, device=x.device, dtype=x.dtype)
+    y = torch.empty(x.shape, device=x.device, dtype=x.dtype if dtype is None else dtype)
     together = 4 if rows >= MANY_ROWS and per % 4 == 0 else 1
-    action = flat[:, :0] if action is None else action
-    _bias_norm_activation[(triton.cdiv(rows, together),)](
-        flat, y, bias.contiguous(), scale.contiguous(), shift.contiguous(), action, flat if own is None else own,
-        rows, per, flat.stride(0), action.stride(0), eps,
-        D=size, A=action.shape[1], BLOCK=triton.next_power_of_2(size), R=together, GROUP=group_size, num_warps=4,
-    )  # fmt: skip
+    given = flat[:, :0] if action is None else action
+    with torch.cuda.device_of(x):  # Triton launches on the present one
+        _bias_norm_activation[(triton.cdiv(rows, together),)](
+            flat, y, bias.contiguous(), scale.contiguous(), shift.contiguous(), given, flat if own is None else own,
+            rows, per, flat.stride(0), given.stride(0), eps,
+            D=size, A=given.shape[1], BLOCK=triton.next_power_of_2(size), R=together, GROUP=group_size, num_warps=4,
+        )  # fmt: skip
     return y
 
 
 def symexp_of_mean(logits: Tensor, support: Tensor) -> Tensor:
-    """See :func:`franka_wm.models.fused.expectation`."""
+    """Logits (..., bins), support (bins,) -> symexp of its mean (..., 1), float32."""
     flat = _rows(logits)
     rows, bins = flat.shape
     y = torch.empty((*logits.shape[:-1], 1), device=logits.device)
     together = 8 if rows >= MANY_ROWS else 1
-    _symexp_of_mean[(triton.cdiv(rows, together),)](
-        flat, support, y, rows, flat.stride(0),
-        BINS=bins, BLOCK=triton.next_power_of_2(bins), R=together, num_warps=4 if together > 1 else 1,
-    )  # fmt: skip
+    with torch.cuda.device_of(logits):
+        _symexp_of_mean[(triton.cdiv(rows, together),)](
+            flat, support, y, rows, flat.stride(0),
+            BINS=bins, BLOCK=triton.next_power_of_2(bins), R=together, num_warps=4 if together > 1 else 1,
+        )  # fmt: skip
     return y

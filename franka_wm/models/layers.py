@@ -58,7 +58,7 @@ class Linear(nn.Linear):
     """`nn.Linear`, whose product is padded with zeros on CUDA where its sizes do not suit tensor cores."""
 
     def forward(self, input: Tensor) -> Tensor:
-        if fused.applies():
+        if fused.applies() and fused.suits(self.weight):
             return fused.linear(input, self.weight, self.bias)
         more, beyond = _missing(self.in_features, input), _missing(self.out_features, input)
         if not (more or beyond):
@@ -89,6 +89,11 @@ class SimNorm(nn.Module):
 
     def extra_repr(self) -> str:
         return f"group_size={self.group_size}"
+
+
+def _as_made(module: nn.Module, kind: type[nn.Module]) -> bool:
+    """Whether a module is of this very kind, and nobody listens to its calls."""
+    return type(module) is kind and not (module._forward_hooks or module._forward_pre_hooks)
 
 
 class NormedLinear(nn.Module):
@@ -124,12 +129,18 @@ class NormedLinear(nn.Module):
 
     @property
     def _fuses(self) -> int | None:
-        """What `fused.normed_linear` is told: the size of the groups, 0 for Mish; None: it cannot do it."""
-        if self.dropout and self.training:
+        """What `fused.normed_linear` is told: the size of the groups, 0 for Mish; None: these layers are not its."""
+        own = (
+            _as_made(self.linear, Linear)
+            and _as_made(self.norm, nn.LayerNorm)
+            and fused.suits(self.linear.weight)
+        )
+        if not own or (self.dropout and self.training):
             return None
-        if isinstance(self.activation, SimNorm):
-            return self.activation.group_size if fused.suits(self.activation.group_size) else None
-        return 0 if isinstance(self.activation, nn.Mish) else None
+        if isinstance(self.activation, SimNorm) and _as_made(self.activation, SimNorm):
+            group = self.activation.group_size
+            return group if group & (group - 1) == 0 else None
+        return 0 if _as_made(self.activation, nn.Mish) else None
 
 
 def mlp(
@@ -222,7 +233,7 @@ class TwoHotSymlog(nn.Module):
 
         In the support's precision, also under autocast: bfloat16's probabilities are too coarse for values of tens.
         """
-        if fused.applies():
+        if fused.applies() and fused.suits(self.support):
             return fused.expectation(logits, self.support)
         probabilities = logits.softmax(-1, dtype=self.support.dtype)
         return symexp((probabilities * self.support).sum(-1, keepdim=True))
@@ -314,12 +325,16 @@ class Ensemble(nn.Module):
 
         if isinstance(members, int) and not 1 <= members <= self.members:
             raise ValueError(f"members must be from 1 to {self.members}, got {members}")
-        if fused.applies() and not dropout:
-            layers = [(parameter(f"weight_{i}"), parameter(f"bias_{i}")) for i in range(self.depth)]
-            norms = [
-                (parameter(f"norm_scale_{i}"), parameter(f"norm_shift_{i}")) for i in range(self.depth - 1)
-            ]
-            return fused.ensemble(x, layers, norms)
+        if fused.applies() and fused.suits(parameter("weight_0")) and not dropout:
+            of = "target_" if weights == "target" else ""
+            layers, norms = (
+                [(getattr(self, f"{of}{one}_{i}"), getattr(self, f"{of}{two}_{i}")) for i in range(depth)]
+                for one, two, depth in (
+                    ("weight", "bias", self.depth),
+                    ("norm_scale", "norm_shift", self.depth - 1),
+                )
+            )
+            return fused.ensemble(x, layers, norms, members)
         leading = x.shape[:-1]
         count = members if isinstance(members, int) else self.members if members is None else members.shape[0]
         h = x.reshape(-1, x.shape[-1]).expand(count, -1, -1)
@@ -348,6 +363,12 @@ class Ensemble(nn.Module):
         targets = [getattr(self, f"target_{name}") for name in self._names]
         live = [getattr(self, name).detach() for name in self._names]
         torch._foreach_lerp_(targets, live, tau)  # pyright: ignore[reportPrivateImportUsage]
+
+
+def reads_apart(network: nn.Module) -> bool:
+    """Whether a network can read features and actions apart, as `fused.Joined`: its first layer takes them so."""
+    first = network[0] if type(network) is nn.Sequential else None
+    return type(network) is Ensemble or (isinstance(first, NormedLinear) and first._fuses is not None)
 
 
 class GaussianPolicy(nn.Module):
@@ -406,36 +427,3 @@ class GaussianPolicy(nn.Module):
     def all_shown(shown: Tensor) -> Tensor:
         """Whether (,) all steps are demonstrations, in the batches of all processes: they share them unequally."""
         return processes.mean(shown.all().float()) == 1
-
-
-class RunningScale(nn.Module):
-    """Running 5-95 percentile range of values, at least 1, by which a policy loss is divided.
-
-    It lets one entropy coefficient serve rewards of any size (TD-MPC2, section 3.2). `update` works on the
-    device, with static shapes.
-    """
-
-    value: Tensor
-
-    def __init__(self, tau: float = 0.01) -> None:
-        super().__init__()
-        self.tau = tau
-        self.register_buffer("value", torch.ones(()))
-
-    @torch.no_grad()
-    def update(self, x: Tensor) -> None:
-        """Move the scale by `tau` towards the 5-95 percentile range of `x` (any shape)."""
-        ordered = processes.gather(x.detach().flatten()).sort().values
-        span = _percentile(ordered, 0.95) - _percentile(ordered, 0.05)
-        self.value.lerp_(span.clamp_min(1.0).to(self.value.dtype), self.tau)
-
-    def forward(self, x: Tensor) -> Tensor:
-        # A copy, so that a later update in place cannot invalidate the graph of this division.
-        return x / self.value.clone()
-
-
-def _percentile(ordered: Tensor, fraction: float) -> Tensor:
-    """Linear-interpolated percentile of a sorted vector (n,); its indices depend on the shape alone."""
-    position = fraction * (ordered.shape[0] - 1)
-    low = math.floor(position)
-    return torch.lerp(ordered[low], ordered[min(low + 1, ordered.shape[0] - 1)], position - low)

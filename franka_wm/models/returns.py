@@ -1,9 +1,11 @@
-"""Discounts of returns, and how large returns can be."""
+"""Discounts of returns, how large returns can be, and the scale by which a policy loss is divided."""
 
 import math
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
+
+from franka_wm import processes
 
 PUBLISHED_RANGE = 10.0
 """Range of two-hot codes to both sides of zero in symlog space: rewards and values from -22,025 to 22,025."""
@@ -131,3 +133,36 @@ def lambda_returns(
         following = reward[t] + discount * going_on[t] * ahead
         returns.append(following)
     return torch.stack(returns[::-1])
+
+
+class RunningScale(nn.Module):
+    """Running 5-95 percentile range of values, at least 1, by which a policy loss is divided.
+
+    It lets one entropy coefficient serve rewards of any size (TD-MPC2, section 3.2). `update` works on the
+    device, with static shapes.
+    """
+
+    value: Tensor
+
+    def __init__(self, tau: float = 0.01) -> None:
+        super().__init__()
+        self.tau = tau
+        self.register_buffer("value", torch.ones(()))
+
+    @torch.no_grad()
+    def update(self, x: Tensor) -> None:
+        """Move the scale by `tau` towards the 5-95 percentile range of `x` (any shape)."""
+        ordered = processes.gather(x.detach().flatten()).sort().values
+        span = _percentile(ordered, 0.95) - _percentile(ordered, 0.05)
+        self.value.lerp_(span.clamp_min(1.0).to(self.value.dtype), self.tau)
+
+    def forward(self, x: Tensor) -> Tensor:
+        # A copy, so that a later update in place cannot invalidate the graph of this division.
+        return x / self.value.clone()
+
+
+def _percentile(ordered: Tensor, fraction: float) -> Tensor:
+    """Linear-interpolated percentile of a sorted vector (n,); its indices depend on the shape alone."""
+    position = fraction * (ordered.shape[0] - 1)
+    low = math.floor(position)
+    return torch.lerp(ordered[low], ordered[min(low + 1, ordered.shape[0] - 1)], position - low)

@@ -15,7 +15,7 @@ from franka_wm.models import fused
 from franka_wm.models.base import WorldModel
 from franka_wm.models.image_encoder import ImageEncoder
 from franka_wm.models.images import ImageSize, RandomShift, check_image_sizes, check_images
-from franka_wm.models.layers import SimNorm, TwoHotSymlog, mlp
+from franka_wm.models.layers import SimNorm, TwoHotSymlog, mlp, reads_apart
 from franka_wm.models.normalizer import (
     check_sizes,
     concatenate,
@@ -182,14 +182,23 @@ class SimplicialWorldModel(WorldModel):
         """Actions (..., A) with 0 in the entries that the task of z has not."""
         return action if self.action_masks is None else action * z[..., self.latent_dim :]
 
-    def joined(self, z: Tensor, action: Tensor) -> Tensor | fused.Joined:
-        """What networks over both read: the features of z and the action, masked."""
+    def joined(self, z: Tensor, action: Tensor, reader: nn.Module | None = None) -> Any:
+        """What networks over both read: the features of z and the action, masked (..., latent_dim + A).
+
+        Args:
+            reader: the network; where kernels are used, one that can read both apart gets a `fused.Joined`.
+        """
         parts = (self.features(z), self.masked(z, action))
-        return fused.Joined(*parts) if fused.applies() else torch.cat(parts, dim=-1)
+        apart = reader is not None and fused.applies() and reads_apart(reader)
+        return fused.Joined(*parts) if apart else torch.cat(parts, dim=-1)
 
     def following(self, z: Tensor, features: Tensor) -> Tensor:
         """The next z: new features (..., latent_dim), and the mask of z."""
-        return features if self.action_masks is None else torch.cat((features, z[..., self.latent_dim :]), -1)
+        return (
+            features
+            if self.action_masks is None
+            else torch.cat((features, z[..., self.latent_dim :].to(features.dtype)), -1)
+        )
 
     def rebuild_overrides(self) -> dict[str, Any]:
         """Constructor arguments that replace a pretrained encoder's file, and the range of rewards and values."""

@@ -18,14 +18,13 @@ from franka_wm.models.images import ImageSize, check_images
 from franka_wm.models.layers import (
     Ensemble,
     GaussianPolicy,
-    RunningScale,
     SimNorm,
     TwoHotSymlog,
     mlp,
     zero_head,
 )
 from franka_wm.models.normalizer import concatenate
-from franka_wm.models.returns import discount_per_step, value_range
+from franka_wm.models.returns import RunningScale, discount_per_step, value_range
 from franka_wm.models.simplicial import SimplicialWorldModel
 from franka_wm.models.streams import side_stream
 from franka_wm.models.windows import check_windows, window_of
@@ -211,11 +210,11 @@ class TDMPC2(SimplicialWorldModel):
 
     def next(self, z: Tensor, action: Tensor) -> Tensor:
         """Latents (..., latent_dim) and actions (..., action_dim) -> next latents (..., latent_dim)."""
-        return self.following(z, self.dynamics(self.joined(z, action)))
+        return self.following(z, self.dynamics(self.joined(z, action, self.dynamics)))
 
     def reward(self, z: Tensor, action: Tensor) -> Tensor:
         """Expected reward (..., 1) of an action (..., action_dim) in z (..., latent_dim)."""
-        return self.two_hot.decode(self.reward_head(self.joined(z, action)))
+        return self.two_hot.decode(self.reward_head(self.joined(z, action, self.reward_head)))
 
     def q(
         self,
@@ -236,9 +235,10 @@ class TDMPC2(SimplicialWorldModel):
                 device, afresh at each call.
             dropout: whether to drop activations, as while fitting.
         """
-        # Ranking noise draws without replacement, on the device; torch.randperm may wait for the host.
+        # Ranking noise draws without replacement, on the device; randperm may wait for the host.
         members = first if reduce == "mean" else torch.rand(self.num_q, device=z.device).topk(2).indices
-        logits = self.q_ensemble(self.joined(z, action), weights=weights, members=members, dropout=dropout)
+        both = self.joined(z, action, self.q_ensemble)
+        logits = self.q_ensemble(both, weights=weights, members=members, dropout=dropout)
         values = self.two_hot.decode(logits)
         return values.amin(0) if reduce == "pair_min" else values.mean(0)
 

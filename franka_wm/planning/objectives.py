@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from functools import partial
 from typing import Literal, Protocol, get_args
 
 import torch
@@ -31,6 +32,9 @@ class Objective:
 
     in_keys: Sequence[str] = ()
     """Entries of the observation that `bind` cannot do without."""
+    coarse = (
+        False  # Whether latents in bfloat16 do, if the model computes so: nothing but the model reads them.
+    )
 
     def __call__(self, trajectory: Tensor, actions: Tensor) -> Tensor:
         """Scores (E, S) of trajectories (E, S, H+1, D) and actions (E, S, H, A)."""
@@ -118,23 +122,19 @@ class RewardPlusValue(Objective):
             ValueError: the model lacks reward, value or discount.
         """
         there = {"reward": model.has_reward, "value": model.has_value, "discount": model.discount >= 0.0}
-        lacking = [name for name, has in there.items() if not has]
-        if lacking:
+        if lacking := [name for name, has in there.items() if not has]:
             raise ValueError(f"{type(model).__name__} has no {', '.join(lacking)}")
         ends = model.terminated if model.terminates else None
         arrival = model.arrival_reward if model.has_arrival_reward else None
-        return cls(model.reward, model.value, model.discount, ends, arrival)
+        made = cls(model.reward, model.value, model.discount, ends, arrival)
+        made.coarse = True
+        return made
 
     def compiled(self) -> RewardPlusValue:
         """The same, with what it calls compiled by `torch.compile`."""
-        ends, arrival = self.terminated, self.arrival_reward
-        return RewardPlusValue(
-            torch.compile(self.reward, dynamic=False),
-            torch.compile(self.value, dynamic=False),
-            self.discount,
-            None if ends is None else torch.compile(ends, dynamic=False),
-            None if arrival is None else torch.compile(arrival, dynamic=False),
-        )
+        fast = partial(torch.compile, dynamic=False)
+        ends, arrival = (one and fast(one) for one in (self.terminated, self.arrival_reward))
+        return RewardPlusValue(fast(self.reward), fast(self.value), self.discount, ends, arrival)
 
     def __call__(self, trajectory: Tensor, actions: Tensor) -> Tensor:
         horizon = actions.shape[2]
@@ -291,11 +291,11 @@ class Sum(Objective):
             raise ValueError("a Sum needs at least one (weight, objective)")
         for weight, objective in terms:
             if not math.isfinite(weight):
-                raise ValueError(
-                    f"the weight of {type(objective).__name__} in a Sum must be finite, got {weight}"
-                )
+                kind = type(objective).__name__
+                raise ValueError(f"the weight of {kind} in a Sum must be finite, got {weight}")
         self.terms = [(float(weight), as_objective(objective)) for weight, objective in terms]
         self.in_keys = list(dict.fromkeys(key for _, objective in self.terms for key in objective.in_keys))
+        self.coarse = all(objective.coarse for _, objective in self.terms)
 
     def compiled(self) -> Sum:
         """The same sum of compiled terms."""
@@ -319,6 +319,8 @@ Masked = Callable[[Tensor, Tensor], Tensor]
 
 class _OfActions(Objective):
     """What costs by the actions alone, where tasks share a model: by the entries that the task of a plan has."""
+
+    coarse = True
 
     def __init__(self, weight: float, masked: Masked | None = None) -> None:
         self.weight, self.masked = _penalty(type(self).__name__, weight), masked

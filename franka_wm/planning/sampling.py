@@ -32,7 +32,7 @@ def rollout(z: Tensor, actions: Tensor, next: Callable[[Tensor, Tensor], Tensor]
     for t in range(actions.shape[2]):
         latents.append(next(latents[-1], actions[:, :, t]))
     latents[0] = latents[0].to(latents[-1].dtype)  # predicted latents may be coarser
-    # On a GPU one step lies behind the other: whole pieces are copied, and read again.
+    # In memory (H+1, E, S, ...) on a GPU, where most of the time is copying: steps are written and read as a whole.
     return torch.stack(latents).movedim(0, 2) if z.is_cuda else torch.stack(latents, dim=2)
 
 

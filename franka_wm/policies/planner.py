@@ -20,14 +20,10 @@ from franka_wm.models.base import WorldModel
 from franka_wm.options import PRECISIONS
 from franka_wm.planning.base import Planner, Prior
 from franka_wm.planning.objectives import (
-    ActionPenalty,
     GoalImage,
     Objective,
-    PolicyPenalty,
     RewardPlusValue,
     Score,
-    Smoothness,
-    Sum,
     as_objective,
     goal_images,
 )
@@ -131,13 +127,6 @@ def captures(wanted: bool | None, observation: Tensor) -> bool:
     if wanted and not observation.is_cuda:
         raise ValueError(f"capture=True needs observations on CUDA, these are on {observation.device}")
     return observation.is_cuda if wanted is None else wanted
-
-
-def by_networks(objective: Objective) -> bool:
-    """Whether an objective scores latents by the model's networks alone, and measures no distances between them."""
-    if isinstance(objective, Sum):
-        return all(by_networks(term) for _, term in objective.terms)
-    return isinstance(objective, RewardPlusValue | ActionPenalty | PolicyPenalty | Smoothness)
 
 
 def _guide(model: WorldModel, objective: Objective) -> Prior | GoalGuide | None:
@@ -328,16 +317,14 @@ class PlannerPolicy(TensorDictModuleBase):
         is_init = tensordict.get("is_init", None)
         low = self.precision == "bfloat16"
         # No cache of cast weights: it would hold tensors of one captured decision into the next.
-        kind = tensordict.get(self.in_keys[0]).device.type
-        with (
-            torch.autocast(kind, torch.bfloat16, low, False),
-            fused.kernels(self._kernels and fused.ready(kind)),
-        ):
+        device = tensordict.get(self.in_keys[0]).device
+        kernels = fused.kernels(self._kernels and fused.ready(device.type), coarse=self.objective.coarse)
+        with torch.autocast(device.type, torch.bfloat16, low, False), kernels:
             z = latent_of(tensordict, self.encode, self.observe)
             z = z.float() if low else z
             result = self.planner.plan(
                 z,
-                self._next_in_float32 if low else self.next,
+                self._next if low else self.next,
                 self.objective.bind(tensordict),
                 prior=self._asked(tensordict),
                 previous=tensordict.get("plan", None),
@@ -354,10 +341,10 @@ class PlannerPolicy(TensorDictModuleBase):
         """Whether the planner has the option, and leaves it on."""
         return getattr(self.planner, "kernels", False) is not False
 
-    def _next_in_float32(self, z: Tensor, action: Tensor) -> Tensor:
-        """Latents as plans are scored by: in float32, but where all that reads them would round them anyway."""
+    def _next(self, z: Tensor, action: Tensor) -> Tensor:
+        """Latents as plans are scored by: in float32, but where kernels may leave them coarse."""
         after = self.next(z, action)
-        return after if fused.applies() and by_networks(self.objective) else after.float()
+        return after if fused.coarse() else after.float()
 
 
 class ModelPolicy(TensorDictModuleBase):

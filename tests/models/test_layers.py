@@ -7,14 +7,13 @@ from franka_wm.models.layers import (
     Ensemble,
     GaussianPolicy,
     NormedLinear,
-    RunningScale,
     SimNorm,
     TwoHotSymlog,
     mlp,
     symexp,
     symlog,
 )
-from franka_wm.models.returns import value_range
+from franka_wm.models.returns import RunningScale, value_range
 
 
 @pytest.fixture(autouse=True)
