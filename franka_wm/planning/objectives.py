@@ -32,9 +32,7 @@ class Objective:
 
     in_keys: Sequence[str] = ()
     """Entries of the observation that `bind` cannot do without."""
-    coarse = (
-        False  # Whether latents in bfloat16 do, if the model computes so: nothing but the model reads them.
-    )
+    coarse = False  # Whether latents may come in bfloat16: nothing but the model reads them.
 
     def __call__(self, trajectory: Tensor, actions: Tensor) -> Tensor:
         """Scores (E, S) of trajectories (E, S, H+1, D) and actions (E, S, H, A)."""
