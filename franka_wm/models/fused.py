@@ -124,6 +124,23 @@ def _pieces(x: Tensor, dim: int = -1) -> Tensor:
     return F.pad(x, (0, 0) * (-dim - 1) + (0, lacking)) if lacking else x
 
 
+def _aligned(x: Tensor) -> Tensor:
+    """Inputs (..., D) in whole pieces, and rows that begin at one: those of a slice may not."""
+    x = _pieces(x)
+    return x.contiguous() if x.dim() > 1 and x.stride(-2) % PIECE else x
+
+
+def _in_order(x: Tensor) -> tuple[Tensor, list[int]]:
+    """x (..., D) with its leading dimensions in the order of memory, so that a product need not copy; and the order."""
+    order = sorted(range(x.dim() - 1), key=lambda k: -x.stride(k))
+    return x.permute(*order, -1), order
+
+
+def _restored(y: Tensor, order: list[int]) -> Tensor:
+    """The result with its leading dimensions as they were before `_in_order`."""
+    return y.permute(*(order.index(k) for k in range(len(order))), -1)
+
+
 def _columns(first: int) -> Callable[[Tensor], Tensor]:
     """Takes the first columns of a weight (..., out, in), in whole pieces."""
     return lambda weight: _pieces(_pieces(weight[..., :first]), -2)
@@ -141,7 +158,9 @@ def linear(x: Tensor | Joined, weight: Tensor, bias: Tensor | None) -> Tensor:
     out, width = weight.shape
     _require_width(x, None, width)
     bias = None if bias is None else _prepared(bias, "bias", x.dtype, _pieces)
-    return F.linear(_pieces(x), _prepared(weight, "product", x.dtype, _columns(width)), bias)[..., :out]
+    x, order = _in_order(x)
+    product = F.linear(_aligned(x), _prepared(weight, f"first {width}", x.dtype, _columns(width)), bias)
+    return _restored(product[..., :out], order)
 
 
 def normed_linear(
@@ -159,12 +178,10 @@ def normed_linear(
 
     features, action = x if isinstance(x, Joined) else (x, None)
     _require_width(features, action, weight.shape[1])
-    # In the order of memory, so that nothing is copied, and back at the end.
-    order = sorted(range(features.dim() - 1), key=lambda k: -features.stride(k))
-    features = _cast(features).permute(*order, -1)
+    features, order = _in_order(_cast(features))
     weights = _prepared(weight, f"first {features.shape[-1]}", features.dtype, _columns(features.shape[-1]))
     y = bias_norm_activation(
-        F.linear(_pieces(features), weights)[..., : len(weight)],
+        F.linear(_aligned(features), weights)[..., : len(weight)],
         bias if bias is not None else weight.new_zeros(len(weight)),
         scale,
         shift,
@@ -174,7 +191,7 @@ def normed_linear(
         # As without the kernels: a softmax in groups gives latents, which are float32 unless they may be coarse.
         dtype=torch.float32 if group_size and not _decision().coarse else None,
     )
-    return y.permute(*(order.index(k) for k in range(len(order))), -1)
+    return _restored(y, order)
 
 
 def ensemble(
@@ -215,15 +232,15 @@ def ensemble(
 
     for (weight, bias), (scale, shift) in zip(layers[:-1], norms, strict=True):
         own = weights(weight)
-        product = (_pieces(h).expand(len(own), -1, -1) @ own)[..., : weight.shape[2]]
+        product = (_aligned(h).expand(len(own), -1, -1) @ own)[..., : weight.shape[2]]
         given, columns = _of_action(action, weight.mT)
         columns = None if columns is None else some(columns)
         h = bias_norm_activation(product, some(bias), some(scale), some(shift), given, columns)
         action = None  # the first layer's alone
     weight, bias = layers[-1]
     own, bias = weights(weight), some(_prepared(bias, "bias", h.dtype, _pieces))
-    h = torch.baddbmm(bias, _pieces(h).expand(len(own), -1, -1), own)[..., : weight.shape[2]]
-    return h.reshape(len(own), *leading, -1)
+    h = torch.baddbmm(bias, _aligned(h).expand(len(own), -1, -1), own)[..., : weight.shape[2]]
+    return h.reshape(len(own), *leading, weight.shape[2])
 
 
 def _of_action(action: Tensor | None, weight: Tensor) -> tuple[Tensor, Tensor] | tuple[None, None]:

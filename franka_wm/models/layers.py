@@ -55,7 +55,10 @@ def _missing(size: int, like: Tensor) -> int:
 
 
 class Linear(nn.Linear):
-    """`nn.Linear`, whose product is padded with zeros on CUDA where its sizes do not suit tensor cores."""
+    """`nn.Linear`, whose product is padded with zeros on CUDA where its sizes do not suit tensor cores.
+
+    In plans on CUDA it calls `fused.linear`.
+    """
 
     def forward(self, input: Tensor) -> Tensor:
         if fused.applies() and fused.suits(self.weight):
@@ -335,6 +338,8 @@ class Ensemble(nn.Module):
                 )
             )
             return fused.ensemble(x, layers, norms, members)
+        if isinstance(x, fused.Joined):  # by weights or with dropout that the kernels do not know
+            x = torch.cat(x, dim=-1)
         leading = x.shape[:-1]
         count = members if isinstance(members, int) else self.members if members is None else members.shape[0]
         h = x.reshape(-1, x.shape[-1]).expand(count, -1, -1)
@@ -367,8 +372,10 @@ class Ensemble(nn.Module):
 
 def reads_apart(network: nn.Module) -> bool:
     """Whether a network can read features and actions apart, as `fused.Joined`: its first layer takes them so."""
-    first = network[0] if type(network) is nn.Sequential else None
-    return type(network) is Ensemble or (isinstance(first, NormedLinear) and first._fuses is not None)
+    first = network[0] if _as_made(network, nn.Sequential) else network  # pyright: ignore[reportIndexIssue]
+    if isinstance(first, NormedLinear) and _as_made(first, NormedLinear):
+        return first._fuses is not None
+    return _as_made(network, Ensemble)
 
 
 class GaussianPolicy(nn.Module):

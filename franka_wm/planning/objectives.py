@@ -125,7 +125,7 @@ class RewardPlusValue(Objective):
         ends = model.terminated if model.terminates else None
         arrival = model.arrival_reward if model.has_arrival_reward else None
         made = cls(model.reward, model.value, model.discount, ends, arrival)
-        made.coarse = True
+        made.coarse = cls is RewardPlusValue
         return made
 
     def compiled(self) -> RewardPlusValue:
