@@ -7,6 +7,8 @@ import torch
 from tensordict import TensorDict
 from torch import Tensor
 
+from plan_kernels import recorded
+
 SIDE = 16
 STEP = 3.0  # pixels at full action
 
@@ -53,3 +55,15 @@ def windows(batch: int, horizon: int, side: int = SIDE) -> TensorDict:
 def dots() -> SimpleNamespace:
     """`draw`, `move` and `windows` of the toy world, and its `size` and `side`."""
     return SimpleNamespace(draw=draw, move=move, windows=windows, size=(SIDE, SIDE, 3), side=SIDE)
+
+
+@pytest.fixture
+def seeded() -> None:
+    """The same random numbers each time."""
+    torch.manual_seed(0)
+
+
+@pytest.fixture
+def calls(monkeypatch: pytest.MonkeyPatch) -> list[str]:
+    """Names of the functions of `franka_wm.models.fused` that layers call, as they do."""
+    return recorded(monkeypatch)

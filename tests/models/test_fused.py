@@ -16,19 +16,10 @@ from tensordict import TensorDict
 from franka_wm.models import fused
 from franka_wm.models.layers import Ensemble, SimNorm, TwoHotSymlog, mlp
 from franka_wm.models.tdmpc2 import TDMPC2
-from plan_kernels import INTERPRETED, model, recorded, runs_kernels, shaken
+from plan_kernels import INTERPRETED, model, runs_kernels, shaken
 
 pytest.importorskip("triton")  # comes with torch on Linux
-
-
-@pytest.fixture(autouse=True)
-def seeded():
-    torch.manual_seed(0)
-
-
-@pytest.fixture
-def calls(monkeypatch):
-    return recorded(monkeypatch)
+pytestmark = pytest.mark.usefixtures("seeded")
 
 
 @pytest.mark.skipif(INTERPRETED, reason="is what began this process")

@@ -11,19 +11,10 @@ from franka_wm.models import fused
 from franka_wm.models.layers import Ensemble, Linear, SimNorm, mlp
 from franka_wm.planning import MPPI, ActionPenalty, GoalDistance, RewardPlusValue, Smoothness, Sum
 from franka_wm.policies import PlannerPolicy
-from plan_kernels import model, recorded, runs_kernels
+from plan_kernels import model, runs_kernels
 
 pytest.importorskip("triton")  # comes with torch on Linux
-
-
-@pytest.fixture(autouse=True)
-def seeded():
-    torch.manual_seed(0)
-
-
-@pytest.fixture
-def calls(monkeypatch):
-    return recorded(monkeypatch)
+pytestmark = pytest.mark.usefixtures("seeded")
 
 
 def test_gradients_flow_as_without(calls):
