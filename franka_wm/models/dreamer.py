@@ -39,7 +39,7 @@ class Dreamer(WorldModel):
       * `encode`, `observe` and `next` take the likeliest codes: what acts and plans is deterministic. Training draws.
       * Vectors are standardised before symlog, see `set_observation_statistics`; the default is the identity.
       * AdamW with clipped gradient norms (of model, actor and critic apart) instead of LaProp with adaptive clipping.
-      * Images go through TD-MPC2's convolutions, and come back through upsampling and convolutions.
+      * Images go through TD-MPC2's convolutions, and come back through sub-pixel convolutions.
       * The two-hot code is TD-MPC2's: bins are equidistant in symlog space, and its expectation is taken there.
 
     Args:

@@ -256,4 +256,5 @@ def expectation(logits: Tensor, support: Tensor) -> Tensor:
     """`TwoHotSymlog.decode`: logits (..., bins), support (bins,) -> symexp of its mean (..., 1), float32."""
     from franka_wm.models.fused_kernels import symexp_of_mean
 
-    return symexp_of_mean(logits, support)
+    logits, order = _in_order(logits)
+    return _restored(symexp_of_mean(logits, support), order)
