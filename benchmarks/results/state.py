@@ -10,7 +10,7 @@ from typing import Any
 from benchmarks.results.records import BESIDE, check_arguments, check_seed
 from benchmarks.results.rows import Row
 from franka_wm.errors import FrankaError
-from franka_wm.report.run import SAME_BUT
+from franka_wm.report.run import SAME_BUT, without_the_seed
 from franka_wm.source import differing
 
 Record = Mapping[str, Any]
@@ -56,7 +56,9 @@ def mixed(row: Row, records: Sequence[Record]) -> list[str]:
         names += [f"{name} {value}" for name, value in made.items() if first["versions"].get(name) != value]
         names += [
             change
-            for change in changes(first["code"]["config"], record["code"]["config"])
+            for change in changes(
+                *(without_the_seed(one["code"]["config"], one.get("seed")) for one in (first, record))
+            )
             if not change.startswith(tuple(f"{name}{end}" for name in BESIDE for end in (" ", ".")))
         ]
         if names:

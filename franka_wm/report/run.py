@@ -160,11 +160,17 @@ def read_config(folder: str | Path) -> dict[str, object]:
 
 def but_for_the_seed(config: Mapping[str, object]) -> str:
     """The same for repetitions, and for nothing else; empty for an empty configuration."""
+    kept = without_the_seed(config, config.get("seed"))
+    return json.dumps(kept, sort_keys=True, default=str) if kept else ""
+
+
+def without_the_seed(config: Mapping[str, object], seed: object) -> dict[str, object]:
+    """Without what repetitions differ in: what is in `SAME_BUT`, and a dataset's seed that follows `seed`."""
     kept = {name: value for name, value in config.items() if name not in SAME_BUT}
     dataset = kept.get("dataset")
-    if isinstance(dataset, Mapping) and dataset.get("seed") == config.get("seed"):  # follows it
+    if isinstance(dataset, Mapping) and dataset.get("seed") == seed:
         kept["dataset"] = {name: value for name, value in dataset.items() if name != "seed"}
-    return json.dumps(kept, sort_keys=True, default=str) if kept else ""
+    return kept
 
 
 def malformed(*folders: Path | str) -> AbstractContextManager[None]:

@@ -175,6 +175,17 @@ def test_arguments_that_change_no_number_do_not_make_a_row_mixed(tmp_path: Path)
     assert state(ROW, records.read(ROW, place(tmp_path, *some))) == ("fresh", [])
 
 
+@pytest.mark.parametrize(("second", "apart"), [(101, False), (5, True)])
+def test_a_datasets_seed_that_follows_the_runs_does_not_make_a_row_mixed(second: int, apart: bool) -> None:
+    config = composed(tuple(ROW.words))
+    assert isinstance(config, dict)
+    some = [
+        record(seed, config={"dataset": config["dataset"] | {"seed": own}})
+        for seed, own in ((100, 100), (101, second))
+    ]
+    assert bool(mixed(ROW, some)) == apart
+
+
 def test_changed_values_are_no_files_and_stand_unfolded(tmp_path: Path) -> None:
     old = {"files": {"gone.py": "1"}, "config": {"scale": "other", "old": 1}}
     text = render.page({"reach": ROW}, place(tmp_path, *(record(seed, **old) for seed in ROW.seeds)))
