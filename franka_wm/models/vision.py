@@ -97,7 +97,8 @@ class ConvDecoder(nn.Module):
     """Images from features: 3 × 3 convolutions, each of whose results is laid out as an image twice as large.
 
     (..., in_features) -> (..., height, width, C), 0 black and 1 white, not bounded. What is wanted of the larger image
-    comes out of the smaller one as four times as many channels (arXiv:1609.05158): no layer reads the larger one.
+    comes out of the smaller one as four times as many channels (arXiv:1609.05158): no convolution reads the larger one.
+    Normalised pixel by pixel, as DreamerV3's.
 
     Args:
         image_size: (height, width, channels).
@@ -110,16 +111,21 @@ class ConvDecoder(nn.Module):
         self.image_size, self.grid = image_size, (-(-height // 16), -(-width // 16))
         widths = [2 * channels, 2 * channels, 3 * channels // 2, channels]
         self.start = nn.Linear(in_features, widths[0] * self.grid[0] * self.grid[1])
-        layers: list[nn.Module] = []
-        for a, b in zip(widths, [*widths[1:], outputs], strict=True):
-            layers += [nn.GroupNorm(1, a), nn.SiLU(), nn.Conv2d(a, 4 * b, 3, padding=1), nn.PixelShuffle(2)]
-        self.network = nn.Sequential(*layers)
+        self.norms = nn.ModuleList(nn.RMSNorm(each, eps=1e-4) for each in widths)
+        self.convolutions = nn.ModuleList(
+            nn.Conv2d(a, 4 * b, 3, padding=1) for a, b in zip(widths, [*widths[1:], outputs], strict=True)
+        )
 
     def forward(self, features: Tensor) -> Tensor:
-        height, width, outputs = self.image_size
-        x = self.start(features).reshape(-1, self.start.out_features // math.prod(self.grid), *self.grid)
-        images = self.network(x)[..., :height, :width].permute(0, 2, 3, 1) + 0.5
-        return images.reshape(*features.shape[:-1], height, width, outputs)
+        # Channels last throughout: what convolutions on a GPU take and give without a copy.
+        x = self.start(features).reshape(-1, *self.grid, self.norms[0].weight.numel())
+        for norm, convolution in zip(self.norms, self.convolutions, strict=True):
+            four = convolution(F.silu(norm(x)).movedim(-1, 1)).movedim(
+                1, -1
+            )  # (N, rows, columns, 4 · channels)
+            x = four.unflatten(-1, (2, 2, -1)).transpose(2, 3).flatten(1, 2).flatten(2, 3)
+        height, width, _ = self.image_size
+        return (x[:, :height, :width] + 0.5).reshape(*features.shape[:-1], *self.image_size)
 
 
 # -- the vision transformer ------------------------------------------------------------------------------
