@@ -39,6 +39,7 @@ class Dreamer(WorldModel):
       * `encode`, `observe` and `next` take the likeliest codes: what acts and plans is deterministic. Training draws.
       * Vectors are standardised before symlog, see `set_observation_statistics`; the default is the identity.
       * AdamW with clipped gradient norms (of model, actor and critic apart) instead of LaProp with adaptive clipping.
+      * The encoder of vectors ends with a plain linear layer, one of its `encoder_layers`.
       * Images go through TD-MPC2's convolutions, and come back through sub-pixel convolutions.
       * The two-hot code is TD-MPC2's: bins are equidistant in symlog space, and its expectation is taken there.
 
@@ -55,7 +56,7 @@ class Dreamer(WorldModel):
         codes, classes: s are so many one-hot codes of so many classes.
         blocks: of the recurrent matrix.
         unimix: share of the uniform distribution in those of codes.
-        encoder_layers: hidden layers of the encoder and of the decoder of vectors.
+        encoder_layers: layers of the encoder, and hidden ones of the decoder, of vectors.
         channels: of each convolution over images.
         bins, value_low, value_high: two-hot code of rewards and values; the range is in symlog space. None:
             derived from `reward_bounds` and the discount, see `value_range`.

@@ -169,6 +169,11 @@ def check_demonstrations(run: RunSettings) -> None:
         raise UserError(
             f"replay.demo_resets={share}: is for tasks with a gripper, such as env=stack; leave it at 0"
         )
+    if not share and not any(run.demo_windows(update) for update in (0, run.trainer.updates)):
+        raise UserError(
+            f"replay.demo_share={run.replay.demo_share}: no update would see replay.demos; give them a share, "
+            "demo_updates or demo_resets"
+        )
     if isinstance(run.env.config, MultiTaskConfig):
         for name, roots in _by_task(run, run.env.config).items():
             _check_recorded(run, roots, run.env.config.tasks[name], f"env.tasks.{name}")
@@ -198,8 +203,16 @@ def _check_recorded(run: RunSettings, roots: Any, arm: FrankaConfig | None, whos
     if arm is None:
         return
     env = {**vars(arm), "urdf_path": run.env.urdf_path}
-    looks = {*(run.model.observations or ())} & {*Spaces.of_config(arm).image_sizes}
-    for source in sources:
+    own = Spaces.of_config(arm)
+    read = {*(run.model.observations or own.observation_sizes)}
+    looks = read & {*own.image_sizes}
+    for source, one in zip(sources, mappings, strict=True):
+        lacking = sorted((read & {*own.observation_sizes, *own.image_sizes}) - {*one.images, *one.vectors})
+        if lacking:
+            raise UserError(
+                f"replay.demos={source.root}: has no {' nor '.join(lacking)}, which model={run.model.name} reads; "
+                f"record it with all that {whose} observes"
+            )
         sessions = (read_provenance(source.root) or {}).get("sessions", ())
         for session in sessions if share else ():
             recorded = session.get("config", {}).get("env", {})

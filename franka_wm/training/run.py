@@ -290,6 +290,8 @@ def start(cfg: DictConfig) -> Run:
         OmegaConf.save(OmegaConf.create(dict(settings.values)), folder / "config.yaml")
     write_versions(folder, device)
     say(f"device {device}   seed {settings.seed}   results in {folder}")
+    if told := settings.told_beside_image:
+        say(f"warning: not the goal's image alone tells where the goal is, but also {' and '.join(told)}")
     if checkpoint is not None:
         done, wanted = int(checkpoint.counters.get("updates", 0)), settings.trainer.updates
         nothing = f"; trainer.updates={wanted} are made: only the run's end is done again, a larger number trains on"

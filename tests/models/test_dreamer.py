@@ -1,5 +1,7 @@
 """DreamerV3: its pieces against plain loops, which gradients go where, and what it learns."""
 
+import math
+
 import pytest
 import torch
 from tensordict import TensorDict
@@ -138,6 +140,24 @@ def test_actions_stay_in_their_range_and_the_mode_is_the_mean():
 
 
 # -- gradients ----------------------------------------------------------------------------------------------
+
+
+def test_an_untrained_actor_varies_its_actions_by_nine_tenths_of_their_range():
+    model = small()
+    with torch.no_grad():
+        for parameter in model.actor.parameters():
+            parameter.zero_()
+    mean, std = model.action_distribution(torch.randn(5, model.latent_dim))
+    assert not mean.any()
+    torch.testing.assert_close(std, torch.full_like(std, 0.1 + 0.9 / (1 + math.exp(-2.0))))
+
+
+def test_vectors_are_read_by_their_symlog():
+    model = small()
+    observation = TensorDict({"state": 1e3 * torch.randn(4, 3), "joint_target": torch.randn(4, 2)}, [4])
+    vectors = torch.cat((observation["state"], observation["joint_target"]), -1)
+    read = model.vector_encoder(symlog(vectors))
+    torch.testing.assert_close(model._embed(observation), read)
 
 
 def test_a_plan_asks_for_the_rewards_of_what_it_has_reached(monkeypatch):

@@ -89,6 +89,16 @@ def test_leading_dimensions_are_free():
     torch.testing.assert_close(flat(state), rssm.state(flat(h), flat(q), sample=False))
 
 
+def test_an_episode_begins_with_a_step_from_nothing():
+    rssm, like = small(), torch.zeros(3, 1)
+    with torch.no_grad():
+        for parameter in rssm.parameters():
+            parameter.normal_(std=0.5)
+    h = rssm.begin(like)
+    nothing, action = torch.zeros(3, rssm.size), torch.zeros(3, rssm.action_dim)
+    assert torch.equal(h, rssm.recur(nothing, action)) and h.all()
+
+
 def test_first_weights_keep_the_size_of_what_passes_through():
     for weight, inputs, scale in (
         (BlockLinear(512, 256, 4).weight, 128, 1.0),

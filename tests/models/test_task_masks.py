@@ -142,6 +142,27 @@ def test_no_reward_reaches_another_task() -> None:
         assert not torch.equal(one[1::2], two[1::2]), name
 
 
+def test_the_loss_itself_asks_for_no_reward_of_another_task(monkeypatch: pytest.MonkeyPatch) -> None:
+    batch = windows([0, 1, 0, 1])
+    other = batch.clone()
+    other["next", "reward"][1::2] += 3.0
+    other["next", "terminated"][1::2, -1] = True
+    made, targets = model(), []
+    begun, two_hot = copy.deepcopy(made.state_dict()), made.two_hot.loss
+    monkeypatch.setattr(
+        made.two_hot, "loss", lambda logits, target: (targets.append(target), two_hot(logits, target))[1]
+    )
+    for one in (batch, other):
+        made.load_state_dict(begun)
+        torch.manual_seed(7)
+        made.loss(one)
+    first, second = targets[: len(targets) // 2], targets[len(targets) // 2 :]
+    assert len(first) == len(second) >= 2  # rewards and values
+    for one, two in zip(first, second, strict=True):
+        assert one.shape[-2] == 4 and torch.equal(one[..., 0::2, :], two[..., 0::2, :])
+        assert not torch.equal(one[..., 1::2, :], two[..., 1::2, :])
+
+
 def losses_by_window(made: Any, batch: TensorDict) -> dict[str, torch.Tensor]:
     """Losses of reward and value (B,), of a model in training mode with the same draws."""
     torch.manual_seed(7)

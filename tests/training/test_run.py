@@ -119,6 +119,23 @@ def test_a_resumed_run_keeps_what_it_was(word: str, tmp_path: Path) -> None:
     assert merged.trainer.updates == 50 and merged.seed == 0
 
 
+@pytest.mark.parametrize(
+    ("words", "told"),
+    [
+        (["model.observations=[pixels,pixels_wrist,state]"], ["state in model.observations"]),
+        (
+            ["model.observations=[pixels,goal]", "env.show_goal=true"],
+            ["goal in model.observations", "env.show_goal=true"],
+        ),
+        (["model.observations=[pixels,pixels_wrist,joint_target]"], []),
+    ],
+)
+def test_what_tells_a_goal_beside_its_image_is_said(words: list[str], told: list[str], settled) -> None:
+    assert settled("env=push_goal_image", "model=lewm", *words).told_beside_image == told
+    assert not settled("env=push_pixels", "model=tdmpc2_pixels", *words).told_beside_image
+    assert not settled("env=reach_fixed_goal_image", "model=lewm", *words).told_beside_image
+
+
 def test_a_value_means_the_same_with_resume(tmp_path: Path) -> None:
     """Hydra's grammar, not YAML's; and what is Hydra's own is none of the run's."""
     words = ("scale=smoke", "device=cpu", "env=reach_fixed")

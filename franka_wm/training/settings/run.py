@@ -308,6 +308,18 @@ class RunSettings:
             return None
         return "reward_value" if family.has_value else "goal_image"
 
+    @property
+    def told_beside_image(self) -> list[str]:
+        """What tells a model that plans to goal images where the goal is without them."""
+        if self.objective_name != "goal_image" or not self.is_arm or self.env.arm.fixed_goal:
+            return []
+        read = [
+            f"{key} in model.observations"
+            for key in ("state", "goal")
+            if key in (self.model.observations or ())
+        ]
+        return read + ["env.show_goal=true"] * self.env.arm.show_goal
+
     @cached_property
     def actor(self) -> str:
         """The name of the policy that gathers experience, by ``collector.policy``.
