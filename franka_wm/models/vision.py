@@ -118,7 +118,7 @@ class ConvDecoder(nn.Module):
 
     def forward(self, features: Tensor) -> Tensor:
         # Channels last throughout: what convolutions on a GPU take and give without a copy.
-        x = self.start(features).reshape(-1, *self.grid, self.norms[0].weight.numel())
+        x = self.start(features).reshape(-1, *self.grid, self.start.out_features // math.prod(self.grid))
         for norm, convolution in zip(self.norms, self.convolutions, strict=True):
             four = convolution(F.silu(norm(x)).movedim(-1, 1)).movedim(
                 1, -1

@@ -12,7 +12,6 @@ from franka_wm.models.dreamer import Dreamer
 from franka_wm.models.layers import symlog
 from franka_wm.models.returns import lambda_returns
 from franka_wm.models.rssm import divergence
-from franka_wm.models.vision import ConvDecoder
 from franka_wm.models.windows import window_of
 from franka_wm.planning import RewardPlusValue
 from franka_wm.training.learner import Learner
@@ -60,24 +59,6 @@ def test_lambda_returns_are_those_of_a_plain_loop():
         lambda_returns(torch.ones(3, 1, 1), ~ended, torch.full((3, 1, 1), 9.0), discount=0.5, decay=0.0),
         torch.tensor([1.0, 5.5, 1.0]).view(3, 1, 1),
     )
-
-
-def test_images_come_back_in_any_size():
-    for size in ((64, 64, 3), (40, 56, 9)):
-        assert ConvDecoder(7, size, channels=2)(torch.randn(2, 3, 7)).shape == (2, 3, *size)
-
-
-def test_four_channels_of_a_small_image_are_a_square_of_the_larger_one():
-    decoder = ConvDecoder(7, (32, 16, 3), channels=2)
-    features = torch.randn(5, 7)
-    x = decoder.start(features).reshape(5, 2, 1, 4)
-    for norm, convolution in zip(decoder.norms, decoder.convolutions, strict=True):
-        four = convolution(torch.nn.functional.silu(norm(x)).permute(0, 3, 1, 2))
-        own_order = (
-            four.unflatten(1, (4, -1)).transpose(1, 2).flatten(1, 2)
-        )  # torch's: a channel's four, one by one
-        x = torch.nn.functional.pixel_shuffle(own_order, 2).permute(0, 2, 3, 1)
-    torch.testing.assert_close(decoder(features), x + 0.5)
 
 
 # -- what acts ----------------------------------------------------------------------------------------------

@@ -2,7 +2,7 @@ import pytest
 import torch
 
 from franka_wm.models.images import RandomShift
-from franka_wm.models.vision import Architecture, Block, ConvEncoder, ViT, vit_size
+from franka_wm.models.vision import Architecture, Block, ConvDecoder, ConvEncoder, ViT, vit_size
 
 
 @pytest.fixture(autouse=True)
@@ -189,3 +189,24 @@ def test_weights_of_another_architecture_are_one_line():
         with pytest.raises(ValueError, match=says) as caught:
             ViT.from_weights(given)
         assert "\n" not in str(caught.value)
+
+
+# -- the decoder
+
+
+def test_images_come_back_in_any_size():
+    for size in ((64, 64, 3), (40, 56, 9)):
+        assert ConvDecoder(7, size, channels=2)(torch.randn(2, 3, 7)).shape == (2, 3, *size)
+
+
+def test_four_channels_of_a_small_image_are_a_square_of_the_larger_one():
+    decoder = ConvDecoder(7, (32, 16, 3), channels=2)
+    features = torch.randn(5, 7)
+    x = decoder.start(features).reshape(5, 2, 1, 4)
+    for norm, convolution in zip(decoder.norms, decoder.convolutions, strict=True):
+        four = convolution(torch.nn.functional.silu(norm(x)).permute(0, 3, 1, 2))
+        own_order = (
+            four.unflatten(1, (4, -1)).transpose(1, 2).flatten(1, 2)
+        )  # torch's: a channel's four, one by one
+        x = torch.nn.functional.pixel_shuffle(own_order, 2).permute(0, 2, 3, 1)
+    torch.testing.assert_close(decoder(features), x + 0.5)
