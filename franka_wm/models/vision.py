@@ -120,9 +120,8 @@ class ConvDecoder(nn.Module):
         # Channels last throughout: what convolutions on a GPU take and give without a copy.
         x = self.start(features).reshape(-1, *self.grid, self.start.out_features // math.prod(self.grid))
         for norm, convolution in zip(self.norms, self.convolutions, strict=True):
-            four = convolution(F.silu(norm(x)).movedim(-1, 1)).movedim(
-                1, -1
-            )  # (N, rows, columns, 4 · channels)
+            # (N, rows, columns, 4 · channels) -> (N, 2 rows, 2 columns, channels)
+            four = convolution(F.silu(norm(x)).movedim(-1, 1)).movedim(1, -1)
             x = four.unflatten(-1, (2, 2, -1)).transpose(2, 3).flatten(1, 2).flatten(2, 3)
         height, width, _ = self.image_size
         return (x[:, :height, :width] + 0.5).reshape(*features.shape[:-1], *self.image_size)
