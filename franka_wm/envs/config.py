@@ -83,6 +83,8 @@ class FrankaConfig:
         max_contacts: Contacts for which there is room in each world, on average. ``None``: by the scene.
         end_when_lost: End the episode where an object has left the table.
         drawer_opening: ``task="drawer"`` is solved where the drawer is open so far [m]. ``None``: 90 % of its travel.
+        disc_radius, disc_spread: Of ``task="push"``: radius of its disc [m]; half-width of the uniform draw of how far
+            ahead of the cube it is, around 20 cm [m].
         home: Joint angles at the start, before noise [rad]. ``None``: the task's.
         reward: ``"dense"`` (−tanh distance), ``"sparse"`` (1 where solved, else 0) or ``"normalized"`` (the part
             of the episode's initial distance that has been closed, at least −1); all minus the action penalty.
@@ -148,6 +150,8 @@ class FrankaConfig:
     max_contacts: int | None = None
     end_when_lost: bool = True
     drawer_opening: float | None = None
+    disc_radius: float = 0.1
+    disc_spread: float = 0.0
     home: tuple[float, ...] | None = None
     reward: str = "dense"
     track_radius: float = 0.1
@@ -228,11 +232,11 @@ class FrankaConfig:
         for name in ("target_ke", "target_kd"):
             value = getattr(self, name)
             gains = value if isinstance(value, tuple) else (value,) * NUM_JOINTS
-            if len(gains) != NUM_JOINTS or not all(_is_number(g) and g >= 0 for g in gains):
+            if len(gains) != NUM_JOINTS or not all(is_real(g) and g >= 0 for g in gains):
                 raise UserError(
                     f"{name}={getattr(self, name)}: give one gain ≥ 0 for all joints or {NUM_JOINTS} of them"
                 )
-        if len(self.goal) != 3 or not all(_is_number(g) for g in self.goal):
+        if len(self.goal) != 3 or not all(is_real(g) for g in self.goal):
             raise UserError(f"goal={self.goal}: give three finite numbers (x, y, z) in metres")
         self._check_choice("solver", ("auto", "mujoco", "featherstone"))
         from franka_wm.envs.robots.sources import SOURCES  # here: robots need this module
@@ -378,7 +382,7 @@ class FrankaConfig:
             object.__setattr__(self, "scene", Scene.of(self.scene))
         if self.home is not None:
             ok = isinstance(self.home, Sequence) and not isinstance(self.home, str)
-            if not ok or len(self.home) != NUM_JOINTS or not all(_is_number(q) for q in self.home):
+            if not ok or len(self.home) != NUM_JOINTS or not all(is_real(q) for q in self.home):
                 raise UserError(f"home={self.home!r}: give {NUM_JOINTS} joint angles [rad], or null")
             object.__setattr__(self, "home", tuple(float(q) for q in self.home))
         self._check_choice("collisions", ("hand", "arm", "self"))
@@ -435,7 +439,7 @@ class FrankaConfig:
 
     def _check_real(self, name: str, low: float, high: float, unit: str, *, open_low: bool = False) -> None:
         value = getattr(self, name)
-        if not _is_number(value) or value > high or value < low or (open_low and value == low):
+        if not is_real(value) or value > high or value < low or (open_low and value == low):
             bounds = f"above {low:g} and at most {high:g}" if open_low else f"from {low:g} to {high:g}"
             raise UserError(f"{name}={value!r}: must be {bounds} ({unit})")
 
@@ -443,7 +447,3 @@ class FrankaConfig:
         value = getattr(self, name)
         if value not in allowed:
             raise UserError(f"{name}={value!r}: must be one of {', '.join(allowed)}{more}")
-
-
-def _is_number(value: object) -> bool:
-    return is_real(value)

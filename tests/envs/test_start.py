@@ -193,6 +193,21 @@ def test_a_task_that_the_scene_makes_impossible_is_refused(said: str, task: str,
     assert said in str(caught.value) and "\n" not in str(caught.value)
 
 
+@pytest.mark.parametrize(
+    ("changes", "said"),
+    [
+        ({"disc_radius": 0.0}, "disc_radius=0.0: must be from 0.01 to 0.2 (m)"),
+        ({"disc_spread": 0.2}, "disc_spread=0.2: must be from 0 to 0.15 (m)"),
+        ({"disc_spread": 0.12}, "0.32 m ahead of it, 0.82 m from the base"),
+        ({"task": "lift", "disc_spread": 0.1}, "disc_spread=0.1: task=lift does not read it, push does"),
+    ],
+)
+def test_a_disc_out_of_reach_is_refused(changes: dict, said: str) -> None:
+    with pytest.raises(UserError) as caught:
+        configured(**({"task": "push"} | changes))
+    assert said in str(caught.value) and "\n" not in str(caught.value)
+
+
 def test_a_wide_object_may_be_pushed() -> None:
     configured("push", scene={"objects": [CUBE | {"size": [0.1, 0.1, 0.04]}]})
 

@@ -55,6 +55,7 @@ ACTIONS = (
 """Options that give recorded actions and states their meaning, where they are read."""
 MEANING = (
     *("task", "reward", *ACTIONS, "action_penalty", "success_distance", "drawer_opening"),
+    *("disc_radius", "disc_spread"),
     "terminate_on_success",
 )
 """Those that give actions, rewards and ends their meaning."""

@@ -4,6 +4,7 @@
 
 # Warp reads annotations as types: no `from __future__ import annotations` here.
 import math
+from functools import partial
 from typing import TYPE_CHECKING
 
 import torch
@@ -22,15 +23,24 @@ from franka_wm.envs.tasks.manipulation import (
     tool_of,
 )
 from franka_wm.errors import UserError
+from franka_wm.options import is_real
 
 if TYPE_CHECKING:
     from franka_wm.envs.config import FrankaConfig
     from franka_wm.envs.simulation import Simulation
 
-AHEAD, RADIUS = 0.20, 0.10
-"""The disc's middle is so far in front of the cube; its radius [m]."""
+AHEAD = 0.20
+"""The disc's middle is so far in front of the cube, plus or minus ``disc_spread`` [m]."""
 BEHIND = 0.035
 """Where the fingers push: so far behind the cube's centre [m]."""
+
+
+@wp.kernel(enable_backward=False)
+def spread_goal(mask: wp.array[wp.bool], draws: wp.array2d[float], half: float, goal: wp.array2d[float]):
+    """Nearer or farther by up to ``half``."""
+    world = wp.tid()
+    if mask[world]:
+        goal[world, 0] += half * (2.0 * draws[world, 0] - 1.0)
 
 
 @wp.kernel(enable_backward=False)
@@ -63,13 +73,13 @@ def push_reward_and_success(
 
 
 def push_reward(
-    state: torch.Tensor, _: torch.Tensor, objects: torch.Tensor, goal: torch.Tensor
+    state: torch.Tensor, _: torch.Tensor, objects: torch.Tensor, goal: torch.Tensor, *, radius: float
 ) -> tuple[torch.Tensor, torch.Tensor]:
     """The same in torch, see :data:`~franka_wm.envs.tasks.manipulation.RewardInTorch`."""
     cube = objects[..., :3]
     missing = (goal - cube)[..., :2].norm(dim=-1)
     flat = (cube[..., 2] - goal[..., 2]).abs() < 0.005
-    solved = (missing < RADIUS) & flat
+    solved = (missing < radius) & flat
     ready = near_in_torch((state[..., 14:17] - moved(cube, x=-BEHIND)).norm(dim=-1))
     value = 0.3 * ready + 0.5 * near_in_torch(missing) * flat
     return torch.where(solved, 0.8 + 0.2 * near_in_torch(missing), value), solved
@@ -79,7 +89,8 @@ class Push(GripperTask):
     """Push a cube onto a disc.
 
     **Scene**: a table and a cube of 4 cm and 50 g. **Randomization**: the cube stands within 7 cm in x and 15 cm in y
-    of (0.42, 0) m. **Goal**: the middle of a disc of 10 cm radius, 20 cm in front of where the cube stood.
+    of (0.42, 0) m. **Goal**: the middle of a disc of 10 cm radius, 20 cm in front of where the cube stood;
+    ``disc_radius`` and ``disc_spread`` give others, the latter draws how far in each episode.
     **Success**: the cube lies on the table with its centre on the disc (ManiSkill3's PushCube: Tao et al. 2024).
     **Reward**, dense, in [0, 1]: on the disc 0.8 to 1, by the distance to its middle; else 0.3 for the tool's nearness
     to where it can push, 1 − tanh(5 · distance), and half for the cube's to the goal; sparse: 1 where it succeeds.
@@ -88,7 +99,7 @@ class Push(GripperTask):
 
     scene = Scene(objects=(Body(name="cube", at=(0.42, 0.0), spread=(0.07, 0.15)),))
     grasps = False
-    marker = RADIUS
+    own_options = ("disc_radius", "disc_spread")
     words = "Push the cube onto the disc."
     relabel_reads = ("state", "joint_target", "objects")
     achieved = ("objects", slice(0, 3))
@@ -98,16 +109,34 @@ class Push(GripperTask):
         super().check(config)
         assert config.resolved_scene is not None
         cube, table = config.resolved_scene.objects[0], config.resolved_scene.table
-        x = cube.at[0] + cube.spread[0] + AHEAD
+        for name, low, high in (("disc_radius", 0.01, 0.2), ("disc_spread", 0.0, AHEAD - 0.05)):
+            value = getattr(config, name)
+            if not is_real(value) or not low <= value <= high:
+                raise UserError(f"{name}={value!r}: must be from {low:g} to {high:g} (m); for task=push")
+        ahead = AHEAD + config.disc_spread
+        x = cube.at[0] + cube.spread[0] + ahead
         far, edge = math.hypot(x, abs(cube.at[1]) + cube.spread[1]), table.at[0] + 0.5 * table.size[0]
         if far > REACH[1] or x + cube.radius > edge:
             raise UserError(
-                f"scene.{cube.name}: task={config.task} asks for a place {AHEAD:g} m ahead of it, {far:.2f} m from "
+                f"scene.{cube.name}: task={config.task} asks for a place {ahead:g} m ahead of it, {far:.2f} m from "
                 f"the base; the arm reaches {REACH[1]:g} m, the table ends at x = {edge:g} m: change at or spread"
+                + " or disc_spread"
+                * (config.disc_spread > 0)
             )
+
+    @property
+    def marker(self) -> float:
+        return self.config.disc_radius
+
+    @property
+    def num_draws(self) -> int:
+        return int(self.config.disc_spread > 0)
 
     def reset(self, sim: "Simulation", mask: wp.array) -> None:
         self.launch_goal(sim, mask, away=(AHEAD, 0.0, 0.0))
+        if self.num_draws:
+            inputs = [mask, sim.warp.draws, self.config.disc_spread, sim.warp.task_goal]
+            wp.launch(spread_goal, sim.num_envs, inputs, device=sim.device)
 
     def goal_was_set(self, sim: "Simulation") -> None:
         """The goal is a place of the lying cube: its height is not for anyone to choose."""
@@ -120,13 +149,14 @@ class Push(GripperTask):
         self.launch_goal_pose(sim, mask, tool=(-BEHIND, 0.0, 0.0), opening=0.0, turned=False)
 
     def reward_and_success(self, sim: "Simulation") -> None:
-        self.launch_reward(sim, push_reward_and_success, RADIUS, BEHIND)
+        self.launch_reward(sim, push_reward_and_success, self.config.disc_radius, BEHIND)
 
     def relabel(self, transitions: TensorDictBase, goal: torch.Tensor) -> TensorDictBase:
         # Where the cube was it may have been tilted; as in goal_was_set, the goal keeps the height of a lying one.
         state = transitions.get("state")[:, 0]
         height = state[:, 16:17] - state[:, 19:20]
-        return relabel_place(self, push_reward, transitions, torch.cat([goal[:, :2], height], -1))
+        reward = partial(push_reward, radius=self.config.disc_radius)
+        return relabel_place(self, reward, transitions, torch.cat([goal[:, :2], height], -1))
 
     def measures(self, sim: "Simulation") -> dict[str, torch.Tensor]:
         way = sim.tensors.next_true_objects[:, :2] - sim.tensors.next_goal[:, :2]
