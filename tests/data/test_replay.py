@@ -177,7 +177,7 @@ def test_capacity_too_small(capacity: int, num_envs: int) -> None:
 
 
 def test_smallest_capacity() -> None:
-    replay = make_replay(capacity=12, num_envs=3, window=3, batch_size=4, device="cpu")
+    replay = make_replay(capacity=12, num_envs=3, window=3, batch_size=64, device="cpu")
     replay.extend(experience(4, lengths=(4, 4, 4)))
     assert replay.sample()["time"].amin() == 0
 

@@ -43,3 +43,9 @@ def test_a_cube_on_a_smaller_disc_is_a_success(make) -> None:
         relabelled = env.simulation.task.relabel(step.unsqueeze(1), step["goal"])
         assert torch.allclose(relabelled["next", "reward"][:, 0], observation["reward"], atol=1e-5)
     assert observation["success"].float().mean() > 0.9
+
+
+def test_the_disc_is_drawn_as_large_as_it_is(make) -> None:
+    look = {"observations": ("segmentation",), "show_goal": True, "image_size": 96}
+    seen = [(make(disc_radius=radius, **look).reset()["segmentation"] == 255).sum() for radius in (0.05, 0.1)]
+    assert 3 < seen[1] / seen[0] < 5

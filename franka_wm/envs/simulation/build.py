@@ -47,7 +47,7 @@ def build_model(
         )
         color = (0.16, 0.58, 0.62) if config.resolved_scene else (0.90, 0.22, 0.12)  # unlike the cube's
         look: dict[str, object] = {"cfg": ghost, "color": color, "label": GOAL_MARKER}
-        disc = task.marker
+        disc = task.disc(config)
         if disc is None:
             arm.add_shape_sphere(body=-1, radius=0.025, **look)
         else:

@@ -119,7 +119,7 @@ class Renderer:
         sim = self.sim
         if sim.config.show_goal:
             scene = sim.config.resolved_scene
-            ground, flat = (scene.top if scene else 0.0), sim.task.marker is not None
+            ground, flat = (scene.top if scene else 0.0), type(sim.task).marker is not None
             w = sim.warp
             inputs = [w.task_goal, flat, ground, w.raised, self._markers, sim.model.shape_transform]
             wp.launch(kernels.move_goal_marker, sim.num_envs, inputs, device=sim.device)

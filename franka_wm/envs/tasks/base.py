@@ -113,6 +113,11 @@ class Task:
                 )
 
     @classmethod
+    def disc(cls, config: FrankaConfig) -> float | None:
+        """Radius of the disc that ``show_goal`` draws [m], where the config has a say in it."""
+        return cls.marker
+
+    @classmethod
     def check_goal_image(cls) -> None:
         """Refuses ``goal_pixels`` with a gripper where the task does not say what they show.
 

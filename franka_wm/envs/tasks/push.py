@@ -99,6 +99,7 @@ class Push(GripperTask):
 
     scene = Scene(objects=(Body(name="cube", at=(0.42, 0.0), spread=(0.07, 0.15)),))
     grasps = False
+    marker = 0.1
     own_options = ("disc_radius", "disc_spread")
     words = "Push the cube onto the disc."
     relabel_reads = ("state", "joint_target", "objects")
@@ -124,9 +125,9 @@ class Push(GripperTask):
                 * (config.disc_spread > 0)
             )
 
-    @property
-    def marker(self) -> float:
-        return self.config.disc_radius
+    @classmethod
+    def disc(cls, config: "FrankaConfig") -> float:
+        return config.disc_radius
 
     @property
     def num_draws(self) -> int:
