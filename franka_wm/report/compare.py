@@ -12,7 +12,7 @@ from franka_wm.errors import UserError
 from franka_wm.evaluation.results import SHOWN, Result
 from franka_wm.report import style
 from franka_wm.report.bars import bars_figure
-from franka_wm.report.curves import panels, seeds_figure
+from franka_wm.report.curves import axis, panels, seeds_figure
 from franka_wm.report.document import (
     Section,
     cards,
@@ -28,7 +28,7 @@ from franka_wm.report.horizon import horizon_figure
 from franka_wm.report.run import RunFiles, but_for_the_seed, malformed
 from franka_wm.report.spectra import spectrum_figure
 from franka_wm.report.table import Table, evaluation_tables, is_interval
-from franka_wm.report.tasks import tasks_table
+from franka_wm.report.tasks import family_of, success_over_time, tasks_table
 
 FILE = "compare.html"
 
@@ -50,7 +50,7 @@ def compare_page(runs: Sequence[RunFiles]) -> str:
         different = differences({name: run.config for name, run in named.items()})
         groups = repetitions(named)
         parts = [
-            Section("tasks", "Tasks and families", _tasks(runs)),
+            Section("tasks", "Tasks and families", _tasks(groups)),
             Section("result", "Results", _results(named)),
             Section("curves", "Learning curves", _curves(groups)),
             Section("horizon", "Open loop", _horizons(named)),
@@ -125,10 +125,27 @@ def repetitions(runs: Mapping[str, RunFiles]) -> dict[str, dict[str, RunFiles]]:
 # -- sections --------------------------------------------------------------------------------------------
 
 
-def _tasks(runs: Sequence[RunFiles]) -> str:
-    found = tasks_table(runs)
-    note = "Success, or return, of the planner (of the policy where there is none): mean over runs (lowest – highest)."
-    return "" if found is None else table(found) + paragraph(note, "note")
+def _tasks(groups: Mapping[str, Mapping[str, RunFiles]]) -> str:
+    found = tasks_table(groups)
+    if found is None:
+        return ""
+    note = (
+        "Success, or return, of the planner (of the policy where there is none): mean over runs that differ in their "
+        "seed alone (lowest – highest)."
+    )
+    curves: dict[str, dict[str, list[list[dict[str, float]]]]] = {}
+    for name, group in groups.items():
+        for run in group.values():
+            for task, key in success_over_time(run).items():
+                rows = [{**row, "success": row[key]} for row in run.rows if key in row]
+                curves.setdefault(task, {}).setdefault(f"{name} ({family_of(run)})", []).append(rows)
+    drawn = []
+    for task, lines in sorted(curves.items()):
+        x = axis([row for runs in lines.values() for rows in runs for row in rows])
+        if x is not None:
+            figure = seeds_figure(lines, "success", x=x, title=f"{task}: successful episodes [%]")
+            drawn.append(chart(figure, f"success at {task} while training"))
+    return table(found) + paragraph(note, "note") + cards(*drawn)
 
 
 def _results(runs: Mapping[str, RunFiles]) -> str:

@@ -35,6 +35,15 @@ QUANTITIES = {
     "success": ("successful episodes [%]", 100.0),
     "return": ("return of an episode", 1.0),
 }
+TASK = "success_"
+"""Of several tasks at once one's success is logged as ``success_TASK``."""
+
+
+def quantity(leaf: str) -> tuple[str, float]:
+    """What a logged quantity is called, and what it is multiplied with; a task's own measures as they are."""
+    if leaf.startswith(TASK):
+        return f"successful episodes of {leaf.removeprefix(TASK).replace('_', ' ')} [%]", 100.0
+    return QUANTITIES.get(leaf, (leaf.replace("_", " "), 1.0))
 
 
 def panels(rows: Rows) -> list[str]:
@@ -170,11 +179,11 @@ def seeds_figure(
 
     Args:
         groups: label -> rows of each of its runs (seeds). A group of one run is a line without a band.
-        key: such as ``eval/policy/final_distance``; the last part decides name and unit (`QUANTITIES`).
+        key: such as ``eval/policy/final_distance``; the last part decides name and unit (`quantity`).
     """
     figure, (axes,) = new_figure(theme=theme)
     leaf = _leaf(key)
-    label, scale = QUANTITIES.get(leaf, (key, 1.0))
+    label, scale = quantity(leaf)
     for index, (name, runs) in enumerate(zip(shortened(groups), groups.values(), strict=True)):
         band = seed_bands(runs, key, x=x)
         if not band["x"].size:
@@ -208,7 +217,7 @@ def seeds_figure(
 def _draw_quantity(
     axes: "Axes", rows: Rows, x: str, leaf: str, success_distance: float | None, theme: Theme
 ) -> None:
-    title, scale = QUANTITIES.get(leaf, (leaf.replace("_", " "), 1.0))
+    title, scale = quantity(leaf)
     keys = _keys(rows, leaf)
     for key in keys:
         _draw_policy(axes, rows, x, key, scale, theme)
@@ -271,7 +280,7 @@ def _finish(axes: "Axes", x: str, title: str, theme: Theme, leaf: str = "") -> N
     finish_axes(axes, x=X_LABELS.get(x, x), title=title, theme=theme)
     if leaf == "final_distance":
         axes.set_ylim(bottom=0)
-    elif leaf == "success":
+    elif leaf == "success" or leaf.startswith(TASK):
         axes.set_ylim(-3, 103)
 
 

@@ -14,7 +14,7 @@ from franka_wm.evaluation.results import COMMAND, END, Result
 from franka_wm.report import style
 from franka_wm.report.bars import bars_figure
 from franka_wm.report.calibration import calibration_figure
-from franka_wm.report.curves import QUANTITIES, axis, panel_figure, panels
+from franka_wm.report.curves import axis, panel_figure, panels, quantity
 from franka_wm.report.document import (
     Section,
     card,
@@ -256,7 +256,7 @@ def health(run: RunFiles) -> str:
 def logged_name(key: str) -> tuple[str, float]:
     """What a logged quantity is called, with its unit, and the factor to that unit: as in the tables and curves."""
     *above, leaf = key.split("/")
-    name, scale = QUANTITIES.get(leaf, (leaf.replace("_", " "), 1.0))
+    name, scale = quantity(leaf)
     who = [style.policy_name(one) for one in above if one != "eval"]
     return ", ".join([name, *who]), scale
 

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 
-from franka_wm.evaluation.results import SHOWN
+from franka_wm.evaluation.results import SHOWN, loggable
 from franka_wm.report import style
+from franka_wm.report.curves import TASK
 from franka_wm.report.outcome import success_rates
 from franka_wm.report.run import RunFiles
 from franka_wm.report.table import Table, is_interval
@@ -13,20 +14,24 @@ from franka_wm.report.table import Table, is_interval
 MISSING, MULTITASK = "–", "multitask"
 
 
-def tasks_table(runs: Iterable[RunFiles]) -> Table | None:
+def tasks_table(groups: Mapping[str, Mapping[str, RunFiles]]) -> Table | None:
     """One row for each task, one column for each family; None where all runs share both.
 
-    A cell is the mean over runs, and their lowest and highest: success of the planner, or of the policy where no
-    planner was measured; the return where a task does not say what success is. Of several distances the largest counts.
-    A run of several tasks at once has a cell for each, in a column of its own beside that of runs of one task.
+    A cell is the mean over a group of runs, and their lowest and highest; where several groups share a cell each has
+    its own, after its name: they differ in more than their seed. Shown is the success of the planner, or of the policy
+    where no planner was measured; the return where a task does not say what success is. Of several distances the
+    largest counts. A run of several tasks at once has a cell for each, in a column of its own beside that of runs of
+    one task.
+
+    Args:
+        groups: name -> runs that differ in their seed alone.
     """
-    cells: dict[str, dict[str, list[tuple[str, float]]]] = {}
-    for run in runs:
-        several = _by_task(run)
-        family = f"{_family(run)}, {MULTITASK}" if several else _family(run)
-        found = _outcome(run)
-        for task, one in (several or ({} if found is None else {task_of(run): found})).items():
-            cells.setdefault(task, {}).setdefault(family, []).append(one)
+    cells: dict[str, dict[str, dict[str, list[tuple[str, float]]]]] = {}
+    for name, group in groups.items():
+        for run in group.values():
+            found = _outcome(run)
+            for task, one in (_by_task(run) or ({} if found is None else {task_of(run): found})).items():
+                cells.setdefault(task, {}).setdefault(family_of(run), {}).setdefault(name, []).append(one)
     families = sorted({family for row in cells.values() for family in row})
     if len(cells) < 2 and len(families) < 2:
         return None
@@ -56,9 +61,22 @@ def task_of(run: RunFiles) -> str:
     return run.preset or str(task or MISSING)
 
 
-def _family(run: RunFiles) -> str:
+def family_of(run: RunFiles) -> str:
+    """The name of its model, and whether it learned several tasks at once."""
     model = run.config.get("model")
-    return str(model.get("name", MISSING)) if isinstance(model, Mapping) else MISSING
+    family = str(model.get("name", MISSING)) if isinstance(model, Mapping) else MISSING
+    return f"{family}, {MULTITASK}" if _by_task(run) else family
+
+
+def success_over_time(run: RunFiles) -> dict[str, str]:
+    """Task -> the key under which its success while training was logged, of the policy that is shown first."""
+    logged = {key for row in run.rows for key in row}
+    ends = {f"{TASK}{loggable(task)}": task for task in _by_task(run)} or {"success": task_of(run)}
+    return {
+        task: key
+        for end, task in ends.items()
+        if (key := next((k for name in SHOWN if (k := f"eval/{name}/{end}") in logged), None))
+    }
 
 
 def _by_task(run: RunFiles) -> dict[str, tuple[str, float]]:
@@ -84,7 +102,16 @@ def _outcome(run: RunFiles) -> tuple[str, float] | None:
     return ("return", returned["mean"]) if is_interval(returned) else None
 
 
-def _cell(found: list[tuple[str, float]]) -> str:
+def _cell(groups: Mapping[str, list[tuple[str, float]]]) -> str:
+    told = {name: _mean(found) for name, found in groups.items()}
+    return (
+        "; ".join(f"{name}: {one}" for name, one in told.items())
+        if len(told) > 1
+        else next(iter(told.values()))
+    )
+
+
+def _mean(found: list[tuple[str, float]]) -> str:
     units = sorted({unit for unit, _ in found})
     if len(units) > 1:
         return f"measured as {' and '.join(units)}"

@@ -6,8 +6,11 @@ from pathlib import Path
 import pytest
 
 from franka_wm.evaluation.results import Result
+from franka_wm.report import tasks
+from franka_wm.report.compare import compare_page, repetitions
 from franka_wm.report.run import RunFiles, read_run
-from franka_wm.report.tasks import task_of, tasks_table
+from franka_wm.report.table import Table
+from franka_wm.report.tasks import task_of
 
 
 def interval(mean: float) -> dict[str, float]:
@@ -23,6 +26,10 @@ def run(
         overrides=[] if typed is None else [f"env={typed}"],
         results=[Result(Path("evaluation.json"), policies=policies)],
     )
+
+
+def tasks_table(runs: list[RunFiles]) -> Table | None:
+    return tasks.tasks_table(repetitions({str(k): one for k, one in enumerate(runs)}))
 
 
 def success(rate: float, **more) -> dict:
@@ -108,3 +115,40 @@ def test_a_run_of_several_tasks_stands_beside_those_of_one() -> None:
     table = tasks_table([several, run("push", "tdmpc2", {"planner": success(0.9)})])
     assert table is not None and table.header == ["task", "tdmpc2", "tdmpc2, multitask"]
     assert table.rows == [["lift", "–", "25 %"], ["push", "90 %", "60 %"]]
+
+
+def test_runs_that_differ_in_more_than_their_seed_are_not_averaged() -> None:
+    slow, fast = (run("push", "a", {"planner": success(rate)}) for rate in (0.9, 0.3))
+    fast = replace(fast, folder=Path("fast"), config={**fast.config, "trainer": {"lr": 1.0}})
+    again = replace(slow, folder=Path("again"), config={**slow.config, "seed": 7})
+    other = run("lift", "a", {"planner": success(0.5)})
+    groups = repetitions({"slow": slow, "fast": fast, "again": again, "other": other})
+    table = tasks.tasks_table(groups)
+    assert table is not None and table.rows[1] == ["push", "slow: 90 % (90 – 90, 2 runs); fast: 30 %"]
+
+
+def test_each_task_has_a_chart_of_all_families(make_run) -> None:
+    runs = [make_run(name) for name in ("a", "b", "unlogged")]
+    for folder, family in zip(runs, ("tdmpc2", "dreamer", "lewm"), strict=True):
+        config = folder / "config.yaml"
+        config.write_text(config.read_text().replace("tdmpc2", family))
+        if folder.name != "unlogged":
+            (folder / "csv" / "scalars" / "eval" / "planner" / "success.csv").write_text(
+                "100,0.5\n200,0.75\n"
+            )
+    page = compare_page([read_run(folder) for folder in runs])
+    drawn = page.split("<title>success at reach_fixed while training")[1].split("</svg>")[0]
+    assert "a (tdmpc2)" in drawn and "b (dreamer)" in drawn and "unlogged" not in drawn
+    assert page.count("<title>success at") == 1
+
+
+def test_success_over_time_is_found_for_each_task() -> None:
+    """Of the planner before the policy; of several tasks at once each task's own."""
+    rows = [{"env_steps": 1, "eval/policy/success": 0.1, "eval/planner/success": 0.2}]
+    one = replace(run("push", "a", {"planner": success(0.5)}), rows=rows)
+    assert tasks.success_over_time(one) == {"push": "eval/planner/success"}
+    assert tasks.success_over_time(run("push", "a", {"planner": success(0.5)})) == {}
+    rates = {"push": interval(0.6), "lift": interval(0.25)}
+    rows = [{"env_steps": 1, "eval/planner/success": 0.2, "eval/policy/success_push": 0.3}]
+    several = replace(run("", "a", {"planner": success(0.4, task_success=rates)}), rows=rows)
+    assert tasks.success_over_time(several) == {"push": "eval/policy/success_push"}
