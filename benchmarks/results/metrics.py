@@ -100,6 +100,12 @@ def verdicts(row: Row, records: Sequence[Record]) -> list[tuple[str, str, bool]]
         elif name == "success":
             worst = min(SUCCESS.of(record, policy) for record in records)
             found.append((f"worst seed ≥ {wanted:g} %", f"{worst:.1f} %", worst >= wanted - 1e-9))
+        elif name == "success_of":
+            for task, least in wanted.items():
+                worst = min(
+                    100 * record["policies"][policy]["task_success"][task]["mean"] for record in records
+                )
+                found.append((f"worst seed ≥ {least:g} % of {task}", f"{worst:.1f} %", worst >= least - 1e-9))
         else:
             cm = name.removeprefix("within_").removesuffix("cm")
             worst = min(WITHIN[cm].of(record, policy) for record in records)

@@ -21,6 +21,7 @@ WANTED = (
     "within_2.5cm",
     "within_1cm",
     "success",
+    "success_of",
     "return",
 )
 

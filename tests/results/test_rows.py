@@ -95,3 +95,15 @@ def test_a_goal_of_no_line_or_number_is_refused(goal) -> None:
     row = Row(name="env", section=Section(title="A GPU"), title="", script="x.py", goals=[goal])
     with pytest.raises(UserError, match="row env: no line has"):
         goals_met(row, LINES)
+
+
+def test_of_several_tasks_each_is_judged_by_its_worst_seed() -> None:
+    row = replace(load_rows()["multitask-gpu"], wanted={"success_of": {"push": 90, "peg": 84}})
+    records = [
+        {"seed": k, "policies": {"planner": {"task_success": {"push": {"mean": 0.9}, "peg": {"mean": rate}}}}}
+        for k, rate in enumerate((0.95, 0.83))
+    ]
+    assert verdicts(row, records) == [
+        ("worst seed ≥ 90 % of push", "90.0 %", True),
+        ("worst seed ≥ 84 % of peg", "83.0 %", False),
+    ]
