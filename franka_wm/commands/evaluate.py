@@ -14,9 +14,9 @@ from franka_wm.files import unwritable
 @verb(
     "evaluate",
     first="checkpoint",
-    others=("planner.", "objective."),
+    others=("planner=", "planner.", "objective."),
     shown=(
-        "planner.KEY=…",
+        "planner=NAME planner.KEY=…",
         "plans otherwise than the run did, also objective.KEY=…; wants out=FOLDER, the run's own results stay",
     ),
 )

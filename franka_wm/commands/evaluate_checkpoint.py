@@ -48,6 +48,16 @@ class Options:
     overrides: tuple[str, ...] = ()
 
 
+def _planning(options: Options) -> dict[str, Any]:
+    """What :func:`load_agent` is told of ``planner=NAME`` and ``planner.KEY=…``, the last of several."""
+    chosen = [word for word in options.overrides if word.startswith("planner=")]
+    others = [word for word in options.overrides if word not in chosen]
+    found: dict[str, Any] = {"planning": changes("evaluate", others)}
+    if chosen:
+        found["planned_by"] = chosen[-1].removeprefix("planner=")
+    return found
+
+
 def run(options: Options) -> dict[str, Any]:
     """Evaluates, prints tables, writes files; returns the content of ``evaluation.json``.
 
@@ -62,7 +72,7 @@ def run(options: Options) -> dict[str, Any]:
             options.checkpoint,
             num_envs=min(options.episodes, WORLDS),
             device=options.device,
-            planning=changes("evaluate", options.overrides),
+            **_planning(options),
         )
     if options.robustness:
         check_shiftable(agent)

@@ -83,8 +83,7 @@ class FrankaConfig:
         max_contacts: Contacts for which there is room in each world, on average. ``None``: by the scene.
         end_when_lost: End the episode where an object has left the table.
         drawer_opening: ``task="drawer"`` is solved where the drawer is open so far [m]. ``None``: 90 % of its travel.
-        disc_radius, disc_spread: Of ``task="push"``: radius of its disc [m]; half-width of the uniform draw of how far
-            ahead of the cube it is, around 20 cm [m].
+        disc_radius, disc_spread: Of push's disc: its radius, and how much nearer or farther than 20 cm it may be [m].
         home: Joint angles at the start, before noise [rad]. ``None``: the task's.
         reward: ``"dense"`` (−tanh distance), ``"sparse"`` (1 where solved, else 0) or ``"normalized"`` (the part
             of the episode's initial distance that has been closed, at least −1); all minus the action penalty.
@@ -213,6 +212,8 @@ class FrankaConfig:
             ("camera_target_height", -100.0, 100.0, "m"),
             ("camera_target_distance", -100.0, 100.0, "m"),
             ("gripper_force", 1.0, 70.0, "N"),
+            ("disc_radius", 0.01, 0.2, "m"),
+            ("disc_spread", 0.0, 0.15, "m"),
         ):
             self._check_real(name, low, high, unit)
         if self.mesh_detail is not None:

@@ -8,8 +8,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import torch
+from omegaconf import OmegaConf
 from tensordict.nn import TensorDictModuleBase
 
+from franka_wm import conf
 from franka_wm.device import resolve_device
 from franka_wm.envs import Environment, FrankaConfig
 from franka_wm.errors import UserError
@@ -58,6 +60,7 @@ def load_agent(
     device: torch.device | str = "auto",
     env_changes: Mapping[str, Any] | None = None,
     seed: int | None = None,
+    planned_by: str | None = None,
     planning: Mapping[str, Mapping[str, Any]] | None = None,
 ) -> Agent:
     """Rebuilds environment, model, planner and policies from a checkpoint.
@@ -68,6 +71,7 @@ def load_agent(
         device: ``auto``, ``cpu``, ``cuda``, ``cuda:K``.
         env_changes: Fields of the environment's configuration to change.
         seed: Seed of the environment and the policies; the run's if not given.
+        planned_by: Another planner, by its name in ``conf/planner``, as the run's scale has it; the run's if not given.
         planning: Options of ``planner`` and ``objective`` that are other than the run's.
 
     Raises:
@@ -77,6 +81,8 @@ def load_agent(
     settings = RunSettings.of(checkpoint.config, saved=True).changed(device=str(device))
     if seed is not None:
         settings = settings.changed(seed=seed)
+    if planned_by is not None:
+        settings = RunSettings.of({**settings.values, "planner": _preset(planned_by, settings)}, saved=True)
     if planning:
         settings = _planning_otherwise(settings, planning)
     if settings.env.kind == "none":
@@ -94,6 +100,16 @@ def load_agent(
     policies = build.make_agent_policies(settings, model, env, spaces)
     planner = getattr(policies.get("planner"), "planner", None)
     return Agent(checkpoint.folder, settings, env, model, planner, policies, dict(checkpoint.counters))
+
+
+def _preset(planner: str, settings: RunSettings) -> dict[str, Any]:
+    """What ``planner=NAME`` would have been in this run."""
+    there = sorted(file.stem for file in Path(conf.__file__).with_name("planner").glob("*.yaml"))
+    if planner not in there:
+        raise UserError(f"planner={planner}: must be one of {', '.join(there)}")
+    composed = conf.compose(f"planner={planner}", f"scale={settings.values['scale']}")
+    found: Any = OmegaConf.to_container(composed.planner, resolve=True)
+    return found
 
 
 def _planning_otherwise(settings: RunSettings, planning: Mapping[str, Mapping[str, Any]]) -> RunSettings:

@@ -82,7 +82,7 @@ def test_the_closed_loop_alone(run_folder: Path, tmp_path: Path, capsys) -> None
         (["a", "planner.num_samples=8"], "do not take the place of its own; give another folder, out=FOLDER"),
         (["a", "out=a/evaluation", "objective.policy_penalty=1"], "do not take the place of its own"),
         (["a", "out=a", "objective.policy_penalty=1"], "do not take the place of its own"),
-        (["a", "out=b", "planner=cem"], "planner: no such option"),
+        (["a", "planner=cem"], "planner=cem: results of other settings than the run's do not take the place"),
         (["checkpoint=a", "outputs/run"], "'outputs/run': write options as name=value"),
     ],
 )
@@ -109,6 +109,12 @@ def test_a_checkpoint_plans_otherwise_than_its_run(run_folder: Path, tmp_path: P
     }
     assert returns["otherwise"]["planner"] != returns["as_it_was"]["planner"]
     assert returns["otherwise"]["policy"] == returns["as_it_was"]["policy"]
+    words_of_cem = [*words, "planner=cem", "planner.horizon=2"]
+    assert cli.main(["evaluate", str(run_folder), f"out={tmp_path / 'cem'}", *words_of_cem]) == 0
+    cem = json.loads((tmp_path / "cem" / "evaluation.json").read_text())
+    assert cem["protocol"]["planner"] == "cem" and cem["policies"]["planner"]["return"]["mean"] not in {
+        one["planner"] for one in returns.values()
+    }
     capsys.readouterr()
     for wrong, says in (
         (
@@ -117,6 +123,7 @@ def test_a_checkpoint_plans_otherwise_than_its_run(run_folder: Path, tmp_path: P
         ),
         ("objective.policy_penalty=-1", "policy_penalty=-1: must be a finite number of at least 0"),
         ("planner.num_samples=0", "planner.num_samples=0: must be a whole number of at least 1"),
+        ("planner=cme", "planner=cme: must be one of cem, gradient, gumbel, icem, mcts, mppi"),
     ):
         assert cli.main(["evaluate", str(run_folder), f"out={tmp_path / 'wrong'}", *words, wrong]) == 1
         assert says in capsys.readouterr().err

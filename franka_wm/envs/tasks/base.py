@@ -114,8 +114,8 @@ class Task:
 
     @classmethod
     def disc(cls, config: FrankaConfig) -> float | None:
-        """Radius of the disc that ``show_goal`` draws [m], where the config has a say in it."""
-        return cls.marker
+        """Radius of the disc that ``show_goal`` draws [m]: ``marker``, or the config's where the task reads it."""
+        return config.disc_radius if "disc_radius" in cls.own_options else cls.marker
 
     @classmethod
     def check_goal_image(cls) -> None:

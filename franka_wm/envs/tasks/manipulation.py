@@ -12,6 +12,7 @@ import warp as wp
 from tensordict import TensorDictBase
 
 from franka_wm.envs.constants import MOST_OPEN, NUM_FINGERS, NUM_JOINTS, OBJECT_DIM
+from franka_wm.envs.kernels.functions import episode_rng
 from franka_wm.envs.kernels.goals import nearest_turn
 from franka_wm.envs.tasks.base import Task, with_goal
 from franka_wm.errors import UserError
@@ -103,6 +104,9 @@ def goal_from_start(
     away: wp.vec3f,
     rises: wp.vec2f,
     sizes: wp.array2d[float],
+    seed: wp.array[int],
+    episode: wp.array[int],
+    spread: float,
     goal: wp.array2d[float],
 ):
     """A goal where an object stands as the episode begins, moved; see :meth:`GripperTask.launch_goal`."""
@@ -112,6 +116,9 @@ def goal_from_start(
             goal[world, i] = rest_q[world, FIRST + 7 * body + i] + away[i]
         if rises[0] > 0.0:
             goal[world, 2] += rises[0] * sizes[world, 0] + rises[1] * sizes[world, body]
+        if spread > 0.0:
+            rng = episode_rng(seed[0], seed[1] + world, episode[world], 7)  # as draw_uniform's first number
+            goal[world, 0] += spread * (2.0 * wp.randf(rng) - 1.0)
 
 
 @wp.kernel(enable_backward=False)
@@ -202,6 +209,7 @@ class GripperTask(Task):
         body: int = 0,
         away: tuple[float, float, float] = (0.0, 0.0, 0.0),
         onto: bool = False,
+        spread: float = 0.0,
     ) -> None:
         """For ``reset``: the goal is where an object stands as the episode begins, moved.
 
@@ -210,9 +218,11 @@ class GripperTask(Task):
             body: Number of the object.
             away: From its centre [m].
             onto: Whether the first object is to lie on that one: up by half of both heights, as they are drawn.
+            spread: Half-width of the uniform draw of how much farther along x, in each episode [m].
         """
         w, halves = sim.warp, [self.objects[k].half_height if onto else 0.0 for k in (0, body)]
-        inputs = [mask, w.rest_q, body, wp.vec3f(*away), wp.vec2f(*halves), w.sizes, w.task_goal]
+        inputs = [mask, w.rest_q, body, wp.vec3f(*away), wp.vec2f(*halves), w.sizes]
+        inputs += [w.seed, w.episode, spread, w.task_goal]
         wp.launch(goal_from_start, sim.num_envs, inputs, device=sim.device)
 
     def launch_reward(self, sim: "Simulation", kernel: wp.Kernel, *further: object) -> None:

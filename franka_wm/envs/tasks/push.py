@@ -4,7 +4,6 @@
 
 # Warp reads annotations as types: no `from __future__ import annotations` here.
 import math
-from functools import partial
 from typing import TYPE_CHECKING
 
 import torch
@@ -23,7 +22,6 @@ from franka_wm.envs.tasks.manipulation import (
     tool_of,
 )
 from franka_wm.errors import UserError
-from franka_wm.options import is_real
 
 if TYPE_CHECKING:
     from franka_wm.envs.config import FrankaConfig
@@ -33,14 +31,6 @@ AHEAD = 0.20
 """The disc's middle is so far in front of the cube, plus or minus ``disc_spread`` [m]."""
 BEHIND = 0.035
 """Where the fingers push: so far behind the cube's centre [m]."""
-
-
-@wp.kernel(enable_backward=False)
-def spread_goal(mask: wp.array[wp.bool], draws: wp.array2d[float], half: float, goal: wp.array2d[float]):
-    """Nearer or farther by up to ``half``."""
-    world = wp.tid()
-    if mask[world]:
-        goal[world, 0] += half * (2.0 * draws[world, 0] - 1.0)
 
 
 @wp.kernel(enable_backward=False)
@@ -72,25 +62,12 @@ def push_reward_and_success(
     success[world, 0] = solved
 
 
-def push_reward(
-    state: torch.Tensor, _: torch.Tensor, objects: torch.Tensor, goal: torch.Tensor, *, radius: float
-) -> tuple[torch.Tensor, torch.Tensor]:
-    """The same in torch, see :data:`~franka_wm.envs.tasks.manipulation.RewardInTorch`."""
-    cube = objects[..., :3]
-    missing = (goal - cube)[..., :2].norm(dim=-1)
-    flat = (cube[..., 2] - goal[..., 2]).abs() < 0.005
-    solved = (missing < radius) & flat
-    ready = near_in_torch((state[..., 14:17] - moved(cube, x=-BEHIND)).norm(dim=-1))
-    value = 0.3 * ready + 0.5 * near_in_torch(missing) * flat
-    return torch.where(solved, 0.8 + 0.2 * near_in_torch(missing), value), solved
-
-
 class Push(GripperTask):
     """Push a cube onto a disc.
 
     **Scene**: a table and a cube of 4 cm and 50 g. **Randomization**: the cube stands within 7 cm in x and 15 cm in y
-    of (0.42, 0) m. **Goal**: the middle of a disc of 10 cm radius, 20 cm in front of where the cube stood;
-    ``disc_radius`` and ``disc_spread`` give others, the latter draws how far in each episode.
+    of (0.42, 0) m. **Goal**: the middle of a disc of 10 cm radius (``disc_radius``), 20 cm in front of where the cube
+    stood, ``disc_spread`` more or less.
     **Success**: the cube lies on the table with its centre on the disc (ManiSkill3's PushCube: Tao et al. 2024).
     **Reward**, dense, in [0, 1]: on the disc 0.8 to 1, by the distance to its middle; else 0.3 for the tool's nearness
     to where it can push, 1 − tanh(5 · distance), and half for the cube's to the goal; sparse: 1 where it succeeds.
@@ -110,34 +87,17 @@ class Push(GripperTask):
         super().check(config)
         assert config.resolved_scene is not None
         cube, table = config.resolved_scene.objects[0], config.resolved_scene.table
-        for name, low, high in (("disc_radius", 0.01, 0.2), ("disc_spread", 0.0, AHEAD - 0.05)):
-            value = getattr(config, name)
-            if not is_real(value) or not low <= value <= high:
-                raise UserError(f"{name}={value!r}: must be from {low:g} to {high:g} (m); for task=push")
-        ahead = AHEAD + config.disc_spread
-        x = cube.at[0] + cube.spread[0] + ahead
+        x = cube.at[0] + cube.spread[0] + AHEAD + config.disc_spread
         far, edge = math.hypot(x, abs(cube.at[1]) + cube.spread[1]), table.at[0] + 0.5 * table.size[0]
         if far > REACH[1] or x + cube.radius > edge:
             raise UserError(
-                f"scene.{cube.name}: task={config.task} asks for a place {ahead:g} m ahead of it, {far:.2f} m from "
-                f"the base; the arm reaches {REACH[1]:g} m, the table ends at x = {edge:g} m: change at or spread"
-                + " or disc_spread"
-                * (config.disc_spread > 0)
+                f"scene.{cube.name}: task={config.task} asks for a place {AHEAD + config.disc_spread:g} m ahead of it, "
+                f"{far:.2f} m from the base; the arm reaches {REACH[1]:g} m, the table ends at x = {edge:g} m: change "
+                "at, spread or disc_spread"
             )
 
-    @classmethod
-    def disc(cls, config: "FrankaConfig") -> float:
-        return config.disc_radius
-
-    @property
-    def num_draws(self) -> int:
-        return int(self.config.disc_spread > 0)
-
     def reset(self, sim: "Simulation", mask: wp.array) -> None:
-        self.launch_goal(sim, mask, away=(AHEAD, 0.0, 0.0))
-        if self.num_draws:
-            inputs = [mask, sim.warp.draws, self.config.disc_spread, sim.warp.task_goal]
-            wp.launch(spread_goal, sim.num_envs, inputs, device=sim.device)
+        self.launch_goal(sim, mask, away=(AHEAD, 0.0, 0.0), spread=self.config.disc_spread)
 
     def goal_was_set(self, sim: "Simulation") -> None:
         """The goal is a place of the lying cube: its height is not for anyone to choose."""
@@ -152,12 +112,23 @@ class Push(GripperTask):
     def reward_and_success(self, sim: "Simulation") -> None:
         self.launch_reward(sim, push_reward_and_success, self.config.disc_radius, BEHIND)
 
+    def in_torch(
+        self, state: torch.Tensor, _: torch.Tensor, objects: torch.Tensor, goal: torch.Tensor
+    ) -> tuple[torch.Tensor, torch.Tensor]:
+        """The same, see :data:`~franka_wm.envs.tasks.manipulation.RewardInTorch`."""
+        cube = objects[..., :3]
+        missing = (goal - cube)[..., :2].norm(dim=-1)
+        flat = (cube[..., 2] - goal[..., 2]).abs() < 0.005
+        solved = (missing < self.config.disc_radius) & flat
+        ready = near_in_torch((state[..., 14:17] - moved(cube, x=-BEHIND)).norm(dim=-1))
+        value = 0.3 * ready + 0.5 * near_in_torch(missing) * flat
+        return torch.where(solved, 0.8 + 0.2 * near_in_torch(missing), value), solved
+
     def relabel(self, transitions: TensorDictBase, goal: torch.Tensor) -> TensorDictBase:
         # Where the cube was it may have been tilted; as in goal_was_set, the goal keeps the height of a lying one.
         state = transitions.get("state")[:, 0]
         height = state[:, 16:17] - state[:, 19:20]
-        reward = partial(push_reward, radius=self.config.disc_radius)
-        return relabel_place(self, reward, transitions, torch.cat([goal[:, :2], height], -1))
+        return relabel_place(self, self.in_torch, transitions, torch.cat([goal[:, :2], height], -1))
 
     def measures(self, sim: "Simulation") -> dict[str, torch.Tensor]:
         way = sim.tensors.next_true_objects[:, :2] - sim.tensors.next_goal[:, :2]
