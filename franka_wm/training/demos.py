@@ -10,6 +10,7 @@ from typing import Any
 from tensordict import TensorDict
 from torch.nn import functional as F
 
+from franka_wm.console import say
 from franka_wm.data.demonstrations import Demonstrations
 from franka_wm.data.hindsight import Hindsight
 from franka_wm.data.image_storage import BOUNDARY
@@ -50,6 +51,7 @@ def open_demonstrations(
         steps = _of_tasks(run, run.env.config, wanted, spaces.action_dim)
     else:
         steps = _recorded(run, run.replay.demos, wanted, spaces.action_dim, starts)
+    say(told(run))
     most = max(run.demo_windows(update) for update in (0, run.replay.demo_updates, run.trainer.updates))
     return Demonstrations(
         steps.exclude(*(key for key in starts if key not in wanted)),
@@ -58,6 +60,15 @@ def open_demonstrations(
         hindsight=hindsight,
         states=steps.select(*starts).squeeze(1) if starts else None,
     )
+
+
+def told(run: RunSettings) -> str:
+    """How much of what is learned from are demonstrations, for whoever watches."""
+    replay = run.replay
+    begin, end = replay.demo_share, replay.demo_share_end
+    falling = "" if end is None or end == begin else f", {100 * end:.0f} % at the last update"
+    alone = f"; the first {replay.demo_updates} updates see them alone" if replay.demo_updates else ""
+    return f"demonstrations: {100 * begin:.0f} % of each batch{falling}{alone}"
 
 
 def _recorded(

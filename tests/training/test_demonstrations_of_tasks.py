@@ -14,7 +14,7 @@ from franka_wm.data.lerobot import cache, open_dataset
 from franka_wm.errors import UserError
 from franka_wm.training import build
 from franka_wm.training.check import check
-from franka_wm.training.demos import open_demonstrations
+from franka_wm.training.demos import open_demonstrations, told
 from franka_wm.training.learner import Learner
 from franka_wm.training.spaces import Spaces
 
@@ -50,14 +50,29 @@ def demos_of(*roots: Path) -> str:
     return f"replay.demos=[{','.join(map(str, roots))}]"
 
 
-def test_they_look_as_the_worlds_of_their_task_do(roots: dict[str, Path], settled) -> None:
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        ((), "demonstrations: 50 % of each batch"),
+        (
+            ("replay.demo_share_end=0.1", "replay.demo_updates=7"),
+            "demonstrations: 50 % of each batch, 10 % at the last update; the first 7 updates see them alone",
+        ),
+        (("replay.demo_share=0.25", "replay.demo_share_end=0.25"), "demonstrations: 25 % of each batch"),
+    ],
+)
+def test_their_share_is_told(words: tuple[str, ...], said: str, settled) -> None:
+    assert told(settled("scale=smoke", "env=push", "device=cpu", "replay.demos=here", *words)) == said
+
+
+def test_they_look_as_the_worlds_of_their_task_do(roots: dict[str, Path], settled, capsys) -> None:
     run = settled("scale=smoke", *MANY, demos_of(roots["stack"], roots["reach"]), "collector.num_envs=6")
     check(run)
     env: Any = build.make_env(run)
     spaces = Spaces.of_tasks(run.env.config)
     assert spaces == Spaces.of_env(env)
     shown = open_demonstrations(run, spaces, None)
-    assert shown is not None
+    assert shown is not None and "demonstrations: 50 % of each batch" in capsys.readouterr().out
     steps = shown.transitions.squeeze(1)
     seen = env.reset()
     whose = {name: steps[steps["task"][:, k] == 1.0] for k, name in enumerate(TASKS)}
