@@ -212,8 +212,8 @@ class FrankaConfig:
             ("camera_target_height", -100.0, 100.0, "m"),
             ("camera_target_distance", -100.0, 100.0, "m"),
             ("gripper_force", 1.0, 70.0, "N"),
-            ("disc_radius", 0.01, 0.2, "m"),
-            ("disc_spread", 0.0, 0.15, "m"),
+            ("disc_radius", 0.02, 0.1, "m"),
+            ("disc_spread", 0.0, 0.09, "m"),  # so no cube begins on its disc
         ):
             self._check_real(name, low, high, unit)
         if self.mesh_detail is not None:

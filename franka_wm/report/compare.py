@@ -12,7 +12,7 @@ from franka_wm.errors import UserError
 from franka_wm.evaluation.results import SHOWN, Result
 from franka_wm.report import style
 from franka_wm.report.bars import bars_figure
-from franka_wm.report.curves import axis, panels, seeds_figure
+from franka_wm.report.curves import panels, seeds_figure
 from franka_wm.report.document import (
     Section,
     cards,
@@ -141,7 +141,7 @@ def _tasks(groups: Mapping[str, Mapping[str, RunFiles]]) -> str:
                 curves.setdefault(task, {}).setdefault(f"{name} ({family_of(run)})", []).append(rows)
     drawn = []
     for task, lines in sorted(curves.items()):
-        x = axis([row for runs in lines.values() for rows in runs for row in rows])
+        x = _axis([rows for runs in lines.values() for rows in runs])
         if x is not None:
             figure = seeds_figure(lines, "success", x=x, title=f"{task}: successful episodes [%]")
             drawn.append(chart(figure, f"success at {task} while training"))
@@ -214,11 +214,11 @@ def _measured(runs: Mapping[str, RunFiles]) -> str:
 
 def _curves(groups: Mapping[str, Mapping[str, RunFiles]]) -> str:
     rows = {name: [run.rows for run in group.values()] for name, group in groups.items()}
-    logged = [row for runs in rows.values() for one in runs for row in one]
+    logs = [one for runs in rows.values() for one in runs if one]
+    logged = [row for one in logs for row in one]
     without = [name for group in groups.values() for name, run in group.items() if not run.rows]
     note = paragraph(f"Without curves, since nothing was logged: {', '.join(without)}." if without else "")
-    axes = [key for key in ("env_steps", "updates") if all(key in row for row in logged)]
-    x = next((key for key in axes if any(row[key] for row in logged)), None)  # recorded data makes no steps
+    x = _axis(logs)
     if x is None:
         return ""
     found = {key for row in logged for key in row}
@@ -236,6 +236,15 @@ def _curves(groups: Mapping[str, Mapping[str, RunFiles]]) -> str:
                 chart(seeds_figure(rows, key, x=x), f"{key} of all runs while training", caption.strip())
             )
     return note + cards(*drawn)
+
+
+def _axis(logs: Sequence[Sequence[Mapping[str, float]]]) -> str | None:
+    """What the curves of all runs can be drawn against: environment steps, or updates where one of them makes none."""
+    for key in ("env_steps", "updates") if logs else ():
+        there = all(key in row for rows in logs for row in rows)
+        if there and all(any(row[key] for row in rows) for rows in logs):
+            return key
+    return None
 
 
 def _best(keys: set[str], quantity: str) -> str:

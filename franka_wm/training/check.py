@@ -422,7 +422,7 @@ def _check_same_actions(run: RunSettings, sources: Named) -> None:
         if (changed := other_option(sessions, env)) is not None:
             name, there = changed
             other = f"{option}: recorded with env.{name}={there}, this run has {env[name]}"
-            say(f"{other}; its rewards and ends are those of then")
+            say(f"{other}; its goals, rewards and ends are those of then")
 
 
 def _check_same_views(run: RunSettings, sources: Named) -> None:

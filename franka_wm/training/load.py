@@ -82,7 +82,7 @@ def load_agent(
     if seed is not None:
         settings = settings.changed(seed=seed)
     if planned_by is not None:
-        settings = RunSettings.of({**settings.values, "planner": _preset(planned_by, settings)}, saved=True)
+        settings = RunSettings.of({**settings.values, "planner": preset_of(planned_by, settings)}, saved=True)
     if planning:
         settings = _planning_otherwise(settings, planning)
     if settings.env.kind == "none":
@@ -102,7 +102,7 @@ def load_agent(
     return Agent(checkpoint.folder, settings, env, model, planner, policies, dict(checkpoint.counters))
 
 
-def _preset(planner: str, settings: RunSettings) -> dict[str, Any]:
+def preset_of(planner: str, settings: RunSettings) -> dict[str, Any]:
     """What ``planner=NAME`` would have been in this run."""
     there = sorted(file.stem for file in Path(conf.__file__).with_name("planner").glob("*.yaml"))
     if planner not in there:

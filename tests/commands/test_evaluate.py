@@ -109,7 +109,7 @@ def test_a_checkpoint_plans_otherwise_than_its_run(run_folder: Path, tmp_path: P
     }
     assert returns["otherwise"]["planner"] != returns["as_it_was"]["planner"]
     assert returns["otherwise"]["policy"] == returns["as_it_was"]["policy"]
-    words_of_cem = [*words, "planner=cem", "planner.horizon=2"]
+    words_of_cem = [*words, "planner=icem", "planner=cem", "planner.num_samples=12"]
     assert cli.main(["evaluate", str(run_folder), f"out={tmp_path / 'cem'}", *words_of_cem]) == 0
     cem = json.loads((tmp_path / "cem" / "evaluation.json").read_text())
     assert cem["protocol"]["planner"] == "cem" and cem["policies"]["planner"]["return"]["mean"] not in {

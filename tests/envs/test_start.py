@@ -196,10 +196,13 @@ def test_a_task_that_the_scene_makes_impossible_is_refused(said: str, task: str,
 @pytest.mark.parametrize(
     ("changes", "said"),
     [
-        ({"disc_radius": 0.0}, "disc_radius=0.0: must be from 0.01 to 0.2 (m)"),
-        ({"disc_spread": 0.2}, "disc_spread=0.2: must be from 0 to 0.15 (m)"),
-        ({"disc_spread": 0.12}, "0.32 m ahead of it, 0.82 m from the base"),
-        ({"task": "lift", "disc_spread": 0.1}, "disc_spread=0.1: task=lift does not read it, push does"),
+        ({"disc_radius": 0.0}, "disc_radius=0.0: must be from 0.02 to 0.1 (m)"),
+        ({"disc_spread": 0.12}, "disc_spread=0.12: must be from 0 to 0.09 (m)"),
+        (
+            {"disc_spread": 0.09, "scene": {"objects": [CUBE | {"at": [0.53, 0.0]}]}},
+            "0.29 m ahead of it, 0.82 m from",
+        ),
+        ({"task": "lift", "disc_spread": 0.05}, "disc_spread=0.05: task=lift does not read it, push does"),
     ],
 )
 def test_a_disc_out_of_reach_is_refused(changes: dict, said: str) -> None:

@@ -18,7 +18,7 @@ from franka_wm.evaluation.projection import principal_components
 from franka_wm.report import style
 from franka_wm.report.bars import bars_figure
 from franka_wm.report.calibration import calibration_figure
-from franka_wm.report.curves import panel_figure, seed_bands, seeds_figure
+from franka_wm.report.curves import panel_figure, quantity, seed_bands, seeds_figure
 from franka_wm.report.figure import inline_svg, save_figure
 from franka_wm.report.frames import hide_patches, mask_figure, strip_figure
 from franka_wm.report.horizon import horizon_figure
@@ -379,3 +379,12 @@ def test_long_names_of_runs_leave_room_and_differ(tmp_path: Path) -> None:
     assert figure.axes[0].get_position().width > 0.3
     labels = [one.get_text() for one in figure.axes[0].get_yticklabels()]
     assert len({*labels}) == 5 and labels[-1].endswith("seed=1 (2)")
+
+
+def test_one_of_several_tasks_success_is_in_percent_of_its_episodes() -> None:
+    """`success_TASK`; other quantities as they are."""
+    assert quantity("success_push") == ("successful episodes of push [%]", 100.0)
+    assert quantity("cube_to_disc_m") == ("cube to disc m", 1.0)
+    rows = [{"env_steps": k, "eval/planner/success_push": 0.1 * k} for k in range(1, 4)]
+    axes = seeds_figure({"a": [rows]}, "eval/planner/success_push").axes[0]
+    assert axes.get_ylim() == (-3, 103) and axes.lines[0].get_ydata()[-1] == pytest.approx(30)

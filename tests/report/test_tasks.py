@@ -142,6 +142,20 @@ def test_each_task_has_a_chart_of_all_families(make_run) -> None:
     assert page.count("<title>success at") == 1
 
 
+def test_curves_of_recorded_data_stand_beside_others_by_updates() -> None:
+    """It makes no environment steps: its points would lie on one another."""
+    config = {"env": {"task": "push"}, "model": {"name": "a"}}
+    drawn = {}
+    for name, each in (("online", 10), ("offline", 0)):
+        rows = [{"env_steps": each * k, "updates": k, "eval/planner/success": k / 4} for k in range(1, 4)]
+        one = run("push", name, {"planner": success(0.5)})
+        drawn[name] = replace(one, rows=rows, config={**config, "model": {"name": name}})
+    page = compare_page(list(drawn.values()))
+    assert "environment steps" not in page and page.count(">updates<") >= 2
+    page = compare_page([drawn["online"], replace(drawn["online"], folder=Path("again"))])
+    assert "environment steps" in page
+
+
 def test_success_over_time_is_found_for_each_task() -> None:
     """Of the planner before the policy; of several tasks at once each task's own."""
     rows = [{"env_steps": 1, "eval/policy/success": 0.1, "eval/planner/success": 0.2}]

@@ -20,7 +20,7 @@ from franka_wm.errors import UserError
 from franka_wm.training import build
 from franka_wm.training.check import check
 from franka_wm.training.learner import Learner
-from franka_wm.training.load import load_agent
+from franka_wm.training.load import load_agent, preset_of
 from franka_wm.training.place import _LOCKS, lock_run_dir
 from franka_wm.training.run import Run
 from franka_wm.training.settings import RunSettings
@@ -243,3 +243,9 @@ def test_what_does_not_go_together(overrides: list[str], named: str, settled) ->
     with pytest.raises(UserError) as caught:
         check(settled(*SMALL, *overrides))
     assert named in str(caught.value) and "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(("scale", "horizon"), [("smoke", 2), ("gpu", 5)])
+def test_another_planner_is_what_the_runs_scale_has(scale: str, horizon: int, settled) -> None:
+    preset = preset_of("cem", settled(f"scale={scale}", "env=reach", "device=cpu"))
+    assert (preset["name"], preset["horizon"]) == ("cem", horizon)

@@ -66,6 +66,10 @@ VIEWS = (
 """Those that give images their meaning, beside the robot and the scene: :func:`other_scene`."""
 
 
+BEFORE = {"disc_radius": 0.1, "disc_spread": 0.0}
+"""What recordings had that do not name these options: they were made before there were any."""
+
+
 def other_option(
     sessions: Iterable[Mapping[str, Any]], env: Mapping[str, Any], names: Iterable[str] = MEANING
 ) -> tuple[str, Any] | None:
@@ -76,6 +80,7 @@ def other_option(
     """
     for session in sessions:
         recorded = session.get("config", {}).get("env", {})
+        recorded = {**BEFORE, **recorded} if recorded else recorded
         unread = _unread(recorded) & _unread(env)
         for name in names:
             if name in unread:
