@@ -16,8 +16,8 @@ from franka_wm.files import unwritable
     first="checkpoint",
     others=("planner=", "planner.", "objective."),
     shown=(
-        "planner=NAME planner.KEY=…",
-        "plans otherwise than the run did, also objective.KEY=…; wants out=FOLDER, the run's own results stay",
+        "planner.KEY=…",
+        "plans otherwise than the run did, also planner=NAME, objective.KEY=…; wants out=FOLDER",
     ),
 )
 @word(

@@ -83,7 +83,7 @@ class FrankaConfig:
         max_contacts: Contacts for which there is room in each world, on average. ``None``: by the scene.
         end_when_lost: End the episode where an object has left the table.
         drawer_opening: ``task="drawer"`` is solved where the drawer is open so far [m]. ``None``: 90 % of its travel.
-        disc_radius, disc_spread: Of push's disc: its radius, and how much nearer or farther than 20 cm it may be [m].
+        disc_radius, disc_spread: Radius of push's disc, and how much nearer or farther than 20 cm it may be [m].
         home: Joint angles at the start, before noise [rad]. ``None``: the task's.
         reward: ``"dense"`` (−tanh distance), ``"sparse"`` (1 where solved, else 0) or ``"normalized"`` (the part
             of the episode's initial distance that has been closed, at least −1); all minus the action penalty.

@@ -36,7 +36,7 @@ QUANTITIES = {
     "return": ("return of an episode", 1.0),
 }
 TASK = "success_"
-"""Of several tasks at once one's success is logged as ``success_TASK``."""
+"""How keys of one task's success begin, where several are learned at once."""
 
 
 def quantity(leaf: str) -> tuple[str, float]:
