@@ -52,6 +52,7 @@ def evaluate(checkpoint: str, out: str | None, overrides: Sequence[str] = (), **
     place = own if out is None else Path(out)
     check_folder(place)
     check_run("evaluate", "checkpoint", checkpoint)
+    check_other(place, own, ", ".join(overrides))
     check_larger(place, options["episodes"], checkpoint)
     from franka_wm.commands.evaluate_checkpoint import Options, run
 
@@ -76,6 +77,31 @@ def check_folder(folder: Path) -> None:
     why = unwritable(folder)
     if why is not None:
         raise UserError(f"evaluate: out={folder}: {why}; give another folder for the results")
+
+
+def check_other(folder: Path, own: Path, planned_with: str) -> None:
+    """Whether a result of something else would be lost there: of another run, or planned otherwise.
+
+    Raises:
+        UserError: It would.
+    """
+    if (folder / "checkpoints").is_dir() and folder.resolve() != own.parent.resolve():
+        raise UserError(
+            f"evaluate: out={folder}: is the folder of another run, whose results would be lost; give another folder"
+        )
+    if not (folder / "evaluation.json").is_file():
+        return
+    from franka_wm.evaluation.results import read_result
+
+    try:
+        there = read_result(folder / "evaluation.json").protocol.get("planned with", "")
+    except UserError:  # nobody can read it
+        return
+    if there != planned_with:
+        how = f"planned with {there}" if there else "planned as its run did"
+        raise UserError(
+            f"evaluate: {folder} holds a result {how}, which this one would replace; give another out="
+        )
 
 
 def check_larger(folder: Path, episodes: int, checkpoint: str) -> None:

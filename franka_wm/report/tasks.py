@@ -50,6 +50,8 @@ def task_of(run: RunFiles) -> str:
     env = run.config.get("env")
     env = env if isinstance(env, Mapping) else {}
     domain, task = env.get("name"), env.get("task")
+    if not env and run.results:  # a folder of results alone
+        return str(run.results[0].protocol.get("task", MISSING))
     if domain:
         return f"{domain} {task}" if task else str(domain)
     if task and any(one.lstrip("+").startswith("env.task=") for one in run.overrides):
@@ -62,10 +64,11 @@ def task_of(run: RunFiles) -> str:
 
 
 def family_of(run: RunFiles) -> str:
-    """The name of its model, and whether it learned several tasks at once."""
-    model = run.config.get("model")
-    family = str(model.get("name", MISSING)) if isinstance(model, Mapping) else MISSING
-    return f"{family}, {MULTITASK}" if _by_task(run) else family
+    """The name of its model, whether it learned several tasks at once, and how it planned if not as in training."""
+    model, told = run.config.get("model"), run.results[0].protocol if run.results else {}
+    name = model.get("name") if isinstance(model, Mapping) else told.get("model")  # of results alone
+    parts = [name or MISSING, *([MULTITASK] if _by_task(run) else ())]
+    return ", ".join(map(str, [*parts, *([told["planned with"]] if "planned with" in told else ())]))
 
 
 def success_over_time(run: RunFiles) -> dict[str, str]:

@@ -138,6 +138,31 @@ def test_a_checkpoint_that_is_not_there(tmp_path: Path, capsys) -> None:
     assert not (tmp_path / "out").exists()
 
 
+def test_results_of_something_else_are_not_replaced(tmp_path: Path, capsys, monkeypatch) -> None:
+    """Those of another run, and those that were planned otherwise."""
+    for name in ("run", "other", "other/evaluation"):
+        (tmp_path / name / "checkpoints").mkdir(parents=True)
+    monkeypatch.setattr("franka_wm.commands.evaluate.check_run", lambda *_: None)
+    monkeypatch.setattr(evaluate_checkpoint, "run", lambda _: None)
+
+    def told(out: str, *words: str) -> str:
+        code = cli.main(["evaluate", str(tmp_path / "run"), f"out={tmp_path / out}", *words])
+        said = capsys.readouterr().err
+        assert bool(code) is bool(said)
+        return said
+
+    assert "other: is the folder of another run" in told("other")
+    assert not told("new", "planner=cem")
+    (tmp_path / "new").mkdir()
+    there = {"protocol": {"episodes": 2, "planned with": "planner=cem"}, "policies": {}}
+    (tmp_path / "new" / "evaluation.json").write_text(json.dumps(there))
+    assert not told("new", "planner=cem")
+    assert "holds a result planned with planner=cem, which this one would replace" in told(
+        "new", "planner=icem"
+    )
+    assert "holds a result planned with planner=cem" in told("new")
+
+
 def test_a_result_of_more_episodes_is_not_replaced(tmp_path: Path, capsys) -> None:
     (tmp_path / "checkpoints").mkdir()
     place = tmp_path / "evaluation"

@@ -166,3 +166,19 @@ def test_success_over_time_is_found_for_each_task() -> None:
     rows = [{"env_steps": 1, "eval/planner/success": 0.2, "eval/policy/success_push": 0.3}]
     several = replace(run("", "a", {"planner": success(0.4, task_success=rates)}), rows=rows)
     assert tasks.success_over_time(several) == {"push": "eval/policy/success_push"}
+
+
+def test_what_was_planned_otherwise_has_a_column_of_its_own() -> None:
+    """Also of a folder of results alone, which has no configuration."""
+    protocol = {"task": "push", "model": "tdmpc2"}
+    one = run("push", "tdmpc2", {"planner": success(0.9)}, typed="push")
+    others = [
+        RunFiles(Path(name), results=[Result(Path("r"), protocol=told, policies={"planner": success(rate)})])
+        for name, rate, told in (
+            ("as_it_was", 0.7, protocol),
+            ("cem", 0.5, protocol | {"planned with": "planner=cem"}),
+        )
+    ]
+    table = tasks_table([one, *others])
+    assert table is not None and table.header == ["task", "tdmpc2", "tdmpc2, planner=cem"]
+    assert table.rows == [["push", "0: 90 %; 1: 70 %", "50 %"]]
