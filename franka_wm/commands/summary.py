@@ -34,7 +34,13 @@ def summary(folders: tuple[str, ...]) -> None:
                 raise UserError(f"summary: {run} is given twice; each run counts once")
             seen.add(run.resolve())
             with malformed(run):
-                groups.setdefault(but_for_the_seed(read_config(run)), {})[run] = read_evaluation(run)
+                found = read_evaluation(run)
+                # Folders of results alone have no configuration, and what acted may not be what the run has.
+                acted = [
+                    str(found.protocol.get(name)) for name in ("task", "model", "planner", "planned with")
+                ]
+                alike = "\n".join([but_for_the_seed(read_config(run)), *acted])
+                groups.setdefault(alike, {})[run] = found
     for group in groups.values():
         with malformed(*group):
             text = table(group, several=len(groups) > 1)

@@ -195,6 +195,10 @@ def test_compare_tells_which_results_were_planned_otherwise(tmp_path, capsys):
     assert main(words) == 0
     page = (tmp_path / "page.html").read_text()
     assert "measured by" in page and page.count(", planned with planner.num_samples=8") == 1
+    capsys.readouterr()
+    assert main(["summary", *words[1:3]]) == 0
+    said = capsys.readouterr().out
+    assert "1 run (as_it_was) of" in said and "1 run (otherwise) of" in said, "no seeds of one another"
 
 
 def test_what_was_found_of_older_weights_does_not_stand_beside_newer_ones(tmp_path):
