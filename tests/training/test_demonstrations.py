@@ -351,7 +351,7 @@ def test_rewards_of_another_task_are_said(demos: Path, settled, capsys) -> None:
     check(settled(*words))
     assert "recorded with" not in capsys.readouterr().out
     check(settled(*words, "env.reward=sparse"))
-    assert "recorded with env.reward=dense, this run has sparse; its rewards" in capsys.readouterr().out
+    assert "recorded with env.reward=dense, this run has sparse; its goals" in capsys.readouterr().out
 
 
 def test_states_that_no_observation_shows_are_refused(pushes: Path, settled) -> None:
