@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import inspect
 import math
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from types import MappingProxyType
 from typing import Any, ClassVar
 
@@ -217,9 +219,23 @@ class WorldModel(nn.Module):
     def after_update(self) -> None:
         """Move slow copies of weights, after each optimiser step; there are none by default."""
 
+    parts_of_loss: ClassVar[tuple[str, ...]] = ()
+    """Methods that `loss` calls through `calls` and that are compiled one by one: what runs side by side on a GPU must
+    not become one program. None: the loss is compiled as a whole."""
+
+    def calls(self, parts: Mapping[str, Callable[..., Any]] | None) -> dict[str, Callable[..., Any]]:
+        """The methods that `parts_of_loss` names, or what `parts` has instead of them."""
+        return {name: getattr(self, name) for name in self.parts_of_loss} | dict(parts or {})
+
     def compiled_loss(self) -> Callable[[TensorDictBase], TensorDict]:
-        """`loss`, compiled by `torch.compile`."""
-        return torch.compile(self.loss)
+        """`loss`, compiled by `torch.compile`, part by part where there are `parts_of_loss`."""
+        if (
+            "parts" not in inspect.signature(self.loss).parameters
+        ):  # also of a subclass with a loss of its own
+            return torch.compile(self.loss)
+        return partial(
+            self.loss, parts={name: torch.compile(getattr(self, name)) for name in self.parts_of_loss}
+        )
 
     def rebuild_overrides(self) -> dict[str, Any]:
         """Constructor arguments that replace those which read other files or depend on the environment.

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Any, ClassVar
+from collections.abc import Callable, Mapping
+from typing import Any, ClassVar, Literal
 
 import torch
 from tensordict import TensorDict, TensorDictBase
@@ -12,13 +12,14 @@ from torch.nn import functional as F
 
 from franka_wm.errors import UserError
 from franka_wm.models.base import WorldModel
-from franka_wm.models.ema import ema_update, frozen_copy
+from franka_wm.models.ema import ema_update, frozen, frozen_copy
 from franka_wm.models.groups import ParameterGroup
 from franka_wm.models.images import ImageSize, check_image_sizes, check_images
 from franka_wm.models.layers import TwoHotSymlog, symlog
 from franka_wm.models.normalizer import ObservationNormalizer
 from franka_wm.models.returns import RunningScale, discount_per_step, lambda_returns, value_range
 from franka_wm.models.rssm import RSSM, divergence, network
+from franka_wm.models.streams import side_stream
 from franka_wm.models.vision import ConvDecoder, ConvEncoder
 from franka_wm.models.windows import check_windows, window_of
 from franka_wm.options import COEFFICIENT, DEPTH, FRACTION, POSITIVE, Bounds, with_defaults
@@ -65,14 +66,15 @@ class Dreamer(WorldModel):
         free_nats: divergences below this are not reduced further.
         dynamics_coef, representation_coef: weights of the prior's and the posterior's divergence.
         decoder_coef: weight of reconstruction; at 0 there is no decoder, and rewards, ends and values shape z.
-        reward_coef, termination_coef: weights of these losses.
-        replay_value_coef: weight of the critic's loss on recorded rewards.
+        reward_coef, termination_coef, replay_value_coef: weights of these losses; the last is the critic's on
+            recorded rewards.
         imagination: steps of an imagined trajectory.
         return_lambda: λ of the returns.
         entropy_coef: weight, against scaled advantages, of the actor's entropy [nat].
         std_min, std_max: bounds of the actor's standard deviation.
-        tau: how far the slow critic moves at each update.
-        scale_tau: how far the scale of returns moves at each update.
+        actor_gradient: "reinforce", that of advantages, as published; "dynamics", that of the returns themselves,
+            back through rewards, critic and imagined steps (DreamerV1, arXiv:1912.01603).
+        tau, scale_tau: how far the slow critic and the scale of returns move at each update.
 
     Raises:
         ValueError: a size or coefficient that cannot work, or nothing to read.
@@ -126,6 +128,7 @@ class Dreamer(WorldModel):
         entropy_coef: float = 3e-4,
         std_min: float = 0.1,
         std_max: float = 1.0,
+        actor_gradient: Literal["reinforce", "dynamics"] = "reinforce",
         tau: float = 0.02,
         scale_tau: float = 0.01,
     ) -> None:
@@ -141,7 +144,7 @@ class Dreamer(WorldModel):
         self.decoder_coef, self.reward_coef = decoder_coef, reward_coef
         self.termination_coef, self.replay_value_coef = termination_coef, replay_value_coef
         self.imagination, self.return_lambda, self.entropy_coef = imagination, return_lambda, entropy_coef
-        self.std_min, self.std_max, self.tau = std_min, std_max, tau
+        self.std_min, self.std_max, self.actor_gradient = std_min, std_max, actor_gradient
 
         deep, size = (hidden_dim,) * encoder_layers, self.vectors.size
         convolutions = {key: ConvEncoder(shape, channels=channels) for key, shape in self.image_sizes.items()}
@@ -242,7 +245,11 @@ class Dreamer(WorldModel):
 
     # ------------------------------------------------------------------ training
 
-    def loss(self, batch: TensorDictBase) -> TensorDict:
+    parts_of_loss = ("_embed", "_seen", "_dreamed", "_model_loss", "_actor_critic_loss", "_replay_value_loss")
+
+    def loss(
+        self, batch: TensorDictBase, *, parts: Mapping[str, Callable[..., Any]] | None = None
+    ) -> TensorDict:
         """Losses of a batch of windows; call `backward` once on the entry `loss`.
 
         In training mode the running scale of returns is updated as well.
@@ -251,6 +258,7 @@ class Dreamer(WorldModel):
             batch: batch size [B, H]: H contiguous transitions, all of one episode, with the observation keys,
                 `action` (B, H, A), and in `next` the observation keys, `reward` (B, H, 1) and `terminated`
                 (B, H, 1) bool.
+            parts: what to call instead of the methods that `parts_of_loss` names.
 
         Returns:
             batch size []: `loss` to differentiate, and detached: `loss_dynamics` and `loss_representation` [nat, not
@@ -263,60 +271,25 @@ class Dreamer(WorldModel):
             ValueError: the batch size is not [B, H].
         """
         check_windows(batch)
+        call = self.calls(parts)
         # Time leads from here on: (H, B, ...).
         action, reward, terminated = (
             batch.get(key).transpose(0, 1) for key in ("action", ("next", "reward"), ("next", "terminated"))
         )
         window = window_of(batch, self.observation_keys).transpose(0, 1)
-        z, posterior = self._filter(self._embed(window), action)  # (H+1, B, ...)
-        prior = self.rssm.prior(z[1:, ..., : self.rssm.deter_dim])
-
-        # The world model.
-        dynamics = divergence(posterior[1:].detach(), prior).clamp_min(self.free_nats).mean()
-        representation = divergence(posterior[1:], prior.detach()).clamp_min(self.free_nats).mean()
-        reconstruction = self._reconstruction(z, window)
-        reward_logits = self.reward_head(z[1:])
-        reward_loss = self.two_hot.loss(reward_logits, reward).mean()
-        loss = (
-            self.dynamics_coef * dynamics
-            + self.representation_coef * representation
-            + self.decoder_coef * reconstruction
-            + self.reward_coef * reward_loss
-        )
-        ends = {}
-        if self.termination_head is not None:
-            logits = self.termination_head(z[1:])
-            termination = F.binary_cross_entropy_with_logits(logits, terminated.to(logits.dtype))
-            loss, ends = (
-                loss + self.termination_coef * termination,
-                {"loss_termination": termination.detach()},
-            )
-
-        # Actor and critic, in imagination and on what was recorded.
-        imagined, actions = self._imagine(z.detach().flatten(0, 1))
+        z, posterior = self._filter(call["_embed"](window), action, call["_seen"])  # (H+1, B, ...)
         begun = torch.cat((torch.ones_like(reward[:1]), (~terminated).to(reward.dtype)))
-        returns, value, weight = self._imagined_returns(imagined, begun.flatten(0, 1))
-        if self.training:
-            self.scale.update(returns)
-        policy_loss, entropy = self._policy_loss(imagined[:-1], actions, returns, value, weight)
-        value_loss = (weight * self._value_loss(imagined[:-1], returns)).mean()
-        recorded = lambda_returns(
-            reward,
-            ~terminated,
-            returns[0].view(*z.shape[:2], 1)[1:],
-            discount=self.discount,
-            decay=self.return_lambda,
-        )
-        replay_value_loss = self._value_loss(z[:-1], recorded).mean()
-        loss = loss + policy_loss + value_loss + self.replay_value_coef * replay_value_loss
-        with torch.no_grad():
-            error = (self.two_hot.decode(reward_logits) - reward).abs().mean()
-            prior_entropy = -(prior.exp() * prior).sum((-2, -1)).mean()
+        # Imagination needs nothing but where it begins: on CUDA it runs beside the model's losses.
+        with side_stream(start := z.detach(), begun) as imagination:
+            imagined, actions = self._imagine(start.flatten(0, 1), call["_dreamed"])
+            policy_loss, value_loss, entropy, returns, value = call["_actor_critic_loss"](
+                imagined, actions, begun.flatten(0, 1)
+            )
+        model_loss, parts_of_model = call["_model_loss"](z, posterior, window, reward, terminated)
+        imagination.join(policy_loss, value_loss, entropy, returns, value)
+        replay_value_loss = call["_replay_value_loss"](z, returns[0], reward, terminated)
         metrics = {
-            "loss_dynamics": dynamics,
-            "loss_representation": representation,
-            "loss_decoder": reconstruction,
-            "loss_reward": reward_loss,
+            **parts_of_model,
             "loss_policy": policy_loss,
             "loss_value": value_loss,
             "loss_replay_value": replay_value_loss,
@@ -324,12 +297,11 @@ class Dreamer(WorldModel):
             "return_mean": returns.mean(),
             "policy_entropy": entropy,
             "policy_scale": self.scale.value.clone(),
-            "reward_error": error,
-            "prior_entropy": prior_entropy,
             "target_outside": self.two_hot.outside(reward, returns),
         }
+        loss = model_loss + policy_loss + value_loss + self.replay_value_coef * replay_value_loss
         detached = {name: value.detach() for name, value in metrics.items()}
-        return TensorDict({"loss": loss, **detached, **ends}, batch_size=[])
+        return TensorDict({"loss": loss, **detached}, batch_size=[])
 
     def parameter_groups(self, lr: float) -> list[ParameterGroup]:
         """Groups for Adam: model, actor and critic, whose gradients are clipped apart."""
@@ -363,15 +335,80 @@ class Dreamer(WorldModel):
     def _see(self, h: Tensor, embedded: Tensor, *, sample: bool) -> Tensor:
         return self.rssm.state(h, self.rssm.posterior(h, embedded), sample=sample)
 
-    def _filter(self, embedded: Tensor, action: Tensor) -> tuple[Tensor, Tensor]:
+    def _seen(self, z: Tensor, action: Tensor, embedded: Tensor) -> tuple[Tensor, Tensor]:
+        """The state (B, Z), drawn, and its posterior after actions (B, A) in z (B, Z) led to features (B, E)."""
+        h = self.rssm.recur(z, action)
+        posterior = self.rssm.posterior(h, embedded)
+        return self.rssm.state(h, posterior, sample=True), posterior
+
+    def _filter(
+        self, embedded: Tensor, action: Tensor, seen: Callable[..., tuple[Tensor, Tensor]]
+    ) -> tuple[Tensor, Tensor]:
         """States (H+1, B, Z) and posteriors (H+1, B, codes, classes) of features (H+1, B, E), actions (H, B, A)."""
-        h, states, posteriors = self.rssm.begin(embedded[0]), [], []
-        for t in range(embedded.shape[0]):
-            if t:
-                h = self.rssm.recur(states[-1], action[t - 1])
-            posteriors.append(self.rssm.posterior(h, embedded[t]))
-            states.append(self.rssm.state(h, posteriors[-1], sample=True))
+        z, nothing = self.rssm.nothing(embedded[0])
+        states, posteriors = [], []
+        for before, features in zip(torch.cat((nothing.unsqueeze(0), action)), embedded, strict=True):
+            z, posterior = seen(z, before, features)
+            states.append(z)
+            posteriors.append(posterior)
         return torch.stack(states), torch.stack(posteriors)
+
+    def _model_loss(
+        self, z: Tensor, posterior: Tensor, window: TensorDictBase, reward: Tensor, terminated: Tensor
+    ) -> tuple[Tensor, dict[str, Tensor]]:
+        """The world model's loss () and its parts, for states z (H+1, B, Z) and posteriors of a window."""
+        prior = self.rssm.prior(z[1:, ..., : self.rssm.deter_dim])
+        dynamics = divergence(posterior[1:].detach(), prior).clamp_min(self.free_nats).mean()
+        representation = divergence(posterior[1:], prior.detach()).clamp_min(self.free_nats).mean()
+        reconstruction = self._reconstruction(z, window)
+        reward_logits = self.reward_head(z[1:])
+        reward_loss = self.two_hot.loss(reward_logits, reward).mean()
+        loss = (
+            self.dynamics_coef * dynamics
+            + self.representation_coef * representation
+            + self.decoder_coef * reconstruction
+            + self.reward_coef * reward_loss
+        )
+        with torch.no_grad():
+            error = (self.two_hot.decode(reward_logits) - reward).abs().mean()
+            prior_entropy = -(prior.exp() * prior).sum((-2, -1)).mean()
+        parts = {
+            "loss_dynamics": dynamics,
+            "loss_representation": representation,
+            "loss_decoder": reconstruction,
+            "loss_reward": reward_loss,
+            "reward_error": error,
+            "prior_entropy": prior_entropy,
+        }
+        if self.termination_head is not None:
+            logits = self.termination_head(z[1:])
+            termination = F.binary_cross_entropy_with_logits(logits, terminated.to(logits.dtype))
+            loss, parts["loss_termination"] = loss + self.termination_coef * termination, termination
+        return loss, parts
+
+    def _actor_critic_loss(self, imagined: Tensor, actions: Tensor, begun: Tensor) -> tuple[Tensor, ...]:
+        """Losses of actor and critic and the actor's entropy (), returns and values (K, N, 1), see `_imagine`.
+
+        Args:
+            begun: (N, 1), 0 where the first state had ended its episode.
+        """
+        with torch.set_grad_enabled(imagined.requires_grad):
+            reached, value, weight = self._imagined_returns(imagined, begun)
+        states, actions, value, weight = (x.detach() for x in (imagined[:-1], actions, value, weight))
+        returns = reached.detach()
+        if self.training:
+            self.scale.update(returns)
+        policy_loss, entropy = self._policy_loss(states, actions, reached, value, weight)
+        value_loss = (weight * self._value_loss(states, returns)).mean()
+        return policy_loss, value_loss, entropy, returns, value
+
+    def _replay_value_loss(self, z: Tensor, imagined: Tensor, reward: Tensor, terminated: Tensor) -> Tensor:
+        """The critic's loss () on recorded rewards (H, B, 1), with returns imagined ((H+1) B, 1) from z (H+1, B, Z)."""
+        bootstrap = imagined.view(*z.shape[:2], 1)[1:]
+        returns = lambda_returns(
+            reward, ~terminated, bootstrap, discount=self.discount, decay=self.return_lambda
+        )
+        return self._value_loss(z[:-1], returns).mean()
 
     def _reconstruction(self, z: Tensor, window: TensorDictBase) -> Tensor:
         """Squared errors (), summed over an observation: of symlog vectors, and of images in [0, 1]."""
@@ -384,27 +421,38 @@ class Dreamer(WorldModel):
             total = total + error.square().sum((-3, -2, -1)).mean()
         return total
 
-    @torch.no_grad()
-    def _imagine(self, z: Tensor) -> tuple[Tensor, Tensor]:
-        """States (K+1, N, Z) and actions (K, N, A), not clamped, of the actor from z (N, Z)."""
-        states, actions = [z], []
-        for _ in range(self.imagination):
-            mean, std = self.action_distribution(states[-1])
-            actions.append(mean + std * torch.randn_like(mean))
-            states.append(self.rssm.next(states[-1], actions[-1].clamp(-1.0, 1.0), sample=True))
-        return torch.stack(states), torch.stack(actions)
+    def _dreamed(self, z: Tensor) -> tuple[Tensor, Tensor]:
+        """The next state (N, Z), drawn, and the actor's action (N, A), not clamped, in z (N, Z)."""
+        mean, std = self.action_distribution(z.detach())
+        action = mean + std * torch.randn_like(mean)
+        return frozen(self.rssm, z, action.clamp(-1.0, 1.0)), action
 
-    @torch.no_grad()
+    def _imagine(
+        self, z: Tensor, dreamed: Callable[[Tensor], tuple[Tensor, Tensor]]
+    ) -> tuple[Tensor, Tensor]:
+        """States (K+1, N, Z) and actions (K, N, A), not clamped, of the actor from z (N, Z).
+
+        With `actor_gradient=dynamics` they have gradients to the actor, through nothing but its actions.
+        """
+        states, actions = [z], []
+        with torch.set_grad_enabled(self.actor_gradient == "dynamics" and torch.is_grad_enabled()):
+            for _ in range(self.imagination):
+                after, action = dreamed(states[-1])
+                states.append(after)
+                actions.append(action)
+            return torch.stack(states), torch.stack(actions)
+
     def _imagined_returns(self, imagined: Tensor, begun: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """λ-returns, values and weights (K, N, 1) of states (K+1, N, Z): the discounted chance to get there.
 
         Args:
             begun: (N, 1), 0 where the first state had ended its episode.
         """
-        reward, value = self.two_hot.decode(self.reward_head(imagined[1:])), self.value(imagined)
+        reward = self.two_hot.decode(frozen(self.reward_head, imagined[1:]))
+        value = self.two_hot.decode(frozen(self.critic, imagined))
         going_on = torch.ones_like(reward)
         if self.termination_head is not None:
-            going_on = torch.sigmoid(-self.termination_head(imagined[1:]))
+            going_on = torch.sigmoid(-frozen(self.termination_head, imagined[1:]))
         returns = lambda_returns(
             reward, going_on, value[1:], discount=self.discount, decay=self.return_lambda
         )
@@ -414,13 +462,14 @@ class Dreamer(WorldModel):
     def _policy_loss(
         self, z: Tensor, actions: Tensor, returns: Tensor, value: Tensor, weight: Tensor
     ) -> tuple[Tensor, Tensor]:
-        """Loss (REINFORCE with the critic as baseline) and mean entropy [nat] of the actor."""
+        """Loss (REINFORCE with the critic as baseline, or returns themselves) and mean entropy [nat] of the actor."""
         mean, std = self.action_distribution(z)
         normal = torch.distributions.Normal(mean, std, validate_args=False)
-        log_prob = normal.log_prob(actions).sum(-1, keepdim=True)
         entropy = normal.entropy().sum(-1, keepdim=True)
-        advantage = self.scale(returns - value)
-        return -(weight * (advantage * log_prob + self.entropy_coef * entropy)).mean(), entropy.mean()
+        gain = self.scale(returns - value)
+        if self.actor_gradient == "reinforce":
+            gain = gain * normal.log_prob(actions).sum(-1, keepdim=True)
+        return -(weight * (gain + self.entropy_coef * entropy)).mean(), entropy.mean()
 
     def _value_loss(self, z: Tensor, returns: Tensor) -> Tensor:
         """Cross-entropy (..., 1) of the critic in z (..., Z) with returns, and with what the slow critic says."""

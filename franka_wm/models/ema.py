@@ -1,14 +1,21 @@
-"""Slow copies of networks: exponential moving averages of their weights."""
+"""Networks whose weights stand still: slow copies (moving averages of weights), and weights taken as constants."""
 
 import copy
 
 import torch
 from torch import Tensor, nn
+from torch.func import functional_call
 
 
 def frozen_copy[Network: nn.Module](network: Network) -> Network:
     """A copy that no optimiser trains."""
     return copy.deepcopy(network).requires_grad_(False)
+
+
+def frozen(network: nn.Module, *inputs: Tensor) -> Tensor:
+    """`network(*inputs)` whose gradients reach the inputs, never the weights."""
+    weights = {name: parameter.detach() for name, parameter in network.named_parameters()}
+    return functional_call(network, weights, inputs)
 
 
 def ema_update(slow: nn.Module, live: nn.Module, keep: Tensor) -> None:

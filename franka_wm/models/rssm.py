@@ -63,10 +63,13 @@ class RSSM(nn.Module):
         self.prior_head = network(deter_dim, (hidden_dim, hidden_dim), codes * classes)
         self.posterior_head = network(deter_dim + embed_dim, (hidden_dim,), codes * classes)
 
+    def nothing(self, like: Tensor) -> tuple[Tensor, Tensor]:
+        """What is before an episode's first observation: z (..., size) and action (..., A) of zeros."""
+        return like.new_zeros(*like.shape[:-1], self.size), like.new_zeros(*like.shape[:-1], self.action_dim)
+
     def begin(self, like: Tensor) -> Tensor:
         """h (..., deter_dim) of an episode's first observation, for inputs `like` (..., anything)."""
-        nothing = like.new_zeros(*like.shape[:-1], self.size)
-        return self.recur(nothing, like.new_zeros(*like.shape[:-1], self.action_dim))
+        return self.recur(*self.nothing(like))
 
     def recur(self, z: Tensor, action: Tensor) -> Tensor:
         """The next h (..., deter_dim) after actions (..., A) in [-1, 1] in z (..., size)."""
@@ -105,6 +108,10 @@ class RSSM(nn.Module):
         """z' (..., size) that the prior expects after actions (..., A)."""
         h = self.recur(z, action)
         return self.state(h, self.prior(h), sample=sample)
+
+    def forward(self, z: Tensor, action: Tensor) -> Tensor:
+        """z' (..., size), drawn: a step of imagination."""
+        return self.next(z, action, sample=True)
 
     def _log_probabilities(self, logits: Tensor) -> Tensor:
         probabilities = logits.float().unflatten(-1, (self.codes, self.classes)).softmax(-1)
