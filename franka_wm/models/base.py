@@ -229,13 +229,10 @@ class WorldModel(nn.Module):
 
     def compiled_loss(self) -> Callable[[TensorDictBase], TensorDict]:
         """`loss`, compiled by `torch.compile`, part by part where there are `parts_of_loss`."""
-        if (
-            "parts" not in inspect.signature(self.loss).parameters
-        ):  # also of a subclass with a loss of its own
-            return torch.compile(self.loss)
-        return partial(
-            self.loss, parts={name: torch.compile(getattr(self, name)) for name in self.parts_of_loss}
-        )
+        loss: Callable[..., TensorDict] = self.loss
+        if "parts" not in inspect.signature(loss).parameters:  # also of a subclass with a loss of its own
+            return torch.compile(loss)
+        return partial(loss, parts={name: torch.compile(getattr(self, name)) for name in self.parts_of_loss})
 
     def rebuild_overrides(self) -> dict[str, Any]:
         """Constructor arguments that replace those which read other files or depend on the environment.

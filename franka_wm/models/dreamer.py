@@ -11,22 +11,20 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from franka_wm.errors import UserError
-from franka_wm.models.base import WorldModel
-from franka_wm.models.ema import ema_update, frozen, frozen_copy
-from franka_wm.models.groups import ParameterGroup
+from franka_wm.models.actor_critic import ActorCritic
+from franka_wm.models.ema import frozen_copy
 from franka_wm.models.images import ImageSize, check_image_sizes, check_images
 from franka_wm.models.layers import TwoHotSymlog, symlog
 from franka_wm.models.normalizer import ObservationNormalizer
-from franka_wm.models.returns import RunningScale, discount_per_step, lambda_returns, value_range
+from franka_wm.models.returns import RunningScale, discount_per_step, value_range
 from franka_wm.models.rssm import RSSM, divergence, network
 from franka_wm.models.streams import side_stream
 from franka_wm.models.vision import ConvDecoder, ConvEncoder
 from franka_wm.models.windows import check_windows, window_of
 from franka_wm.options import COEFFICIENT, DEPTH, FRACTION, POSITIVE, Bounds, with_defaults
-from franka_wm.seeding import normal_like
 
 
-class Dreamer(WorldModel):
+class Dreamer(ActorCritic):
     """RSSM, decoder, reward, end, actor and critic.
 
     z = (h, s), see `RSSM`. The world model is trained to reconstruct observations, rewards and ends from z, and to
@@ -177,8 +175,6 @@ class Dreamer(WorldModel):
         self.scale = RunningScale(scale_tau)
         self.register_buffer("keep", torch.tensor(1.0 - tau), persistent=False)
 
-    keep: Tensor
-
     @classmethod
     def validate(cls, options: Mapping[str, Any], *, window: int | None = None) -> None:
         super().validate(options, window=window)
@@ -219,10 +215,6 @@ class Dreamer(WorldModel):
         """Expected reward (..., 1) of the action that led to z (..., latent_dim)."""
         return self.two_hot.decode(self.reward_head(z))
 
-    def value(self, z: Tensor) -> Tensor:
-        """Expected discounted return (..., 1) of the policy from z (..., latent_dim)."""
-        return self.two_hot.decode(self.critic(z))
-
     def terminated(self, z: Tensor) -> Tensor:
         """Whether an episode ends in z (..., latent_dim), likelier than not: (..., 1) bool.
 
@@ -232,16 +224,6 @@ class Dreamer(WorldModel):
         if self.termination_head is None:
             raise ValueError("this model was built without terminates=True: it does not predict ends")
         return self.termination_head(z) > 0.0
-
-    def policy(self, z: Tensor, deterministic: bool = False) -> Tensor:
-        """Actions (..., action_dim) in [-1, 1] for z (..., latent_dim): a sample, or the mode."""
-        mean, std = self.action_distribution(z)
-        return mean if deterministic else (mean + std * normal_like(mean)).clamp(-1.0, 1.0)
-
-    def action_distribution(self, z: Tensor) -> tuple[Tensor, Tensor]:
-        """Mean in [-1, 1] and standard deviation of the actor's Gaussian, each (..., action_dim)."""
-        mean, raw = self.actor(z).float().chunk(2, dim=-1)
-        return torch.tanh(mean), self.std_min + (self.std_max - self.std_min) * torch.sigmoid(raw + 2.0)
 
     # ------------------------------------------------------------------ training
 
@@ -302,18 +284,6 @@ class Dreamer(WorldModel):
         loss = model_loss + policy_loss + value_loss + self.replay_value_coef * replay_value_loss
         detached = {name: value.detach() for name, value in metrics.items()}
         return TensorDict({"loss": loss, **detached}, batch_size=[])
-
-    def parameter_groups(self, lr: float) -> list[ParameterGroup]:
-        """Groups for Adam: model, actor and critic, whose gradients are clipped apart."""
-        actor, critic = list(self.actor.parameters()), list(self.critic.parameters())
-        apart = {id(parameter) for parameter in (*actor, *critic, *self.slow_critic.parameters())}
-        model = [parameter for parameter in self.parameters() if id(parameter) not in apart]
-        groups = {"model": model, "policy": actor, "value": critic}
-        return [{"name": name, "clip": name, "params": group, "lr": lr} for name, group in groups.items()]
-
-    def after_update(self) -> None:
-        """Move the slow critic by `tau`; call once after each optimiser step."""
-        ema_update(self.slow_critic, self.critic, self.keep)
 
     def set_observation_statistics(self, mean: Tensor, std: Tensor) -> None:
         """Standardise vectors from now on, see `ObservationNormalizer`."""
@@ -386,30 +356,6 @@ class Dreamer(WorldModel):
             loss, parts["loss_termination"] = loss + self.termination_coef * termination, termination
         return loss, parts
 
-    def _actor_critic_loss(self, imagined: Tensor, actions: Tensor, begun: Tensor) -> tuple[Tensor, ...]:
-        """Losses of actor and critic and the actor's entropy (), returns and values (K, N, 1), see `_imagine`.
-
-        Args:
-            begun: (N, 1), 0 where the first state had ended its episode.
-        """
-        with torch.set_grad_enabled(imagined.requires_grad):
-            reached, value, weight = self._imagined_returns(imagined, begun)
-        states, actions, value, weight = (x.detach() for x in (imagined[:-1], actions, value, weight))
-        returns = reached.detach()
-        if self.training:
-            self.scale.update(returns)
-        policy_loss, entropy = self._policy_loss(states, actions, reached, value, weight)
-        value_loss = (weight * self._value_loss(states, returns)).mean()
-        return policy_loss, value_loss, entropy, returns, value
-
-    def _replay_value_loss(self, z: Tensor, imagined: Tensor, reward: Tensor, terminated: Tensor) -> Tensor:
-        """The critic's loss () on recorded rewards (H, B, 1), with returns imagined ((H+1) B, 1) from z (H+1, B, Z)."""
-        bootstrap = imagined.view(*z.shape[:2], 1)[1:]
-        returns = lambda_returns(
-            reward, ~terminated, bootstrap, discount=self.discount, decay=self.return_lambda
-        )
-        return self._value_loss(z[:-1], returns).mean()
-
     def _reconstruction(self, z: Tensor, window: TensorDictBase) -> Tensor:
         """Squared errors (), summed over an observation: of symlog vectors, and of images in [0, 1]."""
         total = z.new_zeros(())
@@ -420,60 +366,3 @@ class Dreamer(WorldModel):
             error = decoder(z) - window.get(key).to(z.dtype) / 255.0
             total = total + error.square().sum((-3, -2, -1)).mean()
         return total
-
-    def _dreamed(self, z: Tensor) -> tuple[Tensor, Tensor]:
-        """The next state (N, Z), drawn, and the actor's action (N, A), not clamped, in z (N, Z)."""
-        mean, std = self.action_distribution(z.detach())
-        action = mean + std * torch.randn_like(mean)
-        return frozen(self.rssm, z, action.clamp(-1.0, 1.0)), action
-
-    def _imagine(
-        self, z: Tensor, dreamed: Callable[[Tensor], tuple[Tensor, Tensor]]
-    ) -> tuple[Tensor, Tensor]:
-        """States (K+1, N, Z) and actions (K, N, A), not clamped, of the actor from z (N, Z).
-
-        With `actor_gradient=dynamics` they have gradients to the actor, through nothing but its actions.
-        """
-        states, actions = [z], []
-        with torch.set_grad_enabled(self.actor_gradient == "dynamics" and torch.is_grad_enabled()):
-            for _ in range(self.imagination):
-                after, action = dreamed(states[-1])
-                states.append(after)
-                actions.append(action)
-            return torch.stack(states), torch.stack(actions)
-
-    def _imagined_returns(self, imagined: Tensor, begun: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """λ-returns, values and weights (K, N, 1) of states (K+1, N, Z): the discounted chance to get there.
-
-        Args:
-            begun: (N, 1), 0 where the first state had ended its episode.
-        """
-        reward = self.two_hot.decode(frozen(self.reward_head, imagined[1:]))
-        value = self.two_hot.decode(frozen(self.critic, imagined))
-        going_on = torch.ones_like(reward)
-        if self.termination_head is not None:
-            going_on = torch.sigmoid(-frozen(self.termination_head, imagined[1:]))
-        returns = lambda_returns(
-            reward, going_on, value[1:], discount=self.discount, decay=self.return_lambda
-        )
-        weight = torch.cat((begun.unsqueeze(0), self.discount * going_on[:-1])).cumprod(0)
-        return returns, value[:-1], weight
-
-    def _policy_loss(
-        self, z: Tensor, actions: Tensor, returns: Tensor, value: Tensor, weight: Tensor
-    ) -> tuple[Tensor, Tensor]:
-        """Loss (REINFORCE with the critic as baseline, or returns themselves) and mean entropy [nat] of the actor."""
-        mean, std = self.action_distribution(z)
-        normal = torch.distributions.Normal(mean, std, validate_args=False)
-        entropy = normal.entropy().sum(-1, keepdim=True)
-        gain = self.scale(returns - value)
-        if self.actor_gradient == "reinforce":
-            gain = gain * normal.log_prob(actions).sum(-1, keepdim=True)
-        return -(weight * (gain + self.entropy_coef * entropy)).mean(), entropy.mean()
-
-    def _value_loss(self, z: Tensor, returns: Tensor) -> Tensor:
-        """Cross-entropy (..., 1) of the critic in z (..., Z) with returns, and with what the slow critic says."""
-        logits = self.critic(z)
-        with torch.no_grad():
-            slow = self.two_hot.decode(self.slow_critic(z))
-        return self.two_hot.loss(logits, returns) + self.two_hot.loss(logits, slow)
