@@ -38,6 +38,7 @@ class ActorCritic(WorldModel):
     scale: RunningScale
     keep: Tensor
     actor_gradient: Literal["reinforce", "dynamics"]
+    actor_critic_lr_scale: float
     imagination: int
     discount: float
     return_lambda: float
@@ -64,8 +65,9 @@ class ActorCritic(WorldModel):
         actor, critic = list(self.actor.parameters()), list(self.critic.parameters())
         apart = {id(parameter) for parameter in (*actor, *critic, *self.slow_critic.parameters())}
         model = [parameter for parameter in self.parameters() if id(parameter) not in apart]
-        groups = {"model": model, "policy": actor, "value": critic}
-        return [{"name": name, "clip": name, "params": group, "lr": lr} for name, group in groups.items()]
+        slower = lr * self.actor_critic_lr_scale
+        groups = (("model", model, lr), ("policy", actor, slower), ("value", critic, slower))
+        return [{"name": name, "clip": name, "params": group, "lr": rate} for name, group, rate in groups]
 
     def after_update(self) -> None:
         """Move the slow critic by `tau`; call once after each optimiser step."""

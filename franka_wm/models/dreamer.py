@@ -72,6 +72,7 @@ class Dreamer(ActorCritic):
         std_min, std_max: bounds of the actor's standard deviation.
         actor_gradient: "reinforce", that of advantages, as published; "dynamics", that of the returns themselves,
             back through rewards, critic and imagined steps (DreamerV1, arXiv:1912.01603).
+        actor_critic_lr_scale: learning rate of actor and critic relative to the model's.
         tau, scale_tau: how far the slow critic and the scale of returns move at each update.
 
     Raises:
@@ -86,6 +87,7 @@ class Dreamer(ActorCritic):
             ("free_nats", "dynamics_coef", "representation_coef", "decoder_coef", "reward_coef"), COEFFICIENT
         ),
         **dict.fromkeys(("termination_coef", "replay_value_coef", "entropy_coef"), COEFFICIENT),
+        "actor_critic_lr_scale": COEFFICIENT,
         **dict.fromkeys(("discount", "unimix"), Bounds(least=0, below=1)),
         **dict.fromkeys(("tau", "scale_tau"), Bounds(above=0, most=1)),
         **dict.fromkeys(("std_min", "std_max"), Bounds(above=0, most=1e6)),
@@ -127,6 +129,7 @@ class Dreamer(ActorCritic):
         std_min: float = 0.1,
         std_max: float = 1.0,
         actor_gradient: Literal["reinforce", "dynamics"] = "reinforce",
+        actor_critic_lr_scale: float = 1.0,
         tau: float = 0.02,
         scale_tau: float = 0.01,
     ) -> None:
@@ -143,6 +146,7 @@ class Dreamer(ActorCritic):
         self.termination_coef, self.replay_value_coef = termination_coef, replay_value_coef
         self.imagination, self.return_lambda, self.entropy_coef = imagination, return_lambda, entropy_coef
         self.std_min, self.std_max, self.actor_gradient = std_min, std_max, actor_gradient
+        self.actor_critic_lr_scale = actor_critic_lr_scale
 
         deep, size = (hidden_dim,) * encoder_layers, self.vectors.size
         convolutions = {key: ConvEncoder(shape, channels=channels) for key, shape in self.image_sizes.items()}

@@ -28,13 +28,15 @@ def hidden_velocity(batch: int, horizon: int) -> TensorDict:
 
 
 @pytest.mark.slow
-def test_it_remembers_what_is_not_seen_and_learns_to_act():
+@pytest.mark.parametrize("actor_gradient", ["reinforce", "dynamics"])
+def test_it_remembers_what_is_not_seen_and_learns_to_act(actor_gradient):
     torch.manual_seed(0)
     model = make(
         "dreamer",
         observation_sizes={"state": 1},
         action_dim=1,
         discount=0.9,
+        actor_gradient=actor_gradient,
         **SIZES,
     )
     optimiser = torch.optim.AdamW(model.parameter_groups(2e-3), weight_decay=0.0)

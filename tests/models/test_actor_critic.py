@@ -1,0 +1,88 @@
+"""Which way the actor's gradient goes: by what actions paid, or back through the model that imagined them."""
+
+import pytest
+import torch
+
+from franka_wm.models.dreamer import Dreamer
+
+STATES, STEPS = 6, 4
+"""That imagination begins in, and how far it goes."""
+
+
+def small(actor_gradient: str) -> Dreamer:
+    torch.manual_seed(0)
+    model = Dreamer(
+        observation_sizes={"state": 3}, action_dim=2, discount=0.8, return_lambda=0.7, deter_dim=16, hidden_dim=16,
+        codes=3, classes=4, blocks=2, encoder_layers=2, bins=21, imagination=STEPS, value_low=-4.0, value_high=4.0,
+        terminates=True, entropy_coef=0.3, actor_gradient=actor_gradient,
+    )  # fmt: skip
+    with torch.no_grad():
+        for head in (model.reward_head, model.critic, model.slow_critic, model.termination_head, model.actor):
+            assert head is not None
+            head[-1].weight.normal_(std=0.5)
+    return model.eval()
+
+
+def policy_loss(model: Dreamer) -> tuple[torch.Tensor, torch.Tensor]:
+    """Loss of the actor, and what it imagined, with the same noise at each call."""
+    torch.manual_seed(1)
+    imagined, actions = model._imagine(torch.randn(STATES, model.latent_dim), model._dreamed)
+    return model._actor_critic_loss(imagined, actions, torch.ones(STATES, 1))[0], imagined
+
+
+def reached(model: Dreamer) -> set[str]:
+    return {name.split(".")[0] for name, p in model.named_parameters() if p.grad is not None and p.grad.any()}
+
+
+@pytest.mark.parametrize("actor_gradient", ["reinforce", "dynamics"])
+def test_the_actors_loss_trains_the_actor_alone(actor_gradient):
+    model = small(actor_gradient)
+    policy_loss(model)[0].backward()
+    assert reached(model) == {"actor"}
+
+
+def test_the_gradient_of_returns_goes_back_through_imagined_steps_to_the_actions():
+    model = small("dynamics")
+    loss, imagined = policy_loss(model)
+    loss.backward()
+    found = [p.grad.clone() for p in model.actor.parameters() if p.grad is not None]
+    model.zero_grad()
+
+    # The same trajectories, written out, through a model that is not held.
+    torch.manual_seed(1)
+    states, spread = [torch.randn(STATES, model.latent_dim)], []
+    for _ in range(STEPS):
+        mean, std = model.action_distribution(states[-1].detach())
+        spread.append(std)
+        action = (mean + std * torch.randn_like(mean)).clamp(-1.0, 1.0)
+        states.append(model.rssm.next(states[-1], action, sample=True))
+    torch.testing.assert_close(torch.stack(states), imagined)
+    returns, weights = [model.value(states[-1])], [torch.ones(STATES, 1)]
+    for z in reversed(states[1:]):
+        going_on = 1.0 - model.termination_head(z).sigmoid()  # type: ignore[misc]
+        ahead = 0.3 * model.value(z) + 0.7 * returns[0]
+        returns.insert(0, model.arrival_reward(z) + 0.8 * going_on * ahead)
+    for z in states[1:-1]:
+        weights.append(weights[-1] * 0.8 * (1.0 - model.termination_head(z).sigmoid()))  # type: ignore[misc]
+    entropy = [(0.5 + 0.5 * torch.log(2.0 * torch.pi * std.square())).sum(-1, keepdim=True) for std in spread]
+    plain = [
+        -w.detach() * (r - model.value(z).detach() + 0.3 * e)
+        for w, r, z, e in zip(weights, returns, states[:-1], entropy, strict=False)
+    ]
+    torch.testing.assert_close(loss, expected := torch.stack(plain).mean())
+    expected.backward()
+    for mine, theirs in zip(found, model.actor.parameters(), strict=True):
+        torch.testing.assert_close(mine, theirs.grad)
+    assert {"rssm", "reward_head", "critic"} <= reached(model)  # so that they were held, above
+
+
+def test_what_paid_more_raises_the_odds_without_a_gradient_of_the_model():
+    model = small("reinforce")
+    assert not policy_loss(model)[1].requires_grad
+    assert policy_loss(small("dynamics"))[1].requires_grad
+
+
+def test_nothing_is_kept_for_gradients_where_none_is_asked_for():
+    with torch.no_grad():
+        loss, imagined = policy_loss(small("dynamics"))
+    assert not loss.requires_grad and not imagined.requires_grad
