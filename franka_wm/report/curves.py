@@ -306,13 +306,12 @@ def _leaf(key: str) -> str:
 
 
 def _short(key: str) -> str:
-    """``loss_value`` → ``value``; ``grad_norm_model`` → ``gradient, model``."""
+    """``train/loss_value`` → ``value``; ``validation/loss_value`` → ``value, validation``; see `_loss_keys`."""
     leaf = _leaf(key)
     if leaf.startswith("grad_norm"):
         return f"gradient, {leaf[9:].strip('_')}" if leaf[9:].strip("_") else "gradient"
-    if leaf.startswith("loss"):
-        return leaf[4:].strip("_") or key
-    return leaf.replace("_", " ")
+    name = leaf[4:].strip("_") or "loss" if leaf.startswith("loss") else leaf.replace("_", " ")
+    return f"{name}, validation" if key.startswith("validation/") else name
 
 
 def _keys(rows: Rows, leaf: str) -> list[str]:

@@ -1,25 +1,28 @@
 """Which way the actor's gradient goes: by what actions paid, or back through the model that imagined them."""
 
+from typing import Any
+
 import pytest
 import torch
 
+from franka_wm.errors import UserError
 from franka_wm.models.dreamer import Dreamer
 
 STATES, STEPS = 6, 4
 """That imagination begins in, and how far it goes."""
 
 
-def small(actor_gradient: str) -> Dreamer:
+def small(actor_gradient: Any, **overrides: Any) -> Dreamer:
     torch.manual_seed(0)
     model = Dreamer(
         observation_sizes={"state": 3}, action_dim=2, discount=0.8, return_lambda=0.7, deter_dim=16, hidden_dim=16,
         codes=3, classes=4, blocks=2, encoder_layers=2, bins=21, imagination=STEPS, value_low=-4.0, value_high=4.0,
-        terminates=True, entropy_coef=0.3, actor_gradient=actor_gradient,
+        terminates=True, entropy_coef=0.3, actor_gradient=actor_gradient, **overrides,
     )  # fmt: skip
     with torch.no_grad():
         for head in (model.reward_head, model.critic, model.slow_critic, model.termination_head, model.actor):
             assert head is not None
-            head[-1].weight.normal_(std=0.5)
+            head[-1].weight.normal_(std=0.5)  # pyright: ignore[reportIndexIssue]
     return model.eval()
 
 
@@ -86,3 +89,14 @@ def test_nothing_is_kept_for_gradients_where_none_is_asked_for():
     with torch.no_grad():
         loss, imagined = policy_loss(small("dynamics"))
     assert not loss.requires_grad and not imagined.requires_grad
+
+
+def test_actor_and_critic_have_a_learning_rate_of_their_own():
+    model = small("dynamics", actor_critic_lr_scale=0.3)
+    rates = {group["name"]: group["lr"] for group in model.parameter_groups(1e-3)}
+    assert rates == {"model": 1e-3, "policy": pytest.approx(3e-4), "value": pytest.approx(3e-4)}
+
+
+def test_a_gradient_that_there_is_not_is_refused():
+    with pytest.raises(UserError, match=r"actor_gradient='straight'.*reinforce.*dynamics"):
+        small("straight")

@@ -388,3 +388,10 @@ def test_one_of_several_tasks_success_is_in_percent_of_its_episodes() -> None:
     rows = [{"env_steps": k, "eval/planner/success_push": 0.1 * k} for k in range(1, 4)]
     axes = seeds_figure({"a": [rows]}, "eval/planner/success_push").axes[0]
     assert axes.get_ylim() == (-3, 103) and axes.lines[0].get_ydata()[-1] == pytest.approx(30)
+
+
+def test_losses_of_recorded_data_say_which_were_held_out():
+    row = {"train/loss": 1.0, "train/loss_policy": 2.0, "validation/loss": 3.0, "validation/loss_policy": 4.0}
+    figure = panel_figure([{"updates": 1, **row}, {"updates": 2, **row}], "losses", x="updates")
+    drawn = {label: y[0] for label, (_, y) in lines(figure).items()}
+    assert drawn == {"loss": 1.0, "policy": 2.0, "loss, validation": 3.0, "policy, validation": 4.0}
