@@ -12,7 +12,7 @@ from franka_wm.errors import UserError
 from franka_wm.evaluation.results import SHOWN, Result
 from franka_wm.report import style
 from franka_wm.report.bars import bars_figure
-from franka_wm.report.curves import panels, seeds_figure
+from franka_wm.report.curves import TASK, panels, seeds_figure
 from franka_wm.report.document import (
     Section,
     cards,
@@ -156,6 +156,8 @@ def _results(runs: Mapping[str, RunFiles]) -> str:
     longest = max(filter(math.isfinite, highs), default=0.0)
     for policy in sorted(policies, key=lambda name: SHOWN.index(name) if name in SHOWN else len(SHOWN)):
         having = {name: run.policies[policy] for name, run in runs.items() if policy in run.policies}
+        if policy not in SHOWN:
+            having = _once(having)
         tables = [
             table(Table(["run", *found.header[1:]], found.rows))
             for found in evaluation_tables(having)
@@ -186,6 +188,14 @@ def _results(runs: Mapping[str, RunFiles]) -> str:
             )
         body += text + cards(drawn)
     return body + folded("Baselines", rest) + _measured(runs)
+
+
+def _once(values: Mapping[str, Mapping[str, Any]]) -> dict[str, Mapping[str, Any]]:
+    """Equal numbers once, after the names of all runs that have them: a baseline is the same on the same episodes."""
+    names: dict[str, list[str]] = {}
+    for name, numbers in values.items():
+        names.setdefault(json.dumps(numbers, sort_keys=True, default=str), []).append(name)
+    return {", ".join(same): values[same[0]] for same in names.values()}
 
 
 _OTHERWISE = "planned with"
@@ -223,7 +233,8 @@ def _curves(groups: Mapping[str, Mapping[str, RunFiles]]) -> str:
         return ""
     found = {key for row in logged for key in row}
     drawn = []
-    for key in [_best(found, panel) for panel in panels(logged)] + ["loss"]:
+    shown = [panel for panel in panels(logged) if not panel.startswith(TASK)]  # those are among the tasks
+    for key in [_best(found, panel) for panel in shown] + ["loss"]:
         if key in found:
             who = "" if key.count("/") < 2 else f"Of {style.policy_name(key.split('/')[1])}. "
             many = any(len(group) > 1 for group in groups.values())

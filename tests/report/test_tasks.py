@@ -182,3 +182,21 @@ def test_what_was_planned_otherwise_has_a_column_of_its_own() -> None:
     table = tasks_table([one, *others])
     assert table is not None and table.header == ["task", "tdmpc2", "tdmpc2, planner=cem"]
     assert table.rows == [["push", "0: 90 %; 1: 70 %", "50 %"]]
+
+
+def test_a_baseline_that_is_the_same_in_all_runs_is_listed_once() -> None:
+    runs = [run("push", name, {"planner": success(0.5), "noop": success(0.25)}) for name in "ab"]
+    page = compare_page(runs)
+    baselines = page.split("Baselines")[1].split("</details>")[0]
+    assert "push-a, push-b" in baselines and baselines.count(">25<") == 1
+    runs[1] = run("push", "b", {"planner": success(0.5), "noop": success(0.125)})
+    assert "push-a, push-b" not in compare_page(runs).split("Baselines")[1].split("</details>")[0]
+
+
+def test_success_of_each_of_several_tasks_is_drawn_once() -> None:
+    rates = {"push": interval(0.6), "lift": interval(0.25)}
+    rows = [{"env_steps": k, "eval/planner/success_push": 0.1 * k} for k in (1, 2)]
+    one = replace(run("", "a", {"planner": success(0.4, task_success=rates)}), rows=rows)
+    page = compare_page([one, replace(one, folder=Path("again"), config={**one.config, "seed": 7})])
+    assert page.count("<title>success at push while training") == 1
+    assert "eval/planner/success_push of all runs" not in page
