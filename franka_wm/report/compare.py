@@ -12,7 +12,7 @@ from franka_wm.errors import UserError
 from franka_wm.evaluation.results import SHOWN, Result
 from franka_wm.report import style
 from franka_wm.report.bars import bars_figure
-from franka_wm.report.curves import TASK, panels, seeds_figure
+from franka_wm.report.curves import TASK, panels, quantity, seeds_figure
 from franka_wm.report.document import (
     Section,
     cards,
@@ -28,7 +28,7 @@ from franka_wm.report.horizon import horizon_figure
 from franka_wm.report.run import RunFiles, but_for_the_seed, malformed
 from franka_wm.report.spectra import spectrum_figure
 from franka_wm.report.table import Table, evaluation_tables, is_interval
-from franka_wm.report.tasks import family_of, success_over_time, tasks_table
+from franka_wm.report.tasks import family_of, success_over_time, task_of, tasks_table
 
 FILE = "compare.html"
 
@@ -223,30 +223,39 @@ def _measured(runs: Mapping[str, RunFiles]) -> str:
 
 
 def _curves(groups: Mapping[str, Mapping[str, RunFiles]]) -> str:
-    rows = {name: [run.rows for run in group.values()] for name, group in groups.items()}
-    logs = [one for runs in rows.values() for one in runs if one]
-    logged = [row for one in logs for row in one]
+    """Of each task apart: a return or a loss of one says nothing beside another's."""
+    logged = {name: group for name, group in groups.items() if any(run.rows for run in group.values())}
     without = [name for group in groups.values() for name, run in group.items() if not run.rows]
     note = paragraph(f"Without curves, since nothing was logged: {', '.join(without)}." if without else "")
-    x = _axis(logs)
+    x = _axis([run.rows for group in logged.values() for run in group.values() if run.rows])
     if x is None:
         return ""
+    tasks: dict[str, dict[str, list[list[dict[str, float]]]]] = {}
+    for name, group in logged.items():
+        task = task_of(next(iter(group.values())))
+        tasks.setdefault(task, {})[name] = [run.rows for run in group.values()]
+    drawn = [
+        one for task, rows in sorted(tasks.items()) for one in _drawn(rows, x, task if len(tasks) > 1 else "")
+    ]
+    return note + cards(*drawn)
+
+
+def _drawn(groups: Mapping[str, Sequence[Sequence[Mapping[str, float]]]], x: str, task: str) -> list[Markup]:
+    """Charts of what the groups logged; `task` is named where there are several."""
+    logged = [row for runs in groups.values() for rows in runs for row in rows]
     found = {key for row in logged for key in row}
-    drawn = []
     shown = [panel for panel in panels(logged) if not panel.startswith(TASK)]  # those are among the tasks
+    many = any(len(runs) > 1 for runs in groups.values())
+    bands = "Mean over runs that differ in their seed alone; bands from lowest to highest." if many else ""
+    drawn = []
     for key in [_best(found, panel) for panel in shown] + ["loss"]:
         if key in found:
             who = "" if key.count("/") < 2 else f"Of {style.policy_name(key.split('/')[1])}. "
-            many = any(len(group) > 1 for group in groups.values())
-            caption = who + (
-                "Mean over runs that differ in their seed alone; bands from lowest to highest."
-                if many
-                else ""
-            )
-            drawn.append(
-                chart(seeds_figure(rows, key, x=x), f"{key} of all runs while training", caption.strip())
-            )
-    return note + cards(*drawn)
+            title = f"{task}: {quantity(key.rsplit('/', 1)[-1])[0]}" if task else None
+            of = f"{key} of all runs of {task}" if task else f"{key} of all runs"
+            figure = seeds_figure(groups, key, x=x, title=title)
+            drawn.append(chart(figure, f"{of} while training", f"{who}{bands}".strip()))
+    return drawn
 
 
 def _axis(logs: Sequence[Sequence[Mapping[str, float]]]) -> str | None:

@@ -200,3 +200,14 @@ def test_success_of_each_of_several_tasks_is_drawn_once() -> None:
     page = compare_page([one, replace(one, folder=Path("again"), config={**one.config, "seed": 7})])
     assert page.count("<title>success at push while training") == 1
     assert "eval/planner/success_push of all runs" not in page
+
+
+def test_returns_of_different_tasks_have_charts_of_their_own() -> None:
+    rows = [{"env_steps": k, "eval/planner/return": 2.0 * k} for k in (1, 2)]
+    runs = [replace(run(task, "a", {"planner": success(0.5)}), rows=rows) for task in ("push", "lift")]
+    page = compare_page(runs)
+    for task in ("push", "lift"):
+        drawn = page.split(f"<title>eval/planner/return of all runs of {task} while")[1].split("</svg>")[0]
+        assert f"{task}: return of an episode" in drawn
+    runs[1] = replace(runs[0], folder=Path("again"))
+    assert compare_page(runs).count("<title>eval/planner/return of all runs while") == 1
