@@ -15,6 +15,7 @@ from franka_wm import conf
 from franka_wm.device import resolve_device
 from franka_wm.envs import Environment, FrankaConfig
 from franka_wm.errors import UserError
+from franka_wm.options import did_you_mean
 from franka_wm.planning.base import Planner
 from franka_wm.planning.mcts import MCTS
 from franka_wm.training import build
@@ -106,7 +107,8 @@ def preset_of(planner: str, settings: RunSettings) -> dict[str, Any]:
     """What ``planner=NAME`` would have been in this run."""
     there = sorted(file.stem for file in Path(conf.__file__).with_name("planner").glob("*.yaml"))
     if planner not in there:
-        raise UserError(f"planner={planner}: must be one of {', '.join(there)}")
+        near = did_you_mean(planner, there)
+        raise UserError(f"planner={planner}: must be one of {', '.join(there)}{near}")
     composed = conf.compose(f"planner={planner}", f"scale={settings.values['scale']}")
     found: Any = OmegaConf.to_container(composed.planner, resolve=True)
     return found

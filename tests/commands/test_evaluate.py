@@ -123,7 +123,10 @@ def test_a_checkpoint_plans_otherwise_than_its_run(run_folder: Path, tmp_path: P
         ),
         ("objective.policy_penalty=-1", "policy_penalty=-1: must be a finite number of at least 0"),
         ("planner.num_samples=0", "planner.num_samples=0: must be a whole number of at least 1"),
-        ("planner=cme", "planner=cme: must be one of cem, gradient, gumbel, icem, mcts, mppi"),
+        (
+            "planner=cemm",
+            "planner=cemm: must be one of cem, gradient, gumbel, icem, mcts, mppi; did you mean cem?",
+        ),
     ):
         assert cli.main(["evaluate", str(run_folder), f"out={tmp_path / 'wrong'}", *words, wrong]) == 1
         assert says in capsys.readouterr().err
