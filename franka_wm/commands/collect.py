@@ -253,6 +253,10 @@ def _simple(
     config = FrankaConfig.from_mapping(values)
     schema_for(config, format=format)  # refuses what cannot be stored before anything is built
     check_worlds("num_envs", worlds, cfg.device)
+    from franka_wm.policies.scripted import IKPolicy, NoopPolicy, SmoothRandomPolicy
+
+    if name == "ik":
+        IKPolicy.check(config)
     with announced(f"building {worlds} worlds; a machine's first start compiles kernels for a minute or two"):
         env = FrankaEnv(config, num_envs=worlds, device=cfg.device, seed=seed, urdf_path=urdf_path)
     cfg.env.observations = values["observations"]
@@ -260,7 +264,6 @@ def _simple(
 
     from franka_wm.data.lerobot.collect import Source
     from franka_wm.policies.expert import ExpertPolicy
-    from franka_wm.policies.scripted import IKPolicy, NoopPolicy, SmoothRandomPolicy
     from franka_wm.seeding import derive_seed
 
     generator = torch.Generator(device=env.device).manual_seed(derive_seed("policies", seed, "collection"))

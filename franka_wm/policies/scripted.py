@@ -127,13 +127,22 @@ class IKPolicy(ScriptedPolicy):
 
     def __init__(self, kinematics: Kinematics, config: FrankaConfig):
         super().__init__()
+        self.check(config)
+        self.kinematics = kinematics
+        self.config = config
+
+    @staticmethod
+    def check(config: FrankaConfig) -> None:
+        """Refuse an arm with a gripper, before it is built.
+
+        Raises:
+            UserError: it has one.
+        """
         if config.has_gripper:
             raise UserError(
                 f"policy=ik: brings the tool to the goal and knows no gripper, which task={config.task} has; use "
                 "policy=expert"
             )
-        self.kinematics = kinematics
-        self.config = config
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         target = _joint_target(tensordict)
