@@ -79,8 +79,7 @@ class ActorCritic(WorldModel):
         Args:
             begun: (N, 1), 0 where the first state had ended its episode.
         """
-        with torch.set_grad_enabled(imagined.requires_grad):
-            reached, value, weight = self._imagined_returns(imagined, begun)
+        reached, value, weight = self._imagined_returns(imagined, begun)
         states, actions, value, weight = (x.detach() for x in (imagined[:-1], actions, value, weight))
         returns = reached.detach()
         if self.training:
@@ -141,10 +140,10 @@ class ActorCritic(WorldModel):
         """Loss (REINFORCE with the critic as baseline, or returns themselves) and mean entropy [nat] of the actor."""
         mean, std = self.action_distribution(z)
         normal = torch.distributions.Normal(mean, std, validate_args=False)
-        entropy = normal.entropy().sum(-1, keepdim=True)
         gain = self.scale(returns - value)
         if self.actor_gradient == "reinforce":
             gain = gain * normal.log_prob(actions).sum(-1, keepdim=True)
+        entropy = normal.entropy().sum(-1, keepdim=True)
         return -(weight * (gain + self.entropy_coef * entropy)).mean(), entropy.mean()
 
     def _value_loss(self, z: Tensor, returns: Tensor) -> Tensor:

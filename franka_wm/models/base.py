@@ -221,7 +221,7 @@ class WorldModel(nn.Module):
 
     parts_of_loss: ClassVar[tuple[str, ...]] = ()
     """Methods that `loss` calls through `calls` and that are compiled one by one: what runs side by side on a GPU must
-    not become one program. None: the loss is compiled as a whole."""
+    not become one program. A loss that takes no `parts` is compiled as a whole."""
 
     def calls(self, parts: Mapping[str, Callable[..., Any]] | None) -> dict[str, Callable[..., Any]]:
         """The methods that `parts_of_loss` names, or what `parts` has instead of them."""

@@ -12,7 +12,7 @@ from franka_wm.errors import UserError
 from franka_wm.evaluation.results import SHOWN, Result
 from franka_wm.report import style
 from franka_wm.report.bars import bars_figure
-from franka_wm.report.curves import TASK, panels, quantity, seeds_figure
+from franka_wm.report.curves import panels, quantity, seeds_figure
 from franka_wm.report.document import (
     Section,
     cards,
@@ -234,21 +234,24 @@ def _curves(groups: Mapping[str, Mapping[str, RunFiles]]) -> str:
     for name, group in logged.items():
         task = task_of(next(iter(group.values())))
         tasks.setdefault(task, {})[name] = [run.rows for run in group.values()]
-    drawn = [
-        one for task, rows in sorted(tasks.items()) for one in _drawn(rows, x, task if len(tasks) > 1 else "")
-    ]
+    runs = [run for group in logged.values() for run in group.values()]
+    told = {key for run in runs for key in success_over_time(run).values() if not key.endswith("/success")}
+    drawn = []
+    for task, rows in sorted(tasks.items()):
+        drawn += _drawn(rows, x, task if len(tasks) > 1 else "", told)
     return note + cards(*drawn)
 
 
-def _drawn(groups: Mapping[str, Sequence[Sequence[Mapping[str, float]]]], x: str, task: str) -> list[Markup]:
-    """Charts of what the groups logged; `task` is named where there are several."""
+def _drawn(
+    groups: Mapping[str, Sequence[Sequence[Mapping[str, float]]]], x: str, task: str, told: set[str]
+) -> list[Markup]:
+    """Charts of what the groups logged, but for the keys `told`; `task` is named where there are several."""
     logged = [row for runs in groups.values() for rows in runs for row in rows]
-    found = {key for row in logged for key in row}
-    shown = [panel for panel in panels(logged) if not panel.startswith(TASK)]  # those are among the tasks
+    found = {key for row in logged for key in row} - told
     many = any(len(runs) > 1 for runs in groups.values())
     bands = "Mean over runs that differ in their seed alone; bands from lowest to highest." if many else ""
     drawn = []
-    for key in [_best(found, panel) for panel in shown] + ["loss"]:
+    for key in [_best(found, panel) for panel in panels(logged)] + ["loss"]:
         if key in found:
             who = "" if key.count("/") < 2 else f"Of {style.policy_name(key.split('/')[1])}. "
             title = f"{task}: {quantity(key.rsplit('/', 1)[-1])[0]}" if task else None

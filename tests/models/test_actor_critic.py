@@ -7,6 +7,7 @@ import torch
 
 from franka_wm.errors import UserError
 from franka_wm.models.dreamer import Dreamer
+from small_tdmpc2 import windows
 
 STATES, STEPS = 6, 4
 """That imagination begins in, and how far it goes."""
@@ -44,8 +45,19 @@ def test_the_actors_loss_trains_the_actor_alone(actor_gradient):
     assert reached(model) == {"actor"}
 
 
+@pytest.mark.parametrize("actor_gradient", ["reinforce", "dynamics"])
+def test_imagination_teaches_the_model_nothing(actor_gradient):
+    """Of the whole loss, where the model's own parts weigh nothing."""
+    nothing = ("dynamics", "representation", "decoder", "reward", "termination", "replay_value")
+    model = small(actor_gradient, **{f"{name}_coef": 0.0 for name in nothing})
+    batch = windows(batch=3, horizon=4).exclude("joint_target", ("next", "joint_target"))
+    model.loss(batch)["loss"].backward()
+    assert reached(model) == {"actor", "critic"}
+
+
 def test_the_gradient_of_returns_goes_back_through_imagined_steps_to_the_actions():
     model = small("dynamics")
+    model.scale.value.fill_(3.0)
     loss, imagined = policy_loss(model)
     loss.backward()
     found = [p.grad.clone() for p in model.actor.parameters() if p.grad is not None]
@@ -69,7 +81,7 @@ def test_the_gradient_of_returns_goes_back_through_imagined_steps_to_the_actions
         weights.append(weights[-1] * 0.8 * (1.0 - model.termination_head(z).sigmoid()))  # type: ignore[misc]
     entropy = [(0.5 + 0.5 * torch.log(2.0 * torch.pi * std.square())).sum(-1, keepdim=True) for std in spread]
     plain = [
-        -w.detach() * (r - model.value(z).detach() + 0.3 * e)
+        -w.detach() * ((r - model.value(z).detach()) / 3.0 + 0.3 * e)
         for w, r, z, e in zip(weights, returns, states[:-1], entropy, strict=False)
     ]
     torch.testing.assert_close(loss, expected := torch.stack(plain).mean())
@@ -79,7 +91,7 @@ def test_the_gradient_of_returns_goes_back_through_imagined_steps_to_the_actions
     assert {"rssm", "reward_head", "critic"} <= reached(model)  # so that they were held, above
 
 
-def test_what_paid_more_raises_the_odds_without_a_gradient_of_the_model():
+def test_only_dynamics_keeps_gradients_of_imagination():
     model = small("reinforce")
     assert not policy_loss(model)[1].requires_grad
     assert policy_loss(small("dynamics"))[1].requires_grad

@@ -1,59 +1,66 @@
-"""A loss compiled part by part is the loss, and leaves no part out."""
+"""Dreamer's loss compiled part by part is its loss; TD-MPC2's: tests/training/test_learner.py."""
 
 from collections import Counter
+from functools import partial
 from typing import Any
 
 import pytest
 import torch
 
 from franka_wm.models import make
-from franka_wm.models.base import WorldModel
-from franka_wm.models.tdmpc2 import TDMPC2
+from franka_wm.models.dreamer import Dreamer
 from small_tdmpc2 import windows
 
-FAMILIES = {
-    "tdmpc2": dict(latent_dim=16, hidden_dim=16, encoder_dim=16, num_q=2, bins=21),
-    "dreamer": dict(
-        deter_dim=16, hidden_dim=16, codes=3, classes=4, blocks=2, encoder_layers=2, imagination=4
-    ),
-}
 
-
-def small(family: str) -> WorldModel:
+def small(actor_gradient: str) -> Dreamer:
     torch.manual_seed(0)
-    sizes = {"state": 3, "joint_target": 2}
-    return make(family, observation_sizes=sizes, action_dim=2, discount=0.9, **FAMILIES[family]).eval()
+    model = make(
+        "dreamer", observation_sizes={"state": 3, "joint_target": 2}, action_dim=2, discount=0.9, deter_dim=16,
+        hidden_dim=16, codes=3, classes=4, blocks=2, encoder_layers=2, imagination=4, actor_gradient=actor_gradient,
+    )  # fmt: skip
+    assert isinstance(model, Dreamer)
+    with torch.no_grad():
+        for head in (model.reward_head, model.critic):
+            head[-1].weight.normal_(std=0.5)
+    return model.eval()
 
 
-@pytest.mark.parametrize("family", FAMILIES)
-def test_each_part_is_compiled_and_called(family, monkeypatch):
-    model, calls = small(family), Counter()
+@pytest.mark.parametrize("actor_gradient", ["reinforce", "dynamics"])
+def test_each_part_is_one_program_and_the_numbers_are_the_same(actor_gradient, monkeypatch):
+    """Without a break of the graph, which a captured update could not replay."""
+    calls, whole = Counter(), partial(torch.compile, backend="eager", fullgraph=True)
 
     def compile(part: Any) -> Any:
+        program = whole(part)
+
         def counted(*given: Any) -> Any:
             calls[part.__name__] += 1
-            return part(*given)
+            return program(*given)
 
         return counted
 
     monkeypatch.setattr(torch, "compile", compile)
-    batch = windows(batch=3, horizon=4)
-    torch.manual_seed(1)
-    plain = model.loss(batch)
-    torch.manual_seed(1)
-    compiled = model.compiled_loss()(batch)
-    assert set(calls) == set(model.parts_of_loss) and model.parts_of_loss
-    for name, value in plain.items():
-        torch.testing.assert_close(compiled[name], value)
+    batch, found = windows(batch=3, horizon=4), []
+    for compiled in (False, True):
+        model = small(actor_gradient)
+        torch.manual_seed(1)
+        losses = (model.compiled_loss() if compiled else model.loss)(batch)
+        losses["loss"].backward()
+        grads = {f"of {name}": p.grad for name, p in model.named_parameters() if p.grad is not None}
+        found.append({**losses.detach(), **grads})
+    assert calls["_seen"] == 5 and calls["_dreamed"] == 4  # steps of a window and of imagination
+    assert set(calls) == set(model.parts_of_loss)
+    assert found[0].keys() == found[1].keys()
+    for name, value in found[0].items():
+        torch.testing.assert_close(found[1][name], value, msg=lambda text, name=name: f"{name}: {text}")
 
 
 def test_a_subclass_with_a_loss_of_its_own_is_compiled_whole(monkeypatch):
-    class Other(TDMPC2):
+    class Other(Dreamer):
         def loss(self, batch):  # type: ignore[override]
             return super().loss(batch)
 
     compiled = []
     monkeypatch.setattr(torch, "compile", lambda part: compiled.append(part.__qualname__) or part)
-    options = FAMILIES["tdmpc2"]
-    Other(observation_sizes={"state": 3}, action_dim=2, discount=0.9, **options).compiled_loss()  # type: ignore[arg-type]
+    Other(observation_sizes={"state": 3}, action_dim=2).compiled_loss()
     assert [name.split(".")[-2:] for name in compiled] == [["Other", "loss"]]

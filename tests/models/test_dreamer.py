@@ -14,7 +14,6 @@ from franka_wm.models.returns import lambda_returns
 from franka_wm.models.rssm import divergence
 from franka_wm.models.windows import window_of
 from franka_wm.planning import RewardPlusValue
-from franka_wm.training.learner import Learner
 from small_tdmpc2 import windows
 
 SMALL = dict(
@@ -431,21 +430,3 @@ def test_statistics_standardise_what_is_encoded_and_reconstructed():
     torch.testing.assert_close(model.encode(observation), other.encode(ones))
     z = torch.randn(1, model.latent_dim)
     torch.testing.assert_close(model._reconstruction(z, observation), other._reconstruction(z, ones))
-
-
-@pytest.mark.gpu
-@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
-def test_a_captured_update_is_the_eager_one():
-    """The whole update as one CUDA graph, with the noise of the default generator."""
-    losses = []
-    for capture in (False, True):
-        torch.manual_seed(0)
-        learner = Learner(randomise(small()).cuda(), lr=1e-4, capture=capture)
-        batches = [windows(batch=16, horizon=6).cuda() for _ in range(8)]
-        for k, batch in enumerate(batches):
-            torch.manual_seed(k)
-            learner.update(batch)
-        losses.append(learner.metrics())
-        assert (learner._graph is not None) is capture
-    for name, value in losses[0].items():
-        assert losses[1][name] == pytest.approx(value, rel=0.02, abs=1e-3), name

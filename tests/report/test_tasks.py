@@ -200,6 +200,10 @@ def test_success_of_each_of_several_tasks_is_drawn_once() -> None:
     page = compare_page([one, replace(one, folder=Path("again"), config={**one.config, "seed": 7})])
     assert page.count("<title>success at push while training") == 1
     assert "eval/planner/success_push of all runs" not in page
+    still = [
+        replace(one, folder=Path(name), results=[]) for name in "ab"
+    ]  # running yet: without a table of tasks
+    assert "<title>eval/planner/success_push of all runs while training" in compare_page(still)
 
 
 def test_returns_of_different_tasks_have_charts_of_their_own() -> None:

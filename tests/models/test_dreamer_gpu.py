@@ -1,0 +1,81 @@
+"""DreamerV3 on a GPU: the update as one CUDA graph, and imagination beside the model's losses."""
+
+import pytest
+import torch
+
+from franka_wm.models import actor_critic, dreamer, make
+from franka_wm.models.dreamer import Dreamer
+from franka_wm.training.learner import Learner
+from small_tdmpc2 import windows
+
+pytestmark = [
+    pytest.mark.gpu,
+    pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device"),
+    pytest.mark.parametrize("actor_gradient", ["reinforce", "dynamics"]),
+]
+
+
+def small(actor_gradient: str, **sizes: int) -> Dreamer:
+    torch.manual_seed(0)
+    sizes = dict(deter_dim=16, hidden_dim=16, codes=3, classes=4, blocks=2, bins=41, imagination=4) | sizes
+    model = make(
+        "dreamer", observation_sizes={"state": 3, "joint_target": 2}, action_dim=2, discount=0.9, encoder_layers=2,
+        actor_gradient=actor_gradient, **sizes,
+    )  # fmt: skip
+    assert isinstance(model, Dreamer) and isinstance(model, actor_critic.ActorCritic)
+    with torch.no_grad():
+        for head in (model.reward_head, model.critic, model.slow_critic):
+            head[-1].weight.normal_(std=0.5)  # pyright: ignore[reportIndexIssue]
+    return model.cuda()
+
+
+@pytest.mark.parametrize("compile", [False, True])
+def test_a_captured_update_is_the_eager_one(actor_gradient, compile):
+    """With the noise of the default generator."""
+    losses = []
+    for capture in (False, True):
+        learner = Learner(small(actor_gradient), lr=1e-4, capture=capture, compile=compile and capture)
+        torch.manual_seed(0)
+        batches = [windows(batch=16, horizon=6).cuda() for _ in range(8)]
+        for k, batch in enumerate(batches):
+            torch.manual_seed(k)
+            learner.update(batch)
+        losses.append(learner.metrics())
+        assert (learner._graph is not None) is capture
+    # Compiled code draws other noise.
+    rel, abs = (0.3, 0.1) if compile else (0.02, 1e-3)
+    for name, value in losses[0].items():
+        assert losses[1][name] == pytest.approx(value, rel=rel, abs=abs), name
+
+
+def test_side_by_side_is_as_one_after_the_other(actor_gradient, monkeypatch):
+    """Losses and gradients do not depend on the streams that they are computed on."""
+
+    class Plainly:
+        def __init__(self, *inputs, lane=0): ...
+
+        def __enter__(self):
+            return self
+
+        def __exit__(self, *error): ...
+
+        def join(self, *outputs): ...
+
+    model = small(actor_gradient, deter_dim=512, hidden_dim=256, codes=16, classes=16, imagination=15).eval()
+    batch = windows(batch=64, horizon=16).cuda()
+
+    def results():
+        found = []
+        for seed in range(10):
+            torch.manual_seed(seed)
+            model.zero_grad()
+            loss = model.loss(batch)["loss"]
+            loss.backward()
+            grads = [p.grad.clone() for p in model.parameters() if p.grad is not None]
+            found += [loss.detach().clone(), *grads]
+        return found
+
+    beside = results()
+    monkeypatch.setattr(dreamer, "side_stream", Plainly)
+    for found, expected in zip(beside, results(), strict=True):
+        torch.testing.assert_close(found, expected, rtol=1e-3, atol=1e-5)
