@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import Literal
 
 import torch
@@ -96,15 +95,7 @@ class ActorCritic(WorldModel):
         )
         return self._value_loss(z[:-1], returns).mean()
 
-    def _dreamed(self, z: Tensor) -> tuple[Tensor, Tensor]:
-        """The next state (N, Z), drawn, and the actor's action (N, A), not clamped, in z (N, Z)."""
-        mean, std = self.action_distribution(z.detach())
-        action = mean + std * torch.randn_like(mean)
-        return frozen(self.rssm, z, action.clamp(-1.0, 1.0)), action
-
-    def _imagine(
-        self, z: Tensor, dreamed: Callable[[Tensor], tuple[Tensor, Tensor]]
-    ) -> tuple[Tensor, Tensor]:
+    def _imagine(self, z: Tensor) -> tuple[Tensor, Tensor]:
         """States (K+1, N, Z) and actions (K, N, A), not clamped, of the actor from z (N, Z).
 
         With `actor_gradient=dynamics` they have gradients to the actor, through nothing but its actions.
@@ -112,9 +103,9 @@ class ActorCritic(WorldModel):
         states, actions = [z], []
         with torch.set_grad_enabled(self.actor_gradient == "dynamics" and torch.is_grad_enabled()):
             for _ in range(self.imagination):
-                after, action = dreamed(states[-1])
-                states.append(after)
-                actions.append(action)
+                mean, std = self.action_distribution(states[-1].detach())
+                actions.append(mean + std * torch.randn_like(mean))
+                states.append(frozen(self.rssm, states[-1], actions[-1].clamp(-1.0, 1.0)))
             return torch.stack(states), torch.stack(actions)
 
     def _imagined_returns(self, imagined: Tensor, begun: Tensor) -> tuple[Tensor, Tensor, Tensor]:

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import inspect
 import math
 from collections.abc import Callable, Mapping, Sequence
-from functools import partial
 from types import MappingProxyType
 from typing import Any, ClassVar
 
@@ -219,20 +217,9 @@ class WorldModel(nn.Module):
     def after_update(self) -> None:
         """Move slow copies of weights, after each optimiser step; there are none by default."""
 
-    parts_of_loss: ClassVar[tuple[str, ...]] = ()
-    """Methods that `loss` calls through `calls` and that are compiled one by one: what runs side by side on a GPU must
-    not become one program. A loss that takes no `parts` is compiled as a whole."""
-
-    def calls(self, parts: Mapping[str, Callable[..., Any]] | None) -> dict[str, Callable[..., Any]]:
-        """The methods that `parts_of_loss` names, or what `parts` has instead of them."""
-        return {name: getattr(self, name) for name in self.parts_of_loss} | dict(parts or {})
-
     def compiled_loss(self) -> Callable[[TensorDictBase], TensorDict]:
-        """`loss`, compiled by `torch.compile`, part by part where there are `parts_of_loss`."""
-        loss: Callable[..., TensorDict] = self.loss
-        if "parts" not in inspect.signature(loss).parameters:  # also of a subclass with a loss of its own
-            return torch.compile(loss)
-        return partial(loss, parts={name: torch.compile(getattr(self, name)) for name in self.parts_of_loss})
+        """`loss`, compiled by `torch.compile`."""
+        return torch.compile(self.loss)
 
     def rebuild_overrides(self) -> dict[str, Any]:
         """Constructor arguments that replace those which read other files or depend on the environment.

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from typing import Any, ClassVar, Literal
 
 import torch
@@ -18,7 +18,6 @@ from franka_wm.models.layers import TwoHotSymlog, symlog
 from franka_wm.models.normalizer import ObservationNormalizer
 from franka_wm.models.returns import RunningScale, discount_per_step, value_range
 from franka_wm.models.rssm import RSSM, divergence, network
-from franka_wm.models.streams import side_stream
 from franka_wm.models.vision import ConvDecoder, ConvEncoder
 from franka_wm.models.windows import check_windows, window_of
 from franka_wm.options import COEFFICIENT, DEPTH, FRACTION, POSITIVE, Bounds, with_defaults
@@ -231,11 +230,7 @@ class Dreamer(ActorCritic):
 
     # ------------------------------------------------------------------ training
 
-    parts_of_loss = ("_embed", "_seen", "_dreamed", "_model_loss", "_actor_critic_loss", "_replay_value_loss")
-
-    def loss(
-        self, batch: TensorDictBase, *, parts: Mapping[str, Callable[..., Any]] | None = None
-    ) -> TensorDict:
+    def loss(self, batch: TensorDictBase) -> TensorDict:
         """Losses of a batch of windows; call `backward` once on the entry `loss`.
 
         In training mode the running scale of returns is updated as well.
@@ -244,7 +239,6 @@ class Dreamer(ActorCritic):
             batch: batch size [B, H]: H contiguous transitions, all of one episode, with the observation keys,
                 `action` (B, H, A), and in `next` the observation keys, `reward` (B, H, 1) and `terminated`
                 (B, H, 1) bool.
-            parts: what to call instead of the methods that `parts_of_loss` names.
 
         Returns:
             batch size []: `loss` to differentiate, and detached: `loss_dynamics` and `loss_representation` [nat, not
@@ -257,23 +251,19 @@ class Dreamer(ActorCritic):
             ValueError: the batch size is not [B, H].
         """
         check_windows(batch)
-        call = self.calls(parts)
         # Time leads from here on: (H, B, ...).
         action, reward, terminated = (
             batch.get(key).transpose(0, 1) for key in ("action", ("next", "reward"), ("next", "terminated"))
         )
         window = window_of(batch, self.observation_keys).transpose(0, 1)
-        z, posterior = self._filter(call["_embed"](window), action, call["_seen"])  # (H+1, B, ...)
+        z, posterior = self._filter(self._embed(window), action)  # (H+1, B, ...)
+        model_loss, parts_of_model = self._model_loss(z, posterior, window, reward, terminated)
+        imagined, actions = self._imagine(z.detach().flatten(0, 1))
         begun = torch.cat((torch.ones_like(reward[:1]), (~terminated).to(reward.dtype)))
-        # Imagination needs nothing but where it begins: on CUDA it runs beside the model's losses.
-        with side_stream(start := z.detach(), begun) as imagination:
-            imagined, actions = self._imagine(start.flatten(0, 1), call["_dreamed"])
-            policy_loss, value_loss, entropy, returns, value = call["_actor_critic_loss"](
-                imagined, actions, begun.flatten(0, 1)
-            )
-        model_loss, parts_of_model = call["_model_loss"](z, posterior, window, reward, terminated)
-        imagination.join(policy_loss, value_loss, entropy, returns, value)
-        replay_value_loss = call["_replay_value_loss"](z, returns[0], reward, terminated)
+        policy_loss, value_loss, entropy, returns, value = self._actor_critic_loss(
+            imagined, actions, begun.flatten(0, 1)
+        )
+        replay_value_loss = self._replay_value_loss(z, returns[0], reward, terminated)
         metrics = {
             **parts_of_model,
             "loss_policy": policy_loss,
@@ -309,22 +299,14 @@ class Dreamer(ActorCritic):
     def _see(self, h: Tensor, embedded: Tensor, *, sample: bool) -> Tensor:
         return self.rssm.state(h, self.rssm.posterior(h, embedded), sample=sample)
 
-    def _seen(self, z: Tensor, action: Tensor, embedded: Tensor) -> tuple[Tensor, Tensor]:
-        """The state (B, Z), drawn, and its posterior after actions (B, A) in z (B, Z) led to features (B, E)."""
-        h = self.rssm.recur(z, action)
-        posterior = self.rssm.posterior(h, embedded)
-        return self.rssm.state(h, posterior, sample=True), posterior
-
-    def _filter(
-        self, embedded: Tensor, action: Tensor, seen: Callable[..., tuple[Tensor, Tensor]]
-    ) -> tuple[Tensor, Tensor]:
+    def _filter(self, embedded: Tensor, action: Tensor) -> tuple[Tensor, Tensor]:
         """States (H+1, B, Z) and posteriors (H+1, B, codes, classes) of features (H+1, B, E), actions (H, B, A)."""
-        z, nothing = self.rssm.nothing(embedded[0])
-        states, posteriors = [], []
-        for before, features in zip(torch.cat((nothing.unsqueeze(0), action)), embedded, strict=True):
-            z, posterior = seen(z, before, features)
-            states.append(z)
-            posteriors.append(posterior)
+        h, states, posteriors = self.rssm.begin(embedded[0]), [], []
+        for t in range(embedded.shape[0]):
+            if t:
+                h = self.rssm.recur(states[-1], action[t - 1])
+            posteriors.append(self.rssm.posterior(h, embedded[t]))
+            states.append(self.rssm.state(h, posteriors[-1], sample=True))
         return torch.stack(states), torch.stack(posteriors)
 
     def _model_loss(

@@ -63,13 +63,10 @@ class RSSM(nn.Module):
         self.prior_head = network(deter_dim, (hidden_dim, hidden_dim), codes * classes)
         self.posterior_head = network(deter_dim + embed_dim, (hidden_dim,), codes * classes)
 
-    def nothing(self, like: Tensor) -> tuple[Tensor, Tensor]:
-        """What is before an episode's first observation: z (..., size) and action (..., A) of zeros."""
-        return like.new_zeros(*like.shape[:-1], self.size), like.new_zeros(*like.shape[:-1], self.action_dim)
-
     def begin(self, like: Tensor) -> Tensor:
         """h (..., deter_dim) of an episode's first observation, for inputs `like` (..., anything)."""
-        return self.recur(*self.nothing(like))
+        nothing = like.new_zeros(*like.shape[:-1], self.size)
+        return self.recur(nothing, like.new_zeros(*like.shape[:-1], self.action_dim))
 
     def recur(self, z: Tensor, action: Tensor) -> Tensor:
         """The next h (..., deter_dim) after actions (..., A) in [-1, 1] in z (..., size)."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any, ClassVar, Literal
 
@@ -277,6 +278,7 @@ class TDMPC2(SimplicialWorldModel):
     # ------------------------------------------------------------------ training
 
     parts_of_loss = ("_encode_window", "_td_target", "_unroll", "_model_losses", "_policy_loss", "_metrics")
+    """Methods that `loss` calls, compiled one by one: what runs side by side on a GPU must not become one program."""
 
     def loss(
         self, batch: TensorDictBase, *, parts: Mapping[str, Callable[..., Any]] | None = None
@@ -305,7 +307,7 @@ class TDMPC2(SimplicialWorldModel):
             ValueError: the batch size is not [B, H].
         """
         check_windows(batch)
-        call = self.calls(parts)
+        call = {name: getattr(self, name) for name in self.parts_of_loss} | dict(parts or {})
         # Time leads from here on: (H, B, ...).
         action, reward, terminated = (
             batch.get(key).transpose(0, 1) for key in ("action", ("next", "reward"), ("next", "terminated"))
@@ -382,6 +384,14 @@ class TDMPC2(SimplicialWorldModel):
     def after_update(self) -> None:
         """Move the target Q-functions by `tau`; call once after each optimiser step."""
         self.q_ensemble.update_target(self.tau)
+
+    def compiled_loss(self) -> Callable[[TensorDictBase], TensorDict]:
+        """`loss` with each of `parts_of_loss` compiled."""
+        if type(self).loss is not TDMPC2.loss:  # a subclass with a loss of its own
+            return super().compiled_loss()
+        return partial(
+            self.loss, parts={name: torch.compile(getattr(self, name)) for name in self.parts_of_loss}
+        )
 
     # ------------------------------------------------------------------ pieces
 

@@ -30,7 +30,7 @@ def small(actor_gradient: Any, **overrides: Any) -> Dreamer:
 def policy_loss(model: Dreamer) -> tuple[torch.Tensor, torch.Tensor]:
     """Loss of the actor, and what it imagined, with the same noise at each call."""
     torch.manual_seed(1)
-    imagined, actions = model._imagine(torch.randn(STATES, model.latent_dim), model._dreamed)
+    imagined, actions = model._imagine(torch.randn(STATES, model.latent_dim))
     return model._actor_critic_loss(imagined, actions, torch.ones(STATES, 1))[0], imagined
 
 
@@ -112,3 +112,21 @@ def test_actor_and_critic_have_a_learning_rate_of_their_own():
 def test_a_gradient_that_there_is_not_is_refused():
     with pytest.raises(UserError, match=r"actor_gradient='straight'.*reinforce.*dynamics"):
         small("straight")
+
+
+@pytest.mark.parametrize("actor_gradient", ["reinforce", "dynamics"])
+def test_the_loss_compiles_as_one_graph(actor_gradient):
+    """A break of the graph would cost time on a GPU, and a wrong one numbers."""
+    batch = windows(batch=3, horizon=4).exclude("joint_target", ("next", "joint_target"))
+    found = []
+    for compiled in (False, True):
+        model = small(actor_gradient)
+        loss = torch.compile(model.loss, backend="eager", fullgraph=True) if compiled else model.loss
+        torch.manual_seed(1)
+        losses = loss(batch)
+        losses["loss"].backward()
+        grads = {f"of {name}": p.grad for name, p in model.named_parameters() if p.grad is not None}
+        found.append({**losses.detach(), **grads})
+    assert found[0].keys() == found[1].keys() and "of actor.0.0.weight" in found[0]
+    for name, value in found[0].items():
+        torch.testing.assert_close(found[1][name], value, msg=lambda text, name=name: f"{name}: {text}")
