@@ -33,7 +33,18 @@ NOT_AS_PUBLISHED = {
 
 
 @pytest.mark.parametrize(
-    "file", ["jepa", "vjepa", "lejepa", "lewm", "action_world_model", "tdmpc2_pixels", "dreamer", "dino_wm"]
+    "file",
+    [
+        "jepa",
+        "vjepa",
+        "lejepa",
+        "lewm",
+        "action_world_model",
+        "tdmpc2_pixels",
+        "dreamer",
+        "dreamer_pixels",
+        "dino_wm",
+    ],
 )
 def test_the_file_names_every_hyper_parameter_with_its_default(file):
     assert (FOLDER / "model" / f"{file}.yaml").read_text(encoding="utf-8").startswith("# ")

@@ -8,6 +8,7 @@ import pytest
 
 from benchmarks.results.metrics import goals_met, verdicts
 from benchmarks.results.rows import Row, Section, load_rows
+from franka_wm import conf
 from franka_wm.errors import UserError
 
 
@@ -107,3 +108,18 @@ def test_of_several_tasks_each_is_judged_by_its_worst_seed() -> None:
         ("worst seed ≥ 90 % of push", "90.0 %", True),
         ("worst seed ≥ 84 % of peg", "83.0 %", False),
     ]
+
+
+TRAINED = {
+    name: row
+    for name, row in load_rows().items()
+    if not row.script and "model.observations" in str(row.words)
+}
+
+
+@pytest.mark.parametrize("name", TRAINED)
+def test_a_rows_model_reads_images_that_its_arm_has(name) -> None:
+    cfg = conf.compose(*TRAINED[name].words)
+    images = [key for key in cfg.model.observations if key.startswith("pixels")]
+    there = ["pixels", *(f"pixels_{camera}" for camera in cfg.env.cameras[1:])]
+    assert images and set(images) <= set(there), (images, there)
