@@ -223,7 +223,7 @@ def _measured(runs: Mapping[str, RunFiles]) -> str:
 
 
 def _curves(groups: Mapping[str, Mapping[str, RunFiles]]) -> str:
-    """Of each task apart: a return or a loss of one says nothing beside another's."""
+    """Each task apart: a return or a loss of one says nothing beside that of another."""
     logged = {name: group for name, group in groups.items() if any(run.rows for run in group.values())}
     without = [name for group in groups.values() for name, run in group.items() if not run.rows]
     note = paragraph(f"Without curves, since nothing was logged: {', '.join(without)}." if without else "")
