@@ -29,7 +29,7 @@ from franka_wm import models
 from franka_wm.envs import FrankaConfig, FrankaEnv
 from franka_wm.planning import MPPI, RewardPlusValue
 from franka_wm.planning.mcts import MCTS
-from franka_wm.policies import PlannerPolicy
+from franka_wm.policies import PlannerPolicy, SearchPolicy
 from franka_wm.training.learner import Learner
 
 NOTES = {
@@ -87,7 +87,7 @@ def learning(seconds: float, *, compile: bool, precision: str) -> dict[str, floa
     return rows
 
 
-def searching_and_stepping(seconds: float) -> dict[str, float]:
+def searching_and_stepping(seconds: float, *, compile: bool) -> dict[str, float]:
     """What has one precision: moves of a tree search, steps of the arm."""
     rows = {}
     seen = TensorDict({"state": torch.randn(1, 27)}, batch_size=[1])
@@ -100,16 +100,10 @@ def searching_and_stepping(seconds: float) -> dict[str, float]:
         hidden_dim=256,
     ).eval()
     search = MCTS(num_actions=15, num_simulations=50)
-
-    @torch.no_grad()
-    def move(seen: TensorDict) -> torch.Tensor:
-        z = muzero.encode(seen)
-        logits, value = muzero.prediction(z)
-        return search.search(logits, value, z, muzero.recurrent, explore=False).get("action")
-
-    rows["MCTS moves, 50 simulations"] = rate(lambda: move(seen), seconds=seconds)
+    policy = SearchPolicy.for_model(muzero, search, explore=False, compile=compile)
+    rows["MCTS moves, 50 simulations"] = rate(lambda: policy(seen), seconds=seconds)
     many = seen.expand(64).clone()
-    rows["MCTS moves, 50 simulations, 64 at once"] = 64 * rate(lambda: move(many), seconds=seconds)
+    rows["MCTS moves, 50 simulations, 64 at once"] = 64 * rate(lambda: policy(many), seconds=seconds)
 
     env = FrankaEnv(FrankaConfig(observations=("pixels", "state")), num_envs=1, device="cpu")
     box = {"at": env.reset()}
@@ -128,12 +122,16 @@ def main() -> None:
     )
     parser.add_argument("--python", required=True, help="a Python that has xwm")
     parser.add_argument("--seconds", type=float, default=5.0, help="for each row")
-    parser.add_argument("--compile", action="store_true", help="torch.compile updates and MPPI")
+    parser.add_argument(
+        "--compile", action="store_true", help="torch.compile updates, MPPI and the search's model"
+    )
     parser.add_argument("--out", help="JSON file")
     args = parser.parse_args()
     urdf = files("franka_wm.envs.robots") / "fr3.urdf"
     each = args.seconds / 3  # rate() takes the median of three measurements
-    mine = learning(each, compile=args.compile, precision="float32") | searching_and_stepping(each)
+    mine = learning(each, compile=args.compile, precision="float32") | searching_and_stepping(
+        each, compile=args.compile
+    )
     half = learning(each, compile=args.compile, precision="bfloat16")
     print("ours measured; now xwm, which compiles first", flush=True)
     side = Path(__file__).parent / "_xwm_side.py"

@@ -57,12 +57,18 @@ def _missing(size: int, like: Tensor) -> int:
 class Linear(nn.Linear):
     """`nn.Linear`, whose product is padded with zeros on CUDA where its sizes do not suit tensor cores.
 
-    In plans on CUDA it calls `fused.linear`.
+    In plans on CUDA it calls `fused.linear`. In compiled programs on a CPU one row is multiplied as a sum, which the
+    compiler joins with what follows; called as a product, it takes longer.
     """
 
     def forward(self, input: Tensor) -> Tensor:
         if fused.applies() and fused.suits(self.weight):
             return fused.linear(input, self.weight, self.bias)
+        if torch.compiler.is_compiling() and input.device.type == "cpu" and input.numel() == self.in_features:
+            product = (
+                (self.weight * input.reshape(1, -1)).sum(-1).reshape(*input.shape[:-1], self.out_features)
+            )
+            return product if self.bias is None else product + self.bias
         more, beyond = _missing(self.in_features, input), _missing(self.out_features, input)
         if not (more or beyond):
             return super().forward(input)

@@ -13,7 +13,7 @@ from torch.nn import functional as F
 from franka_wm.errors import UserError
 from franka_wm.models.groups import ParameterGroup, decay_groups
 from franka_wm.models.images import ImageSize, check_images
-from franka_wm.models.layers import NormedLinear, SimNorm, TwoHotSymlog, initialize, mlp
+from franka_wm.models.layers import Linear, NormedLinear, SimNorm, TwoHotSymlog, initialize, mlp
 from franka_wm.models.returns import discount_per_step, n_step_returns, value_range
 from franka_wm.models.simplicial import SimplicialWorldModel
 from franka_wm.models.windows import check_windows
@@ -142,10 +142,10 @@ class MuZero(SimplicialWorldModel):
         # g and f each have one body and two heads: a search calls them once per simulation.
         self.dynamics_body = _body(latent_dim + num_actions, hidden_dim)
         self.dynamics_head = mlp(hidden_dim, (), latent_dim, output=SimNorm(simnorm_dim))
-        self.reward_head = nn.Linear(hidden_dim, bins)
+        self.reward_head = Linear(hidden_dim, bins)
         self.prediction_body = _body(latent_dim, hidden_dim)
-        self.policy_head = nn.Linear(hidden_dim, num_actions)
-        self.value_head = nn.Linear(hidden_dim, bins)
+        self.policy_head = Linear(hidden_dim, num_actions)
+        self.value_head = Linear(hidden_dim, bins)
         for head in (self.reward_head, self.policy_head, self.value_head):
             nn.init.zeros_(head.weight)  # first predictions: exactly 0, and all actions alike
             nn.init.zeros_(head.bias)

@@ -1,11 +1,57 @@
 """The tree of a Monte Carlo search, for E environments at once, as a fixed set of tensors."""
 
 from collections.abc import Callable
+from typing import Any
 
 import torch
 from torch import Tensor
 
 Recurrent = Callable[[Tensor, Tensor], tuple[Tensor, Tensor, Tensor, Tensor, Tensor]]
+
+
+class Compiled:
+    """A model's `recurrent`, compiled by `torch.compile`: alone, and as `ask` in one program with what is around it."""
+
+    def __init__(self, recurrent: Recurrent) -> None:
+        self.recurrent = recurrent
+        self._programs: dict[tuple[Callable[..., Any], str], Callable[..., Any]] = {}
+
+    def __call__(self, z: Tensor, action: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+        return self._program(self.recurrent, z.device)(z.contiguous(), action)
+
+    def ask(self, embedding: Tensor, env: Tensor, at: Tensor, action: Tensor) -> tuple[Tensor, Tensor]:
+        return self._program(ask, embedding.device)(self.recurrent, embedding, env, at, action)
+
+    def __reduce__(self) -> tuple[type, tuple[Recurrent]]:
+        """A copy compiles its own model."""
+        return Compiled, (self.recurrent,)
+
+    def _program(self, function: Callable[..., Any], device: torch.device) -> Callable[..., Any]:
+        key = function, device.type
+        if key not in self._programs:
+            # For one arm on a CPU a fifth of the time was Python between a program's kernels.
+            self._programs[key] = torch.compile(
+                function, dynamic=False, options={"cpp_wrapper": device.type == "cpu"}
+            )
+        return self._programs[key]
+
+
+def ask(
+    recurrent: Recurrent, embedding: Tensor, env: Tensor, at: Tensor, action: Tensor
+) -> tuple[Tensor, Tensor]:
+    """What the model says of an action (E,) in slot `at` (E,) of each environment.
+
+    Args:
+        embedding: (E, N, Z) latents of the slots.
+        env: (E,), 0 … E - 1.
+
+    Returns:
+        The next latent (E, Z), and (E, 3 + M) in float64: reward, discount, value and logits.
+    """
+    after, reward, discount, logits, value = recurrent(embedding[env, at], action)
+    check_columns(len(env), reward=reward, discount=discount, value=value)
+    return after, torch.cat((reward, discount, value, logits), 1).double()
+
 
 _ABOVE, _DISCOUNT, _REWARD = 0, 1, 2  # planes of `Tree.paths`
 _BITS = 62  # of an int64, so that no sum of bits overflows

@@ -4,18 +4,19 @@
 # (Kernels are Warp's language: pyright knows neither its arrays nor its vectors.)
 """The tree of a Monte Carlo search in Warp kernels: one thread walks down and adds up for each environment.
 
-The same choices as `franka_wm.planning.mcts` makes with plain tensors, which say what is meant; a simulation is two
-launches instead of some fifty operations. Sums are in float64, so equal scores need not be told apart alike.
+The same choices as `franka_wm.planning.mcts` makes with plain tensors, which say what is meant; a simulation is one
+launch instead of some fifty operations. Sums are in float64, so equal scores need not be told apart alike.
 """
 
 # Warp reads annotations as types: no `from __future__ import annotations` here.
+from functools import partial
 from typing import cast
 
 import torch
 import warp as wp
 from torch import Tensor
 
-from franka_wm.planning.tree import Recurrent, check_columns
+from franka_wm.planning.tree import Compiled, Recurrent, ask
 from franka_wm.quiet import start_warp
 
 NOTHING = wp.constant(-1)
@@ -69,9 +70,10 @@ def leave(
         taken[env] = wp.int64(tree.action[env, slot])
 
 
-@wp.kernel(enable_backward=False)
+@wp.func
 def walk_puct(
     tree: Statistics,
+    env: int,
     node: int,
     deepest: int,
     init: wp.float64,
@@ -80,8 +82,11 @@ def walk_puct(
     at: wp.array[wp.int64],
     taken: wp.array[wp.int64],
 ):
-    """From the root by the action of the largest score to one that leads to no slot yet."""
-    env = wp.tid()
+    """From the root by the action of the largest score to one that leads to no slot yet.
+
+    Args:
+        node: how many slots there are.
+    """
     one = wp.float64(1.0)
     low, high = wp.float64(0.0), wp.float64(0.0)
     found = int(0)
@@ -127,9 +132,10 @@ def completed(tree: Statistics, env: int, slot: int, action: int, mixed: wp.floa
     return mixed
 
 
-@wp.kernel(enable_backward=False)
+@wp.func
 def walk_gumbel(
     tree: Statistics,
+    env: int,
     noise: wp.array2d[wp.float64],
     considered: int,
     deepest: int,
@@ -144,7 +150,6 @@ def walk_gumbel(
     Args:
         considered: the visits that an action of the root must have to be chosen.
     """
-    env = wp.tid()
     actions = tree.prior.shape[2]
     slot = int(0)
     chosen = int(0)
@@ -203,9 +208,10 @@ def walk_gumbel(
     leave(tree, env, slot, deepest, at, taken, chosen)
 
 
-@wp.kernel(enable_backward=False)
+@wp.func
 def add(
     tree: Statistics,
+    env: int,
     node: int,
     deepest: int,
     logarithms: int,
@@ -218,7 +224,6 @@ def add(
         logarithms: 1: priors are kept as logarithms.
         found: (E, 3 + M), reward, discount, value and logits of what the action led to.
     """
-    env = wp.tid()
     one = wp.float64(1.0)
     slot = tree.last[env]
     gained = found[env, 2]
@@ -260,8 +265,50 @@ def add(
         slot = above
 
 
+@wp.kernel(enable_backward=False)
+def turn_puct(
+    tree: Statistics,
+    node: int,
+    deepest: int,
+    init: wp.float64,
+    base: wp.float64,
+    tiny: wp.float64,
+    found: wp.array2d[wp.float64],
+    at: wp.array[wp.int64],
+    taken: wp.array[wp.int64],
+):
+    """Adds the answer of simulation `node`, if it is not the root, and walks for the next one, if there is one."""
+    env = wp.tid()
+    if node > 0:
+        add(tree, env, node, deepest, 0, found, taken)
+    if node + 1 < tree.parent.shape[1]:
+        walk_puct(tree, env, node + 1, deepest, init, base, tiny, at, taken)
+
+
+@wp.kernel(enable_backward=False)
+def turn_gumbel(
+    tree: Statistics,
+    node: int,
+    considered: int,
+    noise: wp.array2d[wp.float64],
+    deepest: int,
+    c_visit: wp.float64,
+    c_scale: wp.float64,
+    tiny: wp.float64,
+    found: wp.array2d[wp.float64],
+    at: wp.array[wp.int64],
+    taken: wp.array[wp.int64],
+):
+    """As `turn_puct`; `considered` is of the next simulation."""
+    env = wp.tid()
+    if node > 0:
+        add(tree, env, node, deepest, 1, found, taken)
+    if node + 1 < tree.parent.shape[1]:
+        walk_gumbel(tree, env, noise, considered, deepest, c_visit, c_scale, tiny, at, taken)
+
+
 class KernelTree:
-    """What `franka_wm.planning.tree.Tree` and a rule of `franka_wm.planning.mcts` do, in two launches a simulation.
+    """What `franka_wm.planning.tree.Tree` and a rule of `franka_wm.planning.mcts` do, in one launch a simulation.
 
     Args:
         simulations: N - 1.
@@ -325,37 +372,35 @@ class KernelTree:
         for name, tensor in tensors.items():
             setattr(tree, name, wp.from_torch(tensor))
         deepest = slots if max_depth is None else max_depth
-        at, taken, found = (wp.from_torch(x) for x in (self.at, self.taken, self.found))
+        memory = [wp.from_torch(x) for x in (self.found, self.at, self.taken)]
         if noise is None:
-            self._turn, self._turns = 1, list(range(1, slots))  # what differs between walks: argument, values
-            walk = walk_puct, [tree, 0, deepest, *options, tiny, at, taken]
+            kernel, inputs = turn_puct, [tree, 0, deepest, *options, tiny, *memory]
         else:
             assert considered is not None
-            self._turn, self._turns = 2, considered
-            walk = walk_gumbel, [tree, wp.from_torch(noise.double()), 0, deepest, *options, tiny, at, taken]
-        put = add, [tree, 0, deepest, int(noise is not None), found, taken]
-        self._walk, self._add = (
-            cast(wp.Launch, wp.launch(kernel, envs, inputs=inputs, device=at.device, record_cmd=True))
-            for kernel, inputs in (walk, put)
+            kernel = turn_gumbel
+            inputs = [tree, 0, considered[0], wp.from_torch(noise.double()), deepest, *options, tiny, *memory]
+        self._considered = considered
+        self._turn = cast(
+            wp.Launch, wp.launch(kernel, envs, inputs=inputs, device=memory[0].device, record_cmd=True)
         )
-        self._held = walk, tensors  # what the launches point to
+        self._held = inputs, tensors  # what the launch points to
         self._stream = (
             wp.stream_from_torch(torch.cuda.current_stream(device)) if device.type == "cuda" else None
         )
+        self._turn.launch(self._stream)
 
     def simulate(self, node: int, recurrent: Recurrent) -> None:
-        """Simulation `node`, from 1: a walk, the model, and its answer into slot `node`."""
-        self._walk.set_param_at_index(self._turn, self._turns[node - 1])
-        self._walk.launch(self._stream)
-        after, reward, discount, logits, value = recurrent(self.embedding[self.env, self.at], self.taken)
-        if node == 1:
-            envs, actions = len(self.env), self.prior.shape[2]
-            check_columns(envs, reward=reward, discount=discount, value=value)
-            if logits.shape != (envs, actions):
-                raise ValueError(
-                    f"recurrent must return logits of shape ({envs}, {actions}), got {tuple(logits.shape)}"
-                )
+        """Simulation `node`, from 1: asks the model, puts its answer into slot `node`, and walks for the next one."""
+        asked = recurrent.ask if isinstance(recurrent, Compiled) else partial(ask, recurrent)
+        after, found = asked(self.embedding, self.env, self.at, self.taken)
+        if node == 1 and found.shape != self.found.shape:
+            raise ValueError(
+                f"recurrent must return logits of shape {tuple(self.prior.shape[::2])}, got "
+                f"({found.shape[0]}, {found.shape[1] - 3})"
+            )
         self.embedding[:, node] = after
-        torch.cat((reward, discount, value, logits), 1, out=self.found)
-        self._add.set_param_at_index(1, node)
-        self._add.launch(self._stream)
+        self.found.copy_(found)
+        self._turn.set_param_at_index(1, node)
+        if self._considered is not None and node < len(self._considered):
+            self._turn.set_param_at_index(2, self._considered[node])
+        self._turn.launch(self._stream)

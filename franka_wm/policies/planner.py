@@ -101,14 +101,8 @@ class GoalGuide:
 
 
 def compiled(function: Callable[..., Any]) -> Callable[..., Any]:
-    """`function` of latents compiled, for latents that lie in memory as a model returns them: one kind less.
-
-    After 8 shapes torch runs a function as it is: iCEM has as many for one number of environments. So the limit is
-    raised, for everything that is compiled.
-    """
-    import torch._dynamo.config as dynamo
-
-    dynamo.recompile_limit = max(dynamo.recompile_limit, RECOMPILES)
+    """`function` of latents compiled, for latents that lie in memory as a model returns them: one kind less."""
+    allow_recompiles()
     fast = torch.compile(function, dynamic=False)
 
     @wraps(function, updated=())  # callers look for `deterministic` in its signature
@@ -116,6 +110,16 @@ def compiled(function: Callable[..., Any]) -> Callable[..., Any]:
         return fast(z.contiguous(), *given, **options)
 
     return call
+
+
+def allow_recompiles() -> None:
+    """After 8 shapes torch runs a function as it is: iCEM has as many for one number of environments.
+
+    So the limit is raised, for everything that is compiled.
+    """
+    import torch._dynamo.config as dynamo
+
+    dynamo.recompile_limit = max(dynamo.recompile_limit, RECOMPILES)
 
 
 def captures(wanted: bool | None, observation: Tensor) -> bool:

@@ -12,10 +12,10 @@ from torch import Tensor, nn
 
 from franka_wm.models.base import WorldModel
 from franka_wm.planning.mcts import MCTS
-from franka_wm.planning.tree import Recurrent
+from franka_wm.planning.tree import Compiled, Recurrent
 from franka_wm.policies.capture import GraphCache
 from franka_wm.policies.graph_key import graph_key
-from franka_wm.policies.planner import captures, compiled
+from franka_wm.policies.planner import allow_recompiles, captures
 from franka_wm.seeding import share_of_worlds
 
 
@@ -59,7 +59,8 @@ class SearchPolicy(TensorDictModuleBase):
     ) -> None:
         super().__init__()
         if compile:
-            recurrent = compiled(recurrent)
+            allow_recompiles()
+            recurrent = Compiled(recurrent)
         self.in_keys = list(observation_keys)
         self.out_keys = ["action", "search_policy", "search_value"]
         self.search, self.explore, self.model, self.generator = search, explore, model, generator

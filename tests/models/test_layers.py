@@ -33,6 +33,22 @@ def test_simnorm_gives_simplices_within_each_group():
     torch.testing.assert_close(groups.sum(-1), torch.ones(3, 2, 3))
 
 
+@pytest.mark.parametrize("shape", [(6,), (1, 6), (1, 1, 6), (2, 6)])
+@pytest.mark.parametrize("bias", [True, False])
+def test_one_row_is_a_sum_in_a_compiled_program_on_a_cpu(shape, bias):
+    layer, x, graphs = layers.Linear(6, 5, bias=bias), torch.randn(shape), []
+
+    def keep(graph, _):
+        graphs.append(graph)
+        return graph
+
+    torch._dynamo.reset()
+    with torch.no_grad():
+        torch.testing.assert_close(torch.compile(layer, backend=keep)(x), layer(x))
+    products = [node for node in graphs[0].graph.nodes if "linear" in str(node.target)]
+    assert bool(products) == (shape == (2, 6))
+
+
 def test_mlp_starts_as_published_and_drops_only_in_its_first_layer():
     network = mlp(10, (200, 200), 7, dropout=0.3)
     linears = [m for m in network.modules() if isinstance(m, torch.nn.Linear)]

@@ -11,6 +11,7 @@ from torchrl.data import Categorical, Composite, Unbounded
 from torchrl.envs import EnvBase
 from torchrl.envs.utils import ExplorationType, check_env_specs, set_exploration_type
 
+from franka_wm import models
 from franka_wm.models import WorldModel
 from franka_wm.planning import MCTS
 from franka_wm.policies import SearchPolicy
@@ -79,10 +80,9 @@ class Known(WorldModel):
         return after, -(after - 3).abs(), torch.full_like(z, 0.9), *self.prediction(after)
 
 
-def acting(variant="puct", **options) -> SearchPolicy:
-    return SearchPolicy.for_model(
-        Known(), MCTS(num_actions=3, num_simulations=24, variant=variant), **options
-    )
+def acting(variant="puct", kernels=None, **options) -> SearchPolicy:
+    search = MCTS(num_actions=3, num_simulations=24, variant=variant, kernels=kernels)
+    return SearchPolicy.for_model(Known(), search, **options)
 
 
 def test_the_toy_environment_is_sound():
@@ -143,7 +143,9 @@ def test_a_captured_search_is_of_one_share_of_the_worlds(monkeypatch):
     assert keys[0] == keys[1] != keys[2]
 
 
-def test_a_compiled_search_decides_the_same(monkeypatch):
+@pytest.mark.parametrize(("kernels", "program"), [(True, "ask"), (False, "recurrent")])
+def test_a_compiled_search_decides_the_same(monkeypatch, kernels, program):
+    """In kernels the model is one program with what is read from the tree and written back."""
     calls, compiled = [], torch.compile
 
     def compile(function, **options):
@@ -152,10 +154,27 @@ def test_a_compiled_search_decides_the_same(monkeypatch):
 
     monkeypatch.setattr(torch, "compile", compile)
     start = TensorDict({"state": torch.randn(8, 1)}, [8])
-    plain, fast = (acting(explore=False, compile=wanted)(start.clone()) for wanted in (False, True))
-    assert calls == ["recurrent"]
+    plain, fast = (
+        acting(explore=False, compile=wanted, kernels=kernels)(start.clone()) for wanted in (False, True)
+    )
+    assert calls == [program]
     for key in ("action", "search_policy", "search_value"):
         torch.testing.assert_close(plain[key], fast[key])
+
+
+def test_a_copy_of_a_compiled_search_asks_its_own_model(monkeypatch):
+    monkeypatch.setattr(torch, "compile", lambda function, **_: function)
+    model = models.make("muzero", observation_sizes={"state": 1}, num_actions=3, latent_dim=8, hidden_dim=8)
+    policy = SearchPolicy.for_model(
+        model, MCTS(num_actions=3, num_simulations=2), explore=False, compile=True
+    )
+    start = TensorDict({"state": torch.ones(1, 1)}, [1])
+    policy(start.clone())
+    copied = copy.deepcopy(policy)
+    asked = copied.recurrent.recurrent.__self__
+    assert asked is copied.model is not model
+    monkeypatch.setattr(model, "recurrent", None)
+    copied(start.clone())
 
 
 def test_a_compiled_search_stays_compiled_for_many_numbers_of_worlds(monkeypatch):
