@@ -18,6 +18,7 @@ from __future__ import annotations
 import argparse
 import json
 import subprocess
+from functools import partial
 from importlib.resources import files
 from pathlib import Path
 
@@ -32,7 +33,9 @@ from franka_wm.planning.mcts import MCTS
 from franka_wm.policies import PlannerPolicy, SearchPolicy
 from franka_wm.training.learner import Learner
 
+TWO = ", 512/512, batch 64, two Q-functions"
 NOTES = {
+    f"TD-MPC2 updates{TWO}": "two in both",
     "TD-MPC2 updates": "ours: 5 Q-functions, theirs: 2",
     "MPPI plans": "ours: elites, policy candidates, batched over environments",
     "MCTS moves": "both PUCT; 64 at once by jax.vmap there",
@@ -57,10 +60,14 @@ def learning(seconds: float, *, compile: bool, precision: str) -> dict[str, floa
     """Updates and plans per second, in one precision."""
     torch.manual_seed(0)
     rows = {}
-    agent = models.make("tdmpc2", observation_sizes={"state": 27}, action_dim=7, episode_length=50)
-    learner = Learner(agent, compile=compile, precision=precision)
     batch = windows(64, 3, state=torch.randn(64, 4, 27))
-    rows["TD-MPC2 updates, 512/512, batch 64"] = rate(lambda: learner.update(batch), seconds=seconds)
+    for members, said in ((2, TWO), (5, ", 512/512, batch 64")):
+        agent = models.make(
+            "tdmpc2", observation_sizes={"state": 27}, action_dim=7, episode_length=50, num_q=members
+        )
+        learner = Learner(agent, compile=compile, precision=precision)
+        update = partial(learner.update, batch)
+        rows[f"TD-MPC2 updates{said}"] = rate(update, seconds=seconds)
 
     agent.eval()
     objective = RewardPlusValue(agent.reward, agent.value, agent.discount)
@@ -129,9 +136,8 @@ def main() -> None:
     args = parser.parse_args()
     urdf = files("franka_wm.envs.robots") / "fr3.urdf"
     each = args.seconds / 3  # rate() takes the median of three measurements
-    mine = learning(each, compile=args.compile, precision="float32") | searching_and_stepping(
-        each, compile=args.compile
-    )
+    mine = learning(each, compile=args.compile, precision="float32")
+    mine |= searching_and_stepping(each, compile=args.compile)
     half = learning(each, compile=args.compile, precision="bfloat16")
     print("ours measured; now xwm, which compiles first", flush=True)
     side = Path(__file__).parent / "_xwm_side.py"
@@ -140,6 +146,7 @@ def main() -> None:
     if done.returncode:
         raise SystemExit(f"{args.python}: {done.stderr.strip().splitlines()[-1]}")
     theirs = json.loads(done.stdout.strip().splitlines()[-1])
+    theirs[f"TD-MPC2 updates{TWO}"] = theirs["TD-MPC2 updates, 512/512, batch 64"]
     rows = [
         {
             "": name,
