@@ -108,7 +108,7 @@ def main() -> None:
             # Rewards plus value, or the distance to the goal's image.
             objective = None if model.has_value else GoalImage(model.encode_goal, embed=model.embed)
             launches = arguments.launched or (["eager", "captured"] if cuda else ["eager"])
-            for layers, launched in product(arguments.layers, launches):
+            for layers, launched in product(arguments.layers if cuda else ["plain"], launches):
                 policy = PlannerPolicy.for_model(
                     model,
                     make_planner(name, layers),

@@ -13,7 +13,7 @@ from franka_wm.evaluation import diagnose
 from franka_wm.evaluation.decoder import Imagined
 from franka_wm.evaluation.open_loop import NothingToPredictError
 from franka_wm.evaluation.protocol import Evaluation, describe, evaluate_agent, protocol
-from franka_wm.evaluation.results import COMMAND, to_json
+from franka_wm.evaluation.results import COMMAND, FILE, to_json
 from franka_wm.evaluation.robustness import check_shiftable, note, robustness
 from franka_wm.files import atomic_write
 from franka_wm.report.diagnostics import (
@@ -90,6 +90,9 @@ def run(options: Options) -> dict[str, Any]:
         if table.rows:
             console.print(terminal(table))
     console.print(terminal(timing_table(evaluation.seconds, evaluation.worlds)))
+    # What took longest is kept if the rest does not end; earlier results stay until new ones have all parts.
+    if not (options.out / FILE).exists():
+        _write(options.out, results, _text(results, evaluation, agent), evaluation, None)
     imagined = None
     if options.open_loop or options.probes:
         say("held-out episodes for the diagnostics …")
@@ -100,17 +103,9 @@ def run(options: Options) -> dict[str, Any]:
             _look_inside(agent, held, results, say)
     if options.robustness:
         _shift(agent, options, results, say)
-    tables = diagnostic_tables(results, agent.env.config)
-    for title, table in tables.items():
+    for title, table in diagnostic_tables(results, agent.env.config).items():
         console.print(terminal(table, title))
-    lines = [f"Planned with {text}, not as the run did.\n" for text in otherwise.values()]
-    text = "\n".join(
-        [
-            *lines,
-            evaluation_markdown(evaluation),
-            *(f"### {t}\n\n{markdown(table)}" for t, table in tables.items()),
-        ]
-    )
+    text = _text(results, evaluation, agent)
     _write(options.out, results, text, evaluation, None if imagined is None else imagined[0])
     say(f"results: {options.out}")
     return results
@@ -161,6 +156,14 @@ def _shift(agent: Agent, options: Options, results: dict[str, Any], say: Say) ->
     if note(episodes):
         results["protocol"]["robustness note"] = note(episodes)
         say(f"note: {note(episodes)}")
+
+
+def _text(results: dict[str, Any], evaluation: Evaluation, agent: Agent) -> str:
+    otherwise = results["protocol"].get("planned with")
+    lines = [f"Planned with {otherwise}, not as the run did.\n"] if otherwise else []
+    tables = diagnostic_tables(results, agent.env.config)
+    parts = [f"### {title}\n\n{markdown(table)}" for title, table in tables.items()]
+    return "\n".join([*lines, evaluation_markdown(evaluation), *parts])
 
 
 def _write(

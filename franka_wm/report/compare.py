@@ -26,6 +26,7 @@ from franka_wm.report.document import (
 )
 from franka_wm.report.horizon import horizon_figure
 from franka_wm.report.run import RunFiles, but_for_the_seed, malformed
+from franka_wm.report.sections import logged_name
 from franka_wm.report.spectra import spectrum_figure
 from franka_wm.report.table import Table, evaluation_tables, is_interval
 from franka_wm.report.tasks import family_of, success_over_time, task_of, tasks_table
@@ -255,7 +256,7 @@ def _drawn(
         if key in found:
             who = "" if key.count("/") < 2 else f"Of {style.policy_name(key.split('/')[1])}. "
             title = f"{task}: {quantity(key.rsplit('/', 1)[-1])[0]}" if task else None
-            of = f"{key} of all runs of {task}" if task else f"{key} of all runs"
+            of = f"{logged_name(key)[0]}, of all runs{f' of {task}' if task else ''}"
             figure = seeds_figure(groups, key, x=x, title=title)
             drawn.append(chart(figure, f"{of} while training", f"{who}{bands}".strip()))
     return drawn

@@ -43,7 +43,8 @@ def quantity(leaf: str) -> tuple[str, float]:
     """What a logged quantity is called, and what it is multiplied with; a task's own measures as they are."""
     if leaf.startswith(TASK):
         return f"successful episodes of {leaf.removeprefix(TASK).replace('_', ' ')} [%]", 100.0
-    return QUANTITIES.get(leaf, (leaf.replace("_", " "), 1.0))
+    name = leaf.replace("_", " ")
+    return QUANTITIES.get(leaf, (name.removesuffix(" m") + " [m]" if leaf.endswith("_m") else name, 1.0))
 
 
 def panels(rows: Rows) -> list[str]:

@@ -73,7 +73,7 @@ def curves(run: RunFiles) -> str:
     drawn = (
         chart(
             panel_figure(run.rows, panel, x=x, success_distance=success),
-            f"{panel.replace('_', ' ')} while training",
+            f"{quantity(panel)[0]} while training",
         )
         for panel in panels(run.rows)
     )

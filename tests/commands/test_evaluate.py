@@ -67,6 +67,23 @@ def test_the_closed_loop_alone(run_folder: Path, tmp_path: Path, capsys) -> None
     assert str(tmp_path) in capsys.readouterr().out.splitlines()[-1]
 
 
+@pytest.mark.slow
+def test_what_was_played_is_kept_when_the_rest_is_interrupted(
+    run_folder: Path, tmp_path, monkeypatch
+) -> None:
+    def stop(*_: object, **__: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(diagnose, "hold_out", stop)
+    arguments = ["evaluate", f"checkpoint={run_folder}", f"out={tmp_path}", "device=cpu"]
+    for episodes in (4, 5):  # the second time there are results already, which stay
+        assert cli.main([*arguments, f"episodes={episodes}"]) == 130
+        results = json.loads((tmp_path / "evaluation.json").read_text())
+        assert set(results) == {"protocol", "policies"} and set(results["policies"]) == POLICIES
+        assert results["protocol"]["episodes"] == 4
+        assert "| ik |" in (tmp_path / "evaluation.md").read_text()
+
+
 @pytest.mark.parametrize(
     ("arguments", "says"),
     [

@@ -384,7 +384,8 @@ def test_long_names_of_runs_leave_room_and_differ(tmp_path: Path) -> None:
 def test_one_of_several_tasks_success_is_in_percent_of_its_episodes() -> None:
     """`success_TASK`; other quantities as they are."""
     assert quantity("success_push") == ("successful episodes of push [%]", 100.0)
-    assert quantity("cube_to_disc_m") == ("cube to disc m", 1.0)
+    assert quantity("cube_to_disc_m") == ("cube to disc [m]", 1.0)
+    assert quantity("path_length") == ("path length", 1.0)
     rows = [{"env_steps": k, "eval/planner/success_push": 0.1 * k} for k in range(1, 4)]
     axes = seeds_figure({"a": [rows]}, "eval/planner/success_push").axes[0]
     assert axes.get_ylim() == (-3, 103) and axes.lines[0].get_ydata()[-1] == pytest.approx(30)

@@ -199,11 +199,13 @@ def test_success_of_each_of_several_tasks_is_drawn_once() -> None:
     one = replace(run("", "a", {"planner": success(0.4, task_success=rates)}), rows=rows)
     page = compare_page([one, replace(one, folder=Path("again"), config={**one.config, "seed": 7})])
     assert page.count("<title>success at push while training") == 1
-    assert "eval/planner/success_push of all runs" not in page
+    assert "successful episodes of push [%], planner, of all runs" not in page
     still = [
         replace(one, folder=Path(name), results=[]) for name in "ab"
     ]  # running yet: without a table of tasks
-    assert "<title>eval/planner/success_push of all runs while training" in compare_page(still)
+    assert "<title>successful episodes of push [%], planner, of all runs while training" in compare_page(
+        still
+    )
 
 
 def test_returns_of_different_tasks_have_charts_of_their_own() -> None:
@@ -211,7 +213,9 @@ def test_returns_of_different_tasks_have_charts_of_their_own() -> None:
     runs = [replace(run(task, "a", {"planner": success(0.5)}), rows=rows) for task in ("push", "lift")]
     page = compare_page(runs)
     for task in ("push", "lift"):
-        drawn = page.split(f"<title>eval/planner/return of all runs of {task} while")[1].split("</svg>")[0]
+        drawn = page.split(f"<title>return of an episode, planner, of all runs of {task} while")[1].split(
+            "</svg>"
+        )[0]
         assert f"{task}: return of an episode" in drawn
     runs[1] = replace(runs[0], folder=Path("again"))
-    assert compare_page(runs).count("<title>eval/planner/return of all runs while") == 1
+    assert compare_page(runs).count("<title>return of an episode, planner, of all runs while") == 1
