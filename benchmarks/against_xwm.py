@@ -61,7 +61,7 @@ def learning(seconds: float, *, compile: bool, precision: str) -> dict[str, floa
     torch.manual_seed(0)
     rows = {}
     batch = windows(64, 3, state=torch.randn(64, 4, 27))
-    for members, said in ((2, TWO), (5, ", 512/512, batch 64")):
+    for members, said in ((2, TWO), (5, ", 512/512, batch 64")):  # MPPI plans with the last one
         agent = models.make(
             "tdmpc2", observation_sizes={"state": 27}, action_dim=7, episode_length=50, num_q=members
         )

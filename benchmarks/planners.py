@@ -93,7 +93,13 @@ def main() -> None:
     parser.add_argument("--seconds", type=float, default=3.0, help="of each of three measurements")
     parser.add_argument("--compile", action="store_true", help="torch.compile what the planner calls")
     parser.add_argument("--precision", choices=["float32", "bfloat16"], default="float32")
-    parser.add_argument("--layers", nargs="+", choices=["fused", "plain"], default=["fused"], help="on CUDA")
+    parser.add_argument(
+        "--layers",
+        nargs="+",
+        choices=["fused", "plain"],
+        default=["fused"],
+        help="on CUDA; a CPU has plain ones alone",
+    )
     parser.add_argument("--launched", nargs="+", choices=["eager", "captured"], help="default: both on CUDA")
     parser.add_argument("--out", help="JSON file to write")
     arguments = parser.parse_args()

@@ -9,11 +9,12 @@ from typing import TYPE_CHECKING, Any
 
 from franka_wm.commands.overrides import changes
 from franka_wm.console import announced, say
+from franka_wm.errors import UserError
 from franka_wm.evaluation import diagnose
 from franka_wm.evaluation.decoder import Imagined
 from franka_wm.evaluation.open_loop import NothingToPredictError
 from franka_wm.evaluation.protocol import Evaluation, describe, evaluate_agent, protocol
-from franka_wm.evaluation.results import COMMAND, FILE, to_json
+from franka_wm.evaluation.results import COMMAND, FILE, read_result, to_json
 from franka_wm.evaluation.robustness import check_shiftable, note, robustness
 from franka_wm.files import atomic_write
 from franka_wm.report.diagnostics import (
@@ -90,9 +91,12 @@ def run(options: Options) -> dict[str, Any]:
         if table.rows:
             console.print(terminal(table))
     console.print(terminal(timing_table(evaluation.seconds, evaluation.worlds)))
-    # What took longest is kept if the rest does not end; earlier results stay until new ones have all parts.
-    if not (options.out / FILE).exists():
+    more = options.open_loop or options.probes or options.robustness
+    if more and _replaceable(options.out, described):
+        # What took longest is kept if the rest does not end.
+        results["protocol"]["diagnostics"] = "not ended"
         _write(options.out, results, _text(results, evaluation, agent), evaluation, None)
+        say(f"results of the episodes: {options.out}; diagnostics follow")
     imagined = None
     if options.open_loop or options.probes:
         say("held-out episodes for the diagnostics …")
@@ -105,6 +109,7 @@ def run(options: Options) -> dict[str, Any]:
         _shift(agent, options, results, say)
     for title, table in diagnostic_tables(results, agent.env.config).items():
         console.print(terminal(table, title))
+    results["protocol"].pop("diagnostics", None)
     text = _text(results, evaluation, agent)
     _write(options.out, results, text, evaluation, None if imagined is None else imagined[0])
     say(f"results: {options.out}")
@@ -156,6 +161,17 @@ def _shift(agent: Agent, options: Options, results: dict[str, Any], say: Say) ->
     if note(episodes):
         results["protocol"]["robustness note"] = note(episodes)
         say(f"note: {note(episodes)}")
+
+
+def _replaceable(folder: Path, described: Mapping[str, Any]) -> bool:
+    """Whether what is there may go before all parts of the new results are there: nothing, or less than they have."""
+    if not (folder / FILE).is_file():
+        return True
+    try:
+        there = read_result(folder / FILE)
+    except UserError:  # nobody can read it
+        return True
+    return "diagnostics" in there.protocol or there.updates != described.get("updates")
 
 
 def _text(results: dict[str, Any], evaluation: Evaluation, agent: Agent) -> str:

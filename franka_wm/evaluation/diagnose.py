@@ -217,7 +217,11 @@ def health(agent: Agent, evaluation: Evaluation | None) -> dict[str, Any]:
         out |= {f"planner {name.replace('_', ' ')}": value for name, value in searched.items()}
     if evaluation is not None and {"planner", "policy"} <= evaluation.episodes.keys():
         gains = paired_gain(evaluation.episodes["planner"], evaluation.episodes["policy"])
-        out |= {f"true gain over the policy, {name.replace('_', ' ')}": v for name, v in gains.items()}
+        units = {"final_distance": " [m]"}
+        out |= {
+            f"{name.replace('_', ' ')}, planner minus policy{units.get(name, '')}": v
+            for name, v in gains.items()
+        }
     return out
 
 

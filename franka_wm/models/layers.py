@@ -54,17 +54,30 @@ def _missing(size: int, like: Tensor) -> int:
     return -size % 8 if like.is_cuda and pays else 0
 
 
+def _one_row_of_a_compiled_plan(input: Tensor, weight: Tensor) -> bool:
+    """Whether `input` is one row on a CPU, in a program compiled (or exported) without gradients, in one precision."""
+    return (
+        torch.compiler.is_compiling()
+        and not torch.is_grad_enabled()
+        and input.device.type == "cpu"
+        and input.dtype == weight.dtype
+        and not torch.is_autocast_enabled("cpu")
+        and input.shape[-1:] == weight.shape[1:]
+        and input.shape[:-1].numel() == 1
+    )
+
+
 class Linear(nn.Linear):
     """`nn.Linear`, whose product is padded with zeros on CUDA where its sizes do not suit tensor cores.
 
-    In plans on CUDA it calls `fused.linear`. In compiled programs on a CPU one row is multiplied as a sum, which the
+    In plans on CUDA it calls `fused.linear`. In compiled plans on a CPU one row is multiplied as a sum, which the
     compiler joins with what follows; called as a product, it takes longer.
     """
 
     def forward(self, input: Tensor) -> Tensor:
         if fused.applies() and fused.suits(self.weight):
             return fused.linear(input, self.weight, self.bias)
-        if torch.compiler.is_compiling() and input.device.type == "cpu" and input.numel() == self.in_features:
+        if _one_row_of_a_compiled_plan(input, self.weight):
             product = (
                 (self.weight * input.reshape(1, -1)).sum(-1).reshape(*input.shape[:-1], self.out_features)
             )

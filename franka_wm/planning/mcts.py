@@ -10,7 +10,7 @@ from tensordict import TensorDict
 from torch import Tensor
 
 from franka_wm.options import COEFFICIENT, FRACTION, POSITIVE, Bounds, check_arguments
-from franka_wm.planning.tree import Recurrent, Tree
+from franka_wm.planning.tree import Recurrent, Tree, check_logits
 from franka_wm.seeding import of_worlds
 
 
@@ -136,10 +136,7 @@ class MCTS:
             last = tree.last(off_path)
             action = actions_of(last)
             logits, used = tree.grow(node, last, action, recurrent)
-            if logits.shape != root_logits.shape:
-                raise ValueError(
-                    f"recurrent must return logits of shape ({envs}, {actions}), got {tuple(logits.shape)}"
-                )
+            check_logits(logits, envs, actions)
             rule.add(node, logits, last, used)
         action, policy, visits = rule.result()
         value = (tree.returns[:, 0] / tree.visits[:, 0]).unsqueeze(-1)

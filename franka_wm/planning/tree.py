@@ -9,8 +9,12 @@ from torch import Tensor
 Recurrent = Callable[[Tensor, Tensor], tuple[Tensor, Tensor, Tensor, Tensor, Tensor]]
 
 
-class Compiled:
-    """A model's `recurrent`, compiled by `torch.compile`: alone, and as `ask` in one program with what is around it."""
+class CompiledRecurrent:
+    """A model's `recurrent`, compiled by `torch.compile`.
+
+    Called as `recurrent` itself it is the model alone, which the plain tree asks. `ask`, which the kernels' tree calls,
+    also reads the latents from the tree and packs the answer, in the same program.
+    """
 
     def __init__(self, recurrent: Recurrent) -> None:
         self.recurrent = recurrent
@@ -19,37 +23,47 @@ class Compiled:
     def __call__(self, z: Tensor, action: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
         return self._program(self.recurrent, z.device)(z.contiguous(), action)
 
-    def ask(self, embedding: Tensor, env: Tensor, at: Tensor, action: Tensor) -> tuple[Tensor, Tensor]:
-        return self._program(ask, embedding.device)(self.recurrent, embedding, env, at, action)
+    def ask(
+        self, embedding: Tensor, env: Tensor, at: Tensor, action: Tensor, actions: int
+    ) -> tuple[Tensor, Tensor]:
+        """See the function `ask`."""
+        return self._program(ask, embedding.device)(self.recurrent, embedding, env, at, action, actions)
 
     def __reduce__(self) -> tuple[type, tuple[Recurrent]]:
         """A copy compiles its own model."""
-        return Compiled, (self.recurrent,)
+        return CompiledRecurrent, (self.recurrent,)
 
     def _program(self, function: Callable[..., Any], device: torch.device) -> Callable[..., Any]:
         key = function, device.type
         if key not in self._programs:
-            # For one arm on a CPU a fifth of the time was Python between a program's kernels.
-            self._programs[key] = torch.compile(
-                function, dynamic=False, options={"cpp_wrapper": device.type == "cpu"}
-            )
+            # On a CPU what calls the program's kernels is C++ too: for one arm Python there took a fifth of the time.
+            more: dict[str, Any] = {"options": {"cpp_wrapper": True}} if device.type == "cpu" else {}
+            self._programs[key] = torch.compile(function, dynamic=False, **more)
         return self._programs[key]
 
 
 def ask(
-    recurrent: Recurrent, embedding: Tensor, env: Tensor, at: Tensor, action: Tensor
+    recurrent: Recurrent, embedding: Tensor, env: Tensor, at: Tensor, action: Tensor, actions: int
 ) -> tuple[Tensor, Tensor]:
-    """What the model says of an action (E,) in slot `at` (E,) of each environment.
+    """What the model says of an action in one slot of each environment.
 
     Args:
+        recurrent: see `MCTS.search`.
         embedding: (E, N, Z) latents of the slots.
-        env: (E,), 0 … E - 1.
+        env: (E,) int64, 0 … E - 1.
+        at: (E,) int64, the slots.
+        action: (E,) int64.
+        actions: M.
 
     Returns:
         The next latent (E, Z), and (E, 3 + M) in float64: reward, discount, value and logits.
+
+    Raises:
+        ValueError: the model returns another shape.
     """
     after, reward, discount, logits, value = recurrent(embedding[env, at], action)
     check_columns(len(env), reward=reward, discount=discount, value=value)
+    check_logits(logits, len(env), actions)
     return after, torch.cat((reward, discount, value, logits), 1).double()
 
 
@@ -185,3 +199,11 @@ def check_columns(envs: int, **columns: Tensor) -> None:
     for name, column in columns.items():
         if column.shape != (envs, 1):
             raise ValueError(f"recurrent must return {name} of shape ({envs}, 1), got {tuple(column.shape)}")
+
+
+def check_logits(logits: Tensor, envs: int, actions: int) -> None:
+    """Refuses what a model returns of another shape than (E, M)."""
+    if logits.shape != (envs, actions):
+        raise ValueError(
+            f"recurrent must return logits of shape ({envs}, {actions}), got {tuple(logits.shape)}"
+        )

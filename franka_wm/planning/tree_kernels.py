@@ -16,7 +16,7 @@ import torch
 import warp as wp
 from torch import Tensor
 
-from franka_wm.planning.tree import Compiled, Recurrent, ask
+from franka_wm.planning.tree import CompiledRecurrent, Recurrent, ask
 from franka_wm.quiet import start_warp
 
 NOTHING = wp.constant(-1)
@@ -266,7 +266,7 @@ def add(
 
 
 @wp.kernel(enable_backward=False)
-def turn_puct(
+def add_and_walk_puct(
     tree: Statistics,
     node: int,
     deepest: int,
@@ -277,7 +277,7 @@ def turn_puct(
     at: wp.array[wp.int64],
     taken: wp.array[wp.int64],
 ):
-    """Adds the answer of simulation `node`, if it is not the root, and walks for the next one, if there is one."""
+    """Adds the answer of simulation `node` (0: there is none yet) and walks for the next one, if there is one."""
     env = wp.tid()
     if node > 0:
         add(tree, env, node, deepest, 0, found, taken)
@@ -286,7 +286,7 @@ def turn_puct(
 
 
 @wp.kernel(enable_backward=False)
-def turn_gumbel(
+def add_and_walk_gumbel(
     tree: Statistics,
     node: int,
     considered: int,
@@ -299,7 +299,7 @@ def turn_gumbel(
     at: wp.array[wp.int64],
     taken: wp.array[wp.int64],
 ):
-    """As `turn_puct`; `considered` is of the next simulation."""
+    """As `add_and_walk_puct`; `considered` is of the next simulation."""
     env = wp.tid()
     if node > 0:
         add(tree, env, node, deepest, 1, found, taken)
@@ -374,33 +374,31 @@ class KernelTree:
         deepest = slots if max_depth is None else max_depth
         memory = [wp.from_torch(x) for x in (self.found, self.at, self.taken)]
         if noise is None:
-            kernel, inputs = turn_puct, [tree, 0, deepest, *options, tiny, *memory]
+            kernel, inputs = add_and_walk_puct, [tree, 0, deepest, *options, tiny, *memory]
         else:
             assert considered is not None
-            kernel = turn_gumbel
+            kernel = add_and_walk_gumbel
             inputs = [tree, 0, considered[0], wp.from_torch(noise.double()), deepest, *options, tiny, *memory]
         self._considered = considered
-        self._turn = cast(
+        self._recorded = cast(
             wp.Launch, wp.launch(kernel, envs, inputs=inputs, device=memory[0].device, record_cmd=True)
         )
         self._held = inputs, tensors  # what the launch points to
         self._stream = (
             wp.stream_from_torch(torch.cuda.current_stream(device)) if device.type == "cuda" else None
         )
-        self._turn.launch(self._stream)
+        self._recorded.launch(self._stream)
 
     def simulate(self, node: int, recurrent: Recurrent) -> None:
-        """Simulation `node`, from 1: asks the model, puts its answer into slot `node`, and walks for the next one."""
-        asked = recurrent.ask if isinstance(recurrent, Compiled) else partial(ask, recurrent)
-        after, found = asked(self.embedding, self.env, self.at, self.taken)
-        if node == 1 and found.shape != self.found.shape:
-            raise ValueError(
-                f"recurrent must return logits of shape {tuple(self.prior.shape[::2])}, got "
-                f"({found.shape[0]}, {found.shape[1] - 3})"
-            )
+        """Simulation `node`: asks the model, puts its answer into slot `node`, and walks for the next one.
+
+        To be called for 1, 2, … in turn: where the model is asked is what the call before walked to.
+        """
+        asked = recurrent.ask if isinstance(recurrent, CompiledRecurrent) else partial(ask, recurrent)
+        after, found = asked(self.embedding, self.env, self.at, self.taken, self.prior.shape[2])
         self.embedding[:, node] = after
         self.found.copy_(found)
-        self._turn.set_param_at_index(1, node)
+        self._recorded.set_param_at_index(1, node)
         if self._considered is not None and node < len(self._considered):
-            self._turn.set_param_at_index(2, self._considered[node])
-        self._turn.launch(self._stream)
+            self._recorded.set_param_at_index(2, self._considered[node])
+        self._recorded.launch(self._stream)

@@ -113,9 +113,9 @@ def compiled(function: Callable[..., Any]) -> Callable[..., Any]:
 
 
 def allow_recompiles() -> None:
-    """After 8 shapes torch runs a function as it is: iCEM has as many for one number of environments.
+    """Raise torch's limit of programs for a function to `RECOMPILES`, in the whole process.
 
-    So the limit is raised, for everything that is compiled.
+    After 8 shapes it would run a function as it is: iCEM has as many for one number of environments.
     """
     import torch._dynamo.config as dynamo
 

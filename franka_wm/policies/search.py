@@ -12,7 +12,7 @@ from torch import Tensor, nn
 
 from franka_wm.models.base import WorldModel
 from franka_wm.planning.mcts import MCTS
-from franka_wm.planning.tree import Compiled, Recurrent
+from franka_wm.planning.tree import CompiledRecurrent, Recurrent
 from franka_wm.policies.capture import GraphCache
 from franka_wm.policies.graph_key import graph_key
 from franka_wm.policies.planner import allow_recompiles, captures
@@ -37,7 +37,8 @@ class SearchPolicy(TensorDictModuleBase):
             the policy is to be copied, pass bound methods, not closures.
         generator: source of the noise.
         capture: replay decisions as CUDA graphs, see `PlannerPolicy`; None: where the observations are on CUDA.
-        compile: `torch.compile` what a search calls once for each simulation, `recurrent`; see `PlannerPolicy`.
+        compile: `torch.compile` what is done once for each simulation: read a latent from the tree, `recurrent`, pack
+            the answer. The first decision of each number of environments waits for the compiler.
 
     Raises:
         ValueError, CaptureError: see `PlannerPolicy`.
@@ -60,7 +61,7 @@ class SearchPolicy(TensorDictModuleBase):
         super().__init__()
         if compile:
             allow_recompiles()
-            recurrent = Compiled(recurrent)
+            recurrent = CompiledRecurrent(recurrent)
         self.in_keys = list(observation_keys)
         self.out_keys = ["action", "search_policy", "search_value"]
         self.search, self.explore, self.model, self.generator = search, explore, model, generator

@@ -116,12 +116,17 @@ def preset_of(planner: str, settings: RunSettings) -> dict[str, Any]:
 
 def _planning_otherwise(settings: RunSettings, planning: Mapping[str, Mapping[str, Any]]) -> RunSettings:
     """Refuses options that the run's planner and objective do not have; these would be left out like outdated ones."""
+    if planning.get("objective") and settings.is_discrete:
+        raise UserError(
+            f"objective.{next(iter(planning['objective']))}: a tree search has no objective; leave it out"
+        )
     for group, changes in planning.items():
         there = [key for key in settings.values.get(group, {}) if key != "name"]
         for key in changes:
             if key not in there:
+                near = did_you_mean(key, there)
                 raise UserError(
-                    f"{group}.{key}: what this run has of {group}= has no such option; there are {', '.join(there)}"
+                    f"{group}.{key}: no such option of this run's {group}; there are {', '.join(there)}{near}"
                 )
     return settings.changed(**planning)
 

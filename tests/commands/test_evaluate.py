@@ -14,10 +14,12 @@ from franka_wm.commands import evaluate_checkpoint
 from franka_wm.commands import main as cli
 from franka_wm.commands.evaluate import default_folder
 from franka_wm.commands.evaluate import evaluate as verb
+from franka_wm.errors import UserError
 from franka_wm.evaluation import diagnose
 from franka_wm.evaluation.results import to_json
 from franka_wm.models import WorldModel
 from franka_wm.report import diagnostics
+from franka_wm.training.load import _planning_otherwise
 
 POLICIES = {"planner", "policy", "noop", "random", "ik"}
 
@@ -69,19 +71,31 @@ def test_the_closed_loop_alone(run_folder: Path, tmp_path: Path, capsys) -> None
 
 @pytest.mark.slow
 def test_what_was_played_is_kept_when_the_rest_is_interrupted(
-    run_folder: Path, tmp_path, monkeypatch
+    run_folder: Path, tmp_path: Path, monkeypatch, capsys
 ) -> None:
     def stop(*_: object, **__: object) -> None:
         raise KeyboardInterrupt
 
     monkeypatch.setattr(diagnose, "hold_out", stop)
     arguments = ["evaluate", f"checkpoint={run_folder}", f"out={tmp_path}", "device=cpu"]
-    for episodes in (4, 5):  # the second time there are results already, which stay
-        assert cli.main([*arguments, f"episodes={episodes}"]) == 130
-        results = json.loads((tmp_path / "evaluation.json").read_text())
-        assert set(results) == {"protocol", "policies"} and set(results["policies"]) == POLICIES
-        assert results["protocol"]["episodes"] == 4
+
+    def kept(*more: str) -> dict[str, Any]:
+        assert cli.main([*arguments, *more]) == 130
         assert "| ik |" in (tmp_path / "evaluation.md").read_text()
+        return json.loads((tmp_path / "evaluation.json").read_text())
+
+    results = kept("episodes=4")
+    assert set(results) == {"protocol", "policies"} and set(results["policies"]) == POLICIES
+    assert results["protocol"]["diagnostics"] == "not ended"
+    assert "results of the episodes" in capsys.readouterr().out
+    assert kept("episodes=5")["protocol"]["episodes"] == 5  # it held less
+    assert cli.main([*arguments, "episodes=6", "open_loop=false", "probes=false"]) == 0
+    whole = kept("episodes=7")
+    assert whole["protocol"]["episodes"] == 6 and "diagnostics" not in whole["protocol"]
+    (tmp_path / "evaluation.json").write_text(
+        json.dumps({**whole, "protocol": {**whole["protocol"], "updates": 1}})
+    )
+    assert kept("episodes=7")["protocol"]["episodes"] == 7  # of earlier weights
 
 
 @pytest.mark.parametrize(
@@ -136,7 +150,7 @@ def test_a_checkpoint_plans_otherwise_than_its_run(run_folder: Path, tmp_path: P
     for wrong, says in (
         (
             "planner.num_smaples=6",
-            "planner.num_smaples: what this run has of planner= has no such option; there are horizon",
+            "planner.num_smaples: no such option of this run's planner; there are horizon",
         ),
         ("objective.policy_penalty=-1", "policy_penalty=-1: must be a finite number of at least 0"),
         ("planner.num_samples=0", "planner.num_samples=0: must be a whole number of at least 1"),
@@ -148,6 +162,12 @@ def test_a_checkpoint_plans_otherwise_than_its_run(run_folder: Path, tmp_path: P
         assert cli.main(["evaluate", str(run_folder), f"out={tmp_path / 'wrong'}", *words, wrong]) == 1
         assert says in capsys.readouterr().err
     assert not (tmp_path / "wrong").exists()
+
+
+def test_a_tree_search_is_told_that_it_has_no_objective() -> None:
+    settings: Any = SimpleNamespace(is_discrete=True, values={"objective": {"policy_penalty": 0.0}})
+    with pytest.raises(UserError, match=r"objective\.policy_penalty: a tree search has no objective"):
+        _planning_otherwise(settings, {"planner": {}, "objective": {"policy_penalty": 3.0}})
 
 
 def test_a_checkpoint_that_is_not_there(tmp_path: Path, capsys) -> None:

@@ -33,20 +33,36 @@ def test_simnorm_gives_simplices_within_each_group():
     torch.testing.assert_close(groups.sum(-1), torch.ones(3, 2, 3))
 
 
-@pytest.mark.parametrize("shape", [(6,), (1, 6), (1, 1, 6), (2, 6)])
-@pytest.mark.parametrize("bias", [True, False])
-def test_one_row_is_a_sum_in_a_compiled_program_on_a_cpu(shape, bias):
-    layer, x, graphs = layers.Linear(6, 5, bias=bias), torch.randn(shape), []
+def products(layer, x, *, grad=False, **autocast):
+    """Whether the compiled layer has a product, and what it gives."""
+    graphs = []
 
     def keep(graph, _):
         graphs.append(graph)
         return graph
 
     torch._dynamo.reset()
-    with torch.no_grad():
-        torch.testing.assert_close(torch.compile(layer, backend=keep)(x), layer(x))
-    products = [node for node in graphs[0].graph.nodes if "linear" in str(node.target)]
-    assert bool(products) == (shape == (2, 6))
+    with torch.set_grad_enabled(grad), torch.autocast("cpu", **(autocast or {"enabled": False})):
+        given = torch.compile(layer, backend=keep)(x)
+        torch.testing.assert_close(given, layer(x))
+    return any("linear" in str(node.target) for graph in graphs for node in graph.graph.nodes)
+
+
+@pytest.mark.parametrize("bias", [True, False])
+@pytest.mark.parametrize("shape", [(6,), (1, 6), (1, 1, 6)])
+def test_one_row_is_a_sum_in_a_compiled_plan_on_a_cpu(shape, bias):
+    assert not products(layers.Linear(6, 5, bias=bias), torch.randn(shape))
+
+
+def test_everything_else_stays_a_product():
+    layer, row = layers.Linear(6, 5), torch.randn(1, 6)
+    assert products(layer, torch.randn(2, 6))
+    assert products(layer, row, grad=True)
+    assert products(layer, row, dtype=torch.bfloat16)  # one row is of the precision of many
+    assert products(layers.Linear(0, 5), torch.randn(3, 0))
+    for wrong in (row.double(), torch.randn(1, 1), torch.randn(1, 7)):
+        with torch.no_grad(), pytest.raises(RuntimeError):
+            torch.compile(layer, backend="eager")(wrong)
 
 
 def test_mlp_starts_as_published_and_drops_only_in_its_first_layer():

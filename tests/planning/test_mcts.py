@@ -427,5 +427,8 @@ def test_wrong_shapes_are_named(mcts):
 
     with pytest.raises(ValueError, match="reward"):
         search.search(logits, value, z, flat)
-    with pytest.raises(ValueError, match="logits"):
-        search.search(logits, value, z, lambda z, a: (*model.recurrent(z, a)[:3], logits[:, :2], value))
+    for wrong in (logits[:, :2], logits[:1], logits[0], logits.unsqueeze(-1)):
+        with pytest.raises(ValueError, match=r"logits of shape \(\d+, \d+\), got"):
+            search.search(
+                logits, value, z, lambda z, a, wrong=wrong: (*model.recurrent(z, a)[:3], wrong, value)
+            )

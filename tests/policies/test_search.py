@@ -1,5 +1,6 @@
 # pyright: reportArgumentType=false, reportAttributeAccessIssue=false, reportCallIssue=false, reportOptionalMemberAccess=false, reportIncompatibleMethodOverride=false
 import copy
+import pickle
 from functools import partial
 
 import pytest
@@ -17,6 +18,7 @@ from franka_wm.planning import MCTS
 from franka_wm.policies import SearchPolicy
 from franka_wm.seeding import drawing_for
 
+compiled = torch.compile
 LEFT, RIGHT, STAY = 0, 1, 2
 
 
@@ -146,35 +148,50 @@ def test_a_captured_search_is_of_one_share_of_the_worlds(monkeypatch):
 @pytest.mark.parametrize(("kernels", "program"), [(True, "ask"), (False, "recurrent")])
 def test_a_compiled_search_decides_the_same(monkeypatch, kernels, program):
     """In kernels the model is one program with what is read from the tree and written back."""
-    calls, compiled = [], torch.compile
+    calls = []
 
     def compile(function, **options):
-        calls.append(function.__name__)
-        return compiled(function, backend="eager", **options)
+        calls.append((function.__name__, options["options"]))
+        return compiled(function, backend="eager", dynamic=options["dynamic"])
 
     monkeypatch.setattr(torch, "compile", compile)
     start = TensorDict({"state": torch.randn(8, 1)}, [8])
     plain, fast = (
         acting(explore=False, compile=wanted, kernels=kernels)(start.clone()) for wanted in (False, True)
     )
-    assert calls == [program]
+    assert calls == [(program, {"cpp_wrapper": True})]
     for key in ("action", "search_policy", "search_value"):
         torch.testing.assert_close(plain[key], fast[key])
 
 
-def test_a_copy_of_a_compiled_search_asks_its_own_model(monkeypatch):
-    monkeypatch.setattr(torch, "compile", lambda function, **_: function)
+@pytest.mark.parametrize("copied", [copy.deepcopy, lambda policy: pickle.loads(pickle.dumps(policy))])
+@pytest.mark.parametrize("kernels", [True, False])
+def test_a_copy_of_a_compiled_search_asks_its_own_model(monkeypatch, kernels, copied):
+    monkeypatch.setattr(torch, "compile", lambda function, **_: compiled(function, backend="eager"))
     model = models.make("muzero", observation_sizes={"state": 1}, num_actions=3, latent_dim=8, hidden_dim=8)
-    policy = SearchPolicy.for_model(
-        model, MCTS(num_actions=3, num_simulations=2), explore=False, compile=True
+    search = MCTS(num_actions=3, num_simulations=2, kernels=kernels)
+    policy = SearchPolicy.for_model(model, search, explore=False, compile=True)
+    start = TensorDict({"state": torch.ones(2, 1)}, [2])
+    policy(start.clone())  # it has compiled
+    other = copied(policy)
+    with torch.no_grad():
+        for parameter in other.model.parameters():
+            parameter.normal_()
+    wanted = SearchPolicy.for_model(other.model, search, explore=False)(start.clone())
+    torch.testing.assert_close(other(start.clone())["search_value"], wanted["search_value"])
+
+
+@pytest.mark.slow
+def test_a_search_that_is_really_compiled_decides_the_same():
+    model = models.make("muzero", observation_sizes={"state": 1}, num_actions=3, latent_dim=8, hidden_dim=8)
+    plain, fast = (
+        SearchPolicy.for_model(model, MCTS(num_actions=3, num_simulations=8), explore=False, compile=wanted)
+        for wanted in (False, True)
     )
-    start = TensorDict({"state": torch.ones(1, 1)}, [1])
-    policy(start.clone())
-    copied = copy.deepcopy(policy)
-    asked = copied.recurrent.recurrent.__self__
-    assert asked is copied.model is not model
-    monkeypatch.setattr(model, "recurrent", None)
-    copied(start.clone())
+    for worlds in (1, 3):
+        start = TensorDict({"state": torch.randn(worlds, 1)}, [worlds])
+        for key in ("action", "search_policy", "search_value"):
+            torch.testing.assert_close(plain(start.clone())[key], fast(start.clone())[key])
 
 
 def test_a_compiled_search_stays_compiled_for_many_numbers_of_worlds(monkeypatch):
