@@ -177,8 +177,7 @@ def mlp(
 
     Args:
         hidden: width of each hidden layer.
-        output: activation of the output layer, which is then normalised as well (for example `SimNorm`);
-            a plain linear layer when None.
+        output: activation of the output layer, which is then normalised, too (`SimNorm`); None: a linear layer.
         dropout: probability on the first layer only, as published.
     """
     layers: list[nn.Module] = []
@@ -261,10 +260,7 @@ class TwoHotSymlog(nn.Module):
         return symexp((probabilities * self.support).sum(-1, keepdim=True))
 
     def loss(self, logits: Tensor, target: Tensor) -> Tensor:
-        """Soft cross-entropy: logits (..., bins), target scalars (..., 1) -> (..., 1), broadcasting.
-
-        The target is a constant: no gradient passes through it.
-        """
+        """Soft cross-entropy: logits (..., bins), target scalars (..., 1), constants -> (..., 1), broadcasting."""
         probabilities = self.encode(target.detach())
         return -(probabilities * logits.log_softmax(-1)).sum(-1, keepdim=True)
 
@@ -329,8 +325,7 @@ class Ensemble(nn.Module):
             x: (..., in_features), shared by all members.
             weights: `live` trains them; `detached` uses the same values but lets gradients pass only to `x`,
                 so that a policy loss cannot move its critic; `target` uses the slow copies.
-            members: indices (K,) on the device of `x`, or the first so many; only these are computed. All when
-                None.
+            members: indices (K,) on the device of `x`, or the first so many: these alone; None: all.
             dropout: whether to drop activations of the first layer.
 
         Returns:
