@@ -92,6 +92,16 @@ def test_every_part_takes_any_leading_dimensions(leading):
     assert discount.shape == (*leading, 1) and (discount == 0.9).all()
 
 
+def test_one_row_of_a_compiled_search_has_no_product_to_call():
+    model, graphs = small().eval(), []
+    torch._dynamo.reset()
+    compiled = torch.compile(model.recurrent, backend=lambda graph, _: graphs.append(graph) or graph)
+    with torch.no_grad():
+        compiled(torch.rand(1, 32), torch.zeros(1, dtype=torch.int64))
+    called = [node.target for graph in graphs for node in graph.graph.nodes if node.op == "call_function"]
+    assert called and F.linear not in called
+
+
 def test_latents_are_simplices_and_moves_matter():
     model = small()
     z = model.encode(windows())
