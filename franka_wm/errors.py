@@ -1,6 +1,9 @@
 """Errors that a user can mend. Entry points print them as one line, without a traceback."""
 
 import errno
+import traceback
+from collections.abc import Iterator
+from contextlib import contextmanager
 
 LONGEST, LONGEST_LINE = 1000, 2500
 """Characters of a word and of a message: what a user, or a stranger's file, holds may be of any length."""
@@ -28,6 +31,34 @@ class UserError(FrankaError, ValueError):
     The message says what is wrong, what is allowed, and what to do. Also a `ValueError`, so that code
     which uses the package as a library can catch it without knowing it.
     """
+
+
+@contextmanager
+def trying(what: str, *but: type[Exception]) -> Iterator[None]:
+    """Around a call of the user's own code: what goes wrong in it ends in one line that says where.
+
+    Args:
+        what: is called, in words.
+        but: errors that pass.
+
+    Raises:
+        UserError: `what` fails, by which error, and in which line.
+    """
+    try:
+        yield
+    except (FrankaError, MemoryError, *but):
+        raise
+    except (Exception, SystemExit) as error:
+        raise UserError(f"{what} fails: {where(error)}; mend it") from error
+
+
+def where(error: BaseException) -> str:
+    """Kind and first line of an error, and the line that raised it."""
+    last = traceback.extract_tb(error.__traceback__)[-1]
+    # A SyntaxError says it itself.
+    place = "" if isinstance(error, SyntaxError) else f" ({last.filename}, line {last.lineno})"
+    reason = (str(error).strip() or "no reason given").splitlines()[0]
+    return f"{type(error).__name__}: {reason}{place}"
 
 
 _LOOP = "a link leads to itself; remove it"

@@ -33,6 +33,16 @@ OF_ONES_OWN = "; one of your own: plugins=[MODULE] imports its module, which mus
 """Ends the refusal of a task, model or planner that is not known."""
 
 
+def refuse_ours(name: str, ours: Iterable[str]) -> None:
+    """Refuse to register a name that the package has.
+
+    Raises:
+        UserError: One line.
+    """
+    if name in ours:
+        raise UserError(f"register({name!r}, …): the package has this name; choose another")
+
+
 @dataclass(frozen=True)
 class Rule:
     """What an option may be.

@@ -152,9 +152,14 @@ class Verb(click.Command):
                 awaited = not value
                 yield f"--{name}={value}" if value else f"--{name}"
             elif dashed or (equals and not self._is_other(argument) and not Path(argument).exists()):
-                raise UserError(f"{self.name}: {no_such_option(name, list(self.words))}")
+                raise UserError(f"{self.name}: {no_such_option(name, [*self.words, *self._others()])}")
             else:
                 yield argument
+
+    def _others(self) -> list[str]:
+        """What other words look like."""
+        beginnings = [self.others] if isinstance(self.others, str) else self.others or ()
+        return [one if one.endswith("=") else f"{one}KEY" for one in beginnings]
 
     def _is_other(self, argument: str) -> bool:
         return self.others is not None and argument.startswith(self.others)
@@ -236,6 +241,13 @@ def check_run(verb: str, option: str, folder: str) -> None:
         raise UserError(
             f"{verb}: {option}={folder}: no such folder; give that of a run, as train.py prints it last"
         )
+    place = Path(folder)
+    if (place / "meta" / "info.json").is_file():
+        raise UserError(f"{verb}: {option}={folder}: is a dataset; give the folder of a run")
+    if place.is_dir() and not any((place / one).exists() for one in ("checkpoints", "manifest.json")):
+        runs = sorted(one.name for one in place.iterdir() if (one / "checkpoints").is_dir())
+        if runs:
+            raise UserError(f"{verb}: {option}={folder}: holds several runs; give one of {', '.join(runs)}")
 
 
 def verb(name: str, **settings: Any) -> Callable[[Any], Verb]:
@@ -245,6 +257,11 @@ def verb(name: str, **settings: Any) -> Callable[[Any], Verb]:
 
 
 def no_such_option(name: str, known: Sequence[str]) -> str:
-    """One line about an option that does not exist: the nearest one, or all."""
-    near = did_you_mean(name, known) or (f"; did you mean {known[0]}?" if len(known) == 1 else "")
+    """One line about an option that does not exist: the nearest one, that of another group, or all."""
+    last = name.rpartition(".")[2]
+    near = (
+        did_you_mean(name, known)
+        or (f"; did you mean {last}?" if last in known else "")
+        or (f"; did you mean {known[0]}?" if len(known) == 1 else "")
+    )
     return f"{name}: no such option{near or '; there are ' + ', '.join(known) if known else ''}"

@@ -14,10 +14,11 @@ from franka_wm.files import unwritable
 @verb(
     "evaluate",
     first="checkpoint",
-    others=("planner=", "planner.", "objective."),
+    others=("planner=", "planner.", "objective.", "hydra.searchpath="),
     shown=(
         "planner.KEY=…",
-        "plans otherwise than the run did, also planner=NAME, objective.KEY=…; wants out=FOLDER",
+        "plans otherwise than the run did, also planner=NAME, objective.KEY=…; wants out=FOLDER. One of "
+        "your own: plugins= and hydra.searchpath=[file://FOLDER], as for train",
     ),
 )
 @word(
@@ -52,11 +53,13 @@ def evaluate(checkpoint: str, out: str | None, overrides: Sequence[str] = (), **
     place = own if out is None else Path(out)
     check_folder(place)
     check_run("evaluate", "checkpoint", checkpoint)
-    check_other(place, own, ", ".join(overrides))
+    planned_with = ", ".join(one for one in overrides if not one.startswith("hydra.searchpath="))
+    check_other(place, own, planned_with)
     check_larger(place, options["episodes"], checkpoint)
     from franka_wm.commands.evaluate_checkpoint import Options, run
 
-    run(Options(checkpoint=checkpoint, out=place, overrides=tuple(overrides), **options))
+    words = tuple(overrides)
+    run(Options(checkpoint=checkpoint, out=place, overrides=words, planned_with=planned_with, **options))
 
 
 def default_folder(checkpoint: str) -> Path:

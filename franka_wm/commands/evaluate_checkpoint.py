@@ -47,15 +47,17 @@ class Options:
     probes: bool
     robustness: bool
     overrides: tuple[str, ...] = ()
+    planned_with: str = ""
 
 
 def _planning(options: Options) -> dict[str, Any]:
     """What :func:`load_agent` is told of ``planner=NAME`` and ``planner.KEY=…``, the last of several."""
     chosen = [word for word in options.overrides if word.startswith("planner=")]
-    others = [word for word in options.overrides if word not in chosen]
+    paths = [word for word in options.overrides if word.startswith("hydra.searchpath=")]
+    others = [word for word in options.overrides if word not in (*chosen, *paths)]
     found: dict[str, Any] = {"planning": changes("evaluate", others)}
     if chosen:
-        found["planned_by"] = chosen[-1].removeprefix("planner=")
+        found |= {"planned_by": chosen[-1].removeprefix("planner="), "searchpath": paths}
     return found
 
 
@@ -82,9 +84,9 @@ def run(options: Options) -> dict[str, Any]:
         agent, episodes=options.episodes, report=lambda name, r: say(describe(name, r))
     )
     described = protocol(agent.settings, agent.env, evaluation, by=COMMAND, counters=agent.counters)
-    otherwise = {"planned with": ", ".join(options.overrides)} if options.overrides else {}
+    planned = {"planned with": options.planned_with} if options.planned_with else {}
     results = {
-        "protocol": {"checkpoint": options.checkpoint, **described, **otherwise},
+        "protocol": {"checkpoint": options.checkpoint, **described, **planned},
         "policies": evaluation.policies,
     }
     for table in evaluation_tables(evaluation.policies):
@@ -175,8 +177,8 @@ def _replaceable(folder: Path, described: Mapping[str, Any]) -> bool:
 
 
 def _text(results: dict[str, Any], evaluation: Evaluation, agent: Agent) -> str:
-    otherwise = results["protocol"].get("planned with")
-    lines = [f"Planned with {otherwise}, not as the run did.\n"] if otherwise else []
+    planned = results["protocol"].get("planned with")
+    lines = [f"Planned with {planned}, not as the run did.\n"] if planned else []
     tables = diagnostic_tables(results, agent.env.config)
     parts = [f"### {title}\n\n{markdown(table)}" for title, table in tables.items()]
     return "\n".join([*lines, evaluation_markdown(evaluation), *parts])

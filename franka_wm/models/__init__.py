@@ -9,10 +9,11 @@ is imported when it is made, and torch with the first of them: names alone are r
 from __future__ import annotations
 
 from importlib import import_module
+from inspect import Parameter, signature
 from typing import TYPE_CHECKING, Any
 
 from franka_wm.errors import UserError
-from franka_wm.options import did_you_mean
+from franka_wm.options import did_you_mean, refuse_ours
 
 if TYPE_CHECKING:
     from franka_wm.models.base import WorldModel
@@ -69,12 +70,20 @@ def register(name: str, cls: type[WorldModel], *, line: str = "") -> None:
         line: one line of description.
 
     Raises:
-        UserError: `cls` is no subclass of `WorldModel`.
+        UserError: the package has this name, or `cls` is no subclass of `WorldModel` with `encode` and `loss`.
     """
     from franka_wm.models.base import WorldModel
 
+    refuse_ours(name, _FAMILIES)
+
     if not (isinstance(cls, type) and issubclass(cls, WorldModel)):
         raise UserError(f"model {name!r}: {cls!r} must be a subclass of franka_wm.models.WorldModel")
+    lacking = [one for one in ("encode", "loss") if getattr(cls, one) is getattr(WorldModel, one)]
+    if lacking:
+        raise UserError(
+            f"model {name!r}: {cls.__name__} must define encode and loss; {' and '.join(lacking)} is missing, "
+            "see docs/models.md"
+        )
     _REGISTERED[name] = (cls, line)
 
 
@@ -106,8 +115,23 @@ def make(name: str, **overrides: Any) -> WorldModel:
 
     Raises:
         ValueError: no family has this name; the message lists those that exist.
+        UserError: one of your own answers in other shapes than `WorldModel` says, see `check_model`.
     """
-    return family(name)(**overrides)
+    cls = family(name)
+    if name not in _REGISTERED:
+        return cls(**overrides)
+    from franka_wm.models.check import check_model
+
+    takes = signature(cls).parameters
+    unknown = [key for key in overrides if key not in takes]
+    if unknown and not any(one.kind is Parameter.VAR_KEYWORD for one in takes.values()):
+        raise UserError(
+            f"{cls.__name__} takes no {', '.join(unknown)}; a run gives observation_sizes, image_sizes where there are "
+            "images, action_dim or num_actions, episode_length, and what its conf/model file has"
+        )
+    made = cls(**overrides)
+    check_model(made, action_dim=overrides.get("action_dim"))
+    return made
 
 
 def __getattr__(name: str) -> Any:

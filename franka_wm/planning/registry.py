@@ -6,9 +6,11 @@ file in `conf/planner` with `name:` and the constructor's arguments.
 
 from collections.abc import Mapping
 from importlib import import_module
+from inspect import signature
 from typing import Any
 
-from franka_wm.options import check_arguments, check_names, did_you_mean
+from franka_wm.errors import UserError
+from franka_wm.options import OF_ONES_OWN, check_arguments, check_names, did_you_mean, refuse_ours
 
 # name -> (module, class, whether it chooses among discrete actions, what it is in one line)
 _PLANNERS: dict[str, tuple[str, str, bool, str]] = {
@@ -29,6 +31,9 @@ _PLANNERS: dict[str, tuple[str, str, bool, str]] = {
     "mcts": ("franka_wm.planning.mcts", "MCTS", True, "tree search, PUCT or Gumbel"),
 }
 _REGISTERED: dict[str, tuple[type, bool, str]] = {}
+
+PLAN_KEYWORDS = ("prior", "previous", "is_init", "explore", "generator")
+"""What `Planner.plan` is given by keyword."""
 
 
 def available() -> dict[str, str]:
@@ -55,7 +60,14 @@ def register(name: str, cls: type, *, search: bool = False, line: str = "") -> N
         cls: built with `action_dim=…` (with `num_actions=…` if `search`) and the rest of the configuration.
         search: whether it chooses among discrete actions.
         line: what it is.
+
+    Raises:
+        UserError: the package has this name, or the class has no `plan` that can be called as `Planner.plan` is
+            (no `search`, if it searches).
     """
+    refuse_ours(name, _PLANNERS)
+    if isinstance(cls, type):  # else a function that makes one
+        _check_class(name, cls, search)
     _REGISTERED[name] = (cls, search, line)
 
 
@@ -88,11 +100,33 @@ def make(name: str, **arguments: Any) -> Any:
 
     Raises:
         ValueError: no planner has this name, or an argument that cannot work.
+        UserError: one of your own does not do what `Planner` promises, see `check_planner`.
     """
-    return planner(name)(**arguments)
+    made = planner(name)(**arguments)
+    if name in _REGISTERED and not is_search(name):
+        from franka_wm.planning.check import check_planner
+
+        check_planner(made, action_dim=arguments["action_dim"], name=name)
+    return made
 
 
 def _require(name: str) -> None:
     if name not in _PLANNERS and name not in _REGISTERED:
         known = list(available())
-        raise ValueError(f"must be one of {', '.join(known)}, got {name!r}{did_you_mean(name, known)}")
+        near = did_you_mean(name, known) or OF_ONES_OWN
+        raise ValueError(f"must be one of {', '.join(known)}, got {name!r}{near}")
+
+
+def _check_class(name: str, cls: type, search: bool) -> None:
+    method = getattr(cls, "search" if search else "plan", None)
+    said = f"register({name!r}, {cls.__name__})"
+    if method is None:
+        raise UserError(f"{said}: has no {'search' if search else 'plan'}; see docs/planning.md")
+    if search:
+        return
+    try:
+        signature(method).bind("self", "z", "next", "objective", **dict.fromkeys(PLAN_KEYWORDS))
+    except TypeError as error:
+        raise UserError(
+            f"{said}: plan must take z, next, objective, and by keyword {', '.join(PLAN_KEYWORDS)}: {error}"
+        ) from error

@@ -181,6 +181,10 @@ class Learner:
         # No cache of cast weights: it would hold tensors of one captured update into the next.
         with torch.autocast(self.device.type, torch.bfloat16, enabled=low, cache_enabled=False):
             losses = self._loss(batch)
+        if not isinstance(losses, TensorDictBase) or losses.get("loss", None) is None:
+            raise UserError(
+                f"{type(self.model).__name__}.loss must return a TensorDict: loss, and numbers to log (docs/models.md)"
+            )
         losses.get("loss").backward()
         processes.average_gradients(p for group in self._clip_groups.values() for p in group)
         values = {name: value for name, value in losses.items()}

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import torch
+from hydra.errors import MissingConfigException
 from omegaconf import OmegaConf
 from tensordict.nn import TensorDictModuleBase
 
@@ -62,6 +63,7 @@ def load_agent(
     env_changes: Mapping[str, Any] | None = None,
     seed: int | None = None,
     planned_by: str | None = None,
+    searchpath: Sequence[str] = (),
     planning: Mapping[str, Mapping[str, Any]] | None = None,
 ) -> Agent:
     """Rebuilds environment, model, planner and policies from a checkpoint.
@@ -73,6 +75,7 @@ def load_agent(
         env_changes: Fields of the environment's configuration to change.
         seed: Seed of the environment and the policies; the run's if not given.
         planned_by: Another planner, by its name in ``conf/planner``, as the run's scale has it; the run's if not given.
+        searchpath: ``hydra.searchpath=[file://FOLDER]`` with ``planner/NAME.yaml``, for a planner of one's own.
         planning: Options of ``planner`` and ``objective`` that are other than the run's.
 
     Raises:
@@ -83,7 +86,9 @@ def load_agent(
     if seed is not None:
         settings = settings.changed(seed=seed)
     if planned_by is not None:
-        settings = RunSettings.of({**settings.values, "planner": preset_of(planned_by, settings)}, saved=True)
+        settings = RunSettings.of(
+            {**settings.values, "planner": preset_of(planned_by, settings, *searchpath)}, saved=True
+        )
     if planning:
         settings = _planning_otherwise(settings, planning)
     if settings.env.kind == "none":
@@ -103,13 +108,18 @@ def load_agent(
     return Agent(checkpoint.folder, settings, env, model, planner, policies, dict(checkpoint.counters))
 
 
-def preset_of(planner: str, settings: RunSettings) -> dict[str, Any]:
-    """What ``planner=NAME`` would have been in this run."""
-    there = sorted(file.stem for file in Path(conf.__file__).with_name("planner").glob("*.yaml"))
-    if planner not in there:
-        near = did_you_mean(planner, there)
-        raise UserError(f"planner={planner}: must be one of {', '.join(there)}{near}")
-    composed = conf.compose(f"planner={planner}", f"scale={settings.values['scale']}")
+def preset_of(planner: str, settings: RunSettings, *searchpath: str) -> dict[str, Any]:
+    """What ``planner=NAME`` would have been in this run; ``searchpath``: see :func:`load_agent`."""
+    try:
+        composed = conf.compose(f"planner={planner}", f"scale={settings.values['scale']}", *searchpath)
+    except MissingConfigException as error:
+        group, name = (error.missing_cfg_file or f"planner/{planner}").rsplit("/", 1)
+        there = sorted(error.options or ())
+        near = (
+            did_you_mean(name, there)
+            or f"; of your own: hydra.searchpath=[file://FOLDER], with {group}/{name}.yaml"
+        )
+        raise UserError(f"{group}={name}: must be one of {', '.join(there)}{near}") from error
     found: Any = OmegaConf.to_container(composed.planner, resolve=True)
     return found
 

@@ -6,7 +6,6 @@ import gc
 import importlib
 import logging
 import sys
-import traceback
 from collections.abc import Callable, Collection, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
@@ -31,7 +30,7 @@ from franka_wm.data.replay import WindowReplay
 from franka_wm.device import resolve_device
 from franka_wm.envs import Environment
 from franka_wm.envs.multitask_config import MultiTaskConfig
-from franka_wm.errors import FrankaError, UserError
+from franka_wm.errors import FrankaError, UserError, trying
 from franka_wm.interrupt import INTERRUPTED
 from franka_wm.seeding import derive_seed, seeded
 from franka_wm.training import build
@@ -64,22 +63,13 @@ def import_plugins(names: object) -> None:
         if str(Path.cwd()) not in sys.path:
             sys.path.insert(0, str(Path.cwd()))  # as for python -m: modules beside the one who starts the run
         try:
-            importlib.import_module(name)
+            with trying(f"plugins: {name}", ModuleNotFoundError):
+                importlib.import_module(name)
         except ModuleNotFoundError as error:
             if error.name is None or not f"{name}.".startswith(f"{error.name}."):  # one that it imports
                 raise UserError(f"plugins: {name} fails: {error}; install it, or mend {name}") from error
             raise UserError(
                 f"plugins: no module {error.name!r}, looked for in {Path.cwd()}, too; name modules as in `import`"
-            ) from error
-        except FrankaError:
-            raise
-        except (Exception, SystemExit) as error:
-            # Where: a SyntaxError says it itself, of others the last call does.
-            last = traceback.extract_tb(error.__traceback__)[-1]
-            place = "" if isinstance(error, SyntaxError) else f" ({last.filename}, line {last.lineno})"
-            reason = (str(error).strip() or "no reason given").splitlines()[0]
-            raise UserError(
-                f"plugins: {name} fails: {type(error).__name__}: {reason}{place}; mend it"
             ) from error
 
 

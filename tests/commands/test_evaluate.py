@@ -18,6 +18,7 @@ from franka_wm.errors import UserError
 from franka_wm.evaluation import diagnose
 from franka_wm.evaluation.results import to_json
 from franka_wm.models import WorldModel
+from franka_wm.planning import registry
 from franka_wm.report import diagnostics
 from franka_wm.training.load import _planning_otherwise
 
@@ -113,6 +114,8 @@ def test_what_was_played_is_kept_when_the_rest_is_interrupted(
         (["a", "planner.num_samples=8"], "do not take the place of its own; give another folder, out=FOLDER"),
         (["a", "out=a/evaluation", "objective.policy_penalty=1"], "do not take the place of its own"),
         (["a", "out=a", "objective.policy_penalty=1"], "do not take the place of its own"),
+        (["a", "evaluation.episodes=5"], "evaluation.episodes: no such option; did you mean episodes?"),
+        (["a", "env.fps=20"], "plugins, planner=, planner.KEY, objective.KEY, hydra.searchpath="),
         (["a", "planner=cem"], "planner=cem: results of other settings than the run's do not take the place"),
         (["checkpoint=a", "outputs/run"], "'outputs/run': write options as name=value"),
     ],
@@ -124,7 +127,11 @@ def test_bad_arguments(arguments: list[str], says: str, capsys) -> None:
 
 
 @pytest.mark.slow
-def test_a_checkpoint_plans_otherwise_than_its_run(run_folder: Path, tmp_path: Path, capsys) -> None:
+def test_a_checkpoint_plans_otherwise_than_its_run(
+    root, run_folder, tmp_path: Path, monkeypatch, capsys
+) -> None:
+    monkeypatch.syspath_prepend(root)
+    monkeypatch.setattr(registry, "_REGISTERED", {})
     words = ["episodes=4", "device=cpu", "open_loop=false", "probes=false"]
     changed = ["planner.num_samples=6", "planner.num_elites=3", "planner.num_policy_samples=0"]
     for out, more in (("as_it_was", []), ("otherwise", changed)):
@@ -158,10 +165,34 @@ def test_a_checkpoint_plans_otherwise_than_its_run(run_folder: Path, tmp_path: P
             "planner=cemm",
             "planner=cemm: must be one of cem, gradient, gumbel, icem, mcts, mppi; did you mean cem?",
         ),
+        (
+            "planner=mine",
+            "icem, mcts, mppi; of your own: hydra.searchpath=[file://FOLDER], with planner/mine.yaml",
+        ),
     ):
         assert cli.main(["evaluate", str(run_folder), f"out={tmp_path / 'wrong'}", *words, wrong]) == 1
         assert says in capsys.readouterr().err
     assert not (tmp_path / "wrong").exists()
+    own = [f"hydra.searchpath=[file://{root}/examples/conf]", "plugins=[examples.add_a_planner]"]
+    assert (
+        cli.main(["evaluate", str(run_folder), f"out={tmp_path / 'own'}", *words, *own, "planner=shooting"])
+        == 0
+    )
+    protocol = json.loads((tmp_path / "own" / "evaluation.json").read_text())["protocol"]
+    assert protocol["planner"] == "shooting" and protocol["planned with"] == "planner=shooting"
+
+
+def test_a_folder_of_something_else_is_told_apart(tmp_path: Path, capsys) -> None:
+    for folder in ("sweep/0-reach/checkpoints", "sweep/1-reach/checkpoints", "sweep/plots", "data/meta"):
+        (tmp_path / folder).mkdir(parents=True)
+    (tmp_path / "data" / "meta" / "info.json").write_text("{}")
+    for folder, says in (
+        ("sweep", "sweep: holds several runs; give one of 0-reach, 1-reach"),
+        ("data", "data: is a dataset; give the folder of a run"),
+    ):
+        assert cli.main(["evaluate", str(tmp_path / folder)]) == 1
+        told = capsys.readouterr()
+        assert says in told.err and not told.out
 
 
 def test_a_tree_search_is_told_that_it_has_no_objective() -> None:

@@ -287,3 +287,20 @@ def test_all_of_a_batch_is_copied_into_the_memory_that_a_capture_reads() -> None
     assert (kept == steps(2.0)).all()
     with pytest.raises(KeyError):  # rather than learned from with what a batch before had
         learner._kept(steps(3.0).exclude(("next", "x")), False)
+
+
+def test_a_loss_of_another_form_is_told_in_one_line():
+    class Plain(Line):
+        def loss(self, batch):
+            return super().loss(batch)["loss"]
+
+    class Nameless(Line):
+        def loss(self, batch):
+            return super().loss(batch).select("x_mean")
+
+    for model in (Plain(), Nameless()):
+        name = type(model).__name__
+        with pytest.raises(
+            UserError, match=rf"{name}\.loss must return a TensorDict: loss, and numbers to log"
+        ):
+            Learner(cast(Any, model), lr=0.1).update(batch(1.0))

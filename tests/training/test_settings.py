@@ -11,12 +11,14 @@ from typing import Any
 import pytest
 from omegaconf import OmegaConf
 
+from franka_wm import models
 from franka_wm.conf import FOLDER, KNOWN, compose
 from franka_wm.errors import UserError
 from franka_wm.planning import registry
-from franka_wm.training.build import make_planner
+from franka_wm.training.build import make_model, make_objective, make_planner
 from franka_wm.training.settings import RunSettings
 from franka_wm.training.settings.run import GROUPS, plain
+from franka_wm.training.spaces import Spaces
 
 OUT_OF_RANGE = {
     "seed": [-1],
@@ -321,3 +323,21 @@ def test_each_gpu_has_worlds_of_every_task(settled) -> None:
         with pytest.raises(UserError, match=f"collector.num_envs={worlds}: .* use a multiple of 16"):
             settled(*few, f"collector.num_envs={worlds}")
     settled(*few, "collector.num_envs=32")
+
+
+def test_plans_are_for_returns_unless_the_family_has_no_value_but_goal_images(monkeypatch) -> None:
+    family = models.family("tdmpc2")
+    for has_value, has_goal, chosen in (
+        (True, True, "reward_value"),
+        (False, True, "goal_image"),
+        (False, False, "reward_value"),  # refused then, naming what is missing
+    ):
+        monkeypatch.setattr(family, "has_value", has_value)
+        monkeypatch.setattr(family, "has_goal", has_goal)
+        run = RunSettings.of(compose("model=tdmpc2"))
+        assert run.objective_name == chosen
+    model = make_model(run, Spaces({"state": 3}, {}, 7, 0, 50))
+    with pytest.raises(
+        UserError, match="objective=reward_value: TDMPC2 has no value; goal_image needs encode_goal"
+    ):
+        make_objective(run, model)

@@ -306,7 +306,7 @@ class RunSettings:
         family = self.model.family
         if family.discrete or not family.has_next:
             return None
-        return "reward_value" if family.has_value else "goal_image"
+        return "reward_value" if family.has_value or not family.has_goal else "goal_image"
 
     @property
     def told_beside_image(self) -> list[str]:
