@@ -2,19 +2,20 @@
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from franka_wm.commands.overrides import changes
-from franka_wm.console import announced, say
+from franka_wm.console import announced, program, say
 from franka_wm.errors import UserError
 from franka_wm.evaluation import diagnose
 from franka_wm.evaluation.decoder import Imagined
 from franka_wm.evaluation.open_loop import NothingToPredictError
 from franka_wm.evaluation.protocol import Evaluation, describe, evaluate_agent, protocol
-from franka_wm.evaluation.results import COMMAND, FILE, read_result, to_json
+from franka_wm.evaluation.results import COMMAND, FILE, OF_RUN, OTHERWISE, read_result, to_json
 from franka_wm.evaluation.robustness import check_shiftable, note, robustness
 from franka_wm.files import atomic_write
 from franka_wm.report.diagnostics import (
@@ -23,6 +24,7 @@ from franka_wm.report.diagnostics import (
     terminal,
     timing_table,
 )
+from franka_wm.report.run import read_chosen
 from franka_wm.report.table import evaluation_tables, markdown
 from franka_wm.training.load import load_agent
 
@@ -79,12 +81,15 @@ def run(options: Options) -> dict[str, Any]:
         )
     if options.robustness:
         check_shiftable(agent)
+    own = agent.folder.parents[1] if agent.folder.parent.name == "checkpoints" else agent.folder
+    within = options.out.resolve() == own / "evaluation"
+    of_run = None if within or options.out.resolve() == own else _of_run(agent, options)
     say(f"{options.episodes} held-out episodes for each of {', '.join(agent.policies)} …")
     evaluation = evaluate_agent(
         agent, episodes=options.episodes, report=lambda name, r: say(describe(name, r))
     )
     described = protocol(agent.settings, agent.env, evaluation, by=COMMAND, counters=agent.counters)
-    planned = {"planned with": options.planned_with} if options.planned_with else {}
+    planned = {OTHERWISE: options.planned_with} if options.planned_with else {}
     results = {
         "protocol": {"checkpoint": options.checkpoint, **described, **planned},
         "policies": evaluation.policies,
@@ -97,7 +102,7 @@ def run(options: Options) -> dict[str, Any]:
     if more and _replaceable(options.out, described):
         # What took longest is kept if the rest does not end.
         results["protocol"]["diagnostics"] = "not ended"
-        _write(options.out, results, _text(results, evaluation, agent), evaluation, None)
+        _write(options.out, results, _text(results, evaluation, agent), evaluation, None, of_run)
         say(f"results of the episodes: {options.out}; diagnostics follow")
     imagined = None
     if options.open_loop or options.probes:
@@ -113,9 +118,25 @@ def run(options: Options) -> dict[str, Any]:
         console.print(terminal(table, title))
     results["protocol"].pop("diagnostics", None)
     text = _text(results, evaluation, agent)
-    _write(options.out, results, text, evaluation, None if imagined is None else imagined[0])
+    _write(options.out, results, text, evaluation, None if imagined is None else imagined[0], of_run)
     say(f"results: {options.out}")
+    say(
+        f"a page of them: {program()} report {shlex.quote(str(options.out.parent if within else options.out))}"
+    )
     return results
+
+
+def _of_run(agent: Agent, options: Options) -> dict[str, Any]:
+    """What results that lie elsewhere say of their run; where they lie beside them, the run's own files do."""
+    told: dict[str, Any] = {"config": {}, "overrides": [], "preset": ""}
+    if agent.folder.parent.name == "checkpoints":
+        told = read_chosen(agent.folder.parents[1])
+    values = agent.settings.values
+    changed = {
+        group for group in ("planner", "objective") if any(w.startswith(group) for w in options.overrides)
+    }
+    # These have the device here, and what training found, too; a comparison would list both.
+    return {**told, "config": {**(told["config"] or values), **{group: values[group] for group in changed}}}
 
 
 def _look_ahead(
@@ -177,7 +198,7 @@ def _replaceable(folder: Path, described: Mapping[str, Any]) -> bool:
 
 
 def _text(results: dict[str, Any], evaluation: Evaluation, agent: Agent) -> str:
-    planned = results["protocol"].get("planned with")
+    planned = results["protocol"].get(OTHERWISE)
     lines = [f"Planned with {planned}, not as the run did.\n"] if planned else []
     tables = diagnostic_tables(results, agent.env.config)
     parts = [f"### {title}\n\n{markdown(table)}" for title, table in tables.items()]
@@ -185,7 +206,12 @@ def _text(results: dict[str, Any], evaluation: Evaluation, agent: Agent) -> str:
 
 
 def _write(
-    folder: Path, results: dict[str, Any], text: str, evaluation: Evaluation, imagined: Imagined | None
+    folder: Path,
+    results: dict[str, Any],
+    text: str,
+    evaluation: Evaluation,
+    imagined: Imagined | None,
+    of_run: Mapping[str, Any] | None = None,
 ) -> None:
     """Every file whole; the one that others read, last. Nothing stays of an earlier evaluation."""
     if imagined is None:
@@ -203,9 +229,10 @@ def _write(
         for name, s in evaluation.seconds.items()
     }
     for name, content in (
+        *([] if of_run is None else [(OF_RUN, to_json(of_run))]),
         ("timing.json", to_json(seconds)),
         ("evaluation.md", text),
-        ("evaluation.json", to_json(results)),
+        (FILE, to_json(results)),
     ):
         with atomic_write(folder / name) as path:
             path.write_text(content)

@@ -19,6 +19,9 @@ Quantities are those of :func:`franka_wm.evaluation.closed_loop.summarize`. Of t
     health        {name: number}, and "warnings": [text]
 
 A number that is not known is null.
+
+Where the command writes elsewhere than into the run's folder, ``run.json`` beside it says of which run it is:
+``config``, as it was evaluated, ``overrides``, what was typed after ``train.py``, and ``preset``, that of ``env``.
 """
 
 import json
@@ -33,7 +36,9 @@ from franka_wm.errors import UserError
 from franka_wm.policies.names import RENAMED
 from franka_wm.untrusted import UntrustedFolder
 
-FILE = "evaluation.json"
+FILE, OF_RUN = "evaluation.json", "run.json"
+OTHERWISE = "planned with"
+"""Key of a protocol: settings of the planner that are not the run's, given to ``franka-wm evaluate``."""
 END, COMMAND = "the end of training", "franka-wm evaluate"
 """Who measured, as ``protocol`` says under ``by``."""
 

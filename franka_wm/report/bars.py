@@ -10,6 +10,7 @@ from franka_wm.report.figure import as_label, finish_axes, new_figure, shortened
 from franka_wm.report.style import INK, LIGHT, PAPER, Theme
 
 if TYPE_CHECKING:
+    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
 type Bar = float | Mapping[str, object] | None
@@ -33,7 +34,7 @@ def bars_figure(
             leaves a gap.
         label: of the horizontal axis.
         scale: what all values are multiplied with, such as 100 for percent.
-        limits: of the horizontal axis, after scaling.
+        limits: of the horizontal axis, after scaling. A bar that goes beyond has an arrow and its number there.
         colours: series, or group where there is one series only -> light colour; others take the palette in order.
 
     Raises:
@@ -62,6 +63,8 @@ def bars_figure(
             *(_ends(group[name], scale) for group in values.values() if name in group), strict=True
         )
         axes.barh(places, means, height=0.9 * thick, color=each, label=as_label(name))
+        for place, mean in zip(places, means, strict=True):
+            _say_if_cut(axes, place, mean, limits, theme)
         whiskers = [
             [mean - a for mean, a in zip(means, low, strict=True)],
             [b - mean for mean, b in zip(means, high, strict=True)],
@@ -98,6 +101,26 @@ def bars_figure(
     axes.spines["left"].set_visible(False)
     axes.tick_params(axis="y", length=0)
     return figure
+
+
+def _say_if_cut(
+    axes: "Axes", place: float, value: float, limits: tuple[float, float] | None, theme: Theme
+) -> None:
+    """An arrow and the number at the end of the axis that a bar goes beyond."""
+    if limits is None or limits[0] <= value <= limits[1]:
+        return
+    low = value < limits[0]
+    axes.annotate(
+        f"← {value:.3g}" if low else f"{value:.3g} →",
+        (limits[0] if low else limits[1], place),
+        xytext=(1 if low else -1, 0),
+        textcoords="offset points",
+        ha="left" if low else "right",
+        va="center",
+        fontsize=7,
+        color=theme.colour(INK),
+        bbox={"facecolor": theme.colour(PAPER), "edgecolor": "none", "pad": 0.8},
+    )
 
 
 def _known(bar: Bar) -> bool:

@@ -9,7 +9,7 @@ from typing import Any
 from markupsafe import Markup
 
 from franka_wm.errors import UserError
-from franka_wm.evaluation.results import SHOWN, Result
+from franka_wm.evaluation.results import OTHERWISE, SHOWN, Result
 from franka_wm.report import style
 from franka_wm.report.bars import bars_figure
 from franka_wm.report.curves import panels, quantity, seeds_figure
@@ -119,7 +119,12 @@ def repetitions(runs: Mapping[str, RunFiles]) -> dict[str, dict[str, RunFiles]]:
     groups: dict[str, dict[str, RunFiles]] = {}
     for name, run in runs.items():
         # Runs without a configuration are known to be the same as nothing.
-        groups.setdefault(but_for_the_seed(run.config) or name, {})[name] = run
+        alike = but_for_the_seed(run.config) or name
+        if run.elsewhere:  # of a run that may be here, too, or that was evaluated twice: not another run
+            alike += " elsewhere"
+            if any(one.seed == run.seed for one in groups.get(alike, {}).values()):
+                alike += name
+        groups.setdefault(alike, {})[name] = run
     return {next(iter(group)): group for group in groups.values()}
 
 
@@ -199,12 +204,8 @@ def _once(values: Mapping[str, Mapping[str, Any]]) -> dict[str, Mapping[str, Any
     return {", ".join(same): values[same[0]] for same in names.values()}
 
 
-_OTHERWISE = "planned with"
-"""Key of a result's protocol: settings of the planner that are not the run's, given to ``franka-wm evaluate``."""
-
-
 def _told(result: Result) -> str:
-    otherwise = result.protocol.get(_OTHERWISE)
+    otherwise = result.protocol.get(OTHERWISE)
     return f"{result.told}, planned with {otherwise}" if otherwise else result.told
 
 
@@ -212,7 +213,7 @@ def _measured(runs: Mapping[str, RunFiles]) -> str:
     """By whom, where a run was measured more than once, or planned otherwise: shown is the first."""
     found = [one for run in runs.values() for one in run.results]
     if all(len(run.results) < 2 for run in runs.values()) and not any(
-        _OTHERWISE in one.protocol for one in found
+        OTHERWISE in one.protocol for one in found
     ):
         return ""
     rows = [

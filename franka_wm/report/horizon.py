@@ -18,6 +18,9 @@ type HorizonCurves = Mapping[str, Mapping[str, Sequence[float | None]]]
 NO_CHANGE = ("no_change", "no change", "copy")
 """Names of the baseline that predicts that nothing changes; drawn grey and dashed."""
 
+FAR = 3.0
+"""An interval that goes beyond so many times the highest line is cut: the lines would lie on zero."""
+
 
 def horizon_figure(
     curves: HorizonCurves,
@@ -27,7 +30,7 @@ def horizon_figure(
     title: str = "open-loop error by horizon",
     theme: Theme = LIGHT,
 ) -> "Figure":
-    """Error against steps ahead, with intervals.
+    """Error against steps ahead, with intervals; the axis follows the lines where an interval goes far beyond them.
 
     Args:
         curves: by name; `mean` (H,) and, for a band, `low` and `high` (H,). None and what is not finite leave a gap.
@@ -67,9 +70,18 @@ def horizon_figure(
             axes.fill_between(
                 places, _numbers(curve["low"]), _numbers(curve["high"]), color=drawn, alpha=0.2, linewidth=0
             )
+    highest, reach = (_highest(curves, part) for part in ("mean", "high"))
+    cut = reach > FAR * highest > 0
+    if cut:
+        title += f"\n(intervals are cut; they reach {reach:,.4g})"
     finish_axes(axes, x="steps ahead", y=as_label(unit), title=title, theme=theme)
-    axes.set_ylim(bottom=0)
+    axes.set_ylim(bottom=0, top=1.5 * highest if cut else None)
     return figure
+
+
+def _highest(curves: HorizonCurves, part: str) -> float:
+    values = (y for curve in curves.values() for y in _numbers(curve.get(part, ())))
+    return max(filter(math.isfinite, values), default=0.0)
 
 
 def _numbers(values: Sequence[float | None]) -> list[float]:

@@ -20,6 +20,7 @@ def page(run: RunFiles) -> str:
     with malformed(run.folder):
         known = [run.environment, run.model] if run.config else []
         known += [] if run.seed is None else [f"seed {run.seed}"]
+        known += [f"planned with {run.otherwise}, not as the run did"] if run.otherwise else []
         return document(
             run.name,
             subtitle=" · ".join(known) or "an evaluation",

@@ -5,6 +5,7 @@
     .hydra/hydra.yaml       where configurations of the user's own are, and the preset that was chosen for `env`
     versions.json           packages and machine, as `franka_wm.versions` writes them
     evaluation.json         results, as :mod:`franka_wm.evaluation.results` describes them
+    run.json                instead of config.yaml and .hydra/: of which run ``franka-wm evaluate`` wrote results here
     checkpoints/…           counters and the logged rows; without a checkpoint, rows come from ``csv/``
     video.mp4, last_frame.png, imagined.mp4, imagined.png, masks.png    images
     evaluation/             what ``franka-wm evaluate`` wrote: evaluation.json, timing.json and images. Of two
@@ -25,7 +26,7 @@ from pathlib import Path
 from typing import Any
 
 from franka_wm.errors import UserError
-from franka_wm.evaluation.results import Result, last_row, results
+from franka_wm.evaluation.results import OF_RUN, OTHERWISE, Result, last_row, results
 from franka_wm.untrusted import UntrustedFolder, check_image, check_video, values_of
 
 SAME_BUT = ("seed", "device", "resume")
@@ -50,6 +51,7 @@ class RunFiles:
         images: name -> path, of `IMAGES`.
         timing: policy -> ``seconds_per_decision``, ``worlds``.
         damage: why the newest checkpoint cannot be read; empty if it can, or there is none.
+        elsewhere: the folder is none of a run: results of one that lies elsewhere.
     """
 
     folder: Path
@@ -63,6 +65,7 @@ class RunFiles:
     images: Mapping[str, Path] = field(default_factory=dict)
     timing: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
     damage: str = ""
+    elsewhere: bool = False
 
     @property
     def policies(self) -> Mapping[str, Mapping[str, Any]]:
@@ -75,6 +78,11 @@ class RunFiles:
         shown = self.results[0].updates if self.results else None
         same = [one for one in self.results if one.updates == shown or None in (one.updates, shown)]
         return {name: value for one in reversed(same) for name, value in one.extras.items()}
+
+    @property
+    def otherwise(self) -> str:
+        """What was planned with, in the result that is shown, where it is not what the run planned with."""
+        return str(self.results[0].protocol.get(OTHERWISE, "")) if self.results else ""
 
     @property
     def name(self) -> str:
@@ -119,7 +127,10 @@ def read_run(folder: str | Path) -> RunFiles:
 
 def _read_run(run: Path) -> RunFiles:
     files = UntrustedFolder(run)
-    config = _config(files)
+    config, typed, preset = _chosen(files)
+    told = files.json(OF_RUN) if config is None else None
+    if told is not None:
+        config, typed, preset = told["config"], list(map(str, told["overrides"])), str(told["preset"])
     found = results(run)
     if config is None and not found:
         raise UserError(
@@ -127,7 +138,6 @@ def _read_run(run: Path) -> RunFiles:
             "as train.py prints it last."
         )
     rows, counters, version, damage = _history(files)
-    typed, hydras = list(map(str, files.yaml(".hydra/overrides.yaml") or [])), files.yaml(".hydra/hydra.yaml")
     versions = files.json("versions.json") or ({"franka_wm": version} if version else {})
     end = last_row(found, ((config or {}).get("evaluation") or {}).get("during") or ())
     numbers = end.keys() - {"env_steps", "time_s"}
@@ -137,8 +147,8 @@ def _read_run(run: Path) -> RunFiles:
     return RunFiles(
         folder=run.resolve(),
         config=config or {},
-        overrides=[*typed, *_searchpath(hydras)],
-        preset=_preset(typed, hydras),
+        overrides=typed,
+        preset=preset,
         versions=versions,
         results=found,
         rows=rows,
@@ -146,7 +156,19 @@ def _read_run(run: Path) -> RunFiles:
         images={name: path for name in IMAGES if (path := _image(files, name)) is not None},
         timing=files.json("evaluation/timing.json") or files.json("timing.json") or {},
         damage=damage,
+        elsewhere=told is not None,
     )
+
+
+def read_chosen(folder: str | Path) -> dict[str, Any]:
+    """What a run was told: ``config``, ``overrides`` and ``preset``, as in :class:`RunFiles`.
+
+    Raises:
+        UserError: It cannot be read.
+    """
+    with malformed(folder):
+        config, typed, preset = _chosen(UntrustedFolder(Path(folder)))
+    return {"config": config or {}, "overrides": typed, "preset": preset}
 
 
 def read_config(folder: str | Path) -> dict[str, object]:
@@ -189,6 +211,12 @@ def _config(files: UntrustedFolder) -> dict[str, Any] | None:
             f"{files.root / 'config.yaml'} holds no configuration; remove it or give another run."
         )
     return found
+
+
+def _chosen(files: UntrustedFolder) -> tuple[dict[str, Any] | None, list[str], str]:
+    """Configuration, overrides and preset of a run; None, none and empty where it has none."""
+    typed, hydras = list(map(str, files.yaml(".hydra/overrides.yaml") or [])), files.yaml(".hydra/hydra.yaml")
+    return _config(files), [*typed, *_searchpath(hydras)], _preset(typed, hydras)
 
 
 def _searchpath(hydras: Any) -> list[str]:

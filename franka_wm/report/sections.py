@@ -1,6 +1,7 @@
 """The sections of a run's page. Each is a function of what the run left, and empty where that is not there."""
 
 import math
+import re
 import shlex
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -10,7 +11,7 @@ import yaml
 from markupsafe import Markup
 
 from franka_wm.console import named_plugins, quoted
-from franka_wm.evaluation.results import COMMAND, END, Result
+from franka_wm.evaluation.results import COMMAND, END, OTHERWISE, Result
 from franka_wm.report import style
 from franka_wm.report.bars import bars_figure
 from franka_wm.report.calibration import calibration_figure
@@ -35,6 +36,11 @@ from franka_wm.report.outcome import number, plain, result
 from franka_wm.report.run import RunFiles
 from franka_wm.report.spectra import latent_figure, spectrum_figure
 from franka_wm.report.table import Table, is_interval, nested_table
+
+LOWEST = -1.0
+"""Where the axis of probes ends at the latest: one probe far off would squeeze all others."""
+_WORDS = re.compile(r", (?=planner[.=]|objective\.)")
+"""Between the words in a protocol's `OTHERWISE`; a value may hold commas."""
 
 
 def sections(run: RunFiles) -> list[Section]:
@@ -159,10 +165,12 @@ def probes(run: RunFiles) -> str:
     groups = {name: values for name, values in groups.items() if values}
     drawn = ""
     if groups:
+        low = _least(groups)
+        cut = " A bar with an arrow is cut: it reaches the number there." if low < LOWEST else ""
         drawn = chart(
-            bars_figure(groups, label="R² on episodes not fitted to", limits=(min(0.0, _least(groups)), 1)),
+            bars_figure(groups, label="R² on episodes not fitted to", limits=(min(0.0, max(LOWEST, low)), 1)),
             "how well physical quantities can be read off the latents",
-            "1: read off exactly. 0: no better than the mean.",
+            f"1: read off exactly. 0: no better than the mean.{cut}",
         )
     return cards(drawn, card(table(nested_table(found, first="quantity", skip=("alpha",)))))
 
@@ -293,6 +301,8 @@ def reproduce(run: RunFiles) -> str:
         again = any(one.startswith("resume=") for one in run.overrides)  # its scale is that of the first part
         words = [one for one in run.overrides if not (again and one.startswith("scale="))]
         lines += ["# train it again", f"franka-wm train {shlex.join(words)}", ""]
+    if run.elsewhere and run.results:
+        lines += ["# evaluate it again", f"{_evaluated(run.results[0], place)}{own}", ""]
     kind = (run.config.get("env") or {}).get("kind", "franka")
     if run.counters and kind != "none":  # there is nothing to act in
         shifted, option = (", also in shifted worlds", " robustness=true") if kind == "franka" else ("", "")
@@ -327,19 +337,33 @@ def _range(values: list[float]) -> str:
 
 
 def _least(groups: Mapping[str, Mapping[str, Any]]) -> float:
-    """The lowest value, but not below −1: one probe far off would squeeze all others."""
-    low = min(
+    """The lowest value."""
+    return min(
         float((v["mean"] if isinstance(v, Mapping) else v) or 0)
         for group in groups.values()
         for v in group.values()
     )
-    return max(-1.0, low)
 
 
 def _episodes(run: RunFiles) -> str:
     """As many as it was evaluated over by the command, if it was."""
     episodes = [one.episodes for one in run.results if one.protocol.get("by") == COMMAND]
     return f" episodes={episodes[0]}" if episodes else ""
+
+
+def _evaluated(found: Result, out: str) -> str:
+    """The command that made results that lie elsewhere than in their run's folder."""
+    told = found.protocol
+    words = [
+        str(told["checkpoint"]),
+        *_WORDS.split(str(told.get(OTHERWISE, ""))),
+        f"episodes={found.episodes}",
+    ]
+    if "robustness" in found.extras:
+        words.append("robustness=true")
+    if "diagnostics" not in told:  # else they did not end
+        words += [f"{name}=false" for name in ("open_loop", "probes") if name not in found.extras]
+    return f"franka-wm evaluate {shlex.join(filter(None, words))} out={out}"
 
 
 def _end(run: RunFiles) -> Result | None:

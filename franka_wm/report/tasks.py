@@ -68,7 +68,7 @@ def family_of(run: RunFiles) -> str:
     model, told = run.config.get("model"), run.results[0].protocol if run.results else {}
     name = model.get("name") if isinstance(model, Mapping) else told.get("model")  # of results alone
     parts = [name or MISSING, *([MULTITASK] if _by_task(run) else ())]
-    return ", ".join(map(str, [*parts, *([told["planned with"]] if "planned with" in told else ())]))
+    return ", ".join(map(str, [*parts, *([run.otherwise] if run.otherwise else ())]))
 
 
 def success_over_time(run: RunFiles) -> dict[str, str]:

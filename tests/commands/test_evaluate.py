@@ -35,7 +35,7 @@ def test_everything_twice(run_folder: Path, tmp_path: Path, capsys, monkeypatch)
         assert cli.main(["evaluate", *arguments]) == 0
     said = capsys.readouterr().out
     one, two = tmp_path / "one", tmp_path / "two"
-    names = {"evaluation.json", "evaluation.md", "timing.json", "imagined.png", "imagined.mp4"}
+    names = {"evaluation.json", "evaluation.md", "timing.json", "imagined.png", "imagined.mp4", "run.json"}
     assert {path.name for path in one.iterdir()} == names
     for name in ("evaluation.json", "evaluation.md", "imagined.png"):
         assert (one / name).read_bytes() == (two / name).read_bytes(), name

@@ -223,6 +223,16 @@ def test_horizon_refuses_what_does_not_fit() -> None:
         horizon_figure({})
 
 
+def test_horizon_shows_lines_whose_intervals_are_far_wider() -> None:
+    """The axis follows the lines, and says what it leaves out."""
+    curves = {"model": {"mean": [40, 2], "low": [1, 1], "high": [5341, 9]}, "no_change": {"mean": [1, 1]}}
+    axes = horizon_figure(curves).axes[0]
+    assert axes.get_ylim() == (0, 60) and "intervals are cut; they reach 5,341" in axes.get_title()
+    curves["model"]["high"] = [100, 9]
+    axes = horizon_figure(curves).axes[0]
+    assert axes.get_ylim()[1] >= 100 and "cut" not in axes.get_title()
+
+
 # -- spectra -----------------------------------------------------------------------------------------------
 
 
@@ -287,6 +297,13 @@ def test_bars_have_their_lengths_and_whiskers() -> None:
     assert axes.get_xlim() == (0, 100) and axes.yaxis_inverted()
     with pytest.raises(UserError, match="no bar"):
         bars_figure({"a": {"b": math.nan}})
+
+
+def test_a_bar_that_the_axis_cuts_says_how_far_it_goes() -> None:
+    values = {"joints": {"ridge": 0.5, "neighbours": -6.25}, "tool": {"ridge": -1.0, "neighbours": 1.5}}
+    said = [text.get_text() for text in bars_figure(values, limits=(-1, 1)).axes[0].texts]
+    assert said == ["← -6.25", "1.5 →"]
+    assert not bars_figure(values).axes[0].texts
 
 
 # -- calibration -------------------------------------------------------------------------------------------
