@@ -374,6 +374,21 @@ class DatasetWriter:
         self.close()
 
 
+def episodes_there(out: str | Path) -> int:
+    """How many episodes going on with ``out`` begins with, as :class:`DatasetWriter` will count them; writes nothing.
+
+    Raises:
+        UserError: What is there cannot be read.
+    """
+    out = Path(out).absolute()
+    working, shards = _working(out), _shards(_working(out))
+    state = linked_json(file) if (file := working / "writer.json").is_file() else {}
+    if state.get("replacing") and out.exists() and not (working / "merged").exists():
+        shards = []  # they are in OUT
+    whole = [folder for folder in (out, working / PREVIOUS) if folder.exists()][:1]
+    return sum(_totals(folder)[0] for folder in (*whole, *shards))
+
+
 def default_shard_frames(schema: Schema) -> int:
     """Steps that :data:`SHARD_BYTES` hold, within reason."""
     size = sum(
