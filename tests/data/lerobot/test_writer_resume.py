@@ -106,7 +106,7 @@ def test_scenes_are_not_mixed(tmp_path, make_schema, make_episode) -> None:
         with DatasetWriter(
             out,
             schema,
-            **options({**cube, "mass": 1 if there is not cube else 0.05, "spread": [0.05, 0.0]}),
+            **options({**cube, "spread": [0.05, 0.0]}),
             resume=True,
         ) as writer:
             assert writer.resumed == 1
