@@ -14,6 +14,7 @@ from franka_wm.console import announced, say
 from franka_wm.data.lerobot.schema import FORMATS, schema_for
 from franka_wm.errors import UserError
 from franka_wm.interrupt import INTERRUPTED
+from franka_wm.options import did_you_mean
 from franka_wm.policies.names import refuse_old_name
 
 if TYPE_CHECKING:
@@ -48,7 +49,7 @@ _PARTS = ("planner", "policy")
 )
 @word(
     "num_envs",
-    "worlds at once, on all GPUs; if not given collector.num_envs, of an agent 64, and no more than episodes",
+    "worlds at once, on all GPUs; if not given collector.num_envs, of an agent 64, no more than episodes are missing",
     whole(1),
     metavar="N",
 )
@@ -123,8 +124,9 @@ def _collect(
     noise: float | None,
     **writing: Any,
 ) -> int:
+    missing = _missing(out, episodes) if writing["resume"] else episodes
     source = open_source(
-        policy, checkpoint, overrides, episodes=episodes, num_envs=num_envs, format=format, noise=noise
+        policy, checkpoint, overrides, episodes=missing, num_envs=num_envs, format=format, noise=noise
     )
     from franka_wm.data.lerobot.collect import gather
 
@@ -134,6 +136,14 @@ def _collect(
         return INTERRUPTED
     say(f"dataset: {folder}")
     return 0
+
+
+def _missing(out: str, episodes: int) -> int:
+    """How many are still to be played; as many as there are processes at least, since each needs a world."""
+    from franka_wm import processes
+    from franka_wm.data.lerobot.writer import episodes_there
+
+    return max(episodes - episodes_there(out), min(episodes, processes.count()))
 
 
 # -- who acts ------------------------------------------------------------------------------------------------------
@@ -155,7 +165,7 @@ def open_source(
         name: Name of the policy, or place of an agent.
         checkpoint: The agent, if ``name`` is one of its parts.
         overrides: Changes of train.py's configuration; of an agent's, ``env.KEY=VALUE``, ``seed`` and ``device`` alone.
-        episodes: How many will be played.
+        episodes: How many will be played; no more worlds than that where ``num_envs`` is not given.
         num_envs: Worlds at once.
         format: Format of the dataset's images.
         noise: Noise of the expert's actions.
@@ -180,8 +190,12 @@ def _own(worlds: int) -> int:
 def _require_worlds(worlds: int, count: int) -> None:
     if worlds < count:
         raise UserError(
-            f"collect: {worlds} worlds for {count} processes: give num_envs={count}, or start fewer"
+            f"collect: {_counted(worlds)} for {count} processes: give num_envs={count}, or start fewer"
         )
+
+
+def _counted(worlds: int) -> str:
+    return "1 world" if worlds == 1 else f"{worlds} worlds"
 
 
 def check_policy(
@@ -204,10 +218,14 @@ def check_policy(
         )
     if name not in (*_SIMPLE, *_PARTS):
         if checkpoint:
-            raise UserError(f"collect: policy={name!r}: must be one of {', '.join((*_SIMPLE, *_PARTS))}")
+            raise UserError(
+                f"collect: policy={name!r}: must be one of {', '.join(known := (*_SIMPLE, *_PARTS))}"
+                + did_you_mean(name, known)
+            )
         if not name.startswith("hf:") and not Path(name).exists():
             raise UserError(
                 f"collect: policy={name!r}: must be one of {', '.join(_SIMPLE)}, or the folder of a run"
+                + did_you_mean(name, _SIMPLE)
             )
         name, checkpoint = "", name
     if checkpoint:
@@ -240,9 +258,10 @@ def _simple(
     values: Any = OmegaConf.to_container(cfg.env, resolve=True)
     del values["kind"]
     urdf_path = values.pop("urdf_path")
-    if name == "expert" and FrankaConfig.from_mapping(values).task_class.expert is None:
+    if name == "expert" and (asked := FrankaConfig.from_mapping(values)).task_class.expert is None:
+        solved = "" if asked.has_gripper else f"; policy=ik solves {asked.task} by inverse kinematics"
         raise UserError(
-            f"collect: policy=expert: task={values['task']} has none; env=lift has one, for example"
+            f"collect: policy=expert: task={asked.task} has none; env=lift has one, for example{solved}"
         )
     needed = ("state", "joint_target", *(["objects"] if name == "expert" else []))
     added = [key for key in needed if key not in values["observations"]]
@@ -257,7 +276,9 @@ def _simple(
 
     if name == "ik":
         IKPolicy.check(config)
-    with announced(f"building {worlds} worlds; a machine's first start compiles kernels for a minute or two"):
+    with announced(
+        f"building {_counted(worlds)}; a machine's first start compiles kernels for a minute or two"
+    ):
         env = FrankaEnv(config, num_envs=worlds, device=cfg.device, seed=seed, urdf_path=urdf_path)
     cfg.env.observations = values["observations"]
     import torch

@@ -81,7 +81,7 @@ class WindowSampler(Sampler):
         Raises:
             UserError: There are fewer steps than a window has.
         """
-        filled = storage._len_along_dim0
+        filled = storage._len_along_dim0 or 0  # None before the first batch
         span = filled - self.before - self.length + 1
         if span < 1:
             raise UserError(
@@ -167,6 +167,7 @@ class WindowReplay(ReplayBuffer):
     """A replay buffer of windows: a share of them may get goals in hindsight, another may be demonstrations.
 
     Args:
+        num_envs: Worlds of the batches that it is extended with.
         hindsight: Relabels each batch in place; ``None``: batches are as they were gathered.
         future: Adds frames that were reached later; ``None``: batches are windows alone.
         demonstrations: Replace windows in place; ``None``: batches are of this buffer alone.
@@ -176,13 +177,29 @@ class WindowReplay(ReplayBuffer):
     def __init__(
         self,
         *,
+        num_envs: int,
         hindsight: Hindsight | None = None,
         future: FutureFrames | None = None,
         demonstrations: Demonstrations | None = None,
         **options: Any,
     ):
         super().__init__(**options)
+        self.num_envs = num_envs
         self.hindsight, self.future, self.demonstrations = hindsight, future, demonstrations
+
+    def extend(self, data: Any, *, update_priority: bool | None = None) -> torch.Tensor:
+        """Keeps a batch (worlds, time) of the collector, behind the one before.
+
+        Raises:
+            UserError: It has another shape.
+        """
+        shape = tuple(data.shape)
+        if len(shape) != 2 or shape[0] != self.num_envs:
+            raise UserError(
+                f"the replay buffer: extend with the collector's batch (worlds, time), ({self.num_envs}, …) here, not "
+                f"{shape}"
+            )
+        return super().extend(data, update_priority=update_priority)
 
     def sample(self, batch_size: int | None = None, return_info: bool = False) -> Any:
         batch, info = super().sample(batch_size, return_info=True)
@@ -268,6 +285,7 @@ def make_replay(
         device=device,
     )
     return WindowReplay(
+        num_envs=num_envs,
         hindsight=hindsight,
         future=future,
         demonstrations=demonstrations,

@@ -407,8 +407,8 @@ def _check_same_observations(run: RunSettings, recorded: FeatureMap) -> None:
 
 
 def _check_same_actions(run: RunSettings, sources: Named) -> None:
-    """Actions must mean the same, of the same robot; rewards of another task are said."""
-    from franka_wm.data.lerobot.provenance import ACTIONS, other_option, read_provenance
+    """Actions must mean the same, of the same robot; rewards of another task and other physics are said."""
+    from franka_wm.data.lerobot.provenance import ACTIONS, other_option, read_provenance, told
 
     env = {**vars(run.env.arm), "urdf_path": run.env.urdf_path}
     for option, source in sources:
@@ -419,15 +419,13 @@ def _check_same_actions(run: RunSettings, sources: Named) -> None:
                 f"{option}: recorded with env.{name}={there}, this run has {env[name]}, so actions "
                 f"mean something else; use env.{name}={there}, or env=none to train alone"
             )
-        if (changed := other_option(sessions, env)) is not None:
-            name, there = changed
-            other = f"{option}: recorded with env.{name}={there}, this run has {env[name]}"
-            say(f"{other}; its goals, rewards and ends are those of then")
+        for line in told(sessions, env):
+            say(f"{option}: {line}")
 
 
 def _check_same_views(run: RunSettings, sources: Named) -> None:
     """What a model that acts has learned to see, its world must show; sizes are compared elsewhere."""
-    from franka_wm.data.lerobot.provenance import VIEWS, other_option, other_scene, read_provenance
+    from franka_wm.data.lerobot.provenance import VIEWS, other_option, other_scene, read_provenance, told
 
     arm, family = run.env.arm, run.model.family
     env = {**vars(arm), "urdf_path": run.env.urdf_path}
@@ -447,3 +445,5 @@ def _check_same_views(run: RunSettings, sources: Named) -> None:
         if other_scene(sessions, env, images=bool(looks)):
             other = f"{option}: recorded with another env.scene, so {'images' if looks else 'states'} show something"
             raise UserError(f"{other} else; give the same, or env=none to train alone")
+        for line in told(sessions, env, looks=True) if looks else ():
+            say(f"{option}: {line}")

@@ -170,6 +170,27 @@ def test_too_few_windows() -> None:
         replay.sample()
 
 
+def test_an_empty_buffer_holds_no_steps() -> None:
+    with pytest.raises(UserError, match="holds 0 steps per world, a window needs 6; collect more first"):
+        buffer(40, 6).sample()
+
+
+def test_what_is_no_batch_of_worlds_and_times_is_refused() -> None:
+    """Flat, worlds and times changed over, or of other worlds; nothing of it is kept."""
+    replay, data = buffer(40, 3), experience(7)
+    other = experience(7, lengths=(5, 3))
+    for batch, shape in (
+        (data.reshape(-1), r"\(21,\)"),
+        (data.transpose(0, 1), r"\(7, 3\)"),
+        (other, r"\(2, 7\)"),
+    ):
+        with pytest.raises(
+            UserError, match=rf"collector's batch \(worlds, time\), \(3, …\) here, not {shape}"
+        ):
+            replay.extend(batch)
+        assert len(replay) == 0
+
+
 @pytest.mark.parametrize(("capacity", "num_envs"), [(3, 3), (11, 3), (0, 3), (2, 3)])
 def test_capacity_too_small(capacity: int, num_envs: int) -> None:
     with pytest.raises(UserError, match="at least 12"):

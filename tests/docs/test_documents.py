@@ -84,6 +84,16 @@ def test_readme_collects(tmp_path: Path) -> None:
     assert len(lines) == 10 and all("torch.Size([2, 16, 64, 64, 3])" in line for line in lines)
 
 
+def test_environment_page_samples_windows() -> None:
+    """Two worlds in place of 64."""
+    code, _ = blocks("docs/environment-names.md", "python")
+    scope: dict[str, Any] = {}
+    exec(compile(code.replace("64", "2"), "docs/environment-names.md", "exec"), scope)
+    batch = scope["batch"]
+    assert batch.batch_size == (256, 5) and batch["next", "pixels"].shape == (256, 5, 64, 64, 3)
+    assert (batch["pixels"][:, 1:] == batch["next", "pixels"][:, :-1]).all()
+
+
 def test_models_page_makes_a_model() -> None:
     (code,) = blocks("docs/models.md", "python")
     scope: dict[str, Any] = {}

@@ -14,11 +14,13 @@ from torch import Tensor
 from franka_wm import processes
 from franka_wm.data.lerobot.cache import Cache, Say, open_cache
 from franka_wm.data.lerobot.mapping import FeatureMap, map_features
+from franka_wm.data.lerobot.provenance import read_provenance
 from franka_wm.data.lerobot.source import Source, find_dataset, read_source
 from franka_wm.data.lerobot.windows import RecordedWindows, Recording
 from franka_wm.data.memory import free_memory
 from franka_wm.device import resolve_device
 from franka_wm.errors import UserError
+from franka_wm.untrusted import values_of
 
 MEMORY_SHARE = 0.5
 """How much of the free memory a dataset may take before it is read from the disk instead."""
@@ -186,15 +188,16 @@ def read_datasets(
                 f"{roots[0]} has {sources[0].fps:g} frames per second, {source.root} {source.fps:g}; "
                 "train on them separately"
             )
-    there, size = sources[0].fps, mappings[0].action[1]
+    there, size, task = sources[0].fps, mappings[0].action[1], _recorded_task(sources[0])
     if fps is not None and abs(fps - there) > 1e-6 * there:
         raise UserError(
-            f"{roots[0]} has {there:g} frames per second, the environment {fps:g}; a step would mean something "
-            f"else. Use env.fps={there:g}"
+            f"{task and f'recorded with {task}: '}{roots[0]} has {there:g} frames per second, the environment {fps:g}; "
+            f"a step would mean something else. Use {task and f'an env with {task} and '}env.fps={there:g}"
         )
     if action_dim is not None and not mappings[0].discrete and action_dim != size:
         raise UserError(
-            f"{roots[0]}: its actions have {size} numbers, the environment's {action_dim}; "
+            f"{task and f'recorded with {task}: '}{roots[0]}: its actions have {size} numbers, the environment's "
+            f"{action_dim}; "
             "choose the env that it was recorded in (or its env.action_mode), or another dataset"
         )
     if action_dim is not None and _scales(mappings, normalize_actions):
@@ -203,6 +206,14 @@ def read_datasets(
             "environment; use env=none to train alone, or dataset.normalize_actions=false if they are in [−1, 1]"
         )
     return sources, mappings
+
+
+def _recorded_task(source: Source) -> str:
+    """``env.task=NAME``, if it says so: what else is other may be since this is. It is said before that."""
+    with values_of(str(source.root), "copy or download the dataset again"):
+        sessions = (read_provenance(source.root) or {}).get("sessions") or ()
+        tasks = {session.get("config", {}).get("env", {}).get("task") for session in sessions} - {None}
+        return f"env.task={tasks.pop()}" if len(tasks) == 1 else ""
 
 
 def _scales(mappings: Sequence[FeatureMap], normalize_actions: bool | None) -> bool:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import platform
 import shlex
 import sys
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import fields
 from datetime import UTC, datetime
 from importlib import metadata
@@ -48,6 +48,10 @@ def _typed() -> str:
     return shlex.join(["franka-wm" if name == "__main__.py" else name, *sys.argv[1:]])
 
 
+def _ranges(*names: str) -> list[str]:
+    return [f"randomization.{name}" for name in names]
+
+
 ACTIONS = (
     *("action_mode", "action_scale", "ee_scale"),
     *("robot", "urdf_path", "asset_name", "urdf_relative_path"),
@@ -59,12 +63,28 @@ MEANING = (
     "terminate_on_success",
 )
 """Those that give actions, rewards and ends their meaning."""
+DYNAMICS = (
+    *("fps", "substeps", "solver", "solver_iterations", "solver_ls_iterations"),
+    *("joint_armature", "target_ke", "target_kd", "gravity_compensation", "limit_velocity", "gripper_force"),
+    *("collisions", "collision_pipeline", "track_radius", "track_period"),
+    # Ranges count as any value does: they say which physics the episodes are of, delays and noise among them. Who wants
+    # other ones beside these records a dataset of its own and joins both, dataset.root=[…]. Evaluating, and going on to
+    # train, with other ranges is a use (robustness), so what reads a dataset says it and does not refuse it.
+    *_ranges("gains", "armature", "friction", "mass", "object_size", "table_height", "contact_friction"),
+    *_ranges("grip_force", "action_noise", "action_latency", "observation_noise", "object_noise"),
+)
+"""Those that change what an action does, and what is observed of that, beside the scene. Where episodes start and how
+long they may be (``home``, ``goal_sampling``, ``episode_length``, …) does not; the gripper shows in actions' size."""
 VIEWS = (
     *("cameras", "camera_distance", "camera_height", "camera_target_height", "camera_target_distance"),
     *("camera_fov_degrees", "image_size", "show_goal"),
 )
 """Those that give images their meaning, beside the robot and the scene: :func:`other_scene`."""
-
+LOOKS = (
+    *("enable_shadows", "enable_textures", "finger_opening"),
+    *_ranges("color", "brightness", "camera_position", "camera_target"),
+)
+"""Those that change how the same view looks; not ``mesh_detail``, by default less than a pixel or two."""
 
 BEFORE = {"disc_radius": 0.1, "disc_spread": 0.0}
 """What recordings had that do not name these options: they were made before there were any."""
@@ -73,25 +93,62 @@ BEFORE = {"disc_radius": 0.1, "disc_spread": 0.0}
 def other_option(
     sessions: Iterable[Mapping[str, Any]], env: Mapping[str, Any], names: Iterable[str] = MEANING
 ) -> tuple[str, Any] | None:
-    """The first of these options that sessions were recorded with another value of than ``env`` has, and that value as
-    one types it.
+    """The first of :func:`other_options`, if there is one."""
+    return next(iter(other_options(sessions, env, names).items()), None)
+
+
+def other_options(
+    sessions: Iterable[Mapping[str, Any]], env: Mapping[str, Any], names: Iterable[str]
+) -> dict[str, Any]:
+    """Those of these options that sessions were recorded with another value of than ``env`` has, and that value as one
+    types it. What is not recorded is not known, and no other.
 
     Of cameras the first counts: its images have no name that tells it from others.
     """
+    names, env, others = [*names], flat(env), {}
     for session in sessions:
         recorded = session.get("config", {}).get("env", {})
-        recorded = {**BEFORE, **recorded} if recorded else recorded
+        recorded = {**BEFORE, **flat(recorded)} if recorded else recorded
         unread = _unread(recorded) & _unread(env)
         for name in names:
-            if name in unread:
+            if name in unread or name not in recorded or name not in env:
                 continue
-            if (
-                name in recorded
-                and name in env
-                and _telling(name, recorded[name]) != _telling(name, env[name])
-            ):
-                return name, "null" if recorded[name] is None else recorded[name]
-    return None
+            if _telling(name, recorded[name]) != _telling(name, env[name]):
+                others.setdefault(name, _as_typed(recorded[name]))
+    return others
+
+
+def told(
+    sessions: Sequence[Mapping[str, Any]], env: Mapping[str, Any], *, looks: bool = False
+) -> Iterator[str]:
+    """Lines about what is other and no reason to refuse reading it: meaning and dynamics; with ``looks`` images."""
+    said = {
+        MEANING: "its goals, rewards and ends are those of then",
+        DYNAMICS: "its actions did what they did then",
+    }
+    if looks:
+        said = {LOOKS: "its images look as they did then"}
+    env = flat(env)
+    for names, then in said.items():
+        if others := other_options(sessions, env, names):
+            there = ", ".join(f"env.{name}={value}" for name, value in others.items())
+            here = ", ".join(str(_as_typed(env[name])) for name in others)
+            yield f"recorded with {there}, this run has {here}; {then}"
+    same = not looks and not other_scene(sessions, env, images=False)  # else it is refused
+    if same and other_scene(sessions, env, images=False, moves=True):
+        yield f"recorded with other masses or friction in env.scene; {said[DYNAMICS]}"
+
+
+def flat(env: Mapping[str, Any]) -> dict[str, Any]:
+    """Options by the names that one types, ``randomization.gains`` among them; lists for tuples."""
+    drawn = env.get("randomization")
+    drawn = drawn if isinstance(drawn, Mapping) else getattr(drawn, "__dict__", {})
+    every = {**env, **{f"randomization.{name}": value for name, value in drawn.items()}}
+    return {name: [*value] if isinstance(value, tuple) else value for name, value in every.items()}
+
+
+def _as_typed(value: Any) -> Any:
+    return "null" if value is None else value
 
 
 def _unread(env: Mapping[str, Any]) -> set[str]:
@@ -105,43 +162,53 @@ def _unread(env: Mapping[str, Any]) -> set[str]:
 def _telling(name: str, value: Any) -> Any:
     if name == "robot" and value == "panda_meshes_full":
         return "panda_meshes"  # the same with every triangle
+    if name == "solver" and value == "auto":
+        return "mujoco"
     if name == "urdf_path":
         return value and Path(value).name  # a dataset may come from another machine
+    if name in ("target_ke", "target_kd") and isinstance(value, list) and value == value[:1] * len(value):
+        return (value or [None])[0]  # one number is that of every joint
     return [*value][:1] if name == "cameras" else value
 
 
-def other_scene(sessions: Iterable[Mapping[str, Any]], env: Mapping[str, Any], *, images: bool) -> bool:
+def other_scene(
+    sessions: Iterable[Mapping[str, Any]], env: Mapping[str, Any], *, images: bool, moves: bool = False
+) -> bool:
     """Whether sessions were recorded in a scene of other bodies than that of ``env``, which has ``task`` and ``scene``.
 
-    What does not show in them does not count, nor do folders of files, nor colours where no images are read. Scenes
-    whose files or tasks are not known here are not compared: a dataset may come from another machine.
+    How they move counts with ``moves`` alone, since it does not show in them. How far their starts are spread does
+    not, nor do folders of files, nor colours where no images are read. Scenes whose files or tasks are not known here
+    are not compared: a dataset may come from another machine.
     """
     for session in sessions:
         recorded = session.get("config", {}).get("env", {})
         if "scene" in recorded and "scene" in env:
             try:
-                there = _shown(recorded["scene"], recorded.get("task", env["task"]), images)
+                there = _shown(recorded["scene"], recorded.get("task", env["task"]), images, moves)
             except UserError:
                 continue
-            if there != _shown(env["scene"], env["task"], images):
+            if there != _shown(env["scene"], env["task"], images, moves):
                 return True
     return False
 
 
-UNSEEN = ("mass", "friction", "joint_friction", "joint_damping", "spread", "turn")
-"""What no image shows of a body: how it moves, and how far its start is drawn at random."""
+MOVES = ("mass", "friction", "joint_friction", "joint_damping")
+"""How a body moves, which no image shows."""
+STARTS = ("spread", "turn")
+"""How far its start is drawn at random."""
 COLOURS = ("color", "case_color")
 
 
-def _shown(given: Any, task: str, images: bool) -> list[Any]:
-    """What a scene's bodies look like, and where those that stand still stand; as plain values that can be compared."""
+def _shown(given: Any, task: str, images: bool, moves: bool) -> list[Any]:
+    """What a scene's bodies look like, with ``moves`` how they move, and where those that stand still stand; as plain
+    values that can be compared."""
     from franka_wm.envs.scene import Body, Scene
     from franka_wm.envs.tasks import task_class
 
     scene = task_class(task).scene if given is None else Scene.of(given)
     if scene is None:
         return []
-    unseen = UNSEEN if images else UNSEEN + COLOURS
+    unseen = (*STARTS, *(() if moves else MOVES), *(() if images else COLOURS))
     return [
         (type(one).__name__, {
             field.name: _plain(getattr(one, field.name)) for field in fields(one)

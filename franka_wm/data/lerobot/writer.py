@@ -26,8 +26,9 @@ from typing import Any
 
 import numpy as np
 
+from franka_wm.data.lerobot.alike import check_alike
 from franka_wm.data.lerobot.episodes import Episode
-from franka_wm.data.lerobot.provenance import MEANING, VIEWS, other_option, other_scene, read_provenance
+from franka_wm.data.lerobot.provenance import read_provenance
 from franka_wm.data.lerobot.schema import Schema
 from franka_wm.data.lerobot.shard import check_episode
 from franka_wm.data.lerobot.shard_workers import (
@@ -215,27 +216,10 @@ class DatasetWriter:
         if self.out.exists() and finished is None:
             raise UserError(f"out={self.out} was not written by franka-wm; merge with lerobot-edit-dataset")
         mine = json.loads(json.dumps(self.schema.to_dict()))
+        env = json.loads(json.dumps(self._session.get("config", {}).get("env", {})))
         for other in (state if _shards(self.working) else None, finished):
-            if other is not None and not isinstance(other["sessions"], list):
-                raise TypeError("sessions that are no list")
-            if other is not None and other["schema"] != mine:
-                what = next(key for key in mine if other["schema"].get(key) != mine[key])
-                raise UserError(
-                    f"out={self.out}: what is there has other {what}; give the same env and format, or another out"
-                )
-            env = self._session.get("config", {}).get("env", {})
-            names = (*MEANING, *VIEWS) if self.schema.images else MEANING
-            changed = other and other_option(other["sessions"], json.loads(json.dumps(env)), names)
-            if changed:
-                name, there = changed
-                raise UserError(
-                    f"out={self.out}: what is there was recorded with env.{name}={there}, this has {env[name]}; give "
-                    "the same, or another out"
-                )
-            if other and other_scene(other["sessions"], env, images=bool(self.schema.images)):
-                raise UserError(
-                    f"out={self.out}: what is there was recorded with another env.scene; give the same, or another out"
-                )
+            if other is not None:
+                check_alike(f"out={self.out}", other, mine, env, images=self.schema.images)
 
     def _save_state(self, **more: Any) -> None:
         kind = {} if self._resumable else {"resumable": False}
@@ -388,6 +372,21 @@ class DatasetWriter:
 
     def __exit__(self, *_: object) -> None:
         self.close()
+
+
+def episodes_there(out: str | Path) -> int:
+    """How many episodes going on with ``out`` begins with, as :class:`DatasetWriter` will count them; writes nothing.
+
+    Raises:
+        UserError: What is there cannot be read.
+    """
+    out = Path(out).absolute()
+    working, shards = _working(out), _shards(_working(out))
+    state = linked_json(file) if (file := working / "writer.json").is_file() else {}
+    if state.get("replacing") and out.exists() and not (working / "merged").exists():
+        shards = []  # they are in OUT
+    whole = [folder for folder in (out, working / PREVIOUS) if folder.exists()][:1]
+    return sum(_totals(folder)[0] for folder in (*whole, *shards))
 
 
 def default_shard_frames(schema: Schema) -> int:
