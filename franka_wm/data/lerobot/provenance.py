@@ -55,7 +55,7 @@ ACTIONS = (
 """Options that give recorded actions and states their meaning, where they are read."""
 MEANING = (
     *("task", "reward", *ACTIONS, "action_penalty", "success_distance", "drawer_opening"),
-    *("disc_radius", "disc_spread"),
+    *("disc_radius", "disc_spread", "task_options"),
     "terminate_on_success",
 )
 """Those that give actions, rewards and ends their meaning."""
@@ -66,7 +66,7 @@ VIEWS = (
 """Those that give images their meaning, beside the robot and the scene: :func:`other_scene`."""
 
 
-BEFORE = {"disc_radius": 0.1, "disc_spread": 0.0}
+BEFORE = {"disc_radius": 0.1, "disc_spread": 0.0, "task_options": None}
 """What recordings had that do not name these options: they were made before there were any."""
 
 
@@ -78,6 +78,8 @@ def other_option(
 
     Of cameras the first counts: its images have no name that tells it from others.
     """
+    from franka_wm.envs.tasks.options import typed
+
     for session in sessions:
         recorded = session.get("config", {}).get("env", {})
         recorded = {**BEFORE, **recorded} if recorded else recorded
@@ -85,12 +87,9 @@ def other_option(
         for name in names:
             if name in unread:
                 continue
-            if (
-                name in recorded
-                and name in env
-                and _telling(name, recorded[name]) != _telling(name, env[name])
-            ):
-                return name, "null" if recorded[name] is None else recorded[name]
+            if name in recorded and name in env and _telling(name, recorded) != _telling(name, env):
+                there = recorded[name]
+                return name, typed(there) if there is None or isinstance(there, Mapping) else there
     return None
 
 
@@ -102,12 +101,22 @@ def _unread(env: Mapping[str, Any]) -> set[str]:
     return unread if env.get("robot") == "newton_asset" else unread | {"asset_name", "urdf_relative_path"}
 
 
-def _telling(name: str, value: Any) -> Any:
+def _telling(name: str, env: Mapping[str, Any]) -> Any:
+    value = env[name]
+    if name == "task_options":
+        return _with_defaults(value, env.get("task"))
     if name == "robot" and value == "panda_meshes_full":
         return "panda_meshes"  # the same with every triangle
     if name == "urdf_path":
         return value and Path(value).name  # a dataset may come from another machine
     return [*value][:1] if name == "cameras" else value
+
+
+def _with_defaults(options: Mapping[str, Any] | None, task: Any) -> dict[str, Any]:
+    """A task's own options with the defaults of those left out, where the task is known here."""
+    from franka_wm.envs.tasks import TASKS, task_class
+
+    return {**(task_class(task).option_defaults if task in TASKS else {}), **(options or {})}
 
 
 def other_scene(sessions: Iterable[Mapping[str, Any]], env: Mapping[str, Any], *, images: bool) -> bool:
