@@ -142,6 +142,14 @@ def test_the_printed_preset(
     torch.testing.assert_close(away.norm(dim=-1), torch.full((16,), 0.15))
 
 
+def test_the_preset_of_the_example(root: Path, composed: Callable[..., Any]) -> None:
+    register("raise_tool", importlib.import_module("examples.add_a_task").RaiseTool)
+    place = f"hydra.searchpath=[file://{root}/examples/conf]"
+    arm = RunSettings.of(composed(place, "env=raise_tool", "env.task_options.height=0.8")).env.arm
+    env = FrankaEnv(arm, num_envs=1, device="cpu", seed=0)
+    assert env.reset()["goal"][0, 2] == pytest.approx(0.8)
+
+
 # -- classes and names ---------------------------------------------------------------------------------------
 
 
