@@ -1,15 +1,15 @@
 """A task of your own: raise the tool. Goal, reward and success are Warp kernels, part of the captured step.
 
 python train.py plugins=[examples.add_a_task] env.task=raise_tool
+python train.py plugins=[examples.add_a_task] --config-dir=examples/conf env=raise_tool env.task_options.height=0.8
 """
 
 import warp as wp
 
-from franka_wm.envs import FrankaConfig
 from franka_wm.envs.tasks import Task, register
 
 HEIGHT = 0.75
-"""Where the tool shall be [m]."""
+"""Where the tool shall be, unless ``env.task_options.height`` says otherwise [m]."""
 
 
 @wp.kernel
@@ -37,15 +37,16 @@ class RaiseTool(Task):
     That, the return and the height at the end are what tables and curves of a run show.
     """
 
-    def __init__(self, config: FrankaConfig):
-        super().__init__(config)
+    option_defaults = {"height": HEIGHT}
 
     def reset(self, sim, mask):
-        wp.launch(place_goal, sim.num_envs, [mask, HEIGHT, sim.warp.task_goal], device=sim.device)
+        wp.launch(
+            place_goal, sim.num_envs, [mask, self.options["height"], sim.warp.task_goal], device=sim.device
+        )
 
     def reward_and_success(self, sim):
         w = sim.warp
-        inputs = [w.next_true_state, HEIGHT, w.reward, w.success]
+        inputs = [w.next_true_state, self.options["height"], w.reward, w.success]
         wp.launch(height_reward, sim.num_envs, inputs, device=sim.device)
 
     def measures(self, sim):

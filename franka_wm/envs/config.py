@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from franka_wm.envs.constants import HAND_DIM, HOME, JOINT_DIM, NUM_FINGERS, NUM_JOINTS, OBJECT_DIM, STATE_DIM
 from franka_wm.envs.ranges import Randomization
@@ -71,6 +71,8 @@ class FrankaConfig:
         ee_scale: Tool displacement per unit of action, for ``"ee_delta"`` [m].
         task: What is asked of the arm; ``docs/tasks.md`` lists the tasks. It also says which scene, gripper and home
             pose there are, where the config does not.
+        task_options: Options that the task brings itself, ``option_defaults`` of its class, by name. Those left out
+            have their defaults once the config is made.
         gripper: Drive both fingers by one command: one more action, −1 closed and 1 open. ``None``: if the task
             needs it.
         gripper_force: Largest force of each finger [N]; the Franka Hand's is 70 continuously.
@@ -141,6 +143,7 @@ class FrankaConfig:
     action_mode: str = "joint_delta"
     ee_scale: float = 0.05
     task: str = "reach"
+    task_options: Mapping[str, Any] = field(default_factory=dict, hash=False)  # a mapping has no hash
     gripper: bool | None = None
     gripper_force: float = 20.0
     scene: Scene | None = None
@@ -242,12 +245,14 @@ class FrankaConfig:
         self._check_choice("solver", ("auto", "mujoco", "featherstone"))
         from franka_wm.envs.robots.sources import SOURCES  # here: robots need this module
         from franka_wm.envs.tasks import TASKS
+        from franka_wm.envs.tasks.options import task_options
 
         self._check_choice("robot", tuple(SOURCES), more=ROBOT_OF_ONES_OWN)
         if self.goal_sampling is not None:
             self._check_choice("goal_sampling", ("fixed", "reachable"))
         self._check_choice("action_mode", tuple(ACTION_MODES))
         self._check_choice("task", TASKS, more=OF_ONES_OWN)
+        object.__setattr__(self, "task_options", task_options(self))
         self._check_choice("reward", self.task_class.rewards)
         self._check_choice("auto_reset", ("native", "standard"))
         for name in (f.name for f in fields(self) if isinstance(f.default, bool) or f.name == "gripper"):
@@ -359,14 +364,9 @@ class FrankaConfig:
     def _check_own_options(self) -> None:
         """Refuses options of other tasks, and those of a gripper or a scene without one: they would do nothing."""
         from franka_wm.envs.tasks import own_options
+        from franka_wm.envs.tasks.options import check_own_options
 
-        for name, tasks in own_options().items():
-            value, default = getattr(self, name), getattr(type(self), name)
-            if value != default and name not in self.task_class.own_options:
-                raise UserError(
-                    f"{name}={value}: task={self.task} does not read it, {', '.join(tasks)} "
-                    f"do{'es' * (len(tasks) == 1)}; leave it at {'null' if default is None else default}"
-                )
+        check_own_options(self, own_options())
         for name, there, what in (
             ("gripper_force", self.has_gripper, "the gripper"),
             ("max_contacts", self.resolved_scene, "a scene"),

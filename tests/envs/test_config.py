@@ -121,6 +121,7 @@ def test_options_of_a_task_are_for_it_and_those_that_build_on_it(monkeypatch: py
 
     class Other(TorchTask):
         own_options = ("track_radius",)
+        goal = reward = success = lambda *_: None  # it is not played
 
     monkeypatch.setattr(tasks, "TASKS", [*tasks.TASKS])
     monkeypatch.setattr(tasks, "_REGISTERED", {})

@@ -180,6 +180,12 @@ class Still(TorchTask):
     def goal(self, draws: torch.Tensor) -> torch.Tensor:
         return draws[:, :3]
 
+    def reward(self, state: torch.Tensor, action: torch.Tensor) -> torch.Tensor:
+        return state[..., 0]
+
+    def success(self, state: torch.Tensor) -> torch.Tensor:
+        return state[..., 0] < 0
+
 
 def test_a_task_without_an_image_of_its_goal_is_refused() -> None:
     config = FrankaConfig(observations=("goal_pixels", "state"))

@@ -246,7 +246,7 @@ def test_what_a_class_says_is_checked_as_it_is_written() -> None:
 
 
 def test_rewards_that_a_task_in_torch_does_not_have_are_refused(registries_as_before: None) -> None:
-    register("mine", type("Mine", (TorchTask,), {}))
+    register("mine", type("Mine", (TorchTask,), dict.fromkeys(("goal", "reward", "success"), id)))
     with pytest.raises(UserError, match="reward='sparse': must be one of dense"):
         FrankaConfig(task="mine", reward="sparse")
     assert not FrankaConfig(task="mine").fixed_goal

@@ -59,7 +59,7 @@ ACTIONS = (
 """Options that give recorded actions and states their meaning, where they are read."""
 MEANING = (
     *("task", "reward", *ACTIONS, "action_penalty", "success_distance", "drawer_opening"),
-    *("disc_radius", "disc_spread"),
+    *("disc_radius", "disc_spread", "task_options"),
     "terminate_on_success",
 )
 """Those that give actions, rewards and ends their meaning."""
@@ -86,7 +86,7 @@ LOOKS = (
 )
 """Those that change how the same view looks; not ``mesh_detail``, by default less than a pixel or two."""
 
-BEFORE = {"disc_radius": 0.1, "disc_spread": 0.0}
+BEFORE = {"disc_radius": 0.1, "disc_spread": 0.0, "task_options": None}
 """What recordings had that do not name these options: they were made before there were any."""
 
 
@@ -113,7 +113,7 @@ def other_options(
         for name in names:
             if name in unread or name not in recorded or name not in env:
                 continue
-            if _telling(name, recorded[name]) != _telling(name, env[name]):
+            if _telling(name, recorded) != _telling(name, env):
                 others.setdefault(name, _as_typed(recorded[name]))
     return others
 
@@ -148,7 +148,9 @@ def flat(env: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _as_typed(value: Any) -> Any:
-    return "null" if value is None else value
+    from franka_wm.envs.tasks.options import typed
+
+    return typed(value) if value is None or isinstance(value, Mapping) else value
 
 
 def _unread(env: Mapping[str, Any]) -> set[str]:
@@ -159,7 +161,10 @@ def _unread(env: Mapping[str, Any]) -> set[str]:
     return unread if env.get("robot") == "newton_asset" else unread | {"asset_name", "urdf_relative_path"}
 
 
-def _telling(name: str, value: Any) -> Any:
+def _telling(name: str, env: Mapping[str, Any]) -> Any:
+    value = env[name]
+    if name == "task_options":
+        return _with_defaults(value, env.get("task"))
     if name == "robot" and value == "panda_meshes_full":
         return "panda_meshes"  # the same with every triangle
     if name == "solver" and value == "auto":
@@ -169,6 +174,13 @@ def _telling(name: str, value: Any) -> Any:
     if name in ("target_ke", "target_kd") and isinstance(value, list) and value == value[:1] * len(value):
         return (value or [None])[0]  # one number is that of every joint
     return [*value][:1] if name == "cameras" else value
+
+
+def _with_defaults(options: Mapping[str, Any] | None, task: Any) -> dict[str, Any]:
+    """A task's own options with the defaults of those left out, where the task is known here."""
+    from franka_wm.envs.tasks import TASKS, task_class
+
+    return {**(task_class(task).option_defaults if task in TASKS else {}), **(options or {})}
 
 
 def other_scene(

@@ -75,17 +75,28 @@ def make_task(config: FrankaConfig) -> Task:
 
 
 def register(name: str, task: type[Task]) -> None:
-    """Makes a task of one's own known, for this process: ``env.task=NAME``.
+    """Makes a task of one's own known, for this process: ``env.task=NAME``. The last of a name counts.
 
     Args:
         name: What ``FrankaConfig.task`` will say.
         task: Built with the config alone.
 
     Raises:
-        UserError: It is not a subclass of :class:`Task`.
+        UserError: It is not a subclass of :class:`Task`, lacks what a task must define, or has other ``own_options``
+            than those that tasks of the package read; or the package has the name.
     """
     if not (isinstance(task, type) and issubclass(task, Task)):
         raise UserError(f"register({name!r}, {task!r}): must be a class, a subclass of Task or TorchTask")
+    if name in _BUILT_IN:
+        raise UserError(f"register({name!r}, {task.__name__}): the package has this name; choose another")
+    task.check_defined()
+    for option in task.own_options:
+        if option not in (known := own_options()):
+            raise UserError(
+                f"{task.__name__}.own_options: {option} is none of {', '.join(known)}; what else the config has needs "
+                f"no naming; what the task brings has its default in {task.__name__}.option_defaults, and "
+                f"env.task_options.{option}= sets it"
+            )
     _REGISTERED[name] = task
     if name not in TASKS:
         TASKS.append(name)

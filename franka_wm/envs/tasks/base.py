@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable, Mapping
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import torch
 import warp as wp
@@ -12,6 +12,7 @@ from tensordict import TensorDict, TensorDictBase
 
 from franka_wm.envs.constants import NUM_JOINTS
 from franka_wm.envs.scene import Scene
+from franka_wm.envs.tasks.options import check_defaults
 from franka_wm.errors import UserError
 
 if TYPE_CHECKING:
@@ -39,6 +40,9 @@ class Task:
         lowest_goal: Where the task keeps its goals at or above this height [m]: so do those set by hand.
         rewards: What ``reward`` may be.
         own_options: Options of the config that the task reads and not every task does; others are refused.
+        option_defaults: Options that the task brings itself, by name: numbers, true or false, words.
+            ``env.task_options`` changes them, ``self.options`` has them.
+        must_define: What a subclass has to define.
         words: The task in words, for datasets.
     """
 
@@ -51,6 +55,8 @@ class Task:
     lowest_goal = -math.inf
     rewards: tuple[str, ...] = ("dense", "sparse", "normalized")
     own_options: tuple[str, ...] = ("success_distance",)
+    option_defaults: ClassVar[Mapping[str, float | int | bool | str]] = {}
+    must_define: tuple[str, ...] = ("reset", "reward_and_success")
     words = "Do what the reward asks for."
 
     def __init__(self, config: FrankaConfig):
@@ -60,12 +66,28 @@ class Task:
         super().__init_subclass__(**kwargs)
         if "judge" in vars(cls):
             raise UserError(f"{cls.__name__}.judge: the method is called reward_and_success now; rename it")
+        if "options" in vars(cls):
+            raise UserError(f"{cls.__name__}.options: is read; name the defaults option_defaults")
+        check_defaults(cls.__name__, cls.option_defaults)
+        for name in ("rewards", "own_options"):
+            words = getattr(cls, name)
+            if not isinstance(words, tuple) or not all(isinstance(word, str) for word in words):
+                hint = "; the function is called reward" if callable(words) else ""
+                raise UserError(
+                    f"{cls.__name__}.{name}={words!r}: must be a tuple of words, such as {getattr(Task, name)}{hint}"
+                )
         if cls.scene is not None:
             cls.scene = Scene.of(cls.scene)
         if cls.home is not None and len(cls.home) != NUM_JOINTS:
             raise UserError(
                 f"{cls.__name__}.home={cls.home!r}: give {NUM_JOINTS} joint angles [rad], or None"
             )
+
+    @property
+    def options(self) -> dict[str, Any]:
+        """``option_defaults``, as the config's ``task_options`` changes them."""
+        given = self.config.task_options
+        return {name: given.get(name, default) for name, default in self.option_defaults.items()}
 
     @property
     def reward_bounds(self) -> tuple[float, float] | None:
@@ -111,6 +133,22 @@ class Task:
                 raise UserError(
                     f"{name}={getattr(config, name)}: task={label} draws its own goals; leave it out (docs/tasks.md)"
                 )
+
+    @classmethod
+    def check_defined(cls) -> None:
+        """Refuses a class that lacks what a task must define.
+
+        Raises:
+            UserError: One line.
+        """
+        base = next(one for one in cls.__mro__ if "must_define" in vars(one))
+        missing = [name for name in cls.must_define if getattr(cls, name) is getattr(base, name)]
+        if missing:
+            *most, last = cls.must_define
+            raise UserError(
+                f"{cls.__name__} must define {', '.join(most)} and {last}; "
+                f"{' and '.join(missing)} {'is' if len(missing) == 1 else 'are'} missing"
+            )
 
     @classmethod
     def disc(cls, config: FrankaConfig) -> float | None:

@@ -13,6 +13,7 @@ from franka_wm.envs.tasks.base import Task, with_goal
 from franka_wm.errors import UserError
 
 if TYPE_CHECKING:
+    from franka_wm.envs.config import FrankaConfig
     from franka_wm.envs.simulation import Simulation
 
 
@@ -31,6 +32,11 @@ class TorchTask(Task):
     num_draws = 8
     draws_goals = True
     rewards = ("dense",)
+    must_define = ("goal", "reward", "success")
+
+    def __init__(self, config: FrankaConfig):
+        self.check_defined()  # of one that has no name, too
+        super().__init__(config)
 
     def goal(self, draws: torch.Tensor) -> torch.Tensor:
         """Goal of an episode: (N, num_draws) random numbers, uniform in [0, 1) → (N, 3) [m]."""
