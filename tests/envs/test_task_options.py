@@ -155,7 +155,7 @@ def test_the_preset_of_the_example(root: Path, composed: Callable[..., Any]) -> 
 
 def test_a_name_of_the_package_is_refused_one_of_ones_own_is_not() -> None:
     assert line(lambda: register("reach", Spot)) == (
-        "register('reach', Spot): the package has this name; choose another"
+        "register('reach', …): the package has this name; choose another"
     )
     register("spot", Spot)
     again = type("Again", (Spot,), {})

@@ -78,6 +78,9 @@ def test_what_a_model_answers_otherwise_is_told_in_one_line(wrong, says):
 
 def test_actions_that_are_numbers_are_not_tried():
     check_model(own(wrong="next"), action_dim=None)
+    model = own(wrong="next")
+    model.discrete = True
+    check_model(model, action_dim=2)
 
 
 @pytest.fixture

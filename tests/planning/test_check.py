@@ -22,7 +22,7 @@ class Middle:
     def plan(
         self, z, next, objective, *, prior=None, previous=None, is_init=None, explore=False, generator=None
     ):
-        actions = z.new_zeros(len(z), 1, 2, self.action_dim)
+        actions = 0.0 * torch.rand(len(z), 1, 2, self.action_dim)  # drawn, but not from the generator
         latents = [z.unsqueeze(1)]
         for t in range(2):
             latents.append(next(latents[-1], actions[:, :, t]))

@@ -19,6 +19,7 @@ from franka_wm.envs.tasks.stack import Stack
 from franka_wm.envs.tasks.torch_task import TorchTask
 from franka_wm.envs.tasks.track import Track
 from franka_wm.errors import UserError
+from franka_wm.options import refuse_ours
 
 if TYPE_CHECKING:
     from franka_wm.envs.config import FrankaConfig
@@ -87,8 +88,7 @@ def register(name: str, task: type[Task]) -> None:
     """
     if not (isinstance(task, type) and issubclass(task, Task)):
         raise UserError(f"register({name!r}, {task!r}): must be a class, a subclass of Task or TorchTask")
-    if name in _BUILT_IN:
-        raise UserError(f"register({name!r}, {task.__name__}): the package has this name; choose another")
+    refuse_ours(name, _BUILT_IN)
     task.check_defined()
     for option in task.own_options:
         if option not in (known := own_options()):
