@@ -1,9 +1,11 @@
 """Errors that a user can mend. Entry points print them as one line, without a traceback."""
 
 import errno
+import sysconfig
 import traceback
 from collections.abc import Iterator
 from contextlib import contextmanager
+from pathlib import Path
 
 LONGEST, LONGEST_LINE = 1000, 2500
 """Characters of a word and of a message: what a user, or a stranger's file, holds may be of any length."""
@@ -53,10 +55,19 @@ def trying(what: str, *but: type[Exception]) -> Iterator[None]:
 
 
 def where(error: BaseException) -> str:
-    """Kind and first line of an error, and the line that raised it."""
-    last = traceback.extract_tb(error.__traceback__)[-1]
+    """Kind and first line of an error, and the last line of the user's own that led to it."""
+    others = (
+        str(Path(__file__).parent),
+        sysconfig.get_paths()["purelib"],
+        sysconfig.get_paths()["stdlib"],
+        "<",
+    )
+    frames = traceback.extract_tb(error.__traceback__)
+    own = [one for one in frames if not one.filename.startswith(others)]
     # A SyntaxError says it itself.
-    place = "" if isinstance(error, SyntaxError) else f" ({last.filename}, line {last.lineno})"
+    place = (
+        f" ({own[-1].filename}, line {own[-1].lineno})" if own and not isinstance(error, SyntaxError) else ""
+    )
     reason = (str(error).strip() or "no reason given").splitlines()[0]
     return f"{type(error).__name__}: {reason}{place}"
 

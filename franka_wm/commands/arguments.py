@@ -246,8 +246,8 @@ def check_run(verb: str, option: str, folder: str) -> None:
         raise UserError(f"{verb}: {option}={folder}: is a dataset; give the folder of a run")
     if place.is_dir() and not any((place / one).exists() for one in ("checkpoints", "manifest.json")):
         runs = sorted(one.name for one in place.iterdir() if (one / "checkpoints").is_dir())
-        if runs:
-            raise UserError(f"{verb}: {option}={folder}: holds several runs; give one of {', '.join(runs)}")
+        if runs and runs != ["pretrained"]:  # a run that ended in its first stage
+            raise UserError(f"{verb}: {option}={folder}: holds runs; give one of {', '.join(runs)}")
 
 
 def verb(name: str, **settings: Any) -> Callable[[Any], Verb]:

@@ -141,8 +141,9 @@ def _collect(
 def _missing(out: str, episodes: int) -> int:
     """How many are still to be played; as many as there are processes at least, since each needs a world."""
     from franka_wm import processes
-    from franka_wm.data.lerobot.writer import episodes_there
+    from franka_wm.data.lerobot.writer import check_out, episodes_there
 
+    check_out(out, resume=True)
     return max(episodes - episodes_there(out), min(episodes, processes.count()))
 
 

@@ -6,7 +6,9 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from franka_wm.commands.arguments import FLAG, check_run, plugins, verb, whole, word
+import click
+
+from franka_wm.commands.arguments import FLAG, TYPED, check_run, plugins, verb, whole, word
 from franka_wm.errors import UserError
 from franka_wm.files import unwritable
 
@@ -45,21 +47,23 @@ def evaluate(checkpoint: str, out: str | None, overrides: Sequence[str] = (), **
     Writes evaluation.json and evaluation.md (the same twice on a CPU), timing.json, imagined.png, imagined.mp4.
     """
     own = default_folder(checkpoint)
-    if overrides and (out is None or Path(out).resolve() in (own.resolve(), own.parent.resolve())):
+    planned_with = ", ".join(one for one in overrides if not one.startswith("hydra.searchpath="))
+    if planned_with and (out is None or Path(out).resolve() in (own.resolve(), own.parent.resolve())):
         raise UserError(
-            f"evaluate: {' '.join(overrides)}: results of other settings than the run's do not take the place of its "
-            "own; give another folder, out=FOLDER"
+            f"evaluate: {planned_with}: results of other settings than the run's do not take the place of its own; "
+            "give another folder, out=FOLDER"
         )
     place = own if out is None else Path(out)
     check_folder(place)
     check_run("evaluate", "checkpoint", checkpoint)
-    planned_with = ", ".join(one for one in overrides if not one.startswith("hydra.searchpath="))
     check_other(place, own, planned_with)
     check_larger(place, options["episodes"], checkpoint)
     from franka_wm.commands.evaluate_checkpoint import Options, run
 
-    words = tuple(overrides)
-    run(Options(checkpoint=checkpoint, out=place, overrides=words, planned_with=planned_with, **options))
+    context = click.get_current_context(silent=True)
+    typed = () if context is None else tuple(context.meta[TYPED])
+    words = {"overrides": tuple(overrides), "planned_with": planned_with, "typed": typed}
+    run(Options(checkpoint=checkpoint, out=place, **words, **options))
 
 
 def default_folder(checkpoint: str) -> Path:

@@ -50,6 +50,7 @@ class Options:
     robustness: bool
     overrides: tuple[str, ...] = ()
     planned_with: str = ""
+    typed: tuple[str, ...] = ()
 
 
 def _planning(options: Options) -> dict[str, Any]:
@@ -136,7 +137,8 @@ def _of_run(agent: Agent, options: Options) -> dict[str, Any]:
         group for group in ("planner", "objective") if any(w.startswith(group) for w in options.overrides)
     }
     # These have the device here, and what training found, too; a comparison would list both.
-    return {**told, "config": {**(told["config"] or values), **{group: values[group] for group in changed}}}
+    config = {**(told["config"] or values), **{group: values[group] for group in changed}}
+    return {**told, "config": config, "typed": [*options.typed]}
 
 
 def _look_ahead(

@@ -244,8 +244,8 @@ class FrankaConfig:
             raise UserError(f"goal={self.goal}: give three finite numbers (x, y, z) in metres")
         self._check_choice("solver", ("auto", "mujoco", "featherstone"))
         from franka_wm.envs.robots.sources import SOURCES  # here: robots need this module
+        from franka_wm.envs.task_options import task_options
         from franka_wm.envs.tasks import TASKS
-        from franka_wm.envs.tasks.options import task_options
 
         self._check_choice("robot", tuple(SOURCES), more=ROBOT_OF_ONES_OWN)
         if self.goal_sampling is not None:
@@ -363,8 +363,8 @@ class FrankaConfig:
 
     def _check_own_options(self) -> None:
         """Refuses options of other tasks, and those of a gripper or a scene without one: they would do nothing."""
+        from franka_wm.envs.task_options import check_own_options
         from franka_wm.envs.tasks import own_options
-        from franka_wm.envs.tasks.options import check_own_options
 
         check_own_options(self, own_options())
         for name, there, what in (

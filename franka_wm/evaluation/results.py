@@ -21,7 +21,8 @@ Quantities are those of :func:`franka_wm.evaluation.closed_loop.summarize`. Of t
 A number that is not known is null.
 
 Where the command writes elsewhere than into the run's folder, ``run.json`` beside it says of which run it is:
-``config``, as it was evaluated, ``overrides``, what was typed after ``train.py``, and ``preset``, that of ``env``.
+``config``, as it was evaluated, ``overrides``, what was typed after ``train.py``, ``preset``, that of ``env``, and
+``typed``, what was typed after ``franka-wm evaluate``.
 """
 
 import json

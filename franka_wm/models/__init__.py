@@ -81,8 +81,8 @@ def register(name: str, cls: type[WorldModel], *, line: str = "") -> None:
     lacking = [one for one in ("encode", "loss") if getattr(cls, one) is getattr(WorldModel, one)]
     if lacking:
         raise UserError(
-            f"model {name!r}: {cls.__name__} must define encode and loss; {' and '.join(lacking)} is missing, "
-            "see docs/models.md"
+            f"model {name!r}: {cls.__name__} must define encode and loss; {' and '.join(lacking)} "
+            f"{'is' if len(lacking) == 1 else 'are'} missing, see docs/models.md"
         )
     _REGISTERED[name] = (cls, line)
 

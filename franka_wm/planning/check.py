@@ -26,13 +26,11 @@ def check_planner(planner: Any, *, action_dim: int, name: str = "") -> None:
             such plans (E, …, H, A).
     """
     name, envs, size = name or type(planner).__name__, 2, action_dim + 1
-    seen: list[tuple[int, ...]] = []
 
     def following(z: Tensor, action: Tensor) -> Tensor:
         return z + torch.cat((action, action[..., :1]), -1)
 
     def objective(trajectory: Tensor, actions: Tensor) -> Tensor:
-        seen.append(tuple(actions.shape))
         _require(name, "candidates", actions, (envs, None, None, action_dim), "(E, S, H, A)")
         wanted = (envs, actions.shape[1], actions.shape[2] + 1, size)
         _require(name, "trajectories of latents", trajectory, wanted, "(E, S, H+1, D)")
@@ -56,17 +54,21 @@ def check_planner(planner: Any, *, action_dim: int, name: str = "") -> None:
             raise UserError(
                 f"planner {name}: plan must return a TensorDict with action and plan, not {there}"
             )
-        horizon = seen[-1][2] if seen else None
         _require(name, "action", found["action"], (envs, action_dim), "(E, A)")
-        plan: Tensor = found["plan"]
+        plan, horizon = found["plan"], None if previous is None else previous.shape[-2]
+        if not isinstance(plan, Tensor):
+            raise UserError(f"planner {name}: plan must be a tensor, not {type(plan).__name__}")
         alone = (
             plan if plan.ndim < 4 else plan.reshape(envs, -1, *plan.shape[-2:])[:, 0]
         )  # iCEM carries several
         _require(name, "plan", alone, (envs, horizon, action_dim), "(E, H, A)")
-        previous = found["plan"]
+        previous = plan
 
 
 def _require(name: str, what: str, x: Tensor, shape: tuple[int | None, ...], words: str) -> None:
+    if not isinstance(x, Tensor) or not x.is_floating_point():
+        what = f"{what} must be numbers in a tensor"
+        raise UserError(f"planner {name}: {what}, not {getattr(x, 'dtype', type(x).__name__)}")
     fits = x.ndim == len(shape) and all(want in (None, got) for want, got in zip(shape, x.shape, strict=True))
     if not fits:
         wanted = ", ".join("any" if one is None else str(one) for one in shape)

@@ -102,12 +102,12 @@ def make(name: str, **arguments: Any) -> Any:
         ValueError: no planner has this name, or an argument that cannot work.
         UserError: one of your own does not do what `Planner` promises, see `check_planner`.
     """
-    made = planner(name)(**arguments)
     if name in _REGISTERED and not is_search(name):
         from franka_wm.planning.check import check_planner
 
-        check_planner(made, action_dim=arguments["action_dim"], name=name)
-    return made
+        # Another one than is used: it may remember what it was asked.
+        check_planner(planner(name)(**arguments), action_dim=arguments["action_dim"], name=name)
+    return planner(name)(**arguments)
 
 
 def _require(name: str) -> None:

@@ -52,6 +52,7 @@ class RunFiles:
         timing: policy -> ``seconds_per_decision``, ``worlds``.
         damage: why the newest checkpoint cannot be read; empty if it can, or there is none.
         elsewhere: the folder is none of a run: results of one that lies elsewhere.
+        evaluated: what was typed after ``franka-wm evaluate`` for these.
     """
 
     folder: Path
@@ -66,6 +67,7 @@ class RunFiles:
     timing: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
     damage: str = ""
     elsewhere: bool = False
+    evaluated: Sequence[str] = ()
 
     @property
     def policies(self) -> Mapping[str, Mapping[str, Any]]:
@@ -129,6 +131,8 @@ def _read_run(run: Path) -> RunFiles:
     files = UntrustedFolder(run)
     config, typed, preset = _chosen(files)
     told = files.json(OF_RUN) if config is None else None
+    if told is not None and not {"config", "overrides", "preset", "typed"} <= told.keys():
+        told = None  # of somebody else
     if told is not None:
         config, typed, preset = told["config"], list(map(str, told["overrides"])), str(told["preset"])
     found = results(run)
@@ -157,6 +161,7 @@ def _read_run(run: Path) -> RunFiles:
         timing=files.json("evaluation/timing.json") or files.json("timing.json") or {},
         damage=damage,
         elsewhere=told is not None,
+        evaluated=list(map(str, told["typed"])) if told is not None else [],
     )
 
 

@@ -1,7 +1,6 @@
 """The sections of a run's page. Each is a function of what the run left, and empty where that is not there."""
 
 import math
-import re
 import shlex
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -11,7 +10,7 @@ import yaml
 from markupsafe import Markup
 
 from franka_wm.console import named_plugins, quoted
-from franka_wm.evaluation.results import COMMAND, END, OTHERWISE, Result
+from franka_wm.evaluation.results import COMMAND, END, Result
 from franka_wm.report import style
 from franka_wm.report.bars import bars_figure
 from franka_wm.report.calibration import calibration_figure
@@ -39,8 +38,6 @@ from franka_wm.report.table import Table, is_interval, nested_table
 
 LOWEST = -1.0
 """Where the axis of probes ends at the latest: one probe far off would squeeze all others."""
-_WORDS = re.compile(r", (?=planner[.=]|objective\.)")
-"""Between the words in a protocol's `OTHERWISE`; a value may hold commas."""
 
 
 def sections(run: RunFiles) -> list[Section]:
@@ -301,8 +298,8 @@ def reproduce(run: RunFiles) -> str:
         again = any(one.startswith("resume=") for one in run.overrides)  # its scale is that of the first part
         words = [one for one in run.overrides if not (again and one.startswith("scale="))]
         lines += ["# train it again", f"franka-wm train {shlex.join(words)}", ""]
-    if run.elsewhere and run.results:
-        lines += ["# evaluate it again", f"{_evaluated(run.results[0], place)}{own}", ""]
+    if run.evaluated:
+        lines += ["# evaluate it again", f"franka-wm evaluate {shlex.join(run.evaluated)}", ""]
     kind = (run.config.get("env") or {}).get("kind", "franka")
     if run.counters and kind != "none":  # there is nothing to act in
         shifted, option = (", also in shifted worlds", " robustness=true") if kind == "franka" else ("", "")
@@ -349,21 +346,6 @@ def _episodes(run: RunFiles) -> str:
     """As many as it was evaluated over by the command, if it was."""
     episodes = [one.episodes for one in run.results if one.protocol.get("by") == COMMAND]
     return f" episodes={episodes[0]}" if episodes else ""
-
-
-def _evaluated(found: Result, out: str) -> str:
-    """The command that made results that lie elsewhere than in their run's folder."""
-    told = found.protocol
-    words = [
-        str(told["checkpoint"]),
-        *_WORDS.split(str(told.get(OTHERWISE, ""))),
-        f"episodes={found.episodes}",
-    ]
-    if "robustness" in found.extras:
-        words.append("robustness=true")
-    if "diagnostics" not in told:  # else they did not end
-        words += [f"{name}=false" for name in ("open_loop", "probes") if name not in found.extras]
-    return f"franka-wm evaluate {shlex.join(filter(None, words))} out={out}"
 
 
 def _end(run: RunFiles) -> Result | None:

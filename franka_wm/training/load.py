@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import torch
-from hydra.errors import MissingConfigException
+from hydra.errors import HydraException, MissingConfigException
 from omegaconf import OmegaConf
+from omegaconf.errors import OmegaConfBaseException
 from tensordict.nn import TensorDictModuleBase
 
 from franka_wm import conf
@@ -110,6 +112,8 @@ def load_agent(
 
 def preset_of(planner: str, settings: RunSettings, *searchpath: str) -> dict[str, Any]:
     """What ``planner=NAME`` would have been in this run; ``searchpath``: see :func:`load_agent`."""
+    if not re.fullmatch(r"\w[\w-]*", planner):
+        raise UserError(f"planner={planner}: must be the name of a planner, as franka-wm list has them")
     try:
         composed = conf.compose(f"planner={planner}", f"scale={settings.values['scale']}", *searchpath)
     except MissingConfigException as error:
@@ -120,6 +124,9 @@ def preset_of(planner: str, settings: RunSettings, *searchpath: str) -> dict[str
             or f"; of your own: hydra.searchpath=[file://FOLDER], with {group}/{name}.yaml"
         )
         raise UserError(f"{group}={name}: must be one of {', '.join(there)}{near}") from error
+    except (HydraException, OmegaConfBaseException, ValueError) as error:
+        given = " ".join((f"planner={planner}", *searchpath))
+        raise UserError(f"{given}: {str(error).strip().splitlines()[0]}") from error
     found: Any = OmegaConf.to_container(composed.planner, resolve=True)
     return found
 

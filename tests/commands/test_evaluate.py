@@ -165,6 +165,8 @@ def test_a_checkpoint_plans_otherwise_than_its_run(
             "planner=cemm",
             "planner=cemm: must be one of cem, gradient, gumbel, icem, mcts, mppi; did you mean cem?",
         ),
+        ("planner=../model/tdmpc2", "planner=../model/tdmpc2: must be the name of a planner"),
+        ("planner=cem,icem", "must be the name of a planner"),
         (
             "planner=mine",
             "icem, mcts, mppi; of your own: hydra.searchpath=[file://FOLDER], with planner/mine.yaml",
@@ -183,11 +185,14 @@ def test_a_checkpoint_plans_otherwise_than_its_run(
 
 
 def test_a_folder_of_something_else_is_told_apart(tmp_path: Path, capsys) -> None:
+    (tmp_path / "staged" / "pretrained" / "checkpoints").mkdir(parents=True)
+    assert cli.main(["evaluate", str(tmp_path / "staged")]) == 1
+    assert "holds runs" not in capsys.readouterr().err
     for folder in ("sweep/0-reach/checkpoints", "sweep/1-reach/checkpoints", "sweep/plots", "data/meta"):
         (tmp_path / folder).mkdir(parents=True)
     (tmp_path / "data" / "meta" / "info.json").write_text("{}")
     for folder, says in (
-        ("sweep", "sweep: holds several runs; give one of 0-reach, 1-reach"),
+        ("sweep", "sweep: holds runs; give one of 0-reach, 1-reach"),
         ("data", "data: is a dataset; give the folder of a run"),
     ):
         assert cli.main(["evaluate", str(tmp_path / folder)]) == 1

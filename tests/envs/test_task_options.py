@@ -56,8 +56,11 @@ def line(call: Callable[[], Any]) -> str:
 
 def test_defaults_are_overridden_by_the_config(spot: None) -> None:
     config = FrankaConfig(**STATE, task="spot", task_options={"radius": 1, "upright": False})
-    assert config.task_options == {"radius": 1.0, "turns": 2, "upright": False, "shape": "ring"}
-    assert Spot(config).options == config.task_options and isinstance(config.task_options["radius"], float)
+    assert Spot(config).options == {"radius": 1.0, "turns": 2, "upright": False, "shape": "ring"}
+    assert isinstance(config.task_options["radius"], float), "as its default"
+    assert replace(FrankaConfig(**STATE, task="spot"), task="reach").task_options == {}, (
+        "none but those given"
+    )
     assert Spot(FrankaConfig(**STATE)).options == Spot.option_defaults, "of one that the config does not name"
     same = FrankaConfig.from_mapping(json.loads(json.dumps(asdict(config))))
     assert same == config == replace(config) and hash(same) == hash(config)
@@ -136,7 +139,7 @@ def test_the_printed_preset(
     preset = arm("env=ring")
     assert (preset.task, preset.episode_length, preset.task_options["ring_radius"]) == ("ring", 40, 0.2)
     for config in (arm("env=ring", *ring), arm("env=reach", "env.task=ring", *whole)):
-        assert config.task_options == {"ring_radius": 0.15, "ring_height": 0.5}
+        assert config.task_class(config).options == {"ring_radius": 0.15, "ring_height": 0.5}
     env = FrankaEnv(arm("env=ring", *ring), num_envs=16, device="cpu", seed=0)
     away = env.reset()["goal"] - torch.tensor([0.4, 0.0, 0.5])
     torch.testing.assert_close(away.norm(dim=-1), torch.full((16,), 0.15))
@@ -167,7 +170,7 @@ def test_an_own_option_that_no_task_of_the_package_reads_points_to_the_new_way()
     ring = type("Ring", (Spot,), {"own_options": ("success_distance", "ring_radius")})
     said = line(lambda: register("ring", ring))
     assert said.startswith("Ring.own_options: ring_radius is none of success_distance, track_radius")
-    assert "Ring.option_defaults" in said and "env.task_options.ring_radius=" in said
+    assert "Ring.option_defaults" in said and "'env.task_options={ring_radius: …}' sets it" in said
 
 
 @pytest.mark.parametrize(
@@ -204,3 +207,21 @@ def test_what_a_task_must_define(base: type[Task], defined: tuple[str, ...], sai
 )
 def test_what_a_class_says_must_be_of_its_kind(name: str, value: Any, said: str) -> None:
     assert re.search(said, line(lambda: type("Ring", (Spot,), {name: value})))
+
+
+def test_options_are_not_set_by_a_constructor(spot: None) -> None:
+    def constructor(self: Task, config: FrankaConfig) -> None:
+        self.options = {"radius": 1.0}  # type: ignore[assignment]
+
+    ring = type("Ring", (Spot,), {"__init__": constructor})
+    assert (
+        line(lambda: ring(FrankaConfig(**STATE)))
+        == "Ring.options: is read; name the defaults option_defaults"
+    )
+
+
+def test_a_part_in_warp_needs_no_functions() -> None:
+    parts = {name: lambda *_: None for name in ("goal", "reward_and_success")}
+    type("Mixed", (TorchTask,), parts).check_defined()
+    said = line(lambda: type("Half", (TorchTask,), {"reward_and_success": parts["goal"]}).check_defined())
+    assert said == "Half must define goal; goal is missing"

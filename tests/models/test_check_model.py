@@ -1,5 +1,7 @@
 """A model of one's own is held against the shapes that `WorldModel` promises."""
 
+from contextlib import nullcontext
+
 import pytest
 import torch
 from torch import nn
@@ -76,6 +78,21 @@ def test_what_a_model_answers_otherwise_is_told_in_one_line(wrong, says):
         check_model(own(wrong=wrong), action_dim=2)
 
 
+def test_what_its_constructor_froze_stays_frozen():
+    for wrong in ("", "value"):
+        model = own(wrong=wrong)
+        model.encoder[1].eval()
+        with nullcontext() if not wrong else pytest.raises(UserError):
+            check_model(model, action_dim=2)
+        assert model.training and model.encoder[0].training and not model.encoder[1].training
+
+
+def test_a_policy_may_take_its_mode_by_keyword_alone():
+    model = own()
+    model.policy = lambda z, *, deterministic: z[:, :2] if deterministic else 1 / 0  # type: ignore[method-assign]
+    check_model(model, action_dim=2)
+
+
 def test_actions_that_are_numbers_are_not_tried():
     check_model(own(wrong="next"), action_dim=None)
     model = own(wrong="next")
@@ -105,7 +122,7 @@ def test_what_is_no_whole_model_is_not_registered(registered):
 
     for name, cls, says in (
         ("half", Half, "model 'half': Half must define encode and loss; encode is missing"),
-        ("none", type("Nothing", (WorldModel,), {}), "encode and loss is missing"),
+        ("none", type("Nothing", (WorldModel,), {}), "encode and loss are missing, see"),
         ("tdmpc2", Own, "the package has this name; choose another"),
     ):
         with pytest.raises(UserError, match=says):

@@ -28,7 +28,10 @@ class Middle:
             latents.append(next(latents[-1], actions[:, :, t]))
         objective(torch.stack(latents, 2), actions)
         plan = z.new_zeros(len(z), 2, self.width)
-        return TensorDict({"action": plan[:, 0], self.entry: plan[:, self.drop :]}, batch_size=[len(z)])
+        return TensorDict(
+            {"action": plan[:, 0], self.entry: plan[:, self.drop and previous is not None :]},
+            batch_size=[len(z)],
+        )
 
 
 class Answers(Middle):
@@ -105,6 +108,30 @@ def test_a_planner_of_ones_own_is_tried_when_it_is_made(registered):
     assert registry.make("middle", action_dim=3).action_dim == 3
     with pytest.raises(UserError, match="planner middle: action must be"):
         registry.make("middle", action_dim=3, width=2)
+
+
+def test_the_planner_that_is_used_was_not_asked_before(registered):
+    class Remembers(Middle):
+        seen = 0
+
+        def plan(self, z, next, objective, **others):
+            self.seen += 1
+            return super().plan(z, next, objective, **others)
+
+    registry.register("remembers", Remembers)
+    assert registry.make("remembers", action_dim=3).seen == 0
+
+
+def test_numbers_are_wanted():
+    class Whole(Middle):
+        def plan(self, z, next, objective, **others):
+            found = super().plan(z, next, objective, **others)
+            return found.set("action", found["action"].long())
+
+    with pytest.raises(
+        UserError, match=r"planner Whole: action must be numbers in a tensor, not torch.int64"
+    ):
+        check_planner(Whole(action_dim=3), action_dim=3)
 
 
 def test_what_cannot_plan_is_not_registered(registered):

@@ -56,6 +56,7 @@ def evaluate(monkeypatch, tmp_path: Path) -> Any:
                 False,
                 overrides,
                 ", ".join(overrides),
+                ("RUN", *overrides, "plugins=[mine]"),
             )
         )
         return tmp_path / out
@@ -96,10 +97,8 @@ def test_its_page_says_what_was_planned_with_and_how_to_do_it_again(run: Path, e
     found = read_run(folder)
     header = f"reach, fixed goal · tdmpc2 · seed 0 · planned with {', '.join(CHANGED)}, not as the run did"
     assert header in page(found)
-    again = (
-        f"franka-wm evaluate {run} planner=icem &#39;planner.sizes=[1, 2]&#39; episodes=100 open_loop=false"
-    )
-    assert f"{again} probes=false out={folder}" in reproduce(found)
+    again = "franka-wm evaluate RUN planner=icem &#39;planner.sizes=[1, 2]&#39; &#39;plugins=[mine]&#39;"
+    assert again in reproduce(found)
     assert "franka-wm train env=reach_fixed seed=0" in reproduce(found)
 
 
@@ -133,9 +132,11 @@ def test_a_file_of_another_form_ends_in_one_line(run: Path, evaluate) -> None:
     from franka_wm.errors import UserError
 
     folder = evaluate(run, "icem", *CHANGED)
-    for told in ({}, {"config": [], "overrides": 1, "preset": ""}):
+    (folder / "run.json").write_text(json.dumps({"config": {}}))
+    assert not read_run(folder).elsewhere, "of somebody else"
+    for told in ([], {"config": [], "overrides": 1, "preset": "", "typed": []}):
         (folder / "run.json").write_text(json.dumps(told))
-        with pytest.raises(UserError, match="measure the run again"):
+        with pytest.raises(UserError, match=r"measure the run again|run\.json holds no object"):
             read_run(folder)
 
 

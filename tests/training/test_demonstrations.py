@@ -229,7 +229,7 @@ def test_episodes_without_rewards_are_refused(demos: Path, settled, monkeypatch)
         (("env=reach_pixels", "model=tdmpc2_pixels"), r"\S+: has no pixels, which model=\S+ reads"),
         (
             ("env.terminate_on_success=true",),
-            "recorded with env.terminate_on_success=False, this run has True",
+            "recorded with env.terminate_on_success=false, this run has true",
         ),
         (("replay.demo_resets=0.5",), "is for tasks with a gripper"),
         (("replay.demos=null", "replay.demo_resets=0.5"), "needs demonstrations"),
@@ -382,7 +382,7 @@ def test_the_runs_own_are_refused_whatever_the_dataset_says(pushes: Path, settle
             ("env=drawer", "env.action_scale=0.085"),
             "drawer_opening=0.1",
         ),
-        ({"show_goal": True}, ("env=reach_pixels",), "recorded with env.show_goal=True, this run has False"),
+        ({"show_goal": True}, ("env=reach_pixels",), "recorded with env.show_goal=true, this run has false"),
         (
             {"cameras": ["wrist"]},
             ("env=reach_pixels",),

@@ -5,7 +5,16 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from typing import Any
 
-from franka_wm.data.lerobot.provenance import DYNAMICS, LOOKS, MEANING, VIEWS, flat, other_option, other_scene
+from franka_wm.data.lerobot.provenance import (
+    DYNAMICS,
+    LOOKS,
+    MEANING,
+    VIEWS,
+    as_typed,
+    flat,
+    other_option,
+    other_scene,
+)
 from franka_wm.data.lerobot.schema import IMAGE_PREFIX
 from franka_wm.errors import UserError
 
@@ -38,8 +47,9 @@ def check_alike(
     changed = other_option(other["sessions"], env, (*MEANING, *DYNAMICS, *((*VIEWS, *LOOKS) if seen else ())))
     if changed is not None:
         name, there = changed
-        here = "null" if env[name] is None else env[name]
-        raise UserError(f"{what} was recorded with env.{name}={there}, this has {here}; {close}")
+        raise UserError(
+            f"{what} was recorded with env.{name}={there}, this has {as_typed(env[name])}; {close}"
+        )
     if other_scene(other["sessions"], env, images=seen, moves=True):
         raise UserError(f"{what} was recorded with another env.scene; {close}")
     if other["schema"] != schema:

@@ -188,13 +188,15 @@ def read_datasets(
                 f"{roots[0]} has {sources[0].fps:g} frames per second, {source.root} {source.fps:g}; "
                 "train on them separately"
             )
-    there, size, task = sources[0].fps, mappings[0].action[1], _recorded_task(sources[0])
+    there, size = sources[0].fps, mappings[0].action[1]
     if fps is not None and abs(fps - there) > 1e-6 * there:
+        task = _recorded_task(sources[0])
         raise UserError(
             f"{task and f'recorded with {task}: '}{roots[0]} has {there:g} frames per second, the environment {fps:g}; "
             f"a step would mean something else. Use {task and f'an env with {task} and '}env.fps={there:g}"
         )
     if action_dim is not None and not mappings[0].discrete and action_dim != size:
+        task = _recorded_task(sources[0])
         raise UserError(
             f"{task and f'recorded with {task}: '}{roots[0]}: its actions have {size} numbers, the environment's "
             f"{action_dim}; "

@@ -114,7 +114,7 @@ def other_options(
             if name in unread or name not in recorded or name not in env:
                 continue
             if _telling(name, recorded) != _telling(name, env):
-                others.setdefault(name, _as_typed(recorded[name]))
+                others.setdefault(name, as_typed(recorded[name]))
     return others
 
 
@@ -123,16 +123,16 @@ def told(
 ) -> Iterator[str]:
     """Lines about what is other and no reason to refuse reading it: meaning and dynamics; with ``looks`` images."""
     said = {
-        MEANING: "its goals, rewards and ends are those of then",
-        DYNAMICS: "its actions did what they did then",
+        MEANING: "its goals, rewards and ends are as recorded",
+        DYNAMICS: "what its actions do is as recorded",
     }
     if looks:
-        said = {LOOKS: "its images look as they did then"}
+        said = {LOOKS: "its images look as recorded"}
     env = flat(env)
     for names, then in said.items():
         if others := other_options(sessions, env, names):
             there = ", ".join(f"env.{name}={value}" for name, value in others.items())
-            here = ", ".join(str(_as_typed(env[name])) for name in others)
+            here = ", ".join(str(as_typed(env[name])) for name in others)
             yield f"recorded with {there}, this run has {here}; {then}"
     same = not looks and not other_scene(sessions, env, images=False)  # else it is refused
     if same and other_scene(sessions, env, images=False, moves=True):
@@ -147,15 +147,18 @@ def flat(env: Mapping[str, Any]) -> dict[str, Any]:
     return {name: [*value] if isinstance(value, tuple) else value for name, value in every.items()}
 
 
-def _as_typed(value: Any) -> Any:
-    from franka_wm.envs.tasks.options import typed
+def as_typed(value: Any) -> Any:
+    """A value for a message."""
+    from franka_wm.envs.task_options import typed
 
-    return typed(value) if value is None or isinstance(value, Mapping) else value
+    return typed(value) if value is None or isinstance(value, Mapping | bool) else value
 
 
 def _unread(env: Mapping[str, Any]) -> set[str]:
     """Options that do nothing beside others."""
     unread = set() if env.get("action_mode") == "ee_delta" else {"ee_scale"}
+    if env.get("solver") == "featherstone":
+        unread |= {"solver_iterations", "solver_ls_iterations"}
     if env.get("urdf_path"):
         return unread | {"robot", "asset_name", "urdf_relative_path"}
     return unread if env.get("robot") == "newton_asset" else unread | {"asset_name", "urdf_relative_path"}

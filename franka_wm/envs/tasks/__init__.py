@@ -95,7 +95,7 @@ def register(name: str, task: type[Task]) -> None:
             raise UserError(
                 f"{task.__name__}.own_options: {option} is none of {', '.join(known)}; what else the config has needs "
                 f"no naming; what the task brings has its default in {task.__name__}.option_defaults, and "
-                f"env.task_options.{option}= sets it"
+                f"'env.task_options={{{option}: …}}' sets it"
             )
     _REGISTERED[name] = task
     if name not in TASKS:

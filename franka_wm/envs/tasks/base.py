@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from abc import abstractmethod
 from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, Any, ClassVar
 
@@ -12,7 +13,7 @@ from tensordict import TensorDict, TensorDictBase
 
 from franka_wm.envs.constants import NUM_JOINTS
 from franka_wm.envs.scene import Scene
-from franka_wm.envs.tasks.options import check_defaults
+from franka_wm.envs.task_options import check_defaults
 from franka_wm.errors import UserError
 
 if TYPE_CHECKING:
@@ -42,7 +43,6 @@ class Task:
         own_options: Options of the config that the task reads and not every task does; others are refused.
         option_defaults: Options that the task brings itself, by name: numbers, true or false, words.
             ``env.task_options`` changes them, ``self.options`` has them.
-        must_define: What a subclass has to define.
         words: The task in words, for datasets.
     """
 
@@ -56,7 +56,6 @@ class Task:
     rewards: tuple[str, ...] = ("dense", "sparse", "normalized")
     own_options: tuple[str, ...] = ("success_distance",)
     option_defaults: ClassVar[Mapping[str, float | int | bool | str]] = {}
-    must_define: tuple[str, ...] = ("reset", "reward_and_success")
     words = "Do what the reward asks for."
 
     def __init__(self, config: FrankaConfig):
@@ -86,8 +85,11 @@ class Task:
     @property
     def options(self) -> dict[str, Any]:
         """``option_defaults``, as the config's ``task_options`` changes them."""
-        given = self.config.task_options
-        return {name: given.get(name, default) for name, default in self.option_defaults.items()}
+        return {**self.option_defaults, **self.config.task_options}
+
+    @options.setter
+    def options(self, _: object) -> None:
+        raise UserError(f"{type(self).__name__}.options: is read; name the defaults option_defaults")
 
     @property
     def reward_bounds(self) -> tuple[float, float] | None:
@@ -135,18 +137,22 @@ class Task:
                 )
 
     @classmethod
+    def must_define(cls) -> list[str]:
+        """Methods that a subclass has to define."""
+        return ["reset", "reward_and_success"]
+
+    @classmethod
     def check_defined(cls) -> None:
         """Refuses a class that lacks what a task must define.
 
         Raises:
             UserError: One line.
         """
-        base = next(one for one in cls.__mro__ if "must_define" in vars(one))
-        missing = [name for name in cls.must_define if getattr(cls, name) is getattr(base, name)]
+        names = cls.must_define()
+        missing = [name for name in names if getattr(getattr(cls, name), "__isabstractmethod__", False)]
         if missing:
-            *most, last = cls.must_define
             raise UserError(
-                f"{cls.__name__} must define {', '.join(most)} and {last}; "
+                f"{cls.__name__} must define {' and '.join(filter(None, (', '.join(names[:-1]), names[-1])))}; "
                 f"{' and '.join(missing)} {'is' if len(missing) == 1 else 'are'} missing"
             )
 
@@ -174,6 +180,7 @@ class Task:
         own = {"gripper": self.gripper or None, "scene": self.scene, "home": self.home}
         return {name: value for name, value in own.items() if getattr(config, name) is None}
 
+    @abstractmethod  # said by check_defined: a class without may be made, for what it says alone
     def reset(self, sim: Simulation, mask: wp.array) -> None:
         """Writes ``sim.warp.task_goal`` (N, 3), and ``sim.warp.goal_q`` (N, 7) if known, where ``mask`` (N,)."""
         raise NotImplementedError(f"{type(self).__name__} gives no goal")
@@ -187,6 +194,7 @@ class Task:
     def goal_was_set(self, sim: Simulation) -> None:
         """Called when ``sim.tensors.task_goal`` was set by hand: a goal that moves goes on from there. Only torch."""
 
+    @abstractmethod
     def reward_and_success(self, sim: Simulation) -> None:
         """Writes ``sim.warp.reward`` and ``sim.warp.success`` (N, 1) from ``next_true_state`` (N, 20) and ``action``.
 

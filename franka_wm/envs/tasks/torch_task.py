@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from abc import abstractmethod
 from functools import partial
 from typing import TYPE_CHECKING
 
@@ -32,20 +33,28 @@ class TorchTask(Task):
     num_draws = 8
     draws_goals = True
     rewards = ("dense",)
-    must_define = ("goal", "reward", "success")
 
     def __init__(self, config: FrankaConfig):
         self.check_defined()  # of one that has no name, too
         super().__init__(config)
 
+    @classmethod
+    def must_define(cls) -> list[str]:
+        """Without those of a part that it writes in Warp."""
+        parts = {"goal": "reset", "reward": "reward_and_success", "success": "reward_and_success"}
+        return [name for name, part in parts.items() if getattr(cls, part) is getattr(TorchTask, part)]
+
+    @abstractmethod
     def goal(self, draws: torch.Tensor) -> torch.Tensor:
         """Goal of an episode: (N, num_draws) random numbers, uniform in [0, 1) → (N, 3) [m]."""
         raise NotImplementedError(f"{type(self).__name__} gives no goal")
 
+    @abstractmethod
     def reward(self, state: torch.Tensor, action: torch.Tensor) -> torch.Tensor:
         """Reward of being in ``state`` after ``action``, clipped to [−1, 1]: (..., 20), (..., A) → (...,)."""
         raise NotImplementedError(f"{type(self).__name__} gives no reward")
 
+    @abstractmethod
     def success(self, state: torch.Tensor) -> torch.Tensor:
         """Whether the task is solved in ``state``: (..., 20) → (...,) bool."""
         raise NotImplementedError(f"{type(self).__name__} says no success")

@@ -37,7 +37,7 @@ def added(tmp_path: Path, make_episode):
             {"target_ke": [800.0] * 6 + [400.0]},
             r"env\.target_ke=800\.0, this has \[800\.0, .* 400\.0\]",
         ),
-        ({"limit_velocity": False}, {"limit_velocity": True}, r"env\.limit_velocity=False, this has True"),
+        ({"limit_velocity": False}, {"limit_velocity": True}, r"env\.limit_velocity=false, this has true"),
         ({"solver": "auto"}, {"solver": "featherstone"}, r"env\.solver=auto, this has featherstone"),
         ({"drawer_opening": 0.1}, {"drawer_opening": None}, r"env\.drawer_opening=0\.1, this has null"),
         (

@@ -67,8 +67,8 @@ def test_training_with_other_physics_is_said_and_with_another_task_is_refused(
     assert "recorded with" not in capsys.readouterr().out
     check(settled(*run, "env.substeps=2", "env.randomization.gains=0.2"))
     assert (
-        f"dataset.root={root}: recorded with env.substeps=1, env.randomization.gains=0.0, this run has 2, 0.2; its "
-        "actions did what they did then" in " ".join(capsys.readouterr().out.split())
+        f"dataset.root={root}: recorded with env.substeps=1, env.randomization.gains=0.0, this run has 2, 0.2; what its "
+        "actions do is as recorded" in " ".join(capsys.readouterr().out.split())
     )
     for change, says in (
         (
@@ -98,7 +98,7 @@ def test_training_on_images_that_look_otherwise_is_said(tmp_path: Path, capsys, 
     ]
     capsys.readouterr()
     check(settled(*run, "env.enable_shadows=true"))
-    assert "recorded with env.enable_shadows=False, this run has True; its images" in capsys.readouterr().out
+    assert "recorded with env.enable_shadows=false, this run has true; its images" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize(
@@ -118,3 +118,12 @@ def test_what_was_meant_is_said(words: list[str], says: str, tmp_path: Path, cap
 def test_worlds_of_each_process_are_counted() -> None:
     with pytest.raises(UserError, match="1 world for 2 processes"):
         verb._require_worlds(1, 2)
+
+
+def test_what_is_no_dataset_is_told_before_worlds_are_built(tmp_path: Path, capsys) -> None:
+    (tmp_path / "other").mkdir()
+    assert (
+        main(["collect", f"out={tmp_path / 'other'}", "episodes=2", "policy=noop", "resume=true", *ARM]) == 1
+    )
+    said = capsys.readouterr()
+    assert "other is not a LeRobot dataset; choose another folder" in said.err and "building" not in said.out

@@ -28,13 +28,13 @@ def test_what_is_other_is_said_of_all_options_at_once() -> None:
     there = {"substeps": 16, "target_kd": 40.0, "randomization": {"mass": 0.0}, "solver": "mujoco", "fps": 30}
     assert [*told([{"config": {"env": there}}], now)] == [
         "recorded with env.substeps=16, env.randomization.mass=0.0, this run has 4, 0.1; "
-        "its actions did what they did then"
+        "what its actions do is as recorded"
     ]
     there = {"enable_shadows": True, "randomization": {"color": 0.2}}
     assert [*told([{"config": {"env": there}}], now)] == []
     assert [*told([{"config": {"env": there}}], now, looks=True)] == [
-        "recorded with env.enable_shadows=True, env.randomization.color=0.2, this run has False, 0.0; "
-        "its images look as they did then"
+        "recorded with env.enable_shadows=true, env.randomization.color=0.2, this run has false, 0.0; "
+        "its images look as recorded"
     ]
 
 

@@ -35,7 +35,7 @@ def check_defaults(owner: str, defaults: Any) -> None:
 
 
 def task_options(config: FrankaConfig) -> dict[str, Any]:
-    """What the config's task brings: its defaults, changed by the config's ``task_options``.
+    """The config's ``task_options``, each of the type of its default.
 
     Raises:
         UserError: An option that the task does not have, or a value of another type than its default.
@@ -51,7 +51,7 @@ def task_options(config: FrankaConfig) -> dict[str, Any]:
             raise UserError(f"task_options.{name}={typed(value)}: no such option; {has}")
         if not (rule := KINDS[type(defaults[name])]).fits(value):
             raise UserError(f"task_options.{name}={value!r}: must be {rule.wanted}; {has}")
-    return {name: type(default)(given.get(name, default)) for name, default in defaults.items()}
+    return {name: type(defaults[name])(value) for name, value in given.items()}
 
 
 def check_own_options(config: FrankaConfig, owners: Mapping[str, list[str]]) -> None:
