@@ -67,8 +67,8 @@ def test_training_with_other_physics_is_said_and_with_another_task_is_refused(
     assert "recorded with" not in capsys.readouterr().out
     check(settled(*run, "env.substeps=2", "env.randomization.gains=0.2"))
     assert (
-        f"dataset.root={root}: recorded with env.substeps=1, env.randomization.gains=0.0, this run has 2, 0.2; what its "
-        "actions do is as recorded" in " ".join(capsys.readouterr().out.split())
+        f"dataset.root={root}: recorded with env.substeps=1, env.randomization.gains=0.0, this run has 2, 0.2; what "
+        "its actions do is as recorded" in " ".join(capsys.readouterr().out.split())
     )
     for change, says in (
         (
