@@ -180,7 +180,7 @@ def make_objective(run: RunSettings, model: WorldModel) -> Objective | None:
         try:
             chosen: Objective = planning.RewardPlusValue.of(model)
         except ValueError as error:
-            raise UserError(f"objective=reward_value: {error}; goal_image: encode_goal") from error
+            raise UserError(f"objective=reward_value: {error}; goal_image needs encode_goal") from error
     else:
         if not model.has_goal:
             raise UserError(

@@ -16,6 +16,7 @@ from franka_wm.envs.external_config import ExternalConfig
 from franka_wm.envs.external_ray import import_ray
 from franka_wm.envs.multitask_config import MultiTaskConfig
 from franka_wm.envs.start import check_robot
+from franka_wm.envs.task_options import typed
 from franka_wm.errors import UserError
 from franka_wm.models import WorldModel
 from franka_wm.models.vision import ViT
@@ -416,7 +417,7 @@ def _check_same_actions(run: RunSettings, sources: Named) -> None:
         if (changed := other_option(sessions, env, ACTIONS)) is not None:
             name, there = changed
             raise UserError(
-                f"{option}: recorded with env.{name}={there}, this run has {env[name]}, so actions "
+                f"{option}: recorded with env.{name}={there}, this run has {typed(env[name])}, so actions "
                 f"mean something else; use env.{name}={there}, or env=none to train alone"
             )
         for line in told(sessions, env):
@@ -439,7 +440,7 @@ def _check_same_views(run: RunSettings, sources: Named) -> None:
         if changed := other_option(sessions, env, views):
             name, there = changed
             raise UserError(
-                f"{option}: recorded with env.{name}={there}, this run has {env[name]}, so "
+                f"{option}: recorded with env.{name}={there}, this run has {typed(env[name])}, so "
                 f"images show something else; use env.{name}={there}, or env=none to train alone"
             )
         if other_scene(sessions, env, images=bool(looks)):

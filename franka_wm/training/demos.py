@@ -19,6 +19,7 @@ from franka_wm.envs import Environment
 from franka_wm.envs.config import FrankaConfig
 from franka_wm.envs.multitask_config import MultiTaskConfig
 from franka_wm.envs.simulation.demonstrated import READS
+from franka_wm.envs.task_options import typed
 from franka_wm.errors import UserError
 from franka_wm.training import build
 from franka_wm.training.settings import RunSettings
@@ -232,7 +233,7 @@ def _check_recorded(run: RunSettings, roots: Any, arm: FrankaConfig | None, whos
         if changed is not None:
             name, there = changed
             raise UserError(
-                f"replay.demos={source.root}: recorded with env.{name}={there}, {whose} has {env[name]}"
+                f"replay.demos={source.root}: recorded with env.{name}={there}, {whose} has {typed(env[name])}"
             )
         if other_scene(sessions, env, images=bool(looks)):
             raise UserError(

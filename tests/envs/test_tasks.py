@@ -152,7 +152,8 @@ def test_the_documented_task(height, random_actions, auto_reset: str) -> None:
         gravity_compensation=True,
         auto_reset=auto_reset,
     )
-    env = FrankaEnv(config, num_envs=N, device="cpu", task=height(config, height=0.75))
+    higher = type("Higher", (height,), {"option_defaults": {"height": 0.75}})
+    env = FrankaEnv(config, num_envs=N, device="cpu", task=higher(config))
     assert isinstance(env.simulation.task, Task)
     data = play(env, random_actions(N, 30))
     tool = data["next", "state"][..., 16:17]
