@@ -99,15 +99,22 @@ def pytest_sessionfinish() -> None:
 
 
 @pytest.fixture(autouse=True)
-def registries_as_before() -> Iterator[None]:
-    """What a test registers, or removes, is not there for the next one of its process."""
+def registries_as_before(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
+    """What a test registers, or removes, is not there for the next one of its process.
+
+    Nor are the examples and the modules of its folder: imported once more, in a fork, too, they register again.
+    """
     from franka_wm import models
     from franka_wm.envs import tasks
     from franka_wm.planning import registry
 
     names = tasks._REGISTERED, models._REGISTERED, registry._REGISTERED
-    before, known = [dict(one) for one in names], list(tasks.TASKS)
+    before, known, loaded = [dict(one) for one in names], list(tasks.TASKS), set(sys.modules)
     yield
+    places = str(ROOT / "examples"), str(tmp_path_factory.getbasetemp())
+    for name in sys.modules.keys() - loaded:
+        if (getattr(sys.modules[name], "__file__", None) or "").startswith(places):
+            del sys.modules[name]
     for one, kept in zip(names, before, strict=True):
         one.clear()
         one.update(kept)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import sys
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -133,7 +132,6 @@ def test_a_checkpoint_plans_otherwise_than_its_run(
 ) -> None:
     monkeypatch.syspath_prepend(root)
     monkeypatch.setattr(registry, "_REGISTERED", {})
-    monkeypatch.delitem(sys.modules, "examples.add_a_planner", raising=False)  # for who imports it after
     words = ["episodes=4", "device=cpu", "open_loop=false", "probes=false"]
     changed = ["planner.num_samples=6", "planner.num_elites=3", "planner.num_policy_samples=0"]
     for out, more in (("as_it_was", []), ("otherwise", changed)):

@@ -5,7 +5,6 @@ from __future__ import annotations
 import importlib
 import json
 import re
-import sys
 from collections.abc import Callable
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -129,8 +128,6 @@ def test_the_printed_preset(
     for name, part in files.items():
         (tmp_path / name).write_text(next(block for block in blocks if part in block))
     monkeypatch.syspath_prepend(tmp_path)
-    for name in ("box", "ring"):
-        monkeypatch.delitem(sys.modules, name, raising=False)
     importlib.import_module("ring")
 
     def arm(*overrides: str) -> FrankaConfig:
@@ -148,10 +145,7 @@ def test_the_printed_preset(
     torch.testing.assert_close(away.norm(dim=-1), torch.full((16,), 0.15))
 
 
-def test_the_preset_of_the_example(
-    root: Path, composed: Callable[..., Any], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.delitem(sys.modules, "examples.add_a_task", raising=False)  # for who imports it after
+def test_the_preset_of_the_example(root: Path, composed: Callable[..., Any]) -> None:
     register("raise_tool", importlib.import_module("examples.add_a_task").RaiseTool)
     place = f"hydra.searchpath=[file://{root}/examples/conf]"
     arm = RunSettings.of(composed(place, "env=raise_tool", "env.task_options.height=0.8")).env.arm

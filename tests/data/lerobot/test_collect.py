@@ -6,7 +6,6 @@ import json
 import os
 import re
 import signal
-import sys
 import threading
 import time
 from types import SimpleNamespace
@@ -411,7 +410,6 @@ def test_the_replay_of_a_run_of_an_own_task_is_exported_with_its_plugin(
         + "    reward_and_success = lambda self, sim: None\n" * own
         + "register('near', Near)\n"
     )
-    monkeypatch.delitem(sys.modules, "brought_by_a_plugin", raising=False)
     monkeypatch.chdir(tmp_path)
     monkeypatch.syspath_prepend(str(tmp_path))  # taken out again afterwards
     monkeypatch.setattr("franka_wm.envs.tasks._REGISTERED", dict(_REGISTERED))
