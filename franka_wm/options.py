@@ -210,6 +210,14 @@ def read[T](cls: type[T], values: Any, prefix: str) -> T:
     return cls(**found)
 
 
+def leaves(values: object, name: str = "") -> dict[str, Any]:
+    """``{"env.fps": 20, …}`` of nested values; lists and empty mappings are values."""
+    if not isinstance(values, Mapping) or not values:
+        return {name: values}
+    nested = [leaves(value, f"{name}.{key}" if name else str(key)) for key, value in values.items()]
+    return {key: value for one in nested for key, value in one.items()}
+
+
 def unknown(option: str, known: Sequence[str]) -> str:
     """One line about an option that does not exist: the nearest ones, or all."""
     near = get_close_matches(option, known, n=3)

@@ -23,6 +23,7 @@ from franka_wm.commands.overrides import compose
 from franka_wm.console import quoted, resuming, say
 from franka_wm.errors import UserError
 from franka_wm.interrupt import INTERRUPTED
+from franka_wm.options import leaves
 from franka_wm.source import snapshot
 from franka_wm.untrusted import UntrustedFolder
 from franka_wm.versions import PACKAGES, usable_cores, versions
@@ -98,6 +99,7 @@ def launch_verb(command: list[str], gpus: int, device: str, advice: Callable[[],
 
     for name in ("torch.distributed", "torch.distributed.elastic.agent.server.api"):
         logging.getLogger(name).setLevel(logging.CRITICAL)  # ours say what happened
+    before = dict(os.environ)  # as the next job of a sweep finds it, too
     os.environ.setdefault("OMP_NUM_THREADS", str(max(1, usable_cores() // gpus)))
     places = [str(conf.FOLDER.parents[1]), *filter(None, [os.environ.get("PYTHONPATH")])]
     os.environ["PYTHONPATH"] = os.pathsep.join(places)
@@ -127,7 +129,10 @@ def launch_verb(command: list[str], gpus: int, device: str, advice: Callable[[],
             f"{advice()}"
         ) from None
     finally:
-        del os.environ[LAUNCHER]
+        for name in ("OMP_NUM_THREADS", "PYTHONPATH", LAUNCHER):
+            os.environ.pop(name)
+            if name in before:
+                os.environ[name] = before[name]
 
 
 def refused_job(overrides: list[str]) -> str | None:
@@ -249,7 +254,6 @@ def enter(overrides: list[str]) -> list[str]:
             GPUs.
     """
     from franka_wm import processes
-    from franka_wm.training.place import leaves
     from franka_wm.training.settings import plain
 
     own = [one for one in overrides if not one.startswith(("hydra.run.dir=", "gpus="))]

@@ -46,7 +46,7 @@ class Demonstrations:
         self.transitions, self.most, self.hindsight, self.states = transitions, most, hindsight, states
         device = transitions.device
         episode = transitions.get(BOUNDARY).flatten().cumsum(0)
-        within = episode[window - 1 :] == episode[: len(episode) - window + 1]
+        within = episode[window - 1 :] == episode[: max(0, len(episode) - window + 1)]
         self._starts = within.nonzero().squeeze(1)  # waits for the device, once
         if not len(self._starts):
             raise UserError(f"no demonstration has {window} steps, as the windows of this run")

@@ -31,11 +31,10 @@ class WindowSampler(Sampler):
     Args:
         writer: The buffer's writer; knows where the oldest step is.
         length: Transitions per window, H ≥ 1.
-        boundary: Key of the flag that marks the first step of an episode.
         oversample: Candidates per window kept. With episodes of L steps a candidate is kept with probability
             (L − H + 1) / L; 4 is enough for L ≥ 2 H and batches of 32.
         cross_episode: Windows may go on past the end of an episode, into the next one: for losses that look at
-            ``boundary`` themselves. Then every step starts windows, also the last ones of an episode, and
+            :data:`BOUNDARY` themselves. Then every step starts windows, also the last ones of an episode, and
             episodes shorter than a window are seen.
         before: So many steps before each window must be kept as well: for stacked images.
         marks: Steps under ``("next", "overflow")`` are in no window: contacts were lost in them.
@@ -48,7 +47,6 @@ class WindowSampler(Sampler):
         writer: RoundRobinWriter,
         *,
         length: int,
-        boundary: str = BOUNDARY,
         oversample: int = OVERSAMPLE,
         cross_episode: bool = False,
         before: int = 0,
@@ -58,7 +56,6 @@ class WindowSampler(Sampler):
             raise UserError(f"window length={length}, oversample={oversample}: both must be at least 1")
         self.writer = writer
         self.length = length
-        self.boundary = boundary
         self.oversample = oversample
         self.cross_episode = cross_episode
         self.before = before
@@ -121,7 +118,7 @@ class WindowSampler(Sampler):
                 + torch.arange(self.length, device=device)) % capacity  # fmt: skip
         crossing = None
         if self._whole:
-            starts = data.get(self.boundary)[time[:, 1:], world.unsqueeze(1)]
+            starts = data.get(BOUNDARY)[time[:, 1:], world.unsqueeze(1)]
             crossing = starts.flatten(1).any(1)
         if self.marks:
             lost = data.get(OVERFLOW)[time, world.unsqueeze(1)].flatten(1).any(1)

@@ -11,10 +11,7 @@ from torch import Tensor
 from franka_wm.errors import UserError
 from franka_wm.options import Bounds
 from franka_wm.planning.base import ElitePlanner, Query
-from franka_wm.planning.objectives import Score
 from franka_wm.planning.sampling import best, gaussian_candidates, take
-
-__all__ = ["MPPI", "Score"]
 
 
 @dataclass(kw_only=True, eq=False)

@@ -95,11 +95,6 @@ class GraphCache:
             found.graph.replay()
         return found.outputs.clone()
 
-    def clear(self) -> None:
-        """Forget all graphs."""
-        self._seen.clear()
-        self._graphs.clear()
-
     # A graph belongs to its process and its memory.
     def __deepcopy__(self, memo: dict[int, object]) -> GraphCache:
         return GraphCache(self.keep)

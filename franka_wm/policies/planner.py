@@ -226,7 +226,6 @@ class PlannerPolicy(TensorDictModuleBase):
         model: WorldModel,
         planner: Planner,
         *,
-        observation_keys: Sequence[str] | None = None,
         objective: Objective | Score | None = None,
         explore: bool | None = None,
         capture: bool | None = None,
@@ -236,7 +235,6 @@ class PlannerPolicy(TensorDictModuleBase):
         """Plan with any model that has `encode` and `next`.
 
         Args:
-            observation_keys: the model's own, `observation_keys` or `observation_sizes`, when None.
             objective: rewards plus value of the model, with its `discount`, when None.
             explore, capture, precision, compile: see the class.
 
@@ -244,12 +242,8 @@ class PlannerPolicy(TensorDictModuleBase):
         objective reads images of goals.
 
         Raises:
-            ValueError: the model lacks what a default needs.
+            ValueError: the model lacks what the default objective needs.
         """
-        if observation_keys is None:
-            observation_keys = model.observation_keys
-            if not observation_keys:
-                raise ValueError(f"{type(model).__name__} has no observation_sizes: give observation_keys")
         if objective is None:
             try:
                 objective = RewardPlusValue.of(model)
@@ -260,7 +254,7 @@ class PlannerPolicy(TensorDictModuleBase):
             encode=model.encode,
             next=model.next,
             objective=objective,
-            observation_keys=observation_keys,
+            observation_keys=model.observation_keys,
             observe=model.observe if model.has_memory else None,
             prior=_guide(model, as_objective(objective)),
             explore=explore,

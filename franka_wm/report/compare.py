@@ -10,6 +10,7 @@ from markupsafe import Markup
 
 from franka_wm.errors import UserError
 from franka_wm.evaluation.results import OTHERWISE, SHOWN, Result
+from franka_wm.options import leaves
 from franka_wm.report import style
 from franka_wm.report.bars import bars_figure
 from franka_wm.report.curves import panels, quantity, seeds_figure
@@ -30,8 +31,6 @@ from franka_wm.report.sections import logged_name
 from franka_wm.report.spectra import spectrum_figure
 from franka_wm.report.table import Table, evaluation_tables, is_interval
 from franka_wm.report.tasks import family_of, success_over_time, task_of, tasks_table
-
-FILE = "compare.html"
 
 MISSING = "–"
 
@@ -83,17 +82,6 @@ def unique_names(runs: Sequence[RunFiles]) -> list[str]:
     return ["/".join(path[-depth:]) for path in paths]
 
 
-def flat_config(config: Mapping[str, object], above: str = "") -> dict[str, object]:
-    """``{"env": {"task": "reach"}}`` → ``{"env.task": "reach"}``; lists are values."""
-    flat: dict[str, Any] = {}
-    for name, value in config.items():
-        if isinstance(value, Mapping) and value:
-            flat |= flat_config(value, f"{above}{name}.")
-        else:
-            flat[f"{above}{name}"] = value
-    return flat
-
-
 def differences(configs: Mapping[str, Mapping[str, object]]) -> dict[str, dict[str, object]]:
     """Entries that are not the same in all runs.
 
@@ -103,7 +91,7 @@ def differences(configs: Mapping[str, Mapping[str, object]]) -> dict[str, dict[s
     Returns:
         entry -> run -> value; a run that lacks the entry is not there.
     """
-    flat = {name: flat_config(config) for name, config in configs.items()}
+    flat = {name: leaves(config) for name, config in configs.items()}
     entries = dict.fromkeys(entry for values in flat.values() for entry in values)
     out = {}
     for entry in entries:

@@ -7,7 +7,7 @@
     evaluation.json         results, as :mod:`franka_wm.evaluation.results` describes them
     run.json                instead of config.yaml and .hydra/: of which run ``franka-wm evaluate`` wrote results here
     checkpoints/…           counters and the logged rows; without a checkpoint, rows come from ``csv/``
-    video.mp4, last_frame.png, imagined.mp4, imagined.png, masks.png    images
+    video.mp4, last_frame.png, imagined.mp4, imagined.png    images
     evaluation/             what ``franka-wm evaluate`` wrote: evaluation.json, timing.json and images. Of two
                             evaluation.json that of later weights is shown first, of the same weights the one with
                             more episodes; the other is named
@@ -32,7 +32,7 @@ from franka_wm.untrusted import UntrustedFolder, check_image, check_video, value
 SAME_BUT = ("seed", "device", "resume")
 """Runs whose configurations differ in these alone are repetitions of one another."""
 
-IMAGES = ("video.mp4", "last_frame.png", "imagined.mp4", "imagined.png", "masks.png")
+IMAGES = ("video.mp4", "last_frame.png", "imagined.mp4", "imagined.png")
 
 
 @dataclass(frozen=True)

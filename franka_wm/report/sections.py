@@ -123,10 +123,6 @@ def imagined(run: RunFiles) -> str:
         else "",
         card(video(film, "imagined beside real"), "Real and imagined, side by side.") if film else "",
     ]
-    masks = run.images.get("masks.png")
-    parts.append(
-        card(image(masks, "what the masks hide"), "What the masks hide.", kind="single") if masks else ""
-    )
     text = "A decoder, trained on the side and used by nothing else, turns latents into images."
     return paragraph(text if film or strip else "") + cards(*parts)
 

@@ -30,6 +30,7 @@ from omegaconf.errors import OmegaConfBaseException
 from safetensors import SafetensorError
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor, nn
+from torch.optim import Optimizer
 
 from franka_wm.conf import use_present_names
 from franka_wm.errors import UserError
@@ -37,10 +38,11 @@ from franka_wm.files import sync
 from franka_wm.options import is_real
 from franka_wm.seeding import random_state, restore_random_state
 from franka_wm.training.manifest import MANIFEST, Manifest, read_manifest, saved_at, write_manifest
-from franka_wm.training.optimizer_state import Optimizers, load_optimizer_state, optimizer_state
+from franka_wm.training.optimizer_state import load_optimizer_state, optimizer_state
 from franka_wm.training.tree import (
     damaged,
     first_difference,
+    nested,
     only_tensors,
     read_tensors,
     read_tree,
@@ -68,7 +70,7 @@ def save_checkpoint(
     model: nn.Module,
     config: Mapping[str, object],
     counters: Mapping[str, int | float],
-    optimizer: Optimizers | None = None,
+    optimizer: Optimizer | None = None,
     replay: TensorDictBase | None = None,
     extra: Mapping[str, object] | None = None,
     others: Callable[[], int | None] = lambda: 1,
@@ -79,10 +81,10 @@ def save_checkpoint(
 
     Args:
         folder: where the checkpoint will be. Missing parents are made.
-        model: on any device; a compiled module is saved as the module it wraps.
+        model: on any device.
         config: plain values, nested.
         counters: numbers by name, such as `env_steps` and `updates`.
-        optimizer: one optimizer, or several by name.
+        optimizer: whose state goes along.
         replay: the filled part of the buffer, tensors only, any batch dimensions.
         extra: nested dicts, lists and tuples of numbers, strings, None and tensors (a `torch.Generator`'s
             state, say).
@@ -98,7 +100,7 @@ def save_checkpoint(
         TypeError: a value that cannot be stored without pickle.
     """
     target = Path(folder).resolve()
-    writing = _sibling(target, WRITING)
+    writing = sibling(target, WRITING)
     with explained(target):
         # Renaming would fail only after everything has been written; this is the place to say it.
         if (target.exists() and not target.is_dir()) or (
@@ -110,8 +112,8 @@ def save_checkpoint(
             shutil.rmtree(writing)
         writing.mkdir()
         try:
-            _write_contents(writing, _unwrap(model), optimizer, config, counters, replay, extra)
-            write_manifest(writing, type(_unwrap(model)).__name__, processes=others())
+            _write_contents(writing, model, optimizer, config, counters, replay, extra)
+            write_manifest(writing, type(model).__name__, processes=others())
             _swap_in(writing, target)
         except Exception:
             shutil.rmtree(writing, ignore_errors=True)
@@ -122,7 +124,7 @@ def save_checkpoint(
 def _write_contents(
     folder: Path,
     model: nn.Module,
-    optimizer: Optimizers | None,
+    optimizer: Optimizer | None,
     config: Mapping[str, object],
     counters: Mapping[str, int | float],
     replay: TensorDictBase | None,
@@ -142,7 +144,7 @@ def _write_contents(
 
 def _swap_in(writing: Path, target: Path) -> None:
     """Put the whole folder `writing` at `target`. See the module's docstring for what a kill leaves."""
-    old = _sibling(target, _OLD)
+    old = sibling(target, _OLD)
     if target.exists():
         if old.exists():
             shutil.rmtree(old)
@@ -187,7 +189,6 @@ class Checkpoint:
         Raises:
             UserError: the model is another one. Its weights are then untouched.
         """
-        model = _unwrap(model)
         saved = self.check_model(model)
         broken = next((name for name, x in saved.items() if not bool(x.isfinite().all())), None)
         if broken is not None:
@@ -214,17 +215,14 @@ class Checkpoint:
             )
         return saved
 
-    def load_optimizer(self, optimizer: Optimizers) -> None:
+    def load_optimizer(self, optimizer: Optimizer) -> None:
         """Give `optimizer` the saved state; it goes on exactly where the saved one stopped.
 
-        How the optimizer runs (`fused`, `capturable`, `foreach`) stays as it was built. State tensors are
-        new objects afterwards: load before a CUDA graph is captured, not after.
-
-        Args:
-            optimizer: one or several by name, as they were saved.
+        How the optimizer runs (`fused`, `capturable`, `foreach`), and its options but for the learning rate, stay
+        as it was built. State tensors are new objects afterwards: load before a CUDA graph is captured, not after.
 
         Raises:
-            UserError: other optimizers, or for other parameters. None of them is then changed.
+            UserError: another optimizer, or for other parameters. It is then not changed.
         """
         saved = self._tree("optimizer")
         if saved is None:
@@ -385,13 +383,6 @@ def _found(places: Sequence[Path]) -> list[tuple[int, Path]]:
 # -- parts of the state ------------------------------------------------------------------------------------
 
 
-def _unwrap(model: nn.Module) -> nn.Module:
-    """The module inside `torch.compile`'s wrapper, whose names carry a prefix otherwise."""
-    inner = getattr(model, "_orig_mod", model)
-    assert isinstance(inner, nn.Module)
-    return inner
-
-
 def _tensor_state(model: nn.Module) -> dict[str, Tensor]:
     return {name: value for name, value in model.state_dict().items() if isinstance(value, Tensor)}
 
@@ -402,15 +393,7 @@ def _part(name: str, rank: int) -> str:
 
 def replay_tree(replay: TensorDictBase) -> dict[str, object]:
     """Experience as nested values."""
-    return {"batch_size": list(replay.batch_size), "entries": _entries(replay)}
-
-
-def _entries(data: TensorDictBase) -> dict[str, object]:
-    """A TensorDict as nested dicts of tensors."""
-    return {
-        str(key): _entries(value) if isinstance(value, TensorDictBase) else value
-        for key, value in data.items()
-    }
+    return {"batch_size": list(replay.batch_size), "entries": nested(replay)}
 
 
 def _plain_number(name: str, value: int | float) -> int | float:
@@ -422,13 +405,14 @@ def _plain_number(name: str, value: int | float) -> int | float:
 # -- files -------------------------------------------------------------------------------------------------
 
 
-def _sibling(folder: Path, suffix: str) -> Path:
+def sibling(folder: Path, suffix: str) -> Path:
+    """What stands beside a checkpoint while it is written, or replaced."""
     return folder.with_name(folder.name + suffix)
 
 
 def _find(folder: Path) -> Path | None:
     """`folder` if it is a checkpoint, else its predecessor that a killed save has moved aside, else None."""
-    candidates: Sequence[Path] = (folder, _sibling(folder, _OLD))
+    candidates: Sequence[Path] = (folder, sibling(folder, _OLD))
     return next((path for path in candidates if (path / MANIFEST).is_file()), None)
 
 

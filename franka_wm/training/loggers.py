@@ -20,6 +20,7 @@ from torchrl.record.loggers import Logger
 
 from franka_wm.console import say
 from franka_wm.errors import UserError
+from franka_wm.options import leaves
 
 FILES = ("csv", "tensorboard")
 SERVICES = ("wandb", "mlflow", "trackio")
@@ -120,7 +121,7 @@ def log_config(loggers: Iterable[Logger], config: Mapping[str, object]) -> None:
     for logger in loggers:
         if kind(logger) == "mlflow":  # knows no nesting, and takes so many at a time
             mlflow = import_module("mlflow")
-            flat = [(name, str(value)[:LONGEST_PARAMETER]) for name, value in flatten(config).items()]
+            flat = [(name, str(value)[:LONGEST_PARAMETER]) for name, value in leaves(config).items()]
             for start in range(0, len(flat), MOST_PARAMETERS):
                 mlflow.log_params(dict(flat[start : start + MOST_PARAMETERS]))
         elif kind(logger) in ("wandb", "trackio"):
@@ -178,14 +179,6 @@ def kind(logger: Logger) -> str:
     """Which of `NAMES` a TorchRL logger is."""
     name = type(logger).__name__.removesuffix("Logger").lower()
     return name if name in NAMES else "other"
-
-
-def flatten(config: Mapping[str, Any], above: str = "") -> dict[str, Any]:
-    """``{"env": {"task": "reach"}}`` → ``{"env.task": "reach"}``."""
-    flat: dict[str, Any] = {}
-    for name, value in config.items():
-        flat |= flatten(value, f"{above}{name}.") if isinstance(value, Mapping) else {f"{above}{name}": value}
-    return flat
 
 
 def _open(name: str, folder: Path, options: dict[str, Any]) -> Any:

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from typing import Any, Protocol, runtime_checkable
 
 import torch
-from tensordict import TensorDict, TensorDictBase
+from tensordict import TensorDict
 from tensordict.nn import TensorDictModuleBase
 from torchrl.collectors import Collector
 
@@ -14,6 +14,7 @@ from franka_wm.envs import Environment, FrankaEnv, MultiTaskEnv
 from franka_wm.envs.specs import MARKS
 from franka_wm.seeding import derive_seed
 from franka_wm.training.build import arm_of
+from franka_wm.training.tree import nested
 
 
 def same_worlds(saved: Mapping[str, Any], now: Mapping[str, Any]) -> bool:
@@ -37,7 +38,7 @@ def worlds_now(env: Environment, collector: Collector | None) -> dict[str, objec
     if worlds is None or collector is None:
         return None
     # TorchRL keeps this to itself; its own state_dict leaves it out.
-    return {"state": _nested(worlds.get_state()), "carry": _nested(collector._carrier)}
+    return {"state": nested(worlds.get_state()), "carry": nested(collector._carrier)}
 
 
 def put_back(env: Environment, collector: Collector, worlds: Mapping[str, Any]) -> None:
@@ -90,12 +91,4 @@ def _drawing(policies: Mapping[str, TensorDictModuleBase]) -> dict[str, Drawing]
         for name, policy in policies.items()
         for path, module in policy.named_modules()
         if isinstance(module, Drawing)
-    }
-
-
-def _nested(data: TensorDictBase) -> dict[str, object]:
-    """A TensorDict as nested dicts of tensors."""
-    return {
-        str(key): _nested(value) if isinstance(value, TensorDictBase) else value
-        for key, value in data.items()
     }

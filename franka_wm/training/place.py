@@ -11,6 +11,7 @@ from omegaconf import DictConfig, ListConfig, OmegaConf
 
 from franka_wm import files
 from franka_wm.errors import UserError
+from franka_wm.options import leaves
 from franka_wm.training.checkpoint import latest_checkpoint
 from franka_wm.training.settings import plain
 from franka_wm.untrusted import UntrustedFolder
@@ -88,14 +89,6 @@ def make_absolute(node: DictConfig | ListConfig) -> None:
             make_absolute(value)
         elif key in OF_FILES and isinstance(value, str) and os.path.isfile(path := os.path.expanduser(value)):
             node[key] = os.path.abspath(path)  # pyright: ignore[reportArgumentType]
-
-
-def leaves(values: object, name: str = "") -> dict[str, object]:
-    """``{"env.fps": 20, …}`` of nested values."""
-    if not isinstance(values, dict) or not values:
-        return {name: values}
-    nested = [leaves(value, f"{name}.{key}" if name else str(key)) for key, value in values.items()]
-    return {key: value for one in nested for key, value in one.items()}
 
 
 _LOCKS: list[IO[str]] = []  # open files: their locks last as long as the process

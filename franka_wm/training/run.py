@@ -283,7 +283,8 @@ def start(cfg: DictConfig) -> Run:
     if told := settings.told_beside_image:
         say(f"warning: not the goal's image alone tells where the goal is, but also {' and '.join(told)}")
     if checkpoint is not None:
-        done, wanted = int(checkpoint.counters.get("updates", 0)), settings.trainer.updates
+        done = int(checkpoint.counters.get("updates", 0))
+        wanted = (settings.pretrain if "whole_run" in checkpoint.config else settings.trainer).updates
         nothing = f"; trainer.updates={wanted} are made: only the run's end is done again, a larger number trains on"
         say(f"going on from update {done} of {checkpoint.folder}{nothing if done >= wanted else ''}")
     run = Run(settings, folder, checkpoint, open_loggers(settings, folder))

@@ -14,7 +14,14 @@ from torch import Tensor
 from franka_wm import processes
 from franka_wm.errors import UserError
 from franka_wm.seeding import random_state
-from franka_wm.training.checkpoint import WRITING, Checkpoint, explained, replay_tree, save_checkpoint
+from franka_wm.training.checkpoint import (
+    WRITING,
+    Checkpoint,
+    explained,
+    replay_tree,
+    save_checkpoint,
+    sibling,
+)
 from franka_wm.training.tree import tree_files, write_tree
 
 
@@ -51,7 +58,7 @@ def save_together(
 
 def _require_parts(folder: Path, with_replay: bool) -> None:
     """Waits until the first process sees all parts: what others wrote to a disk of the network may come later."""
-    writing = _writing(folder)
+    writing = sibling(folder.resolve(), WRITING)
     kinds = ("rng", "moment", *(["replay"] if with_replay else []))
     wanted = [(k, f) for k in range(1, processes.count()) for kind in kinds for f in tree_files(f"{kind}{k}")]
     until = time.monotonic() + processes.SOON
@@ -65,19 +72,13 @@ def _require_parts(folder: Path, with_replay: bool) -> None:
         time.sleep(0.1)
 
 
-def _writing(folder: Path) -> Path:
-    """Where a checkpoint is until it is whole."""
-    target = folder.resolve()
-    return target.with_name(target.name + WRITING)
-
-
 def add_part(folder: Path, rank: int, *, replay: TensorDictBase | None, moment: Mapping[str, object]) -> None:
     """Adds what process ``rank`` > 0 has of its own to the checkpoint that the first one is writing.
 
     Raises:
         UserError: The folder cannot be written.
     """
-    writing = _writing(folder)
+    writing = sibling(folder.resolve(), WRITING)
     with explained(folder.resolve()):
         write_tree(writing, f"rng{rank}", random_state())
         write_tree(writing, f"moment{rank}", moment)
@@ -102,9 +103,9 @@ def own_experience(checkpoint: Checkpoint, device: torch.device) -> TensorDictBa
 
 def own_moment(checkpoint: Checkpoint) -> dict[str, Any]:
     """Where this process's worlds and policies stood; of another number of processes its worlds alone."""
-    moments = [checkpoint.moment(k) for k in range(checkpoint.processes)]
     if checkpoint.processes == processes.count():
-        return moments[processes.rank()]
+        return checkpoint.moment(processes.rank())
+    moments = [checkpoint.moment(k) for k in range(checkpoint.processes)]
     worlds = [one.get("worlds") for one in moments]
     if any(one is None for one in worlds):  # recorded data: all processes draw from one sequence
         return {name: value for name, value in moments[0].items() if name in ("windows", "validation")}

@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from safetensors import SafetensorError
 from safetensors.torch import load_file, save_file
-from tensordict import TensorDict
+from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
 from franka_wm.errors import UserError
@@ -32,6 +32,13 @@ def write_tree(folder: Path, name: str, tree: object) -> None:
     structure = _encode(tree, name, tensors)
     write_json(folder / f"{name}.json", structure)
     save_tensors(tensors, folder / f"{name}.safetensors")
+
+
+def nested(data: TensorDictBase) -> dict[str, object]:
+    """A TensorDict as nested dicts of tensors."""
+    return {
+        str(key): nested(value) if isinstance(value, TensorDictBase) else value for key, value in data.items()
+    }
 
 
 def read_tree(folder: Path, name: str) -> object:

@@ -77,8 +77,9 @@ def test_windows_are_uniform_over_those_within_an_episode() -> None:
 
 
 def test_an_episode_shorter_than_a_window_is_no_demonstration() -> None:
-    with pytest.raises(UserError, match="no demonstration has 6 steps"):
-        Demonstrations(steps(0, LENGTHS), window=6, most=4)
+    for window in (6, 12, 13, 30):  # all of them together have 12 steps
+        with pytest.raises(UserError, match=f"no demonstration has {window} steps"):
+            Demonstrations(steps(0, LENGTHS), window=window, most=4)
 
 
 def test_without_demonstrations_batches_are_as_before() -> None:

@@ -26,6 +26,7 @@ from franka_wm import processes
 from franka_wm.commands import entry, several
 from franka_wm.commands.overrides import compose, given
 from franka_wm.console import quoted
+from franka_wm.data.moments import moments
 from franka_wm.errors import UserError
 from franka_wm.training import run
 from franka_wm.versions import versions
@@ -242,6 +243,42 @@ def test_statistics_of_unequal_parts(monkeypatch) -> None:
     mean, std = processes.pooled(*moments[0])
     torch.testing.assert_close(mean, torch.cat(parts).mean(0))
     torch.testing.assert_close(std, torch.cat(parts).std(0))
+
+
+def test_one_row_deviates_by_nothing(monkeypatch) -> None:
+    """One seeded step of one world, alone or beside a process that has more."""
+    alone, more = torch.randn(1, 3), torch.randn(9, 3)
+    mean, std = moments(alone)
+    assert torch.equal(mean, alone[0]) and torch.equal(std, torch.zeros(3))
+    parts = [(*moments(x), len(x)) for x in (alone, more)]
+    means, stds, counts = (list(one) for one in zip(*parts, strict=True))
+    answers = iter([torch.stack(means), torch.stack(stds), torch.tensor(counts).view(2, 1).float()])
+    monkeypatch.setattr(processes, "gather", lambda x: next(answers))
+    torch.testing.assert_close(processes.pooled(*parts[0])[1], torch.cat((alone, more)).std(0))
+
+
+@pytest.mark.parametrize("mine", [None, "/mine"])
+def test_the_next_job_of_a_sweep_finds_the_environment_as_it_was(mine, monkeypatch) -> None:
+    from torch.distributed.launcher import api
+
+    seen = []
+
+    def elastic_launch(config, program):
+        return lambda *words: seen.append({name: os.environ.get(name) for name in names})
+
+    names = ("OMP_NUM_THREADS", "PYTHONPATH", several.LAUNCHER)
+    monkeypatch.setattr(api, "elastic_launch", elastic_launch)
+    monkeypatch.setattr(several, "usable_cores", lambda: 8)
+    monkeypatch.delenv("OMP_NUM_THREADS", raising=False)
+    monkeypatch.delenv("PYTHONPATH", raising=False)
+    if mine is not None:
+        monkeypatch.setenv("PYTHONPATH", mine)
+    before = dict(os.environ)
+    for gpus in (2, 4):
+        several.launch_verb(["train"], gpus, "cpu", lambda: "")
+        assert dict(os.environ) == before
+    assert [one["OMP_NUM_THREADS"] for one in seen] == ["4", "2"]
+    assert seen[0]["PYTHONPATH"] == seen[1]["PYTHONPATH"] and all(one[several.LAUNCHER] for one in seen)
 
 
 def _exchanged(x: torch.Tensor, other: int) -> torch.Tensor:

@@ -19,7 +19,6 @@ from franka_wm.training.loggers import (
     NAMES,
     check_loggers,
     close_loggers,
-    flatten,
     log_config,
     log_numbers,
     log_video,
@@ -285,7 +284,3 @@ def test_every_logger_has_a_preset(root: Path, composed) -> None:
         for name, options in chosen.items():
             assert name in names
             check_loggers([], **{name: options})
-
-
-def test_nested_configurations_are_flattened() -> None:
-    assert flatten({"a": {"b": {"c": 1}, "d": [1, 2]}, "e": None}) == {"a.b.c": 1, "a.d": [1, 2], "e": None}

@@ -7,6 +7,7 @@ from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
 
+import httpx
 import huggingface_hub
 import pytest
 from huggingface_hub import constants
@@ -67,6 +68,15 @@ def test_a_dataset_by_name_is_compared_as_one_in_a_folder(
     assert f"{named}: recorded with env.success_distance=0.05" in capsys.readouterr().out
     fetched = [path for _, path in hub.requests if "/resolve/" in path]
     assert bool(fetched) == by_name and not [path for path in fetched if "/meta/" not in path]
+
+
+def test_a_network_that_is_lost_while_it_comes_is_one_line(hub: Hub, monkeypatch) -> None:
+    def lost(*_, **__) -> None:
+        raise httpx.ReadTimeout("The read operation timed out")
+
+    monkeypatch.setattr(huggingface_hub, "snapshot_download", lost)
+    with pytest.raises(UserError, match=r"^dataset\.repo_id=user/reach: the Hub cannot be reached"):
+        find_dataset("user/reach")
 
 
 def test_its_rows_follow_when_they_are_read(recorded: Path, hub: Hub) -> None:

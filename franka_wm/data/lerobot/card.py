@@ -193,13 +193,13 @@ def _first_episode(source: Source, name: str, kind: str) -> np.ndarray:
     """(T, H, W, 3) uint8."""
     import pyarrow.parquet as pq
 
-    from franka_wm.data.lerobot.png import decode_png
+    from franka_wm.data.lerobot.png import decode_image
 
     if kind == "image":
         data = source.data_path(*source.data_files[0].tolist())
         group = pq.ParquetFile(data).read_row_group(0, columns=[name, "episode_index"])
         rows = zip(group[name].to_pylist(), group["episode_index"].to_pylist(), strict=True)
-        return np.stack([decode_png(cell["bytes"]) for cell, episode in rows if episode == 0])
+        return np.stack([decode_image(cell["bytes"]) for cell, episode in rows if episode == 0])
     video = source.video_path(name, *source.video_files[name][0].tolist())
     frames = islice(video_frames(video), int(source.lengths[0]))
     return np.stack([frame.to_ndarray(format="rgb24") for frame, _ in frames])

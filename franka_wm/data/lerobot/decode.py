@@ -10,7 +10,6 @@ few or too many cannot go unnoticed.
 
 from __future__ import annotations
 
-import io
 import json
 import sys
 from collections.abc import Iterator, Sequence
@@ -20,6 +19,7 @@ from typing import Any
 
 import numpy as np
 
+from franka_wm.data.lerobot.png import decode_image
 from franka_wm.errors import UserError
 from franka_wm.untrusted import MOST_PIXELS
 
@@ -118,20 +118,14 @@ class TableJob:
         return values
 
     def _image(self, cell: Any, feature: str) -> np.ndarray:
-        from PIL import Image
-
         data = cell.get("bytes") if isinstance(cell, dict) else cell
         if not isinstance(data, bytes):
             raise UserError(
                 f"{self.path}: {feature} holds no image but a path; embed the images (LeRobot's own writer does)"
             )
         try:
-            # Of other formats some are programs: Pillow starts Ghostscript for PostScript.
-            with Image.open(io.BytesIO(data), formats=("PNG", "JPEG")) as image:
-                if image.width * image.height > MOST_PIXELS:
-                    raise ValueError(f"{image.width} × {image.height} pixels")
-                return np.asarray(image.convert("RGB"))
-        except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:
+            return decode_image(data)
+        except ValueError as error:
             raise UserError(f"{self.path}: an image of {feature} cannot be decoded: {error}") from error
 
 

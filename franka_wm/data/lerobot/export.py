@@ -258,10 +258,6 @@ def check_export(settings: Mapping[str, Any]) -> None:
         UserError: One line.
     """
     wanted = settings["export"]
-    if wanted["kind"] not in ("none", "lerobot"):
-        raise UserError(f"export.kind={wanted['kind']!r}: must be none or lerobot")
-    if wanted["kind"] == "none":
-        return
     schema_for(replace(arm_config(settings), frame_stack=1), format=wanted["format"])
     if wanted["repo_id"]:
         from franka_wm.data.lerobot.publish import hub_client

@@ -46,12 +46,11 @@ def check_license(license: str) -> None:
         )
 
 
-def download(repo_id: str, *, revision: str | None = None) -> Path:
+def download(repo_id: str) -> Path:
     """A published model, in the Hub's own cache: only safetensors, JSON and YAML, whatever else is there.
 
     Args:
-        repo_id: ``user/name``, or ``user/name@revision``.
-        revision: A branch, tag or commit.
+        repo_id: ``user/name``, or ``user/name@revision``: a branch, tag or commit.
 
     Returns:
         Its folder.
@@ -61,10 +60,10 @@ def download(repo_id: str, *, revision: str | None = None) -> Path:
     """
     from huggingface_hub import snapshot_download
 
-    repo_id, _, given = repo_id.partition("@")
+    repo_id, _, revision = repo_id.partition("@")
     check_repo_id(repo_id)
     with explained(repo_id):
-        folder = Path(snapshot_download(repo_id, revision=given or revision, allow_patterns=list(SAFE)))
+        folder = Path(snapshot_download(repo_id, revision=revision or None, allow_patterns=list(SAFE)))
     if not (folder / "manifest.json").is_file():
         raise UserError(f"hf:{repo_id} holds no model of franka-wm (no manifest.json)")
     return folder

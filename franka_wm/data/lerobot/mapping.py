@@ -55,12 +55,6 @@ class FeatureMap:
         return self.action[1] == 0
 
     @property
-    def numbers(self) -> list[str]:
-        """All features that are no images, each once."""
-        out = [f for features, _ in self.vectors.values() for f in features]
-        return list(dict.fromkeys([*out, *self.action[0], *self.after.values()]))
-
-    @property
     def image_features(self) -> list[str]:
         """All features that are images, each once."""
         return list(dict.fromkeys(feature for feature, _ in self.images.values()))

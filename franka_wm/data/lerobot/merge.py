@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from franka_wm.data.lerobot.schema import EPISODE_KEY, PROVENANCE
-from franka_wm.data.lerobot.shard import INFO_PATH, STATS_PATH, TASKS_PATH, write_json
+from franka_wm.data.lerobot.shard import INFO_PATH, STATS_PATH, TASKS_PATH, lists, write_json
 from franka_wm.data.lerobot.stats import aggregate
 from franka_wm.data.lerobot.terminal import TERMINAL_FOLDER
 from franka_wm.errors import UserError
@@ -63,9 +63,7 @@ def merge(out: Path, roots: Sequence[Path], provenance: dict[str, Any]) -> None:
     }
     write_json(out / INFO_PATH, info)
     stats = aggregate([linked_json(root / STATS_PATH) for root in roots])
-    write_json(
-        out / STATS_PATH, {name: {k: v.tolist() for k, v in one.items()} for name, one in stats.items()}
-    )
+    write_json(out / STATS_PATH, lists(stats))
     merge_terminals(out, roots)
     (out / PROVENANCE).write_text(json.dumps(provenance, indent=1), encoding="utf-8")
     check_merged(out, roots)

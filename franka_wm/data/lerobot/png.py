@@ -1,4 +1,4 @@
-"""Images as PNG, bit for bit."""
+"""Images, written as PNG, bit for bit, and read."""
 
 from __future__ import annotations
 
@@ -33,16 +33,17 @@ def _chunk(kind: bytes, data: bytes) -> bytes:
     return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
 
 
-def decode_png(data: bytes) -> np.ndarray:
-    """PNG as (H, W, 3) uint8.
+def decode_image(data: bytes) -> np.ndarray:
+    """PNG or JPEG as (H, W, 3) uint8.
 
     Raises:
-        ValueError: It is none, is damaged, or has too many pixels.
+        ValueError: It is neither, is damaged, or has too many pixels.
     """
     from PIL import Image
 
     try:
-        with Image.open(io.BytesIO(data), formats=("PNG",)) as image:
+        # Of other formats some are programs: Pillow starts Ghostscript for PostScript.
+        with Image.open(io.BytesIO(data), formats=("PNG", "JPEG")) as image:
             if image.width * image.height > MOST_PIXELS:
                 raise ValueError(f"an image of {image.width} × {image.height} pixels")
             return np.asarray(image.convert("RGB"))

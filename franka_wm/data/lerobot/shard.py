@@ -233,7 +233,7 @@ def _write_meta(
         "splits": {"train": f"0:{len(episodes)}"},
     }
     write_json(folder / INFO_PATH, info)
-    write_json(folder / STATS_PATH, _lists(aggregate(list(stats))))
+    write_json(folder / STATS_PATH, lists(aggregate(list(stats))))
 
 
 def write_json(path: Path, value: object) -> None:
@@ -241,7 +241,8 @@ def write_json(path: Path, value: object) -> None:
     path.write_text(json.dumps(value, indent=4, ensure_ascii=False), encoding="utf-8")
 
 
-def _lists(stats: dict[str, dict[str, np.ndarray]]) -> dict[str, dict[str, object]]:
+def lists(stats: dict[str, dict[str, np.ndarray]]) -> dict[str, dict[str, object]]:
+    """Statistics as JSON has them."""
     return {name: {stat: value.tolist() for stat, value in one.items()} for name, one in stats.items()}
 
 

@@ -14,12 +14,11 @@ from typing import Any
 
 import numpy as np
 
+from franka_wm.data.lerobot.hub import explained
+from franka_wm.data.lerobot.shard import DATA_PATH, VIDEO_PATH
 from franka_wm.errors import UserError
 from franka_wm.options import is_real, is_whole
 from franka_wm.untrusted import UntrustedFolder, linked_bytes, linked_json
-
-DEFAULT_DATA_PATH = "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
-DEFAULT_VIDEO_PATH = "videos/{video_key}/chunk-{chunk_index:03d}/file-{file_index:03d}.mp4"
 
 LONGEST_PATH = 255
 """Longest template of a path [characters]."""
@@ -59,13 +58,11 @@ class Source:
 
     def data_path(self, chunk: int, file: int) -> Path:
         """The parquet file of these numbers."""
-        return self._path("data_path", DEFAULT_DATA_PATH, chunk_index=chunk, file_index=file)
+        return self._path("data_path", DATA_PATH, chunk_index=chunk, file_index=file)
 
     def video_path(self, feature: str, chunk: int, file: int) -> Path:
         """The video file of these numbers."""
-        return self._path(
-            "video_path", DEFAULT_VIDEO_PATH, video_key=feature, chunk_index=chunk, file_index=file
-        )
+        return self._path("video_path", VIDEO_PATH, video_key=feature, chunk_index=chunk, file_index=file)
 
     def fingerprint(self) -> str:
         """A hash of ``meta/info.json`` and of the path, size and time of change of every file."""
@@ -260,12 +257,11 @@ def check_finite(root: Path) -> None:
             raise UserError(f"{path} cannot be read: {error}") from error
 
 
-def find_dataset(repo_id: str, revision: str | None = None, *, meta: bool = False) -> Path:
+def find_dataset(repo_id: str, *, meta: bool = False) -> Path:
     """The folder of a dataset on the Hub: LeRobot's own copy if there is one, otherwise downloaded.
 
     Args:
         repo_id: ``user/name``.
-        revision: A tag, branch or commit; the one that LeRobot loads if not given.
         meta: Download what it says of itself alone, no rows.
 
     Raises:
@@ -274,39 +270,31 @@ def find_dataset(repo_id: str, revision: str | None = None, *, meta: bool = Fals
     from lerobot.utils.constants import HF_LEROBOT_HOME, HF_LEROBOT_HUB_CACHE
 
     here = Path(HF_LEROBOT_HOME) / repo_id
-    if revision is None and (here / "meta" / "info.json").is_file():
+    if (here / "meta" / "info.json").is_file():
         return here
     from huggingface_hub import snapshot_download
-    from huggingface_hub.errors import (
-        HfHubHTTPError,
-        HFValidationError,
-        LocalEntryNotFoundError,
-        RevisionNotFoundError,
-    )
+    from huggingface_hub.errors import HFValidationError, LocalEntryNotFoundError, RevisionNotFoundError
 
-    try:
-        folder = snapshot_download(
-            repo_id,
-            repo_type="dataset",
-            revision=revision or "v3.0",
-            cache_dir=HF_LEROBOT_HUB_CACHE,
-            allow_patterns=["meta/*"] if meta else None,
-        )
-    except HFValidationError as error:
-        raise UserError(f"dataset.repo_id={repo_id!r}: must look like user/name") from error
-    except LocalEntryNotFoundError as error:
-        how = "HF_HUB_OFFLINE is set" if os.environ.get("HF_HUB_OFFLINE") else "the Hub cannot be reached"
-        raise UserError(
-            f"dataset.repo_id={repo_id}: not on this machine, and {how}; give dataset.root=FOLDER instead"
-        ) from error
-    except RevisionNotFoundError as error:
-        raise UserError(
-            f"dataset.repo_id={repo_id}: has no tag {revision or 'v3.0'} on the Hub; it is in an older format, or was "
-            "published without its tag"
-        ) from error
-    except (HfHubHTTPError, OSError) as error:
-        reason = str(error).strip().splitlines()[0] if str(error).strip() else ""
-        raise UserError(
-            f"dataset.repo_id={repo_id}: cannot be fetched ({type(error).__name__}: {reason})"
-        ) from error
+    version = "v3.0"  # the tag that LeRobot loads
+    with explained(f"dataset.repo_id={repo_id}"):
+        try:
+            folder = snapshot_download(
+                repo_id,
+                repo_type="dataset",
+                revision=version,
+                cache_dir=HF_LEROBOT_HUB_CACHE,
+                allow_patterns=["meta/*"] if meta else None,
+            )
+        except HFValidationError as error:
+            raise UserError(f"dataset.repo_id={repo_id!r}: must look like user/name") from error
+        except LocalEntryNotFoundError as error:
+            how = "HF_HUB_OFFLINE is set" if os.environ.get("HF_HUB_OFFLINE") else "the Hub cannot be reached"
+            raise UserError(
+                f"dataset.repo_id={repo_id}: not on this machine, and {how}; give dataset.root=FOLDER instead"
+            ) from error
+        except RevisionNotFoundError as error:
+            raise UserError(
+                f"dataset.repo_id={repo_id}: has no tag {version} on the Hub; it is in an older format, or was "
+                "published without its tag"
+            ) from error
     return Path(folder)

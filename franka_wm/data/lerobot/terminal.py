@@ -20,7 +20,7 @@ from typing import Any
 
 import numpy as np
 
-from franka_wm.data.lerobot.png import decode_png, encode_png
+from franka_wm.data.lerobot.png import decode_image, encode_png
 from franka_wm.data.lerobot.schema import OWN_FOLDER
 from franka_wm.errors import UserError
 from franka_wm.untrusted import values_of
@@ -148,7 +148,7 @@ def _read_file(
             for feature, array in values.items():
                 cell = table[feature][row].as_py()
                 value = (
-                    decode_png(cell)
+                    decode_image(cell)
                     if isinstance(cell, bytes)
                     else np.asarray(cell, array.dtype).reshape(array.shape[1:])
                 )

@@ -155,7 +155,8 @@ class RecordedWindows:
                 f"no episode is left for {split}: {len(recording.episodes)} in all, "
                 f"dataset.validation_fraction={validation_fraction}; record more episodes, or change it"
             )
-        dataset, start, length, known = recording.episodes[chosen].T
+        self._episodes = recording.episodes[chosen]
+        dataset, start, length, known = self._episodes.T
         first = np.searchsorted(recording.episodes[:, 0], dataset)
         self.episodes = list(zip(dataset.tolist(), (chosen - first).tolist(), strict=True))
         self._all_lengths = recording.episodes[:, 2] + recording.episodes[:, 3] - 1
@@ -340,7 +341,7 @@ class RecordedWindows:
         """Which rows are observations of this split, and which of them have an action."""
         mask = np.zeros(int(self._bounds[-1]), bool)
         action_mask = mask.copy()
-        _, start, length, known = self._chosen().T
+        _, start, length, known = self._episodes.T
         for s, n, k in zip(start, length, known, strict=True):
             mask[s : s + n + k] = True
             action_mask[s : s + n] = True
@@ -352,12 +353,6 @@ class RecordedWindows:
             return action
         centre, half = (t.to(action.device) for t in self._scale)
         return action * half + centre
-
-    def _chosen(self) -> np.ndarray:
-        first = {
-            d: i for d, i in zip(*np.unique(self.recording.episodes[:, 0], return_index=True), strict=True)
-        }
-        return self.recording.episodes[[int(first[d]) + i for d, i in self.episodes]]
 
     def _whole(self, name: str) -> np.ndarray:
         return np.concatenate([part.cpu().numpy() for part in self.recording.arrays[name]])

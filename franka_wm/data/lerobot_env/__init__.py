@@ -141,7 +141,7 @@ def recorded_settings(root: str) -> dict[str, Any]:
     Without ``frame_stack``: of a run that stacked images, too, a dataset holds single ones.
 
     Raises:
-        UserError: If the dataset does not say, or was recorded with several.
+        UserError: If the dataset does not say, or was recorded with several, or with a robot from a file.
     """
     provenance = read_provenance(root)
     if provenance is None or not provenance.get("sessions"):
@@ -153,6 +153,11 @@ def recorded_settings(root: str) -> dict[str, Any]:
         one.pop("frame_stack", None)
     if any(other != settings[0] for other in settings):
         raise UserError(f"env.dataset={root}: recorded with different settings; give env.options instead")
+    if settings and settings[0].get("urdf_path"):
+        raise UserError(
+            f"env.dataset={root}: recorded with a robot of its own, env.urdf_path={settings[0]['urdf_path']}, which "
+            "lerobot-eval cannot build; franka-wm evaluate can"
+        )
     return {key: value for key, value in settings[0].items() if key not in ("kind", "urdf_path")}
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import json
 import os
 import shutil
@@ -161,6 +162,29 @@ def test_the_first_episode_may_be_in_any_file(
         cards.make_image(one, tmp_path / f"{name}.gif")
         images.append((tmp_path / f"{name}.gif").read_bytes())
     assert images[0] == images[1]
+
+
+def test_embedded_images_may_be_jpeg(make_schema, make_episode, write, tmp_path) -> None:
+    """As another program may have written them: what trains is published, too."""
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+    from PIL import Image
+
+    schema = make_schema("exact")
+    root = write(tmp_path / "set", schema, [make_episode(schema, 0)])
+    file = root / "data" / "chunk-000" / "file-000.parquet"
+    table = pq.read_table(file)
+    for name in schema.images:
+        cells = []
+        for cell in table[name].to_pylist():
+            jpeg = io.BytesIO()
+            Image.open(io.BytesIO(cell["bytes"])).save(jpeg, "JPEG")
+            cells.append(cell | {"bytes": jpeg.getvalue()})
+        at = table.column_names.index(name)
+        table = table.set_column(at, table.field(name), pa.array(cells, table.field(name).type))
+    pq.write_table(table, file)
+    cards.make_image(root, tmp_path / "first.gif")
+    assert (tmp_path / "first.gif").read_bytes().startswith(b"GIF")
 
 
 def test_pipes_in_a_dataset_are_refused(copy, tmp_path) -> None:

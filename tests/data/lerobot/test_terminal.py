@@ -11,7 +11,7 @@ import av
 import numpy as np
 import pytest
 
-from franka_wm.data.lerobot.png import decode_png, encode_png
+from franka_wm.data.lerobot.png import decode_image, encode_png
 from franka_wm.data.lerobot.schema import EPISODE_KEY, OWN_FOLDER
 from franka_wm.data.lerobot.terminal import TERMINAL_FOLDER, read_terminals
 from franka_wm.errors import UserError
@@ -80,7 +80,7 @@ def test_another_datasets_file_is_refused(dataset, make_schema) -> None:
 @pytest.mark.parametrize("shape", [(1, 1, 3), (16, 16, 3), (7, 33, 3)])
 def test_png_is_exact_for_any_decoder(shape) -> None:
     picture = np.random.default_rng(0).integers(0, 256, shape, np.uint8)
-    assert np.array_equal(decode_png(encode_png(picture)), picture)
+    assert np.array_equal(decode_image(encode_png(picture)), picture)
     with av.open(io.BytesIO(encode_png(picture)), format="png_pipe") as container:
         frame = next(container.decode(video=0))
     assert np.array_equal(frame.to_ndarray(format="rgb24"), picture)
@@ -93,16 +93,16 @@ def test_a_png_of_too_many_pixels_is_no_value(side: int) -> None:
     header = b"IHDR" + struct.pack(">IIBBBBB", side, side, 8, 2, 0, 0, 0)
     bomb = data[:12] + header + struct.pack(">I", zlib.crc32(header)) + data[33:]
     with pytest.raises(ValueError, match="pixels"):
-        decode_png(bomb)
+        decode_image(bomb)
 
 
 def test_only_a_whole_png_is_a_value() -> None:
     """Pillow would start Ghostscript for a program in PostScript, and has errors of its own for what is damaged."""
     with pytest.raises(ValueError, match="cannot identify"):
-        decode_png(b"%!PS-Adobe-3.0 EPSF-3.0\n%%BoundingBox: 0 0 16 16\n%%EndComments\nshowpage\n%%EOF\n")
+        decode_image(b"%!PS-Adobe-3.0 EPSF-3.0\n%%BoundingBox: 0 0 16 16\n%%EndComments\nshowpage\n%%EOF\n")
     data = encode_png(np.random.default_rng(0).integers(0, 256, (64, 64, 3), np.uint8))
     begun = (
         data[:33] + struct.pack(">I", 2000) + data[37:2041] + b"crc?"
     )  # a part of the values, and then no chunk
     with pytest.raises(ValueError, match="broken PNG"):
-        decode_png(begun + struct.pack(">I", 100) + b"\1\2\3\4" + data[2041:])
+        decode_image(begun + struct.pack(">I", 100) + b"\1\2\3\4" + data[2041:])

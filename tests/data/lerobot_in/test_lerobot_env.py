@@ -93,6 +93,9 @@ def test_settings_of_a_dataset(tmp_path: Path) -> None:
     provenance(env, env | {"fps": 30.0})
     with pytest.raises(UserError, match="recorded with different settings"):
         FrankaWMEnv(dataset=str(tmp_path))
+    provenance(env | {"urdf_path": "arm.urdf"})  # another robot would be driven by its actions
+    with pytest.raises(UserError, match=r"recorded with a robot of its own, env\.urdf_path=arm\.urdf"):
+        FrankaWMEnv(dataset=str(tmp_path))
     with pytest.raises(UserError, match=r"has no meta/franka_wm/provenance\.json"):
         recorded_settings(str(tmp_path / "nothing"))
 
