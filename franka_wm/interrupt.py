@@ -14,7 +14,8 @@ INTERRUPTED = 130
 
 
 def _tell(signum: int) -> None:
-    say("\ninterrupted: finishing this step and saving; press Ctrl-C again to stop at once")
+    again = "; press Ctrl-C again to stop at once" if signum == signal.SIGINT else ""
+    say(f"\nasked to stop: finishing this step and saving{again}")
 
 
 @contextmanager

@@ -175,15 +175,16 @@ def own_gpu() -> torch.device:
 
 
 def speaks_first() -> bool:
-    """Whether no process of the job has said before why it ends; the first to ask is told so, once.
+    """Whether no process of this host has said before why it ends; the first to ask is told so, once.
 
     Before they have met, the first process of each host is.
     """
     if not _joined():
         return os.environ.get("LOCAL_RANK", "0") == "0"
     store = distributed.distributed_c10d._get_default_store()
+    restart, host = (os.environ.get(name, "0") for name in ("TORCHELASTIC_RESTART_COUNT", "GROUP_RANK"))
     try:
-        return store.add(f"ends {os.environ.get('TORCHELASTIC_RESTART_COUNT', 0)}", 1) == 1
+        return store.add(f"ends {restart} on {host}", 1) == 1
     except RuntimeError:  # the one who keeps the store is gone: then nobody else can have heard
         return True
 
@@ -380,7 +381,11 @@ def _together(what: Any) -> None:
         if isinstance(error, torch.OutOfMemoryError):
             raise
         why = str(error).splitlines()[0][:120]
-        raise UserError(
+        raise LostAnother(
             f"process {os.environ.get('RANK', 0)} has lost another one of this run ({why}); what was saved is whole: "
             "go on with resume=FOLDER, and collect with resume=true"
         ) from error
+
+
+class LostAnother(UserError):
+    """Another process of the job has ended, or cannot be reached. Who has started both says more, if we have."""

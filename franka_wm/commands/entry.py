@@ -70,7 +70,7 @@ def ends_together() -> Iterator[None]:
             try:
                 yield
             except FrankaError as error:
-                fail(str(error))
+                fail_by(error)
     except BaseException as error:
         several.part(error)
         raise
@@ -240,7 +240,7 @@ def one_line_errors(main: Callable[[DictConfig], object]) -> Callable[[DictConfi
                 return main(cfg)
         except FrankaError as error:
             _discard()
-            fail(str(error))
+            fail_by(error)
         except SystemExit:  # what the machine refused; or a run that has saved
             _discard()
             raise
@@ -315,6 +315,15 @@ def fail(message: str) -> NoReturn:
 
         processes.leave(1)
     sys.exit(1)
+
+
+def fail_by(error: FrankaError) -> NoReturn:
+    """The same by what ended a run. Of a process that has lost another one the launcher tells, where it is ours."""
+    from franka_wm import processes
+
+    if isinstance(error, processes.LostAnother) and several.LAUNCHER in os.environ:
+        processes.leave(1)
+    fail(str(error))
 
 
 def with_scale(arguments: list[str], stream: TextIO | None = None, *, quiet: bool = False) -> list[str]:

@@ -103,6 +103,9 @@ def launch_verb(command: list[str], gpus: int, device: str, advice: Callable[[],
     os.environ.setdefault("OMP_NUM_THREADS", str(max(1, usable_cores() // gpus)))
     places = [str(conf.FOLDER.parents[1]), *filter(None, [os.environ.get("PYTHONPATH")])]
     os.environ["PYTHONPATH"] = os.pathsep.join(places)
+    # Python tells of the semaphores of a process that was killed, as if there were something to do.
+    quiet = [*filter(None, [os.environ.get("PYTHONWARNINGS")]), "ignore:resource_tracker"]
+    os.environ["PYTHONWARNINGS"] = ",".join(quiet)
     os.environ[LAUNCHER] = str(os.getpid())
     try:
         with tempfile.TemporaryDirectory(prefix="franka_wm-") as logs, patience():
@@ -129,7 +132,7 @@ def launch_verb(command: list[str], gpus: int, device: str, advice: Callable[[],
             f"{advice()}"
         ) from None
     finally:
-        for name in ("OMP_NUM_THREADS", "PYTHONPATH", LAUNCHER):
+        for name in ("OMP_NUM_THREADS", "PYTHONPATH", "PYTHONWARNINGS", LAUNCHER):
             os.environ.pop(name)
             if name in before:
                 os.environ[name] = before[name]

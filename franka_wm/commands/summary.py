@@ -10,9 +10,14 @@ import click
 
 from franka_wm.commands.arguments import verb
 from franka_wm.errors import UserError
+from franka_wm.options import leaves
 
 if TYPE_CHECKING:
     from franka_wm.evaluation.results import Result
+
+
+MOST_NAMED = 3
+"""Options by which a table tells its runs from those of the others."""
 
 
 @verb("summary")
@@ -23,10 +28,11 @@ def summary(folders: tuple[str, ...]) -> None:
     Runs that differ in more than their seed get a table for each configuration. Of a sweep, runs that have not been
     evaluated yet, or failed, are named and left out.
     """
-    from franka_wm.report.run import but_for_the_seed, malformed, read_config
+    from franka_wm.report.run import but_for_the_seed, malformed, read_config, without_the_seed
     from franka_wm.report.seeds import evaluated, read_evaluation
 
     groups: dict[str, dict[Path, Result]] = {}
+    configs: dict[str, dict[str, object]] = {}
     seen: set[Path] = set()
     for folder in folders:
         for run in evaluated(folder, print):
@@ -39,29 +45,49 @@ def summary(folders: tuple[str, ...]) -> None:
                 acted = [
                     str(found.protocol.get(name)) for name in ("task", "model", "planner", "planned with")
                 ]
-                alike = "\n".join([but_for_the_seed(read_config(run)), *acted])
+                config = read_config(run)
+                alike = "\n".join([but_for_the_seed(config), *acted])
                 groups.setdefault(alike, {})[run] = found
-    for group in groups.values():
+                configs.setdefault(alike, leaves(without_the_seed(config, config.get("seed"))))
+    for alike, group in groups.items():
         with malformed(*group):
-            text = table(group, several=len(groups) > 1)
+            text = table(group, apart=_own(configs, alike) if len(groups) > 1 else None)
         print(text)
 
 
-def table(group: Mapping[Path, Result], *, several: bool) -> str:
-    """The table of runs that differ in their seed alone; with their names where there are several tables."""
+def _own(configs: Mapping[str, Mapping[str, object]], one: str) -> str:
+    """What one of several configurations has that not all have, in a few words."""
+    mine = configs[one]
+    own = [
+        f"{name}={value}"
+        for name, value in mine.items()
+        if any(str(other.get(name)) != str(value) for other in configs.values())
+    ]
+    return ", ".join(own[:MOST_NAMED]) + (f" and {len(own) - MOST_NAMED} more" * (len(own) > MOST_NAMED))
+
+
+def table(group: Mapping[Path, Result], *, apart: str | None) -> str:
+    """The table of runs that differ in their seed alone.
+
+    Args:
+        group: the runs.
+        apart: What their configuration has that those of other tables have not; ``None``: there is one table.
+    """
     from franka_wm.report.seeds import cells_told, seeds_table
 
     found = list(group.values())
     counts = sorted({one.episodes for one in found})
     runs = f"{len(found)} run{'s' * (len(found) > 1)}"
-    if several:
-        runs += f" ({', '.join(run.name for run in group)})"
+    if apart is not None:
+        runs += f" ({', '.join(run.name for run in group)}{apart and f': {apart}'})"
     episodes = f"{counts[0]}" if len(counts) == 1 else f"{counts[0]} to {counts[-1]}"
     by = sorted({str(one.protocol.get("by", one.path)) for one in found})
     return (
         f"{runs} of {episodes} episodes each: {cells_told(len(found))}\n"
         f"measured by {' and '.join(by)}; of a run measured twice, its later weights, of these what rests on more "
-        f"episodes\n{_apart(found)}\n" + seeds_table([one.policies for one in found]) + "\n" * several
+        f"episodes\n{_apart(found)}\n"
+        + seeds_table([one.policies for one in found])
+        + "\n" * (apart is not None)
     )
 
 

@@ -435,16 +435,13 @@ def open_recorded(run: RunSettings, device: torch.device) -> tuple[RecordedWindo
     """
     from franka_wm.data.lerobot import open_dataset
 
-    arm = run.env.arm if run.is_arm else None  # what is learned will act there
     train = open_dataset(
         **run.dataset.options,
         window=run.window,
         batch_size=run.replay.batch_size,
         device=device,
-        keys=run.model.observations,
         frame_stack=run.env.frame_stack,
         future=run.replay.future,
-        fps=arm and arm.fps,
-        action_dim=arm and arm.action_dim,
+        **run.of_recorded,
     )
     return train, train.validation()

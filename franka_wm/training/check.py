@@ -373,11 +373,9 @@ def _check_dataset(run: RunSettings) -> None:
         sources, mappings = read_datasets(
             [folder for _, folder in found],
             features=run.dataset.features,
-            keys=run.model.observations,
             image_size=run.dataset.image_size,
             normalize_actions=run.dataset.normalize_actions,
-            fps=arm and arm.fps,
-            action_dim=arm and arm.action_dim,
+            **run.of_recorded,
         )
         if arm is not None:
             _check_same_observations(run, mappings[0])

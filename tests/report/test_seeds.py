@@ -120,8 +120,8 @@ def test_runs_of_different_tasks_are_not_averaged(tmp_path, capsys):
     (tmp_path / "multirun.yaml").touch()
     assert main(["summary", str(tmp_path)]) == 0
     out = capsys.readouterr().out
-    assert "2 runs (0-reach, 2-reach)" in out and "2.00 (1.00 – 3.00)" in out
-    assert "1 run (1-reach_fixed)" in out and "| planner | 2.00 | 100 |" in out
+    assert "2 runs (0-reach, 2-reach: env.task=reach)" in out and "2.00 (1.00 – 3.00)" in out
+    assert "1 run (1-reach_fixed: env.task=reach_fixed)" in out and "| planner | 2.00 | 100 |" in out
 
 
 def test_the_seed_of_recorded_data_follows_the_runs(tmp_path):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
@@ -10,6 +11,7 @@ from pathlib import Path
 import httpx
 import huggingface_hub
 import pytest
+import torch
 from huggingface_hub import constants
 from lerobot.utils import constants as lerobot_constants
 
@@ -18,6 +20,7 @@ from franka_wm.commands import main as cli
 from franka_wm.data.lerobot.schema import PROVENANCE
 from franka_wm.data.lerobot.source import find_dataset
 from franka_wm.errors import UserError
+from franka_wm.training.build import open_recorded
 from franka_wm.training.check import check
 
 ARM = ("env=reach", "env.substeps=1", "env.episode_length=8", "seed=0", "device=cpu")
@@ -86,6 +89,27 @@ def test_its_rows_follow_when_they_are_read(recorded: Path, hub: Hub) -> None:
     names = {f.relative_to(whole).as_posix() for f in whole.rglob("*") if f.is_file()}
     assert names == set(hub.repos["datasets/user/reach"]["files"])
     assert json.loads((whole / PROVENANCE).read_text()) == json.loads((recorded / PROVENANCE).read_text())
+
+
+@pytest.mark.parametrize("by_name", [True, False])
+def test_a_dataset_without_rewards_is_refused_before_it_is_decoded(
+    by_name: bool, recorded: Path, hub: Hub, settled, tmp_path
+) -> None:
+    """By name without an arm, as it is opened: nothing is fetched for the check."""
+    root = tmp_path / "set"
+    shutil.copytree(recorded, root)
+    info = json.loads((root / "meta/info.json").read_text())
+    del info["features"]["next.reward"]
+    (root / "meta/info.json").write_text(json.dumps(info))
+    hub.repos["datasets/user/reach"]["files"]["meta/info.json"] = (root / "meta/info.json").read_bytes()
+    where = "dataset.repo_id=user/reach" if by_name else f"dataset.root={root}"
+    words = ("scale=smoke", "env=none", "dataset=lerobot", "trainer=offline", where)
+    words += (f"dataset.cache_dir={tmp_path / 'cache'}", "device=cpu")
+    run = settled(*words)
+    with pytest.raises(UserError, match="no reward, which model=tdmpc2 learns from"):
+        open_recorded(run, torch.device("cpu")) if by_name else check(run)
+    assert not (tmp_path / "cache").exists()
+    check(settled(*words, "model=lewm", "model.observations=[state]"))
 
 
 def test_cameras_of_a_dataset_by_name_are_compared(recorded: Path, hub: Hub, settled) -> None:

@@ -58,7 +58,7 @@ class TableJob:
                 for batch in file.iter_batches(ROWS_AT_A_TIME, row_groups=self.groups, columns=columns):
                     rows = self._rows(batch, starts, lengths)
                     for feature, places in self.numbers.items():
-                        values = self._values(batch.column(feature), feature, places[0][2])
+                        values = self._values(batch, feature, places[0][2])
                         for name, first, size in places:
                             target = arrays[name]
                             if target.ndim == 1:
@@ -74,7 +74,7 @@ class TableJob:
                     arrays.mark("table", rows)
                     done += len(rows)
         except (pa.ArrowException, OSError, KeyError) as error:
-            raise UserError(f"{self.path} cannot be read: {error}") from error
+            raise UserError(f"{self.path} cannot be read: {error}; copy or download it again") from error
         arrays.flush()
         return done
 
@@ -93,9 +93,10 @@ class TableJob:
             )
         return starts[episode] + frame
 
-    def _values(self, column: Any, feature: str, size: int) -> np.ndarray:
+    def _values(self, batch: Any, feature: str, size: int) -> np.ndarray:
         import pyarrow.compute as pc
 
+        column = batch.column(feature)
         flat, even = column, True
         while hasattr(flat, "flatten") and hasattr(flat.type, "value_type"):
             even = even and len(pc.call_function("list_value_length", [flat]).unique()) <= 1
@@ -110,10 +111,12 @@ class TableJob:
             raise UserError(f"{self.path}: {feature} should have {size} numbers in every row and has not")
         values = values.reshape(len(column), size)
         with np.errstate(over="ignore"):  # a number that float32 cannot hold is none either
-            finite = np.isfinite(values.astype(np.float32)).all()
-        if values.dtype.kind == "f" and not finite:
+            finite = np.isfinite(values.astype(np.float32)).all(1)
+        if values.dtype.kind == "f" and not finite.all():
+            episode = batch.column("episode_index")[int(np.argmin(finite))]
             raise UserError(
-                f"{self.path}: {feature} holds a number that is not finite; delete the episode (lerobot-edit-dataset)"
+                f"{self.path}: {feature} holds a number that is not finite, in episode {episode}; delete the episode "
+                "(lerobot-edit-dataset)"
             )
         return values
 
@@ -284,7 +287,7 @@ def row_groups(path: Path, rows: int) -> Sequence[tuple[tuple[int, ...], int]]:
     try:
         facts = pq.read_metadata(path)
     except (pa.ArrowException, OSError) as error:
-        raise UserError(f"{path} cannot be read: {error}") from error
+        raise UserError(f"{path} cannot be read: {error}; copy or download it again") from error
     out: list[tuple[tuple[int, ...], int]] = []
     groups: list[int] = []
     count = 0

@@ -71,6 +71,7 @@ def map_features(
     *,
     features: Mapping[str, str | Sequence[str]] | None = None,
     keys: Sequence[str] | None = None,
+    rewards_for: str | None = None,
     image_size: int | Sequence[int] | None = None,
 ) -> FeatureMap:
     """Decides what is read from a dataset and what it is called.
@@ -98,6 +99,7 @@ def map_features(
         features: Entry → feature, or a list of vectors that are put one behind the other. It replaces the
             observations above; ``action`` and the entries under ``next`` may be left to convention.
         keys: Observations that are needed; others are not read. ``None``: all.
+        rewards_for: Who learns from rewards; ``None``: nobody.
         image_size: Side of the square, or (height, width), that images are resized to [px].
 
     Raises:
@@ -160,6 +162,11 @@ def map_features(
                     f"dataset.features.{key}={after[key]}: must be a single number per row, "
                     f"its shape is {tuple(there[after[key]]['shape'])}"
                 )
+    if "reward" not in after and rewards_for is not None:
+        raise UserError(
+            f"{source.root} has no reward, which {rewards_for} learns from: say which feature it is, "
+            f"dataset.features={{reward: …, …}} ({_list(there)}), or use a model that needs none, such as model=lewm"
+        )
     if "reward" not in after:
         notes.append("no reward in the dataset: families that learn from rewards cannot be trained on it")
     if "terminated" not in after and ("reward" in after or "done" in after):

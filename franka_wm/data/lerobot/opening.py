@@ -38,6 +38,7 @@ def open_dataset(
     seed: int = 0,
     features: Mapping[str, str | Sequence[str]] | None = None,
     keys: Sequence[str] | None = None,
+    rewards_for: str | None = None,
     image_size: int | Sequence[int] | None = None,
     normalize_actions: bool | None = None,
     cache_dir: str | Path | None = None,
@@ -64,6 +65,7 @@ def open_dataset(
         features: Which feature becomes which entry; by convention if not given
             (:func:`~franka_wm.data.lerobot.mapping.map_features`).
         keys: Observations that are needed; others are not decoded.
+        rewards_for: Who learns from rewards, for the message where there are none; ``None``: nobody.
         image_size: Images are resized to this square, or to (height, width) [px].
         normalize_actions: Scale actions to [−1, 1]; ``None``: where the dataset is not of this package.
         cache_dir: Where caches are kept; ``~/.cache/franka_wm/datasets`` if not given.
@@ -84,6 +86,7 @@ def open_dataset(
         roots,
         features=features,
         keys=keys,
+        rewards_for=rewards_for,
         image_size=image_size,
         normalize_actions=normalize_actions,
         fps=fps,
@@ -164,6 +167,7 @@ def read_datasets(
     *,
     features: Mapping[str, str | Sequence[str]] | None = None,
     keys: Sequence[str] | None = None,
+    rewards_for: str | None = None,
     image_size: int | Sequence[int] | None = None,
     normalize_actions: bool | None = None,
     fps: float | None = None,
@@ -180,7 +184,8 @@ def read_datasets(
     if not roots:
         raise UserError("dataset=lerobot: give dataset.root=FOLDER or dataset.repo_id=USER/NAME")
     sources = [read_source(one) for one in roots]
-    mappings = [map_features(s, features=features, keys=keys, image_size=image_size) for s in sources]
+    asked: dict[str, Any] = {"features": features, "keys": keys, "rewards_for": rewards_for}
+    mappings = [map_features(s, image_size=image_size, **asked) for s in sources]
     for other, source in zip(mappings[1:], sources[1:], strict=True):
         _check_alike(mappings[0], other, str(roots[0]), str(source.root))
         if source.fps != sources[0].fps:

@@ -63,6 +63,10 @@ def wait_for_orphans(path: Path) -> None:
         os.close(descriptor)
 
 
+class WorkerEnded(Exception):
+    """A writing process ended by itself, and with it the shard that it was writing."""
+
+
 class Worker:
     """A process that writes shards, and the connection to it. It ends when this process does, however that ends.
 
@@ -93,6 +97,11 @@ class Worker:
             raise self._died() from error
         self.busy = True
 
+    def check(self) -> None:
+        """Raises :class:`WorkerEnded` if the process is there no more."""
+        if self._process.poll() is not None:
+            raise self._died()
+
     def receive(self) -> None:
         try:
             problem = self.connection.recv()
@@ -101,12 +110,11 @@ class Worker:
         self.busy = False
         _raise(problem)
 
-    def _died(self) -> UserError:
+    def _died(self) -> WorkerEnded:
         self.busy = False
         self._process.wait()
-        return UserError(
-            f"a writing process ended (exit code {self._process.returncode}; {self.log} may say why); what is "
-            "finished is kept: collect goes on with resume=true"
+        return WorkerEnded(
+            f"a writing process ended (exit code {self._process.returncode}; {self.log} may say why)"
         )
 
     def stop(self) -> None:
@@ -122,6 +130,8 @@ class InProcess:
     """Does the same jobs in this process."""
 
     busy = False
+
+    def check(self) -> None: ...
 
     def send(self, job: tuple[Any, ...]) -> None:
         _raise(_do(*job))

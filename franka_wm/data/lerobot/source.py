@@ -254,7 +254,7 @@ def check_finite(root: Path) -> None:
                         "(lerobot-edit-dataset)"
                     )
         except (pa.ArrowException, OSError) as error:
-            raise UserError(f"{path} cannot be read: {error}") from error
+            raise UserError(f"{path} cannot be read: {error}; copy or download it again") from error
 
 
 def find_dataset(repo_id: str, *, meta: bool = False) -> Path:

@@ -19,7 +19,8 @@ import math
 import os
 import re
 import shutil
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager
 from multiprocessing.connection import wait
 from pathlib import Path
 from typing import Any
@@ -36,6 +37,7 @@ from franka_wm.data.lerobot.shard_workers import (
     PARTIAL,
     InProcess,
     Worker,
+    WorkerEnded,
     lock_folder,
     wait_for_orphans,
 )
@@ -250,10 +252,11 @@ class DatasetWriter:
             numbers = range(self._number_of_workers)
             self._workers = [Worker(self.working, self._first_worker + n) for n in numbers] or [InProcess()]
         if wait:
-            for worker in self._workers:
-                worker.send(("nothing",))
-            while any(worker.busy for worker in self._workers):
-                self._receive()
+            with self._rescuing():
+                for worker in self._workers:
+                    worker.send(("nothing",))
+                while any(worker.busy for worker in self._workers):
+                    self._receive()
 
     def add(self, episodes: Iterable[Episode]) -> None:
         """Takes episodes over; returns when they are in memory or on their way to a process.
@@ -262,14 +265,32 @@ class DatasetWriter:
             UserError: An episode that cannot be written (:func:`~franka_wm.data.lerobot.shard.check_episode`), or
                 writing failed.
         """
-        for episode in episodes:
-            check_episode(self.schema, episode)
-            self._buffer.append(episode)
-            self._buffered += episode.length
-            self.episodes += 1
-            self.frames += episode.length
-            if self._buffered >= self.shard_frames:
+        with self._rescuing():
+            for worker in self._workers:
+                worker.check()
+            for episode in episodes:
+                check_episode(self.schema, episode)
+                self._buffer.append(episode)
+                self._buffered += episode.length
+                self.episodes += 1
+                self.frames += episode.length
+                if self._buffered >= self.shard_frames:
+                    self._dispatch()
+
+    @contextmanager
+    def _rescuing(self) -> Iterator[None]:
+        """Inside, the end of a writing process costs the shard that it was at: what is in memory is written here."""
+        try:
+            yield
+        except WorkerEnded as error:
+            for worker in self._workers:
+                worker.stop()  # once it has written its shard
+            self._workers = [InProcess()]
+            if self._buffer:
                 self._dispatch()
+            raise UserError(
+                f"{error}; {episodes_there(self.out)} episodes are on disk: collect goes on with resume=true"
+            ) from error
 
     def _dispatch(self) -> None:
         self.start()
@@ -295,10 +316,11 @@ class DatasetWriter:
 
     def flush(self) -> None:
         """Writes what is in memory as a shard and waits until all shards are on disk."""
-        if self._buffer:
-            self._dispatch()
-        while any(worker.busy for worker in self._workers):
-            self._receive()
+        with self._rescuing():
+            if self._buffer:
+                self._dispatch()
+            while any(worker.busy for worker in self._workers):
+                self._receive()
 
     # -- after -------------------------------------------------------------------------------------------------
 
@@ -331,9 +353,9 @@ class DatasetWriter:
         roots = ([self.out] if self.out.exists() else []) + shards
         sessions = self._sessions_with_episodes(shards)
         merged = self.working / "merged"
-        worker = self._idle_worker()
         provenance = {"sessions": sessions, "schema": self.schema.to_dict()}
-        worker.send(("merge", merged, roots, provenance))
+        with self._rescuing():
+            self._idle_worker().send(("merge", merged, roots, provenance))
         self.flush()
         self._save_state(replacing=True)
         if self.out.exists():

@@ -183,22 +183,25 @@ class RunSettings:
     @property
     def on_each(self) -> str:
         """Says in a message that its number is one process's, where what it names is of all."""
-        what = "processes" if self.device == "cpu" else "GPUs"
-        return f" on each of {self.parts} {what}" if self.parts > 1 else ""
+        return f" on each of {self.parts} {self._parts_are}" if self.parts > 1 else ""
+
+    @property
+    def _parts_are(self) -> str:
+        return "processes" if self.device == "cpu" else "GPUs"
 
     def _shared(self, parts: int) -> RunSettings:
         """What one of so many processes has of the whole run."""
-        c, r = self.collector, self.replay
+        c, r, what = self.collector, self.replay, self._parts_are
         divided = {"collector.num_envs": c.num_envs, "replay.batch_size": r.batch_size}
         divided |= {"collector.planner_worlds": c.planner_worlds, "collector.workers": c.workers}
         for name, value in divided.items():
             if value % parts:
-                raise UserError(f"{name}={value}: {parts} GPUs cannot share it; use a multiple of {parts}")
+                raise UserError(f"{name}={value}: {parts} {what} cannot share it; use a multiple of {parts}")
         if parts > 1 and isinstance(self.env.config, MultiTaskConfig) and not self.is_offline:
             tasks = len(self.env.config.tasks)
             if c.num_envs % (parts * tasks):
                 raise UserError(
-                    f"collector.num_envs={c.num_envs}: on each of {parts} GPUs as many worlds must have each of the "
+                    f"collector.num_envs={c.num_envs}: on each of {parts} {what} as many worlds must have each of the "
                     f"{tasks} tasks; use a multiple of {parts * tasks}"
                 )
         return replace(
@@ -229,6 +232,18 @@ class RunSettings:
     def is_discrete(self) -> bool:
         """Whether the model chooses among discrete actions."""
         return self.model.family.discrete
+
+    @property
+    def of_recorded(self) -> dict[str, Any]:
+        """What the model, and the arm that it is to act in, ask of recorded data: arguments of ``read_datasets``."""
+        family, arm = self.model.family, self.env.arm if self.is_arm else None
+        rewarded = family.has_value or self.model.options.get("reward_head")
+        return {
+            "keys": self.model.observations,
+            "rewards_for": f"model={self.model.name}" if rewarded else None,
+            "fps": arm and arm.fps,
+            "action_dim": arm and arm.action_dim,
+        }
 
     @property
     def crosses_episodes(self) -> bool:

@@ -268,30 +268,6 @@ def test_two_writers_do_not_mix(tmp_path, make_schema, make_episode) -> None:
             DatasetWriter(tmp_path / "set", schema, provenance={}, resume=True)
 
 
-def test_processes_write_the_same(tmp_path, make_schema, make_episode, write, load) -> None:
-    schema = make_schema()
-    episodes = [make_episode(schema, i) for i in range(6)]
-    root = write(tmp_path / "set", schema, episodes, workers=2, shard_frames=7)
-    compare(load(root), schema, episodes)
-    assert [p.name for p in tmp_path.iterdir()] == ["set"]
-
-
-def test_a_writing_process_that_dies_is_one_line(tmp_path, make_schema, make_episode, write, load) -> None:
-    schema = make_schema()
-    episodes = [make_episode(schema, i) for i in range(4)]
-    out = tmp_path / "set"
-    with DatasetWriter(out, schema, provenance={}, workers=1, shard_frames=7) as writer:
-        writer.add(episodes[:2])
-        writer.flush()
-        worker = writer._workers[0]
-        os.kill(worker._process.pid, signal.SIGKILL)  # pyright: ignore[reportAttributeAccessIssue]
-        with pytest.raises(UserError, match="a writing process ended"):
-            writer.add(episodes[2:])
-            writer.flush()
-    write(out, schema, episodes[2:], resume=True)
-    compare(load(out), schema, episodes)
-
-
 def _write(given: Path, out: Path) -> None:
     """What is killed, in a process group of its own."""
     os.setsid()

@@ -100,6 +100,16 @@ def test_discrete_actions() -> None:
     assert mapping.discrete
 
 
+def test_without_a_reward_what_learns_from_it_is_refused() -> None:
+    features = {"observation.state": VECTOR, "points": {"dtype": "float32", "shape": [1]}, "action": VECTOR}
+    assert any("no reward" in note for note in map_features(source(features)).notes)
+    with pytest.raises(UserError, match=r"no reward, which model=tdmpc2 learns from.*points") as error:
+        map_features(source(features), rewards_for="model=tdmpc2")
+    assert "\n" not in str(error.value)
+    named = {"state": "observation.state", "reward": "points"}
+    assert map_features(source(features), features=named, rewards_for="x").after == {"reward": "points"}
+
+
 def test_only_what_is_needed() -> None:
     features = {"observation.images.top": PICTURE, "observation.state": VECTOR, "action": VECTOR}
     mapping = map_features(source(features), keys=["state"])
