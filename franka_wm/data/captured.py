@@ -84,7 +84,7 @@ class CapturedSampling:
         uniform = torch.rand(sampler.candidates(size), dtype=torch.float64, device=data.device)
         # The largest product rounds up to the number of choices itself for huge buffers only; hence the bound.
         draw = torch.minimum(uniform * self._choices, self._choices - 1.0).long()
-        time, world, crossing = sampler.choose(data, draw, self._oldest, size)
+        time, world, crossing = sampler.choose(data, draw, self._oldest, self._choices / data.shape[1], size)
         storage: Any = self.replay.storage
         self._batch = storage.windows(time, world)
         if isinstance(self.replay, WindowReplay):

@@ -36,6 +36,8 @@ class WindowSampler(Sampler):
         cross_episode: Windows may go on past the end of an episode, into the next one: for losses that look at
             :data:`BOUNDARY` themselves. Then every step starts windows, also the last ones of an episode, and
             episodes shorter than a window are seen.
+        moved: Windows that would cross the end of an episode are moved to the side of it where they have more steps.
+            Else the first and the last steps of an episode are in few windows, its very first and last in one.
         before: So many steps before each window must be kept as well: for stacked images.
         marks: Steps under ``("next", "overflow")`` are in no window: contacts were lost in them.
     """
@@ -49,6 +51,7 @@ class WindowSampler(Sampler):
         length: int,
         oversample: int = OVERSAMPLE,
         cross_episode: bool = False,
+        moved: bool = False,
         before: int = 0,
         marks: bool = False,
     ):
@@ -58,6 +61,7 @@ class WindowSampler(Sampler):
         self.length = length
         self.oversample = oversample
         self.cross_episode = cross_episode
+        self.moved = moved
         self.before = before
         self.marks = marks
         self._missing: torch.Tensor | None = None
@@ -67,7 +71,7 @@ class WindowSampler(Sampler):
         worlds = storage._storage.shape[1]
         count = self.candidates(batch_size)
         draw = torch.randint(span * worlds, (count,), device=storage._storage.device)
-        time, world, crossing = self.choose(storage._storage, draw, oldest, batch_size)
+        time, world, crossing = self.choose(storage._storage, draw, oldest, span, batch_size)
         if crossing is not None:
             self.record_missing(crossing)
         return (time, world), {}
@@ -98,7 +102,12 @@ class WindowSampler(Sampler):
         return self.oversample * batch_size + 64 if self._whole or self.marks else batch_size
 
     def choose(
-        self, data: Any, draw: torch.Tensor, oldest: int | torch.Tensor, batch_size: int
+        self,
+        data: Any,
+        draw: torch.Tensor,
+        oldest: int | torch.Tensor,
+        span: int | torch.Tensor,
+        batch_size: int,
     ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor | None]:
         """The windows of a batch among the drawn ones; no operation waits for the device.
 
@@ -106,6 +115,7 @@ class WindowSampler(Sampler):
             data: The storage, (time, worlds).
             draw: (candidates,) int64, from [0, span · worlds): uniform.
             oldest: The first time that a window may start at.
+            span: How many times a window may start at.
 
         Returns:
             Time and world of each step, (batch_size, length) both, and which windows cross an episode's start, or have
@@ -113,13 +123,17 @@ class WindowSampler(Sampler):
             ``None`` where all may.
         """
         (capacity, worlds), device = data.shape[:2], draw.device
-        world = draw % worlds
-        time = (torch.div(draw, worlds, rounding_mode="floor").unsqueeze(1) + oldest
-                + torch.arange(self.length, device=device)) % capacity  # fmt: skip
+        world, start = draw % worlds, torch.div(draw, worlds, rounding_mode="floor")
+        steps = torch.arange(self.length, device=device)
+        time = (start.unsqueeze(1) + oldest + steps) % capacity
         crossing = None
         if self._whole:
-            starts = data.get(BOUNDARY)[time[:, 1:], world.unsqueeze(1)]
-            crossing = starts.flatten(1).any(1)
+            starts = data.get(BOUNDARY)[time[:, 1:], world.unsqueeze(1)].flatten(1)
+            if self.moved:
+                start = self._moved(start, starts, span)
+                time = (start.unsqueeze(1) + oldest + steps) % capacity
+                starts = data.get(BOUNDARY)[time[:, 1:], world.unsqueeze(1)].flatten(1)
+            crossing = starts.any(1)
         if self.marks:
             lost = data.get(OVERFLOW)[time, world.unsqueeze(1)].flatten(1).any(1)
             crossing = lost if crossing is None else crossing | lost
@@ -128,6 +142,15 @@ class WindowSampler(Sampler):
             order = torch.sort(crossing, stable=True).indices[:batch_size]
             time, world, crossing = time[order], world[order], crossing[order]
         return time, world.unsqueeze(1).expand_as(time), crossing
+
+    def _moved(self, start: torch.Tensor, starts: torch.Tensor, span: int | torch.Tensor) -> torch.Tensor:
+        """Where windows (n,) with these starts of episodes after their first step (n, length - 1) begin instead.
+
+        Where an episode starts if they have more of it than of the one before, else where they end with that one.
+        """
+        before = starts.long().argmax(1) + 1  # steps of the episode that it begins in
+        moved = torch.where(2 * before <= self.length, start + before, start + before - self.length)
+        return torch.where(starts.any(1) & (moved >= 0) & (moved < span), moved, start)
 
     def record_missing(self, crossing: torch.Tensor) -> None:
         """Keeps in mind whether a batch holds windows that are not whole, for :meth:`check`."""
@@ -234,6 +257,7 @@ def make_replay(
     batch_size: int,
     device: torch.device | str,
     cross_episode: bool = False,
+    moved: bool = False,
     frame_stack: int = 1,
     stacked: Sequence[str] = (),
     hindsight: Hindsight | None = None,
@@ -251,6 +275,7 @@ def make_replay(
         batch_size: Windows per sample.
         device: Where everything lives.
         cross_episode: Windows may go on past the end of an episode, see :class:`WindowSampler`.
+        moved: Windows are moved into an episode, see there.
         frame_stack: Images in each observation under ``stacked``, as ``env.frame_stack``: each is kept once, and
             samples have stacks again.
         stacked: Keys of such observations.
@@ -272,7 +297,7 @@ def make_replay(
         )
     writer = RoundRobinWriter()
     oversample = WindowSampler.OVERSAMPLE
-    if window <= episode_length < 2 * window:
+    if window <= episode_length < 2 * window and not moved:
         oversample = math.ceil(oversample * episode_length / (episode_length - window + 1))
     storage = ImageStorage(
         steps * num_envs,
@@ -292,6 +317,7 @@ def make_replay(
             length=window,
             oversample=oversample,
             cross_episode=cross_episode,
+            moved=moved,
             before=before,
             marks=marks,
         ),

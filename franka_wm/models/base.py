@@ -57,6 +57,9 @@ class WorldModel(nn.Module):
     """Whether actions are numbers of discrete actions (...) int64, chosen by tree search."""
     cross_episode: bool = False
     """Whether `loss` takes windows that go on past the end of an episode."""
+    moved_windows: bool = False
+    """Whether its windows are so long that the first and last steps of episodes would be in few of them: windows that
+    would cross the end of an episode are moved into it."""
     replay_keys: tuple[str, ...] = ()
     """Entries that the acting policy writes and `loss` reads."""
     pretrained: bool = False

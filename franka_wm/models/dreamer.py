@@ -78,6 +78,7 @@ class Dreamer(ActorCritic):
         ValueError: a size or coefficient that cannot work, or nothing to read.
     """
 
+    moved_windows = True
     ranges: ClassVar[Mapping[str, Bounds]] = {
         **dict.fromkeys(("action_dim", "deter_dim", "hidden_dim", "codes", "blocks"), POSITIVE),
         **dict.fromkeys(("channels", "imagination"), POSITIVE),

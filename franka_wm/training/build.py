@@ -418,6 +418,7 @@ def make_replay_buffer(
         batch_size=run.replay.batch_size,
         device=device,
         cross_episode=run.crosses_episodes,
+        moved=run.model.family.moved_windows,
         frame_stack=run.env.frame_stack,
         stacked=("pixels", *(f"pixels_{camera}" for camera in cameras)) if run.env.frame_stack > 1 else (),
         hindsight=hindsight,

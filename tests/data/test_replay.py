@@ -59,6 +59,47 @@ def whole_windows(first: int, last: int, window: int) -> set[tuple[int, int]]:
     }
 
 
+@pytest.mark.parametrize(("window", "length"), [(4, 12), (6, 9), (8, 8)])
+def test_moved_windows_show_the_ends_of_episodes_as_often(window: int, length: int) -> None:
+    """Also where the buffer has wrapped around; else the first and the last step would be in one window."""
+    torch.manual_seed(0)
+    lengths, steps = (length,) * WORLDS, 40 * length
+    options = {"capacity": steps * WORLDS, "num_envs": WORLDS, "window": window, "device": "cpu"}
+    replay = make_replay(**options, batch_size=600, episode_length=length, moved=True)  # type: ignore[arg-type]
+    replay.extend(experience(steps, lengths=lengths))
+    replay.extend(
+        experience(5 * length + 1, start=steps, lengths=lengths)
+    )  # by a number of episodes that is not whole
+    seen = torch.zeros(length)
+    for _ in range(40):
+        sample = replay.sample()
+        assert (sample["episode"] == sample["episode"][:, :1]).all()
+        assert (sample["time"] == sample["time"][:, :1] + torch.arange(window)).all()
+        assert (sample["time"] > 5 * length).all()
+        seen += (sample["time"] % length).flatten().bincount(minlength=length)
+    # A half of the windows across each end is moved to either side of it.
+    starts = torch.arange(length)
+    over = (starts + window - length).clamp_min(0)  # steps in the next episode
+    moved = torch.where(2 * (window - over) <= window, 0, length - window)
+    start = torch.where(over > 0, moved, starts)
+    expected = (start.unsqueeze(1) + torch.arange(window)).flatten().bincount(minlength=length)
+    assert expected.min() >= 0.3 * expected.max()
+    share = expected / expected.sum()
+    assert (seen / seen.sum() - share).abs().max() < 0.1 * share.min()
+
+
+def test_a_graph_moves_windows_by_tensors_alike() -> None:
+    replay = make_replay(capacity=300, num_envs=WORLDS, window=4, batch_size=9, device="cpu", moved=True)
+    replay.extend(experience(100, lengths=(9,) * WORLDS))
+    sampler, storage = replay.sampler, replay.storage
+    assert isinstance(sampler, WindowSampler)
+    span, oldest = sampler.bounds(storage)
+    draw = torch.randint(span * WORLDS, (sampler.candidates(9),))
+    held = torch.tensor(oldest), torch.tensor(span * WORLDS, dtype=torch.float64) / WORLDS
+    found = [sampler.choose(storage._storage, draw, *one, 9) for one in ((oldest, span), held)]  # type: ignore[union-attr]
+    assert all(torch.equal(a, b) for a, b in zip(*found, strict=True))  # type: ignore[arg-type]
+
+
 @pytest.mark.parametrize("window", [1, 2, 3])
 @pytest.mark.parametrize(("total", "chunk"), [(21, 7), (40, 8), (63, 9), (67, 5)])
 def test_windows(window: int, total: int, chunk: int) -> None:

@@ -33,13 +33,20 @@ def page(root) -> dict[str, set[str]]:
     return {flag: {NAMES[name.split(" (")[0].strip()] for name in who.split(",")} for flag, who in rows}
 
 
-@pytest.mark.parametrize("flag", [*ABILITIES, "discrete", "cross_episode"])
+@pytest.mark.parametrize("flag", [*ABILITIES, "discrete", "cross_episode", "moved_windows"])
 def test_the_page_tells_which_family_has_which_ability(page, flag):
     assert {name for name in NAMES.values() if getattr(models.family(name), flag)} == page[flag]
 
 
 def test_the_page_tells_of_every_ability_and_of_nothing_else(page):
-    assert set(page) == {*ABILITIES, "discrete", "cross_episode", "terminates", "replay_keys"}
+    assert set(page) == {
+        *ABILITIES,
+        "discrete",
+        "cross_episode",
+        "moved_windows",
+        "terminates",
+        "replay_keys",
+    }
     assert set(NAMES.values()) == set(models._FAMILIES)
     assert page["terminates"] == {"tdmpc2", "dreamer"}
     asking = {name for name in NAMES.values() if models.family(name).replay_keys}

@@ -258,6 +258,8 @@ def test_a_run_keeps_each_picture_of_a_stack_once(settled, random_actions) -> No
     time, world = torch.arange(2, 20).expand(4, 18), torch.arange(4).unsqueeze(1).expand(4, 18)
     assert torch.equal(replay.storage.get((time, world))["pixels"], played["pixels"][:, 2:])
     replay = build.make_replay_buffer(settled("collector.num_envs=4"), torch.device("cpu"))
+    other = build.make_replay_buffer(settled("model=dreamer"), torch.device("cpu"))
+    assert (replay.sampler.moved, other.sampler.moved) == (False, True)
     replay.extend(played.select("state", "is_init"))
     assert len(replay) == 80 and replay.sampler.before == 0
 
