@@ -29,6 +29,9 @@ TIMEOUT = timedelta(minutes=30)
 LAST_WORDS = 1.0
 """So long does the first process outlive what it refuses [s]: others that refuse the same ask its store who says so."""
 
+LOST = 75
+"""Exit status of a process that has lost another one, whose launcher says so: none of those of errors."""
+
 PIECE = 2**20
 """So much of the weights is compared at once [bytes]."""
 _WHOLE = {1: torch.uint8, 2: torch.int16, 4: torch.int32, 8: torch.int64}
@@ -163,7 +166,7 @@ def leave(status: int = 0) -> None:
     if _joined():
         sys.stdout.flush()
         sys.stderr.flush()
-        if status == 1 and is_first():
+        if status in (1, LOST) and is_first():
             time.sleep(LAST_WORDS)
         util._run_finalizers(0)  # semaphores of the replay, of which Python would tell as leaked  # pyright: ignore
         os._exit(status)

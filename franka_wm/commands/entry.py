@@ -318,11 +318,11 @@ def fail(message: str) -> NoReturn:
 
 
 def fail_by(error: FrankaError) -> NoReturn:
-    """The same by what ended a run. Of a process that has lost another one the launcher tells, where it is ours."""
+    """The same by what ended a run; that a process has lost another one, our launcher says better, where it waits."""
     from franka_wm import processes
 
     if isinstance(error, processes.LostAnother) and several.LAUNCHER in os.environ:
-        processes.leave(1)
+        processes.leave(processes.LOST)
     fail(str(error))
 
 

@@ -124,9 +124,17 @@ def launch_verb(command: list[str], gpus: int, device: str, advice: Callable[[],
     except SignalException as stopped:  # the processes have saved, and said so
         sys.exit(INTERRUPTED if stopped.sigval == signal.SIGINT else 128 + stopped.sigval)
     except ChildFailedError as error:
-        rank, failure = min(error.failures.items(), key=lambda one: one[1].timestamp)
-        if failure.exitcode >= 0:  # it has said why
-            sys.exit(failure.exitcode)
+        from franka_wm.processes import LOST
+
+        # One that was killed says nothing; one that has lost another leaves it to this place; others have said why.
+        failures = sorted(error.failures.items(), key=lambda one: one[1].timestamp)
+        killed = [one for one in failures if one[1].exitcode < 0]
+        said = [one[1].exitcode for one in failures if one[1].exitcode not in (LOST, *range(-64, 0))]
+        if said and not killed:
+            sys.exit(said[0])
+        if not killed:
+            raise UserError(f"the processes of the run have lost one another; {advice()}") from None
+        rank, failure = killed[0]
         raise UserError(
             f"process {rank} of the run (pid {failure.pid}) was ended by {failure.signal_name()}, the others with it; "
             f"{advice()}"

@@ -281,6 +281,44 @@ def test_the_next_job_of_a_sweep_finds_the_environment_as_it_was(mine, monkeypat
     assert seen[0]["PYTHONPATH"] == seen[1]["PYTHONPATH"] and all(one[several.LAUNCHER] for one in seen)
 
 
+@pytest.mark.parametrize(
+    ("ended", "says"),
+    [
+        ({0: processes.LOST, 1: -9}, "process 1 of the run .* was ended by SIGKILL.*; go on"),
+        ({0: processes.LOST, 1: processes.LOST}, "have lost one another; go on"),
+        ({0: processes.LOST, 1: 1}, None),  # it has said why
+    ],
+)
+def test_the_launcher_tells_of_what_nobody_could_say(ended, says, monkeypatch) -> None:
+    from torch.distributed.elastic.multiprocessing import errors
+    from torch.distributed.launcher import api
+
+    def failure(rank: int, status: int) -> errors.ProcessFailure:
+        return errors.ProcessFailure(local_rank=rank, pid=7, exitcode=status, error_file="none")
+
+    def elastic_launch(config, program):
+        def fails(*_: str) -> None:
+            raise errors.ChildFailedError("train", {rank: failure(rank, s) for rank, s in ended.items()})
+
+        return fails
+
+    monkeypatch.setattr(api, "elastic_launch", elastic_launch)
+    with pytest.raises(SystemExit if says is None else UserError, match=says or "1"):
+        several.launch_verb(["train"], 2, "cpu", lambda: "go on")
+
+
+def test_a_process_that_has_lost_another_leaves_the_word_to_its_launcher(monkeypatch, capsys) -> None:
+    left = []
+    monkeypatch.setattr(processes, "leave", left.append)
+    for launched in (True, False):
+        with monkeypatch.context() as patched:
+            patched.setenv(several.LAUNCHER, "1") if launched else patched.delenv(several.LAUNCHER, False)
+            with pytest.raises(SystemExit):
+                entry.fail_by(processes.LostAnother("process 0 has lost another one"))
+        assert (left.pop() == processes.LOST) if launched else not left
+        assert "has lost another one" in capsys.readouterr().err
+
+
 def _exchanged(x: torch.Tensor, other: int) -> torch.Tensor:
     """`x` with its first entry in the place of another one."""
     x = x.clone()
