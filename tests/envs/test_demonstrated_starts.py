@@ -11,17 +11,9 @@ from franka_wm.envs import FrankaConfig, FrankaEnv
 from franka_wm.envs.scene import Articulated, Body, Scene, Table
 from franka_wm.envs.simulation.demonstrated import READS
 from franka_wm.policies.expert import ExpertPolicy
+from presets import LIFT
 
-PRESET: dict[str, Any] = {
-    "task": "lift",
-    "observations": ("state", "joint_target", "objects"),
-    "substeps": 4,
-    "pose_noise": 0.02,
-    "action_scale": 0.085,
-    "limit_velocity": True,
-    "gravity_compensation": True,
-    "episode_length": 40,
-}
+PRESET = LIFT | {"episode_length": 40}
 ROOM = Scene(
     objects=(Body(name="cube", at=(0.45, 0.03), spread=(0.0, 0.02)),),
     articulated=(

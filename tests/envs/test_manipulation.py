@@ -19,18 +19,10 @@ from franka_wm.errors import UserError
 from franka_wm.evaluation.closed_loop import play_episodes
 from franka_wm.policies.expert import ExpertPolicy
 from franka_wm.training.settings import RunSettings
+from presets import LIFT
 
 OBSERVED = ("state", "joint_target", "objects", "contacts")
-PRESET = {
-    "task": "lift",
-    "observations": OBSERVED,
-    "substeps": 4,
-    "pose_noise": 0.02,
-    "action_scale": 0.085,
-    "limit_velocity": True,
-    "gravity_compensation": True,
-    "episode_length": 60,
-}
+PRESET = LIFT | {"observations": OBSERVED}
 CUBE = Body(name="cube", at=(0.5, 0.0))
 
 

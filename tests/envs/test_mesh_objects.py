@@ -17,17 +17,8 @@ from franka_wm.envs.scene import Body, Obstacle, Scene
 from franka_wm.errors import UserError
 from franka_wm.evaluation.closed_loop import play_episodes
 from franka_wm.policies.expert import ExpertPolicy
+from presets import LIFT
 
-PRESET: dict[str, Any] = {
-    "task": "lift",
-    "observations": ("state", "joint_target", "objects"),
-    "substeps": 4,
-    "pose_noise": 0.02,
-    "action_scale": 0.085,
-    "limit_velocity": True,
-    "gravity_compensation": True,
-    "episode_length": 60,
-}
 DRAWN: dict[str, Any] = {"at": (0.5, 0.0), "spread": (0.10, 0.15), "turn": math.pi / 4}
 LEGS = (0.06, 0.04, 0.03)
 
@@ -82,7 +73,7 @@ def mesh(files: Path, file: str, *, scale: float = 0.001, **more: Any) -> Body:
 
 def make(scene: Scene, num_envs: int = 2, *, seed: int = 1, **changes: Any) -> FrankaEnv:
     return FrankaEnv(
-        FrankaConfig(**(PRESET | {"scene": scene} | changes)), num_envs=num_envs, device="cpu", seed=seed
+        FrankaConfig(**(LIFT | {"scene": scene} | changes)), num_envs=num_envs, device="cpu", seed=seed
     )
 
 

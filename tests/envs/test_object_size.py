@@ -15,17 +15,8 @@ from franka_wm.errors import UserError
 from franka_wm.evaluation.closed_loop import play_episodes
 from franka_wm.policies.expert import ExpertPolicy
 from franka_wm.training.settings import RunSettings
+from presets import LIFT
 
-PRESET: dict[str, Any] = {
-    "task": "lift",
-    "observations": ("state", "joint_target", "objects"),
-    "substeps": 4,
-    "pose_noise": 0.02,
-    "action_scale": 0.085,
-    "limit_velocity": True,
-    "gravity_compensation": True,
-    "episode_length": 60,
-}
 WIDTH = 0.3
 ROOM = Scene(
     objects=(
@@ -39,7 +30,7 @@ HALVES = torch.tensor([0.02, 0.03, 0.04, 0.02])
 
 
 def make(num_envs: int, *, seed: int = 0, size: float = WIDTH, **changes: Any) -> FrankaEnv:
-    values = PRESET | {"scene": ROOM} | changes
+    values = LIFT | {"scene": ROOM} | changes
     ranges = {"object_size": size} | values.pop("randomization", {})
     return FrankaEnv(FrankaConfig(**values, randomization=ranges), num_envs=num_envs, device="cpu", seed=seed)
 

@@ -18,17 +18,8 @@ from franka_wm.evaluation.closed_loop import play_episodes
 from franka_wm.live.objects import move_object
 from franka_wm.policies.expert import ExpertPolicy
 from franka_wm.training.settings import RunSettings
+from presets import LIFT
 
-PRESET: dict[str, Any] = {
-    "task": "lift",
-    "observations": ("state", "joint_target", "objects"),
-    "substeps": 4,
-    "pose_noise": 0.02,
-    "action_scale": 0.085,
-    "limit_velocity": True,
-    "gravity_compensation": True,
-    "episode_length": 60,
-}
 WIDTH, TOP = 0.08, 0.02
 CHEST = {"name": "chest", "kind": "drawer", "size": (0.2, 0.2, 0.2), "travel": 0.1, "at": (0.6, -0.4)}
 ROOM = Scene(
@@ -44,7 +35,7 @@ LOOK: dict[str, Any] = {
 
 
 def make(num_envs: int, *, height: float = WIDTH, **changes: Any) -> FrankaEnv:
-    values = PRESET | {"scene": ROOM} | changes
+    values = LIFT | {"scene": ROOM} | changes
     ranges = {"table_height": height} | values.pop("randomization", {})
     return FrankaEnv(FrankaConfig(**values, randomization=ranges), num_envs=num_envs, device="cpu", seed=0)
 
