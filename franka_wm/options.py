@@ -212,7 +212,7 @@ def read[T](cls: type[T], values: Any, prefix: str) -> T:
 
 def leaves(values: object, name: str = "") -> dict[str, Any]:
     """``{"env.fps": 20, …}`` of nested values; lists and empty mappings are values."""
-    if not isinstance(values, Mapping) or not values:
+    if not isinstance(values, Mapping) or (name and not values):
         return {name: values}
     nested = [leaves(value, f"{name}.{key}" if name else str(key)) for key, value in values.items()]
     return {key: value for one in nested for key, value in one.items()}

@@ -381,12 +381,11 @@ def _together(what: Any) -> None:
     try:
         what()
     except RuntimeError as error:
-        if isinstance(error, torch.OutOfMemoryError):
+        if isinstance(error, torch.OutOfMemoryError) or "CUDA error" in str(error):
             raise
         why = str(error).splitlines()[0][:120]
         raise LostAnother(
-            f"process {os.environ.get('RANK', 0)} has lost another one of this run ({why}); what was saved is whole: "
-            "go on with resume=FOLDER, and collect with resume=true"
+            f"process {os.environ.get('RANK', 0)} has lost another one of this run ({why}); what was saved is whole"
         ) from error
 
 

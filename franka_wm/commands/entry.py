@@ -321,9 +321,11 @@ def fail_by(error: FrankaError) -> NoReturn:
     """The same by what ended a run; that a process has lost another one, our launcher says better, where it waits."""
     from franka_wm import processes
 
-    if isinstance(error, processes.LostAnother) and several.LAUNCHER in os.environ:
+    if isinstance(error, processes.LostAnother) and several.TOLD in os.environ:
+        Path(os.environ[several.TOLD]).write_text(str(error), encoding="utf-8")
         processes.leave(processes.LOST)
-    fail(str(error))
+    lost = isinstance(error, processes.LostAnother)
+    fail(f"{error}{': go on with resume=FOLDER, and collect with resume=true' if lost else ''}")
 
 
 def with_scale(arguments: list[str], stream: TextIO | None = None, *, quiet: bool = False) -> list[str]:

@@ -15,6 +15,7 @@ import uuid
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any, NoReturn
 
 from omegaconf import DictConfig
 
@@ -32,6 +33,8 @@ SAVING = 1800
 """How long processes that were asked to stop may take to save [s]."""
 LAUNCHER = "FRANKA_WM_LAUNCHER"
 """Process ID of the one that has started those of a job on this host by ``gpus=N``."""
+TOLD = "FRANKA_WM_LOST"
+"""The file where its processes say that they have lost another one: it knows better why."""
 JOB = "FRANKA_WM_JOB"
 """In the environment of a process: it is one of several of a sweep's job, whose folder this is."""
 
@@ -90,7 +93,7 @@ def launch_verb(command: list[str], gpus: int, device: str, advice: Callable[[],
 
     Raises:
         UserError: This host has fewer GPUs, or a process was killed.
-        SystemExit: With the status of the first process that ended otherwise than well.
+        SystemExit: With the status of the first process that said why it ended otherwise than well.
     """
     _require_gpus(gpus, device)
     from torch.distributed.elastic.multiprocessing.api import DefaultLogsSpecs, SignalException
@@ -108,7 +111,8 @@ def launch_verb(command: list[str], gpus: int, device: str, advice: Callable[[],
     os.environ["PYTHONWARNINGS"] = ",".join(quiet)
     os.environ[LAUNCHER] = str(os.getpid())
     try:
-        with tempfile.TemporaryDirectory(prefix="franka_wm-") as logs, patience():
+        with tempfile.TemporaryDirectory(prefix="franka_wm-") as logs, patience() as stopped:
+            os.environ[TOLD] = told = f"{logs}/lost"
             config = LaunchConfig(
                 min_nodes=1,
                 max_nodes=1,
@@ -120,30 +124,36 @@ def launch_verb(command: list[str], gpus: int, device: str, advice: Callable[[],
                 max_restarts=0,
                 logs_specs=DefaultLogsSpecs(log_dir=logs),
             )
-            elastic_launch(config, sys.executable)("-m", "franka_wm", *command)
+            try:
+                elastic_launch(config, sys.executable)("-m", "franka_wm", *command)
+            except ChildFailedError as error:
+                own = {rank: one for rank, one in error.failures.items() if rank not in stopped}
+                _end(own or error.failures, Path(told), advice)
     except SignalException as stopped:  # the processes have saved, and said so
         sys.exit(INTERRUPTED if stopped.sigval == signal.SIGINT else 128 + stopped.sigval)
-    except ChildFailedError as error:
-        from franka_wm.processes import LOST
-
-        # One that was killed says nothing; one that has lost another leaves it to this place; others have said why.
-        failures = sorted(error.failures.items(), key=lambda one: one[1].timestamp)
-        killed = [one for one in failures if one[1].exitcode < 0]
-        said = [one[1].exitcode for one in failures if one[1].exitcode not in (LOST, *range(-64, 0))]
-        if said and not killed:
-            sys.exit(said[0])
-        if not killed:
-            raise UserError(f"the processes of the run have lost one another; {advice()}") from None
-        rank, failure = killed[0]
-        raise UserError(
-            f"process {rank} of the run (pid {failure.pid}) was ended by {failure.signal_name()}, the others with it; "
-            f"{advice()}"
-        ) from None
     finally:
-        for name in ("OMP_NUM_THREADS", "PYTHONPATH", "PYTHONWARNINGS", LAUNCHER):
-            os.environ.pop(name)
+        for name in ("OMP_NUM_THREADS", "PYTHONPATH", "PYTHONWARNINGS", LAUNCHER, TOLD):
+            os.environ.pop(name, None)
             if name in before:
                 os.environ[name] = before[name]
+
+
+def _end(failures: Mapping[int, Any], told: Path, advice: Callable[[], str]) -> NoReturn:
+    """Ends by processes that failed by themselves: that were killed, have said why, or have lost one another."""
+    from franka_wm.processes import LOST
+
+    by_time = sorted(failures.items(), key=lambda one: one[1].timestamp)
+    for rank, one in by_time:
+        if one.exitcode < 0:
+            raise UserError(
+                f"process {rank} of the run (pid {one.pid}) was ended by {one.signal_name()}, the others with it; "
+                f"{advice()}"
+            ) from None
+    said = [one.exitcode for _, one in by_time if one.exitcode != LOST]
+    if said:
+        sys.exit(said[0])
+    why = told.read_text(encoding="utf-8") if told.is_file() else "the processes have lost one another"
+    raise UserError(f"{why}; {advice()}") from None
 
 
 def refused_job(overrides: list[str]) -> str | None:
@@ -195,24 +205,28 @@ def launch_job(overrides: list[str], cfg: DictConfig, folder: Path) -> None:
 
 
 @contextmanager
-def patience() -> Iterator[None]:
+def patience() -> Iterator[set[int]]:
     """Inside, processes that are asked to stop have half an hour to save, not torchrun's 30 s.
 
     Once: who asks again does not want to wait. Nor do those wait for long that have lost one of them.
+
+    Yields those that were asked to stop, by rank: torchrun tells of how they ended as if they had failed.
     """
     from torch.distributed.elastic.multiprocessing.api import SubprocessContext
 
     before, asked = SubprocessContext._close, False
+    stopped: set[int] = set()
 
     def close(self: SubprocessContext, death_sig: signal.Signals, timeout: int = 30) -> None:
         nonlocal asked
-        live = all(one.proc.poll() is None for one in self.subprocess_handlers.values())
+        live = {rank for rank, one in self.subprocess_handlers.items() if one.proc.poll() is None}
         first, asked = not asked, True
-        before(self, death_sig, SAVING if first and live else timeout)
+        stopped.update(live if first else ())
+        before(self, death_sig, SAVING if first and len(live) == len(self.subprocess_handlers) else timeout)
 
     SubprocessContext._close = close
     try:
-        yield
+        yield stopped
     finally:
         SubprocessContext._close = before
 

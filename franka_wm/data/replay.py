@@ -18,7 +18,7 @@ from franka_wm.errors import UserError
 
 
 class WindowSampler(Sampler):
-    """Windows of consecutive steps of one episode, uniform over all such windows, at a cost of O(batch).
+    """Windows of consecutive steps of one episode, uniform over all such windows but for ``moved``, in O(batch).
 
     The storage is (time, worlds), written round-robin along time. A window starts at a uniformly drawn
     (time, world) and is kept if it neither crosses the writer's position nor contains the start of an episode
@@ -138,7 +138,7 @@ class WindowSampler(Sampler):
             lost = data.get(OVERFLOW)[time, world.unsqueeze(1)].flatten(1).any(1)
             crossing = lost if crossing is None else crossing | lost
         if crossing is not None:
-            # Stable: keeps the order of the draws, so the first batch_size whole windows are a uniform sample.
+            # Stable: keeps the order of the draws, so the first batch_size whole windows are drawn as all are.
             order = torch.sort(crossing, stable=True).indices[:batch_size]
             time, world, crossing = time[order], world[order], crossing[order]
         return time, world.unsqueeze(1).expand_as(time), crossing

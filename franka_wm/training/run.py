@@ -284,9 +284,12 @@ def start(cfg: DictConfig) -> Run:
         say(f"warning: not the goal's image alone tells where the goal is, but also {' and '.join(told)}")
     if checkpoint is not None:
         done = int(checkpoint.counters.get("updates", 0))
-        wanted = (settings.pretrain if "whole_run" in checkpoint.config else settings.trainer).updates
+        wanted = settings.trainer.updates
+        all_made = (
+            done >= wanted and "whole_run" not in checkpoint.config
+        )  # of a first stage: the second comes
         nothing = f"; trainer.updates={wanted} are made: only the run's end is done again, a larger number trains on"
-        say(f"going on from update {done} of {checkpoint.folder}{nothing if done >= wanted else ''}")
+        say(f"going on from update {done} of {checkpoint.folder}{nothing if all_made else ''}")
     run = Run(settings, folder, checkpoint, open_loggers(settings, folder))
     if _begun is not None:
         _begun = (folder, _files(folder), run.loggers)

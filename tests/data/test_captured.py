@@ -49,6 +49,22 @@ DEVICES = [
 
 
 @pytest.mark.parametrize(("device", "kind"), DEVICES)
+def test_moved_windows_of_a_growing_buffer(device: str, kind: type[CapturedSampling]) -> None:
+    """The buffer ends where an episode has just begun: a window moved into it would go on at its oldest steps."""
+    torch.manual_seed(0)
+    sizes = {"capacity": WORLDS * STEPS, "num_envs": WORLDS, "window": WINDOW, "batch_size": 256}
+    replay = make_replay(**sizes, device=device, moved=True)
+    sampling, end = kind(replay), 0
+    for until in (22, 40, 66):
+        replay.extend(experience(end, until).to(device))
+        end = until
+        for _ in range(40):
+            batch = sampling().to("cpu")
+            assert (batch["time"].diff(dim=1) == 1).all() and not batch["is_init"][:, 1:].any()
+        replay.sampler.check()
+
+
+@pytest.mark.parametrize(("device", "kind"), DEVICES)
 def test_windows_of_a_growing_buffer(device: str, kind: type[CapturedSampling]) -> None:
     """Half full, full, wrapped around: every whole window of what is there, equally often, and nothing else."""
     torch.manual_seed(0)

@@ -6,6 +6,7 @@ import os
 import signal
 import socket
 import subprocess
+import sys
 import time
 from collections.abc import Callable
 from contextlib import nullcontext
@@ -266,11 +267,12 @@ def test_the_next_job_of_a_sweep_finds_the_environment_as_it_was(mine, monkeypat
     def elastic_launch(config, program):
         return lambda *words: seen.append({name: os.environ.get(name) for name in names})
 
-    names = ("OMP_NUM_THREADS", "PYTHONPATH", several.LAUNCHER)
+    names = ("OMP_NUM_THREADS", "PYTHONPATH", "PYTHONWARNINGS", several.LAUNCHER)
     monkeypatch.setattr(api, "elastic_launch", elastic_launch)
     monkeypatch.setattr(several, "usable_cores", lambda: 8)
     monkeypatch.delenv("OMP_NUM_THREADS", raising=False)
     monkeypatch.delenv("PYTHONPATH", raising=False)
+    monkeypatch.setenv("PYTHONWARNINGS", "default")
     if mine is not None:
         monkeypatch.setenv("PYTHONPATH", mine)
     before = dict(os.environ)
@@ -279,17 +281,22 @@ def test_the_next_job_of_a_sweep_finds_the_environment_as_it_was(mine, monkeypat
         assert dict(os.environ) == before
     assert [one["OMP_NUM_THREADS"] for one in seen] == ["4", "2"]
     assert seen[0]["PYTHONPATH"] == seen[1]["PYTHONPATH"] and all(one[several.LAUNCHER] for one in seen)
+    assert seen[0]["PYTHONWARNINGS"] == "default,ignore:resource_tracker"
 
 
 @pytest.mark.parametrize(
-    ("ended", "says"),
+    ("ended", "stopped", "says"),
     [
-        ({0: processes.LOST, 1: -9}, "process 1 of the run .* was ended by SIGKILL.*; go on"),
-        ({0: processes.LOST, 1: processes.LOST}, "have lost one another; go on"),
-        ({0: processes.LOST, 1: 1}, None),  # it has said why
+        ({0: processes.LOST, 1: -9}, [], "process 1 of the run .* was ended by SIGKILL.*; go on"),
+        ({0: -15, 1: -9}, [0], "process 1 of the run .* was ended by SIGKILL.*; go on"),
+        ({0: processes.LOST, 1: processes.LOST}, [], "^process 1 has lost another one: a timeout; go on"),
+        ({0: processes.LOST, 1: -15}, [1], "^process 1 has lost another one: a timeout; go on"),
+        ({0: processes.LOST, 1: 1}, [], 1),  # it has said why
+        ({0: -15, 1: 1}, [0], 1),  # the launcher has stopped the other one
+        ({0: -15, 1: 130}, [0], 130),  # it has saved
     ],
 )
-def test_the_launcher_tells_of_what_nobody_could_say(ended, says, monkeypatch) -> None:
+def test_the_launcher_tells_of_what_nobody_could_say(ended, stopped, says, monkeypatch) -> None:
     from torch.distributed.elastic.multiprocessing import errors
     from torch.distributed.launcher import api
 
@@ -298,25 +305,50 @@ def test_the_launcher_tells_of_what_nobody_could_say(ended, says, monkeypatch) -
 
     def elastic_launch(config, program):
         def fails(*_: str) -> None:
+            if processes.LOST in ended.values():
+                Path(os.environ[several.TOLD]).write_text("process 1 has lost another one: a timeout")
             raise errors.ChildFailedError("train", {rank: failure(rank, s) for rank, s in ended.items()})
 
         return fails
 
     monkeypatch.setattr(api, "elastic_launch", elastic_launch)
-    with pytest.raises(SystemExit if says is None else UserError, match=says or "1"):
-        several.launch_verb(["train"], 2, "cpu", lambda: "go on")
+    monkeypatch.setattr(several, "patience", lambda: nullcontext(set(stopped)))
+    if isinstance(says, int):
+        with pytest.raises(SystemExit) as ends:
+            several.launch_verb(["train"], 2, "cpu", lambda: "go on")
+        assert ends.value.code == says
+    else:
+        with pytest.raises(UserError, match=says):
+            several.launch_verb(["train"], 2, "cpu", lambda: "go on")
 
 
-def test_a_process_that_has_lost_another_leaves_the_word_to_its_launcher(monkeypatch, capsys) -> None:
-    left = []
-    monkeypatch.setattr(processes, "leave", left.append)
-    for launched in (True, False):
-        with monkeypatch.context() as patched:
-            patched.setenv(several.LAUNCHER, "1") if launched else patched.delenv(several.LAUNCHER, False)
-            with pytest.raises(SystemExit):
-                entry.fail_by(processes.LostAnother("process 0 has lost another one"))
-        assert (left.pop() == processes.LOST) if launched else not left
-        assert "has lost another one" in capsys.readouterr().err
+def test_a_process_that_has_lost_another_leaves_the_word_to_its_launcher(
+    monkeypatch, capsys, tmp_path
+) -> None:
+    monkeypatch.setattr(processes, "leave", sys.exit)
+    lost = processes.LostAnother("process 0 has lost another one")
+    with pytest.raises(SystemExit) as ends:
+        entry.fail_by(lost)
+    said = capsys.readouterr().err
+    assert ends.value.code == 1 and "has lost another one: go on with resume=FOLDER" in said
+    monkeypatch.setenv(several.TOLD, str(tmp_path / "lost"))
+    with pytest.raises(SystemExit) as ends:
+        entry.fail_by(lost)
+    assert ends.value.code == processes.LOST and not capsys.readouterr().err
+    assert (tmp_path / "lost").read_text() == str(lost)
+
+
+def test_only_a_lost_process_is_one() -> None:
+    """What the device or the program did wrong has a traceback of its own."""
+    for message in ("CUDA error: an illegal memory access was encountered", "CUDA error: out of memory"):
+        with pytest.raises(RuntimeError, match="CUDA error"):
+            processes._together(partial(_fail, RuntimeError(message)))
+    with pytest.raises(processes.LostAnother, match="Connection closed by peer"):
+        processes._together(partial(_fail, RuntimeError("Connection closed by peer")))
+
+
+def _fail(error: Exception) -> None:
+    raise error
 
 
 def _exchanged(x: torch.Tensor, other: int) -> torch.Tensor:

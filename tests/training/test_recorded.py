@@ -73,13 +73,24 @@ def test_a_dataset_by_name_is_compared_as_one_in_a_folder(
     assert bool(fetched) == by_name and not [path for path in fetched if "/meta/" not in path]
 
 
-def test_a_network_that_is_lost_while_it_comes_is_one_line(hub: Hub, monkeypatch) -> None:
-    def lost(*_, **__) -> None:
-        raise httpx.ReadTimeout("The read operation timed out")
+@pytest.mark.parametrize(
+    ("error", "says"),
+    [
+        (httpx.ReadTimeout("The read operation timed out"), "the Hub cannot be reached"),
+        (
+            OSError("Consistency check failed: 3 of 5 bytes\nmore"),
+            r"cannot be fetched.*Consistency check failed",
+        ),
+    ],
+)
+def test_what_fails_while_a_dataset_comes_is_one_line(error, says: str, hub: Hub, monkeypatch) -> None:
+    def fails(*_, **__) -> None:
+        raise error
 
-    monkeypatch.setattr(huggingface_hub, "snapshot_download", lost)
-    with pytest.raises(UserError, match=r"^dataset\.repo_id=user/reach: the Hub cannot be reached"):
+    monkeypatch.setattr(huggingface_hub, "snapshot_download", fails)
+    with pytest.raises(UserError, match=rf"^dataset\.repo_id=user/reach: {says}") as refused:
         find_dataset("user/reach")
+    assert "\n" not in str(refused.value)
 
 
 def test_its_rows_follow_when_they_are_read(recorded: Path, hub: Hub) -> None:

@@ -98,7 +98,7 @@ def explained(repo_id: str) -> Iterator[None]:
         status = error.response.status_code if error.response is not None else None
         if status in (401, 403):
             raise UserError(
-                f"{repo_id}: the Hub refuses the token (status {status}); log in with a token that may write: "
+                f"{repo_id}: the Hub refuses the token (status {status}); log in with one that has the right: "
                 "hf auth login"
             ) from error
         raise UserError(f"{repo_id}: the Hub answered with status {status}; try again later") from error
@@ -106,3 +106,6 @@ def explained(repo_id: str) -> Iterator[None]:
         raise UserError(
             f"{repo_id}: the Hub cannot be reached; check the network, then run it again"
         ) from error
+    except OSError as error:
+        reason = (str(error).strip().splitlines() or [""])[0]
+        raise UserError(f"{repo_id}: cannot be fetched or sent ({type(error).__name__}: {reason})") from error

@@ -93,9 +93,13 @@ class Worker:
     def send(self, job: tuple[Any, ...]) -> None:
         try:
             self.connection.send(job)
-        except OSError as error:
-            raise self._died() from error
-        self.busy = True
+            self.busy = True
+        except OSError:
+            self.busy = False
+        # Not raised in there: it would keep the frames of the failed send, and Python 3.12 crashes as it collects
+        # their buffer.
+        if not self.busy:
+            raise self._died()
 
     def check(self) -> None:
         """Raises :class:`WorkerEnded` if the process is there no more."""

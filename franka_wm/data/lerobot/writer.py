@@ -284,12 +284,17 @@ class DatasetWriter:
             yield
         except WorkerEnded as error:
             for worker in self._workers:
-                worker.stop()  # once it has written its shard
+                worker.stop()  # with its shard written, unless that takes half a minute
             self._workers = [InProcess()]
-            if self._buffer:
-                self._dispatch()
+            also = ""
+            try:
+                if self._buffer:
+                    self._dispatch()
+            except UserError as other:
+                also = f"; what was in memory is lost: {other}"
+            more = ": collect goes on with resume=true" if self._resumable else ""
             raise UserError(
-                f"{error}; {episodes_there(self.out)} episodes are on disk: collect goes on with resume=true"
+                f"{error}{also}; {episodes_there(self.out)} episodes are on disk{more}"
             ) from error
 
     def _dispatch(self) -> None:

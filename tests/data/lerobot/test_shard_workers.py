@@ -40,23 +40,51 @@ def test_a_writing_process_that_dies_is_one_line(tmp_path, make_schema, make_epi
     compare(load(out), schema, episodes)
 
 
-@pytest.mark.parametrize("at", ["a shard", "its end"])
+@pytest.mark.parametrize("at", ["a shard", "its end", "its start"])
 def test_a_writing_process_that_dies_at_work_costs_its_shard_alone(
     at: str, tmp_path, make_schema, make_episode, load
 ) -> None:
     schema = make_schema()
-    episodes = [make_episode(schema, i) for i in range(4)]
+    episodes = [make_episode(schema, i) for i in range(5)]
     out = tmp_path / "set"
-    with DatasetWriter(out, schema, provenance={}, workers=1, shard_frames=7) as writer:
-        writer.add(episodes[:2])
+    with DatasetWriter(out, schema, provenance={}, workers=1, shard_frames=14) as writer:
+        writer.add(episodes[:2])  # a shard
         writer.flush()
         worker: Any = writer._workers[0]
+        os.kill(worker._process.pid, signal.SIGSTOP)  # what it is given now waits in its connection
+        if at == "a shard":
+            writer.add(episodes[2:])  # one that it is given, and an episode of the next one
         os.kill(worker._process.pid, signal.SIGKILL)
-        with pytest.raises(UserError, match=r"a writing process ended.*episodes are on disk"):
-            writer.finish() if at == "its end" else (writer.add(episodes[2:]), writer.flush())
+        worker._process.wait()
+        kept = 3 if at == "a shard" else 2
+        with pytest.raises(
+            UserError, match=rf"a writing process ended.*; {kept} episodes are on disk: collect"
+        ):
+            {"a shard": writer.flush, "its end": writer.finish, "its start": lambda: writer.start(wait=True)}[
+                at
+            ]()
     with DatasetWriter(out, schema, provenance={}, workers=0, resume=True) as writer:
         there = writer.keys()
-        assert {one.key for one in episodes[:2]} <= there and len(there) == episodes_there(out)
+        assert {one.key for one in episodes[:2]} <= there and len(there) == kept == episodes_there(out)
         writer.add(one for one in episodes if one.key not in there)
         writer.finish()
     assert sorted(load(out).hf_dataset.unique("episode_key")) == sorted(one.key for one in episodes)
+
+
+def test_what_cannot_be_written_here_either_is_told_with_it(
+    tmp_path, make_schema, make_episode, monkeypatch
+) -> None:
+    """An export is not gone on with, so nothing says how."""
+    episodes = [make_episode(schema := make_schema(), i) for i in range(2)]
+    options: Any = {"provenance": {}, "workers": 1, "shard_frames": 100, "resumable": False}
+    with DatasetWriter(tmp_path / "set", schema, **options) as writer:
+        writer.start(wait=True)
+        writer.add(episodes[:1])
+        worker: Any = writer._workers[0]
+        os.kill(worker._process.pid, signal.SIGKILL)
+        worker._process.wait()
+        monkeypatch.setattr("franka_wm.data.lerobot.shard_workers._do", lambda *_: "no room on the disk")
+        with pytest.raises(
+            UserError, match=r"ended.*memory is lost: writing failed: no room.*0 episodes are on disk$"
+        ):
+            writer.add(episodes[1:])
