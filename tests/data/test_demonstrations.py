@@ -77,7 +77,7 @@ def test_windows_are_uniform_over_those_within_an_episode() -> None:
 
 
 def test_an_episode_shorter_than_a_window_is_no_demonstration() -> None:
-    for window in (6, 12, 13, 30):  # all of them together have 12 steps
+    for window in (6, 12, 13, 15, 30):  # all of them together have 12 steps
         with pytest.raises(UserError, match=f"no demonstration has {window} steps"):
             Demonstrations(steps(0, LENGTHS), window=window, most=4)
 
