@@ -318,7 +318,7 @@ def fail(message: str) -> NoReturn:
 
 
 def fail_by(error: FrankaError) -> NoReturn:
-    """The same by what ended a run; that a process has lost another one, our launcher says better, where it waits."""
+    """As :func:`fail`, by what ended a run; that it lost another process is left to our launcher, if that waits."""
     from franka_wm import processes
 
     if isinstance(error, processes.LostAnother) and several.TOLD in os.environ:

@@ -20,17 +20,9 @@ from franka_wm.errors import UserError
 from franka_wm.evaluation.closed_loop import play_episodes
 from franka_wm.policies.expert import ExpertPolicy
 from franka_wm.training.settings import RunSettings
+from presets import GRIPPER
 
 OBSERVED = ("state", "joint_target", "objects", "goal")
-PRESET = {
-    "observations": ("state", "joint_target", "objects"),
-    "substeps": 4,
-    "pose_noise": 0.02,
-    "action_scale": 0.085,
-    "limit_velocity": True,
-    "gravity_compensation": True,
-    "episode_length": 60,
-}
 ROOM = Scene(
     objects=(Body(name="cube", at=(0.45, 0.03), spread=(0.0, 0.02)),),
     articulated=(
@@ -51,7 +43,7 @@ ROOM = Scene(
 
 def make(num_envs: int, task: str = "drawer", *, seed: int = 0, **changes) -> FrankaEnv:
     return FrankaEnv(
-        FrankaConfig(**(PRESET | {"task": task} | changes)), num_envs=num_envs, device="cpu", seed=seed
+        FrankaConfig(**(GRIPPER | {"task": task} | changes)), num_envs=num_envs, device="cpu", seed=seed
     )
 
 
@@ -356,7 +348,7 @@ CHEST = {"name": "chest"}
 )
 def test_what_cannot_be_is_said_in_one_line(changes: dict, said: str) -> None:
     with pytest.raises(UserError) as caught:
-        FrankaConfig(**(PRESET | {"task": "drawer"} | changes))
+        FrankaConfig(**(GRIPPER | {"task": "drawer"} | changes))
     assert said in str(caught.value) and "\n" not in str(caught.value)
 
 

@@ -16,6 +16,7 @@ from franka_wm.envs import FrankaConfig, FrankaEnv
 from franka_wm.envs.scene import ArticulatedFile, Scene
 from franka_wm.evaluation.closed_loop import play_episodes
 from franka_wm.policies.expert import ExpertPolicy
+from presets import GRIPPER
 
 TABLE = {"size": [1.5, 1.4, 0.05], "at": [0.55, 0.0, 0.0]}
 OBSERVED = ("state", "joint_target", "objects", "goal")
@@ -39,18 +40,8 @@ def body(file: str, **changes) -> ArticulatedFile:
 
 
 def config(one: ArticulatedFile, **changes) -> FrankaConfig:
-    preset = {
-        "task": "drawer",
-        "scene": Scene.of({"table": TABLE, "articulated": [one]}),
-        "observations": ("state", "joint_target", "objects"),
-        "substeps": 4,
-        "pose_noise": 0.02,
-        "action_scale": 0.085,
-        "limit_velocity": True,
-        "gravity_compensation": True,
-        "episode_length": 60,
-    }
-    return FrankaConfig(**(preset | changes))
+    scene = Scene.of({"table": TABLE, "articulated": [one]})
+    return FrankaConfig(**(GRIPPER | {"task": "drawer", "scene": scene} | changes))
 
 
 def make(one: ArticulatedFile, num_envs: int = 2, **changes) -> FrankaEnv:

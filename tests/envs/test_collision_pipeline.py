@@ -14,23 +14,14 @@ from franka_wm.envs.scene import Articulated, Body, Scene
 from franka_wm.errors import UserError
 from franka_wm.evaluation.closed_loop import play_episodes
 from franka_wm.policies.expert import ExpertPolicy
+from presets import LIFT
 
 OBSERVED = ("state", "joint_target", "objects", "contacts")
 CUBE = Body(name="cube", at=(0.5, 0.0), spread=(0.1, 0.15), turn=math.pi / 4)
 
 
 def make(num_envs: int = 2, *, seed: int = 0, **changes) -> FrankaEnv:
-    values = {
-        "task": "lift",
-        "observations": OBSERVED,
-        "substeps": 4,
-        "pose_noise": 0.02,
-        "action_scale": 0.085,
-        "limit_velocity": True,
-        "gravity_compensation": True,
-        "episode_length": 60,
-        "collision_pipeline": "newton",
-    }
+    values = LIFT | {"observations": OBSERVED, "collision_pipeline": "newton"}
     return FrankaEnv(FrankaConfig(**(values | changes)), num_envs=num_envs, device="cpu", seed=seed)
 
 

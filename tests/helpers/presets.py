@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-LIFT: dict[str, Any] = {
-    "task": "lift",
+GRIPPER: dict[str, Any] = {
     "observations": ("state", "joint_target", "objects"),
     "substeps": 4,
     "pose_noise": 0.02,
@@ -14,4 +13,6 @@ LIFT: dict[str, Any] = {
     "gravity_compensation": True,
     "episode_length": 60,
 }
-"""Of ``env=lift``, with fewer substeps."""
+"""What the presets of tasks with a gripper share, with fewer substeps."""
+
+LIFT = {"task": "lift"} | GRIPPER

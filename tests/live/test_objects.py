@@ -17,17 +17,9 @@ from franka_wm.errors import UserError
 from franka_wm.live.session import Session
 from franka_wm.policies.expert import ExpertPolicy
 from franka_wm.policies.scripted import NoopPolicy
+from presets import GRIPPER
 
-STACK: dict[str, Any] = {
-    "task": "stack",
-    "observations": ("state", "joint_target", "objects"),
-    "substeps": 4,
-    "pose_noise": 0.02,
-    "action_scale": 0.085,
-    "limit_velocity": True,
-    "gravity_compensation": True,
-    "episode_length": 1_000_000,
-}
+STACK = GRIPPER | {"task": "stack", "episode_length": 1_000_000}
 ELSEWHERE = (0.42, -0.12, 0.02)
 CAMERA = {
     "type": "ViewerCameraMessage", "wxyz": [1, 0, 0, 0], "position": [1, 1, 1], "look_at": [0, 0, 0],
