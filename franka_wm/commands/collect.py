@@ -67,7 +67,7 @@ def collect(gpus: int, overrides: Sequence[str], **options: Any) -> int:
 
     Ctrl-C stops and leaves a dataset of the whole episodes so far.
     """
-    from franka_wm.commands import several
+    from franka_wm.commands import launching, several
     from franka_wm.data.lerobot.writer import check_out
 
     if several.started_by_torchrun():
@@ -77,7 +77,7 @@ def collect(gpus: int, overrides: Sequence[str], **options: Any) -> int:
         return _collect(overrides, **options)
     check_policy(options["policy"], options["checkpoint"], overrides, noise=options["noise"])
     _require_worlds(options["num_envs"] or options["episodes"], gpus)
-    several.launch_verb(
+    launching.launch_verb(
         ["collect", *_typed()], gpus, _device(overrides), lambda: "collect goes on with resume=true"
     )
     return 0

@@ -22,7 +22,7 @@ from omegaconf import DictConfig, ListConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from franka_wm import conf
-from franka_wm.commands import several
+from franka_wm.commands import launching, several
 from franka_wm.commands.overrides import compose, explain, given
 from franka_wm.commands.sweep import Sweep, jobs, names
 from franka_wm.console import program, quoted, resuming, say, terminal_log
@@ -157,7 +157,7 @@ def _launched(flags: list[str], overrides: list[str], multirun: bool) -> bool:
     try:
         gpus, device = several.wanted(overrides)
         if gpus > 1:
-            several.launch(flags, overrides, gpus, device)
+            launching.launch(flags, overrides, gpus, device)
     except FrankaError as error:
         fail(str(error))
     return gpus > 1
@@ -399,7 +399,7 @@ def check_sweep(overrides: list[str]) -> Sweep:
     except FrankaError as error:
         fail(str(error))
     for name, job in zip(names(found), found, strict=True):
-        problem = check_command(job.overrides, job.folder) or several.refused_job(job.overrides)
+        problem = check_command(job.overrides, job.folder) or launching.refused_job(job.overrides)
         if problem is not None:
             fail(f"{name}: {problem}")
     return Sweep(names(found), [job.folder for job in found])

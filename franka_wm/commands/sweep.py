@@ -18,7 +18,7 @@ from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 
 from franka_wm import conf
-from franka_wm.commands import several
+from franka_wm.commands import launching, several
 from franka_wm.console import log_anew, say
 from franka_wm.errors import REFUSALS, FrankaError, UserError, machine_refused
 from franka_wm.interrupt import INTERRUPTED, interruptible
@@ -141,7 +141,7 @@ class Sweep:
             if cfg.gpus == 1:
                 return main(cfg)
             paths = [one for one in told.overrides.hydra if one.startswith("hydra.searchpath=")]
-            several.launch_job([*told.overrides.task, *paths], cfg, folder)
+            launching.launch_job([*told.overrides.task, *paths], cfg, folder)
             return _score(folder)
         except (KeyboardInterrupt, SystemExit):  # the latter is how a run ends that has saved after Ctrl-C
             if beside_others:

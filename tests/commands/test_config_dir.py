@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 from omegaconf import OmegaConf
 
-from franka_wm.commands import entry, several
+from franka_wm.commands import entry, launching, several
 from franka_wm.commands import sweep as sweeps
 from franka_wm.commands.sweep import Sweep
 
@@ -36,7 +36,7 @@ def test_several_processes_are_started(mine: list[str], monkeypatch: pytest.Monk
     """Those of the command again find the preset, too."""
     started = []
     monkeypatch.setattr(
-        several, "launch", lambda flags, overrides, gpus, _: started.append((overrides, gpus))
+        launching, "launch", lambda flags, overrides, gpus, _: started.append((overrides, gpus))
     )
     entry._run(lambda: pytest.fail("one process"), [*mine, "gpus=2"])
     [(overrides, gpus)] = started
@@ -78,7 +78,7 @@ def test_a_job_of_several_processes_finds_the_presets_of_its_sweep(
     )  # fmt: skip
     monkeypatch.setattr(sweeps.HydraConfig, "get", lambda: told)
     started = []
-    monkeypatch.setattr(several, "launch_job", lambda overrides, cfg, folder: started.append(overrides))
+    monkeypatch.setattr(launching, "launch_job", lambda overrides, cfg, folder: started.append(overrides))
     Sweep(["job 0"], [tmp_path / "0"]).run(
         lambda cfg: None, OmegaConf.create({"resume": None, "gpus": 2, "device": "cpu"})
     )

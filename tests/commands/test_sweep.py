@@ -19,9 +19,10 @@ from hydra.types import RunMode
 from omegaconf import OmegaConf
 
 from forks import TRAIN, Fork, script, spare, torchrun_in_fork, train_in_fork
-from franka_wm.commands import entry, several
+from franka_wm.commands import entry, launching
+from franka_wm.commands.launching import refused_job
 from franka_wm.commands.overrides import compose, explain
-from franka_wm.commands.several import refused_job, spread
+from franka_wm.commands.several import spread
 from franka_wm.errors import UserError
 from franka_wm.evaluation.results import read_result, score
 from franka_wm.training import run
@@ -306,7 +307,7 @@ def test_jobs_of_several_processes_that_cannot_be(monkeypatch: pytest.MonkeyPatc
     assert "gpus=2: this machine has 0 usable CUDA devices" in str(refused_job(several_gpus))
     assert "would take the same GPUs" in str(refused_job([*several_gpus, "hydra/launcher=joblib"]))
     assert refused_job(["scale=smoke", "gpus=2", "device=cpu"]) is None
-    monkeypatch.setattr(several, "wanted", lambda _: (2, "cuda"))  # the extra may be missing
+    monkeypatch.setattr(launching, "wanted", lambda _: (2, "cuda"))  # the extra may be missing
     assert refused_job([*several_gpus, "hydra/launcher=ray"]) is None  # its hosts may have them
 
 
@@ -327,9 +328,9 @@ def test_a_begun_job_of_several_processes_keeps_its_groups(
         monkeypatch.setattr(HydraConfig, "get", lambda: OmegaConf.create(told))
         entry.one_line_errors(began.append)(compose(command[1:]))
 
-    monkeypatch.setattr(several, "launch_verb", processes)
+    monkeypatch.setattr(launching, "launch_verb", processes)
     monkeypatch.setattr(entry, "_sweep", None)
-    several.launch_job(options, cfg, tmp_path)
+    launching.launch_job(options, cfg, tmp_path)
     command, goes_on = began
     assert command == [*options, f"hydra.run.dir={tmp_path}"] and goes_on.resume == str(tmp_path)
     assert "a run has left its weights there" in str(entry.check_command(command))  # not of a sweep

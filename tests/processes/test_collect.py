@@ -13,7 +13,7 @@ import pytest
 import torch
 
 from forks import module, spare, torchrun, torchrun_in_fork
-from franka_wm.commands import several
+from franka_wm.commands import launching
 from franka_wm.commands.main import main
 from franka_wm.data.lerobot.schema import EPISODE_KEY, SEED
 
@@ -100,7 +100,7 @@ def test_a_killed_process_ends_the_others_and_leaves_no_dataset(tmp_path) -> Non
 )
 def test_what_cannot_be_started_is_one_line(tmp_path, capsys, monkeypatch, words, says) -> None:
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
-    monkeypatch.setattr(several, "usable_cores", lambda: 2)
+    monkeypatch.setattr(launching, "usable_cores", lambda: 2)
     default = [word for word in ("device=cpu", "gpus=8") if word.split("=")[0] not in " ".join(words)]
     assert main(["collect", f"out={tmp_path}/set", *words, *default]) == 1
     said = capsys.readouterr().err

@@ -24,7 +24,7 @@ from torch.utils._python_dispatch import TorchDispatchMode
 
 from forks import Fork
 from franka_wm import processes
-from franka_wm.commands import entry, several
+from franka_wm.commands import entry, launching, several
 from franka_wm.commands.overrides import compose, given
 from franka_wm.console import quoted
 from franka_wm.data.moments import moments
@@ -222,10 +222,10 @@ def test_processes_that_shall_stop_may_take_long_to_save(monkeypatch) -> None:
         return SimpleNamespace(subprocess_handlers=dict(enumerate(SimpleNamespace(proc=one) for one in proc)))
 
     for processes_of_job in ([ended(None, None)] * 2, [ended(None, -9)]):
-        with several.patience():
+        with launching.patience():
             for one in processes_of_job:
                 SubprocessContext._close(one, 15)  # pyright: ignore[reportArgumentType]
-    assert given == [several.SAVING, 30, 30]  # who asks again, and who has lost a process, does not wait
+    assert given == [launching.SAVING, 30, 30]  # who asks again, and who has lost a process, does not wait
 
 
 @pytest.mark.parametrize("name", ["a b", "[1,2]", "it's", "{x:1}", "k=v", "end\\", "back\\'s", "ü#"])
@@ -269,7 +269,7 @@ def test_the_next_job_of_a_sweep_finds_the_environment_as_it_was(mine, monkeypat
 
     names = ("OMP_NUM_THREADS", "PYTHONPATH", "PYTHONWARNINGS", several.LAUNCHER)
     monkeypatch.setattr(api, "elastic_launch", elastic_launch)
-    monkeypatch.setattr(several, "usable_cores", lambda: 8)
+    monkeypatch.setattr(launching, "usable_cores", lambda: 8)
     monkeypatch.delenv("OMP_NUM_THREADS", raising=False)
     monkeypatch.delenv("PYTHONPATH", raising=False)
     monkeypatch.setenv("PYTHONWARNINGS", "default")
@@ -277,7 +277,7 @@ def test_the_next_job_of_a_sweep_finds_the_environment_as_it_was(mine, monkeypat
         monkeypatch.setenv("PYTHONPATH", mine)
     before = dict(os.environ)
     for gpus in (2, 4):
-        several.launch_verb(["train"], gpus, "cpu", lambda: "")
+        launching.launch_verb(["train"], gpus, "cpu", lambda: "")
         assert dict(os.environ) == before
     assert [one["OMP_NUM_THREADS"] for one in seen] == ["4", "2"]
     assert seen[0]["PYTHONPATH"] == seen[1]["PYTHONPATH"] and all(one[several.LAUNCHER] for one in seen)
@@ -312,14 +312,14 @@ def test_the_launcher_tells_of_what_nobody_could_say(ended, stopped, says, monke
         return fails
 
     monkeypatch.setattr(api, "elastic_launch", elastic_launch)
-    monkeypatch.setattr(several, "patience", lambda: nullcontext(set(stopped)))
+    monkeypatch.setattr(launching, "patience", lambda: nullcontext(set(stopped)))
     if isinstance(says, int):
         with pytest.raises(SystemExit) as ends:
-            several.launch_verb(["train"], 2, "cpu", lambda: "go on")
+            launching.launch_verb(["train"], 2, "cpu", lambda: "go on")
         assert ends.value.code == says
     else:
         with pytest.raises(UserError, match=says):
-            several.launch_verb(["train"], 2, "cpu", lambda: "go on")
+            launching.launch_verb(["train"], 2, "cpu", lambda: "go on")
 
 
 def test_a_process_that_has_lost_another_leaves_the_word_to_its_launcher(
@@ -415,9 +415,9 @@ def test_comparing_weights_takes_little_memory(monkeypatch) -> None:
 
 def test_what_to_do_after_a_killed_process_is_what_can_be_done(monkeypatch, tmp_path: Path) -> None:
     told = []
-    monkeypatch.setattr(several, "launch_verb", lambda command, gpus, device, advice: told.append(advice))
-    monkeypatch.setattr(several, "run_folder", lambda _: tmp_path)
-    several.launch([], ["scale=smoke", "device=cpu", "plugins=[mine]"], 2, "cpu")
+    monkeypatch.setattr(launching, "launch_verb", lambda command, gpus, device, advice: told.append(advice))
+    monkeypatch.setattr(launching, "run_folder", lambda _: tmp_path)
+    launching.launch([], ["scale=smoke", "device=cpu", "plugins=[mine]"], 2, "cpu")
     (advice,) = told
     assert advice() == "nothing was saved before; start it again"
     save(tmp_path / "checkpoints" / "latest")
