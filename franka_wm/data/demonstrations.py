@@ -8,7 +8,7 @@ import torch
 from tensordict import TensorDictBase
 
 from franka_wm.data.hindsight import Hindsight
-from franka_wm.data.image_storage import BOUNDARY
+from franka_wm.data.image_storage import BOUNDARY, begin_where_repeated
 from franka_wm.errors import UserError
 
 DEMONSTRATED = "demonstrated"
@@ -26,6 +26,7 @@ class Demonstrations:
     Args:
         transitions: All of them, episode after episode, (T, 1); what the replay keeps, and what `hindsight` reads.
         window: Transitions per window, H.
+        burn_in: Steps in front of each window, as in the replay's batches.
         most: How many windows of a batch are replaced at most.
         hindsight: Relabels a share of them; `None`: none.
         states: Where worlds may begin, (T,): what a simulation restores a state from; `None`: nowhere.
@@ -39,6 +40,7 @@ class Demonstrations:
         transitions: TensorDictBase,
         *,
         window: int,
+        burn_in: int = 0,
         most: int,
         hindsight: Hindsight | None = None,
         states: Any = None,
@@ -50,7 +52,7 @@ class Demonstrations:
         self._starts = within.nonzero().squeeze(1)  # waits for the device, once
         if not len(self._starts):
             raise UserError(f"no demonstration has {window} steps, as the windows of this run")
-        self._steps = torch.arange(window, device=device)
+        self._steps = torch.arange(-burn_in, window, device=device)
         self._numbers = torch.arange(most, device=device)
         self._count = torch.zeros((), dtype=torch.int64, device=device)
         self.use(most)
@@ -63,9 +65,10 @@ class Demonstrations:
         """Replaces windows of `batch` (B, H) in place, and marks them; no operation waits for the device."""
         device = self.transitions.device
         drawn = torch.randint(len(self._starts), (self.most,), device=device)
-        time = self._starts[drawn].unsqueeze(1) + self._steps
+        time = (self._starts[drawn].unsqueeze(1) + self._steps).clamp_min(0)
         world = torch.zeros_like(time)
         windows: Any = self.transitions[time, world]
+        begin_where_repeated(windows, time)
         if self.hindsight is not None:
             self.hindsight(windows, self.transitions, time, world, len(self.transitions) - 1)
         mask = self._numbers < self._count

@@ -13,7 +13,7 @@ from torchrl.data.replay_buffers import RoundRobinWriter, Sampler
 from franka_wm.data.demonstrations import Demonstrations
 from franka_wm.data.future import FutureFrames
 from franka_wm.data.hindsight import Hindsight
-from franka_wm.data.image_storage import BOUNDARY, OVERFLOW, ImageStorage
+from franka_wm.data.image_storage import BOUNDARY, OVERFLOW, ImageStorage, begin_where_repeated
 from franka_wm.errors import UserError
 
 
@@ -39,6 +39,8 @@ class WindowSampler(Sampler):
         moved: Windows that would cross the end of an episode are moved to the side of it where they have more steps.
             Else the first and the last steps of an episode are in few windows, its very first and last in one.
         before: So many steps before each window must be kept as well: for stacked images.
+        burn_in: So many steps before each window are given in front of it, of whatever episode, for a memory to begin
+            with. The oldest one that is kept stands for those that are not.
         marks: Steps under ``("next", "overflow")`` are in no window: contacts were lost in them.
     """
 
@@ -53,6 +55,7 @@ class WindowSampler(Sampler):
         cross_episode: bool = False,
         moved: bool = False,
         before: int = 0,
+        burn_in: int = 0,
         marks: bool = False,
     ):
         if length < 1 or oversample < 1:
@@ -63,6 +66,7 @@ class WindowSampler(Sampler):
         self.cross_episode = cross_episode
         self.moved = moved
         self.before = before
+        self.burn_in = burn_in
         self.marks = marks
         self._missing: torch.Tensor | None = None
 
@@ -118,9 +122,9 @@ class WindowSampler(Sampler):
             span: How many times a window may start at.
 
         Returns:
-            Time and world of each step, (batch_size, length) both, and which windows cross an episode's start, or have
-            a marked step, though they should not, (batch_size,) bool: none where there are enough whole ones,
-            ``None`` where all may.
+            Time and world of each step, (batch_size, burn_in + length) both, and which windows cross an episode's
+            start, or have a marked step, though they should not, (batch_size,) bool: none where there are enough whole
+            ones, ``None`` where all may.
         """
         (capacity, worlds), device = data.shape[:2], draw.device
         world, start = draw % worlds, torch.div(draw, worlds, rounding_mode="floor")
@@ -140,7 +144,10 @@ class WindowSampler(Sampler):
         if crossing is not None:
             # Stable: keeps the order of the draws, so the first batch_size whole windows are drawn as all are.
             order = torch.sort(crossing, stable=True).indices[:batch_size]
-            time, world, crossing = time[order], world[order], crossing[order]
+            start, time, world, crossing = start[order], time[order], world[order], crossing[order]
+        if self.burn_in:
+            earlier = start.unsqueeze(1) + torch.arange(-self.burn_in, 0, device=device)
+            time = torch.cat(((earlier.clamp_min(0) + oldest) % capacity, time), 1)
         return time, world.unsqueeze(1).expand_as(time), crossing
 
     def _moved(self, start: torch.Tensor, starts: torch.Tensor, span: int | torch.Tensor) -> torch.Tensor:
@@ -235,6 +242,8 @@ class WindowReplay(ReplayBuffer):
         No operation waits for the device.
         """
         storage = cast(Any, self.storage)
+        if cast(WindowSampler, self.sampler).burn_in:
+            begin_where_repeated(batch, time)
         if self.hindsight is not None:
             self.hindsight(batch, storage._storage, time, world, newest)
         if self.future is not None:
@@ -258,6 +267,7 @@ def make_replay(
     device: torch.device | str,
     cross_episode: bool = False,
     moved: bool = False,
+    burn_in: int = 0,
     frame_stack: int = 1,
     stacked: Sequence[str] = (),
     hindsight: Hindsight | None = None,
@@ -276,6 +286,7 @@ def make_replay(
         device: Where everything lives.
         cross_episode: Windows may go on past the end of an episode, see :class:`WindowSampler`.
         moved: Windows are moved into an episode, see there.
+        burn_in: Steps in front of each window, see there.
         frame_stack: Images in each observation under ``stacked``, as ``env.frame_stack``: each is kept once, and
             samples have stacks again.
         stacked: Keys of such observations.
@@ -319,6 +330,7 @@ def make_replay(
             cross_episode=cross_episode,
             moved=moved,
             before=before,
+            burn_in=burn_in,
             marks=marks,
         ),
         writer=writer,

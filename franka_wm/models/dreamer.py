@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any, ClassVar, Literal
+from typing import Any, ClassVar, Literal, cast
 
 import torch
 from tensordict import TensorDict, TensorDictBase
@@ -32,8 +32,8 @@ class Dreamer(ActorCritic):
     recorded rewards. The model has memory: `observe` carries z along. The defaults are the published 12 M size.
 
     Deliberate differences from the paper (docs/models/dreamer.md):
-      * A window starts with an empty memory wherever in its episode it starts, and lies within one episode. So the
-        divergences of its first step, which nothing can foresee, are left out.
+      * A window lies within one episode. Its memory comes from the `burn_in` steps before it, as the model sees them
+        now, or is empty, not from states kept in the replay; the divergences of its first step are left out.
       * `encode`, `observe` and `next` take the likeliest codes: what acts and plans is deterministic. Training draws.
       * Vectors are standardised before symlog, see `set_observation_statistics`; the default is the identity.
       * AdamW with clipped gradient norms (of model, actor and critic apart) instead of LaProp with adaptive clipping.
@@ -69,6 +69,7 @@ class Dreamer(ActorCritic):
         return_lambda: λ of the returns.
         entropy_coef: weight, against scaled advantages, of the actor's entropy [nat].
         std_min, std_max: bounds of the actor's standard deviation.
+        burn_in: steps in front of each window that `loss` takes, see there.
         actor_gradient: "reinforce", that of advantages, as published; "dynamics", that of the returns themselves,
             back through rewards, critic and imagined steps (DreamerV1, arXiv:1912.01603).
         actor_critic_lr_scale: learning rate of actor and critic relative to the model's.
@@ -88,6 +89,7 @@ class Dreamer(ActorCritic):
         ),
         **dict.fromkeys(("termination_coef", "replay_value_coef", "entropy_coef"), COEFFICIENT),
         "actor_critic_lr_scale": COEFFICIENT,
+        "burn_in": Bounds(least=0, most=1000),
         **dict.fromkeys(("discount", "unimix"), Bounds(least=0, below=1)),
         **dict.fromkeys(("tau", "scale_tau"), Bounds(above=0, most=1)),
         **dict.fromkeys(("std_min", "std_max"), Bounds(above=0, most=1e6)),
@@ -128,6 +130,7 @@ class Dreamer(ActorCritic):
         entropy_coef: float = 3e-4,
         std_min: float = 0.1,
         std_max: float = 1.0,
+        burn_in: int = 0,
         actor_gradient: Literal["reinforce", "dynamics"] = "reinforce",
         actor_critic_lr_scale: float = 1.0,
         tau: float = 0.02,
@@ -144,6 +147,7 @@ class Dreamer(ActorCritic):
         self.dynamics_coef, self.representation_coef = dynamics_coef, representation_coef
         self.decoder_coef, self.reward_coef = decoder_coef, reward_coef
         self.termination_coef, self.replay_value_coef = termination_coef, replay_value_coef
+        self.burn_in = burn_in
         self.imagination, self.return_lambda, self.entropy_coef = imagination, return_lambda, entropy_coef
         self.std_min, self.std_max, self.actor_gradient = std_min, std_max, actor_gradient
         self.actor_critic_lr_scale = actor_critic_lr_scale
@@ -237,9 +241,10 @@ class Dreamer(ActorCritic):
         In training mode the running scale of returns is updated as well.
 
         Args:
-            batch: batch size [B, H]: H contiguous transitions, all of one episode, with the observation keys,
-                `action` (B, H, A), and in `next` the observation keys, `reward` (B, H, 1) and `terminated`
-                (B, H, 1) bool.
+            batch: batch size [B, burn_in + H]: H contiguous transitions, all of one episode, with the observation keys,
+                `action` (…, A), and in `next` the observation keys, `reward` (…, 1) and `terminated` (…, 1) bool. In
+                front of them `burn_in` steps, of whatever episode, from which the memory begins; with them, `is_init`
+                (…, 1) bool of all.
 
         Returns:
             batch size []: `loss` to differentiate, and detached: `loss_dynamics` and `loss_representation` [nat, not
@@ -252,12 +257,16 @@ class Dreamer(ActorCritic):
             ValueError: the batch size is not [B, H].
         """
         check_windows(batch)
+        earlier = cast(TensorDictBase, batch[:, : self.burn_in])
+        batch = cast(TensorDictBase, batch[:, self.burn_in :])
         # Time leads from here on: (H, B, ...).
         action, reward, terminated = (
             batch.get(key).transpose(0, 1) for key in ("action", ("next", "reward"), ("next", "terminated"))
         )
         window = window_of(batch, self.observation_keys).transpose(0, 1)
-        z, posterior = self._filter(self._embed(window), action)  # (H+1, B, ...)
+        embedded = self._embed(window)
+        h = self._remember(earlier, batch[:, 0], embedded[0])
+        z, posterior = self._filter(h, embedded, action)  # (H+1, B, ...)
         model_loss, parts_of_model = self._model_loss(z, posterior, window, reward, terminated)
         imagined, actions = self._imagine(z.detach().flatten(0, 1))
         begun = torch.cat((torch.ones_like(reward[:1]), (~terminated).to(reward.dtype)))
@@ -300,9 +309,27 @@ class Dreamer(ActorCritic):
     def _see(self, h: Tensor, embedded: Tensor, *, sample: bool) -> Tensor:
         return self.rssm.state(h, self.rssm.posterior(h, embedded), sample=sample)
 
-    def _filter(self, embedded: Tensor, action: Tensor) -> tuple[Tensor, Tensor]:
-        """States (H+1, B, Z) and posteriors (H+1, B, codes, classes) of features (H+1, B, E), actions (H, B, A)."""
-        h, states, posteriors = self.rssm.begin(embedded[0]), [], []
+    def _remember(self, earlier: TensorDictBase, first: TensorDictBase, embedded: Tensor) -> Tensor:
+        """h (B, deter_dim) of a window's `first` step (B,), whose features are (B, E), after `earlier` steps (B, K).
+
+        No gradient reaches them: the burn-in of R2D2 (Kapturowski et al., 2019).
+        """
+        h = begin = self.rssm.begin(embedded)
+        if not self.burn_in:
+            return begin
+        with torch.no_grad():
+            features, is_init = self._embed(earlier), earlier.get("is_init")
+            for t in range(self.burn_in):
+                z = self._see(torch.where(is_init[:, t], begin, h), features[:, t], sample=True)
+                h = self.rssm.recur(z, earlier.get("action")[:, t])
+        return torch.where(first.get("is_init"), begin, h)
+
+    def _filter(self, h: Tensor, embedded: Tensor, action: Tensor) -> tuple[Tensor, Tensor]:
+        """States (H+1, B, Z) and posteriors (H+1, B, codes, classes) of features (H+1, B, E), actions (H, B, A).
+
+        h (B, deter_dim) is the first step's.
+        """
+        states, posteriors = [], []
         for t in range(embedded.shape[0]):
             if t:
                 h = self.rssm.recur(states[-1], action[t - 1])

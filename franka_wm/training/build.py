@@ -419,6 +419,7 @@ def make_replay_buffer(
         device=device,
         cross_episode=run.crosses_episodes,
         moved=run.model.family.moved_windows,
+        burn_in=run.burn_in,
         frame_stack=run.env.frame_stack,
         stacked=("pixels", *(f"pixels_{camera}" for camera in cameras)) if run.env.frame_stack > 1 else (),
         hindsight=hindsight,
@@ -443,6 +444,7 @@ def open_recorded(run: RunSettings, device: torch.device) -> tuple[RecordedWindo
         device=device,
         frame_stack=run.env.frame_stack,
         future=run.replay.future,
+        burn_in=run.burn_in,
         **run.of_recorded,
     )
     return train, train.validation()

@@ -57,6 +57,7 @@ def open_demonstrations(
     return Demonstrations(
         steps.exclude(*(key for key in starts if key not in wanted)),
         window=run.window,
+        burn_in=run.burn_in,
         most=most,
         hindsight=hindsight,
         states=steps.select(*starts).squeeze(1) if starts else None,

@@ -79,7 +79,9 @@ def check_memory(run: RunSettings, model: WorldModel, spaces: Spaces) -> None:
     parts = {
         "the model and its optimiser (model, size)": 16 * sum(x.numel() for x in model.parameters()),
         f"experience ({_capacity(run)})": step * min(r.capacity, steps),
-        f"a batch (replay.batch_size={r.batch_size * run.parts})": _bytes(model) * r.batch_size * run.window,
+        f"a batch (replay.batch_size={r.batch_size * run.parts})": _bytes(model)
+        * r.batch_size
+        * (run.burn_in + run.window),
         f"worlds (collector.num_envs={c.num_envs * run.parts})": c.num_envs
         * (PER_WORLD + seen * c.steps_per_batch),
         f"worlds (evaluation.episodes={e.episodes})": played * (PER_WORLD + seen),

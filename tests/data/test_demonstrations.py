@@ -32,11 +32,12 @@ def steps(first: int, lengths: tuple[int, ...]) -> TensorDict:
     return TensorDict({"x": number, "action": number, "is_init": begins, "next": after}, [total, 1])
 
 
-def mixed(device: str, demonstrations: Demonstrations | None, window: int = WINDOW) -> Any:
+def mixed(device: str, demonstrations: Demonstrations | None, window: int = WINDOW, burn_in: int = 0) -> Any:
     replay = make_replay(
         capacity=200,
         num_envs=2,
         window=window,
+        burn_in=burn_in,
         batch_size=BATCH,
         device=device,
         demonstrations=demonstrations,
@@ -64,6 +65,25 @@ def test_so_many_windows_are_demonstrations_and_they_are_marked(device: str) -> 
             assert torch.equal(batch["action"], batch["x"]) and torch.equal(
                 batch["next", "reward"], -batch["x"]
             )
+
+
+@pytest.mark.parametrize("device", DEVICES)
+def test_steps_before_a_window_come_with_it(device: str) -> None:
+    """Also across episodes, whose starts are marked; those before the first one are that one, marked."""
+    shown = Demonstrations(steps(0, LENGTHS).to(device), window=WINDOW, burn_in=2, most=BATCH)
+    replay = mixed(device, shown, burn_in=2)
+    seen = set()
+    for _ in range(6):
+        batch = draw(replay)
+        for x, is_init in zip(
+            batch["x"].flatten(1).tolist(), batch["is_init"].flatten(1).tolist(), strict=True
+        ):
+            start = int(x[2])
+            assert x == [max(0, start + k) for k in range(-2, WINDOW)]
+            repeated = [False, *(a == b for a, b in zip(x[1:], x, strict=False))]
+            assert is_init == [a in (0, 5, 8) or b for a, b in zip(x, repeated, strict=True)]
+            seen.add(start)
+    assert seen == {0, 1, 2, 5, 8, 9}
 
 
 def test_windows_are_uniform_over_those_within_an_episode() -> None:

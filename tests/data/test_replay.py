@@ -127,6 +127,26 @@ def test_windows(window: int, total: int, chunk: int) -> None:
     assert chisquare([counts[w] for w in sorted(expected)]).pvalue > 1e-3
 
 
+@pytest.mark.parametrize("total", [9, 31])
+def test_steps_before_a_window_come_with_it(total: int) -> None:
+    """Those that are not kept, any more or yet, are the oldest one, where a memory begins anew."""
+    sizes = {"capacity": 12 * WORLDS, "num_envs": WORLDS, "window": 3, "batch_size": 64, "device": "cpu"}
+    replay = make_replay(**sizes, burn_in=4, moved=True)  # type: ignore[arg-type]
+    for first in range(0, total, 7):
+        replay.extend(experience(min(7, total - first), start=first))
+    kept, seen = max(0, total - 12), 0
+    batch = replay.sample()
+    assert batch.shape == (64, 7)
+    for time, world, is_init in zip(batch["time"], batch["world"][:, 0], batch["is_init"], strict=True):
+        start = int(time[4])
+        assert time.tolist() == [max(start - k, kept) for k in (4, 3, 2, 1)] + [start, start + 1, start + 2]
+        begins = [t % (5, 3, 7)[world] == 0 for t in time.tolist()]
+        stood_for = [k > 0 and start + k - 4 <= kept for k in range(7)]
+        assert [*is_init[1:].flatten()] == [a or b for a, b in zip(begins[1:], stood_for[1:], strict=True)]
+        seen += start < kept + 4
+    assert seen  # some windows start among the oldest steps
+
+
 def test_every_last_transition_can_be_sampled() -> None:
     torch.manual_seed(0)
     replay = buffer(40, 3, 500)

@@ -86,7 +86,8 @@ def test_windows_are_filtered_as_observe_does_step_by_step(monkeypatch):
     state = model.rssm.state
     monkeypatch.setattr(model.rssm, "state", lambda h, p, *, sample: state(h, p, sample=False))
     frames = window_of(batch, model.observation_keys)
-    found, posterior = model._filter(model._embed(frames.transpose(0, 1)), batch["action"].transpose(0, 1))
+    embedded = model._embed(frames.transpose(0, 1))
+    found, posterior = model._filter(model.rssm.begin(embedded[0]), embedded, batch["action"].transpose(0, 1))
     z = model.encode(frames[:, 0])
     for t in range(5):
         if t:

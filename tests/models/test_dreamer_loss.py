@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections import defaultdict
 
+import pytest
 import torch
 from tensordict import TensorDict
 from torch import Tensor
@@ -20,12 +21,13 @@ WEIGHTS = {"dynamics": 0.7, "representation": 0.3, "decoder": 0.2, "reward": 1.5
 WEIGHTS |= {"replay_value": 0.4}
 
 
-def small() -> Dreamer:
+def small(burn_in: int) -> Dreamer:
     """Heads with random weights: rewards, values, ends and the slow critic all say something, and not the same."""
     model = Dreamer(
         observation_sizes={"state": 3, "joint_target": 2}, action_dim=2, discount=0.8, return_lambda=0.7,
         deter_dim=16, hidden_dim=16, codes=3, classes=4, blocks=2, encoder_layers=2, bins=21, imagination=K,
         value_low=-4.0, value_high=4.0, terminates=True, free_nats=0.9, entropy_coef=0.3,
+        burn_in=burn_in,
         **{f"{name}_coef": weight for name, weight in WEIGHTS.items()},
     )  # fmt: skip
     with torch.no_grad():
@@ -121,10 +123,11 @@ class Plain:
         return {name: sum(numbers) / len(numbers) for name, numbers in parts.items()}
 
 
+@pytest.mark.parametrize("burn_in", [0, 2])
 @torch.no_grad()
-def test_the_whole_loss_is_that_of_plain_loops(monkeypatch) -> None:
+def test_the_whole_loss_is_that_of_plain_loops(burn_in: int, monkeypatch) -> None:
     torch.manual_seed(3)
-    model = small().eval()
+    model = small(burn_in).eval()
     model.scale.value.fill_(2.5)
     batch = windows(batch=B, horizon=H)
     batch["next", "reward"] = torch.linspace(-1.0, 3.0, B * H).view(B, H, 1)[:, torch.randperm(H)]
@@ -136,7 +139,9 @@ def test_the_whole_loss_is_that_of_plain_loops(monkeypatch) -> None:
         monkeypatch.setattr(
             model, name, lambda *given, name=name, made=made: drawn.setdefault(name, made(*given))
         )
-    found = model.loss(batch)
+    earlier = windows(batch=B, horizon=burn_in)
+    begins = torch.zeros(B, burn_in + H, 1, dtype=torch.bool)
+    found = model.loss(torch.cat((earlier, batch), 1).set("is_init", begins))  # type: ignore[arg-type]
     (z, posterior), (imagined, actions) = drawn["_filter"], drawn["_imagine"]
     assert torch.equal(imagined[0], z.flatten(0, 1))  # a trajectory from every state of the batch
     expected = Plain(model, z, imagined, actions).losses(batch, posterior, 2.5)

@@ -46,6 +46,7 @@ def open_dataset(
     workers: int | None = None,
     frame_stack: int = 1,
     future: bool = False,
+    burn_in: int = 0,
     fps: float | None = None,
     action_dim: int | None = None,
     say: Say = print,
@@ -72,7 +73,7 @@ def open_dataset(
         in_memory: Keep everything in the device's memory, else read from the disk's cache; ``None``: where it
             takes at most half of what is free, for every process of a job, each of which calls this.
         workers: Processes that decode; ``None``: all cores.
-        frame_stack, future: See :class:`RecordedWindows`.
+        frame_stack, future, burn_in: See :class:`RecordedWindows`.
         fps, action_dim: Frames per second and size of actions of the environment that is to be acted in.
         say: Takes lines for the terminal.
 
@@ -134,6 +135,7 @@ def open_dataset(
         seed=seed,
         frame_stack=frame_stack,
         future=future,
+        burn_in=burn_in,
     )
     where = f"in {device} memory" if in_memory else "read from the disk's cache"
     size = sum(c.nbytes for c in caches)

@@ -102,6 +102,8 @@ class RecordedWindows:
         frame_stack: Images in each observation under ``pixels`` and ``pixels_…``: the present one and those before
             it in its episode, oldest first along the channels, the first one repeated (as ``env.frame_stack``).
         future: Each window also has a frame that its episode reached later, see :mod:`franka_wm.data.future`.
+        burn_in: So many steps of its episode are in front of each window, for a memory to begin with: batches are
+            (B, burn_in + H). The episode's first step stands for those before it, each time as a first one.
 
     Attributes:
         observation_sizes: Vector key → size.
@@ -125,6 +127,7 @@ class RecordedWindows:
         seed: int = 0,
         frame_stack: int = 1,
         future: bool = False,
+        burn_in: int = 0,
     ):
         for name, value in (("window", window), ("batch_size", batch_size), ("frame_stack", frame_stack)):
             whole_rule(least=1).check(name, value)
@@ -135,7 +138,7 @@ class RecordedWindows:
                 f"dataset.validation_fraction={validation_fraction!r}: must be at least 0 and below 1"
             )
         self.recording, self.seed, self.future = recording, seed, future
-        self.window, self.batch_size = window, batch_size
+        self.window, self.batch_size, self.burn_in = window, batch_size, burn_in
         self.validation_fraction = validation_fraction
         self.device = recording.device
         mapping = recording.mapping
@@ -179,7 +182,7 @@ class RecordedWindows:
         self._shift = torch.from_numpy(shift).to(self._home)
         self._first_rows = torch.from_numpy(start[useful]).to(self._home)
         self._last_rows = torch.from_numpy((start + transitions)[useful]).to(self._home)
-        self._steps = torch.arange(window + 1, device=self._home)
+        self._steps = torch.arange(-burn_in, window + 1, device=self._home)
         self._generator = torch.Generator(device=self._home).manual_seed(derive_seed("windows", seed, split))
         self._bounds = torch.tensor([0, *np.cumsum([c.arrays["action"].shape[0] for c in recording.caches])])
         if mapping.discrete:
@@ -206,7 +209,7 @@ class RecordedWindows:
         return self.recording.action_high
 
     def sample(self, batch_size: int | None = None) -> TensorDict:
-        """A batch of uniformly drawn windows, [B, H]; no wait for the device where the data lies on it.
+        """A batch of uniformly drawn windows, [B, burn_in + H]; no wait for the device where the data lies on it.
 
         Several processes draw one batch together, by the same numbers, and each takes its part.
         """
@@ -236,13 +239,13 @@ class RecordedWindows:
                 windows that have any; ``None``: half the way.
 
         Returns:
-            [B, H], on :attr:`device`.
+            [B, burn_in + H], on :attr:`device`.
         """
         indices = indices.to(self._home)
         episode = torch.searchsorted(self._ends, indices, right=True)
         first = indices + self._shift[episode]
-        rows = first.unsqueeze(1) + self._steps
-        batch, h = indices.shape[0], self.window
+        rows = torch.maximum(first.unsqueeze(1) + self._steps, self._first_rows[episode].unsqueeze(1))
+        batch, h = indices.shape[0], self.burn_in + self.window
         before, after = {}, {}
         for key in (*self.observation_sizes, *self.image_sizes):
             values = self._frames(key, rows, episode)
@@ -286,6 +289,7 @@ class RecordedWindows:
             seed=self.seed,
             frame_stack=self.frame_stack,
             future=self.future,
+            burn_in=self.burn_in,
         )
 
     def validation(self) -> RecordedWindows | None:
@@ -373,7 +377,7 @@ class RecordedWindows:
     def _gather(self, name: str, rows: Tensor) -> Tensor:
         """(B, T) rows → (B, T, …) on the device."""
         parts = self.recording.arrays[name]
-        flat = rows.reshape(-1)
+        flat = rows.reshape(-1).contiguous()
         if len(parts) == 1:
             values = parts[0].index_select(0, flat)
         else:

@@ -255,6 +255,11 @@ class RunSettings:
         """Transitions of a training window."""
         return self.model.window if self.replay.window is None else self.replay.window
 
+    @property
+    def burn_in(self) -> int:
+        """Steps in front of a training window, from which a memory begins."""
+        return self.model.options.get("burn_in", 0)
+
     def demo_windows(self, update: int) -> int:
         """How many windows of this process's batch are demonstrations at this update: its part of the job's."""
         r, total = self.replay, self.trainer.updates

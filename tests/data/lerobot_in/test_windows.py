@@ -44,6 +44,22 @@ def test_within_episodes_and_uniform(pictures: Path, opened: Callable, window: i
     assert chisquare([counts[w] for w in sorted(expected)]).pvalue > 1e-3
 
 
+@pytest.mark.parametrize("in_memory", [True, False])
+def test_steps_before_a_window_come_with_it(pictures: Path, opened: Callable, in_memory: bool) -> None:
+    """Those of its episode; before that one began, its first step, each time as a first one."""
+    windows = opened(pictures, window=3, in_memory=in_memory, keys=["joints"])
+    longer = opened(pictures, window=3, burn_in=2, in_memory=in_memory, keys=["joints"])
+    assert len(longer) == len(windows) and longer.split("all").burn_in == 2
+    alone, batch = next(windows.batches()), next(longer.batches())
+    assert batch.batch_size == (len(windows), 5)
+    assert (batch[:, 2:] == alone).all()
+    earlier, first = batch[:, :2], alone["joints"][:, 0]
+    for back, k in ((2, 0), (1, 1)):
+        assert torch.equal(earlier["joints"][:, k, 1], (first[:, 1] - back).clamp_min(0))
+        assert torch.equal(earlier["joints"][:, k, 0], first[:, 0])
+        assert torch.equal(earlier["is_init"][:, k, 0], first[:, 1] <= back)
+
+
 def test_processes_divide_each_batch(pictures: Path, opened: Callable, monkeypatch) -> None:
     """Side by side their windows, and the frames reached later, are those that one process draws."""
 

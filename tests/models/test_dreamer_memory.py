@@ -1,0 +1,81 @@
+"""The steps before a window, from which Dreamer's memory begins: as when it acts, of one episode, without gradients."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from tensordict import TensorDict
+
+from franka_wm.errors import UserError
+from franka_wm.models.dreamer import Dreamer
+from small_tdmpc2 import windows
+
+B, EARLIER, H = 4, 3, 2
+
+
+def small() -> Dreamer:
+    torch.manual_seed(0)
+    model = Dreamer(
+        observation_sizes={"state": 3, "joint_target": 2}, action_dim=2, deter_dim=16, hidden_dim=16, codes=3,
+        classes=4, blocks=2, encoder_layers=2, bins=21, imagination=2, burn_in=EARLIER,
+    )  # fmt: skip
+    with torch.no_grad():
+        model.reward_head[-1].weight.normal_()
+    return model
+
+
+def batch() -> TensorDict:
+    """Windows of one episode, of one that begins amid the steps before it, and of one that begins with it."""
+    data = windows(batch=B, horizon=EARLIER + H)
+    data["is_init"] = torch.zeros(B, EARLIER + H, 1, dtype=torch.bool)
+    data["is_init"][1, 1] = data["is_init"][2, EARLIER] = True
+    return data
+
+
+def first_memory(model: Dreamer, data: TensorDict) -> torch.Tensor:
+    first = data[:, EARLIER]
+    return model._remember(data[:, :EARLIER], first, model._embed(first))
+
+
+def test_a_windows_memory_is_that_of_acting(monkeypatch) -> None:
+    model, data = small(), batch()
+    see = model._see
+    monkeypatch.setattr(model, "_see", lambda h, embedded, sample: see(h, embedded, sample=False))
+    z = model.encode(data[:, 0])
+    for t in range(1, EARLIER + 1):
+        z = model.observe(data[:, t], z, data["action"][:, t - 1], data["is_init"][:, t])
+    torch.testing.assert_close(first_memory(model, data), z[:, :16])
+
+
+def test_codes_are_drawn_on_the_way() -> None:
+    model, data = small(), batch()
+    assert not torch.equal(first_memory(model, data)[0], first_memory(model, data)[0])
+
+
+@pytest.mark.parametrize(("window", "since"), [(0, 0), (1, 1), (2, EARLIER)])
+def test_what_came_before_an_episode_is_forgotten(window: int, since: int) -> None:
+    model, data = small().eval(), batch()
+
+    def loss() -> torch.Tensor:
+        torch.manual_seed(1)
+        return model.loss(data[window : window + 1])["loss"].detach()
+
+    before = loss()
+    for t in range(EARLIER):
+        kept = data["action"][window, t].clone()
+        data["action"][window, t] = -kept
+        assert torch.equal(loss(), before) == (t < since)
+        data["action"][window, t] = kept
+
+
+def test_no_gradient_reaches_the_steps_before() -> None:
+    model, data = small(), batch()
+    state = data["state"].requires_grad_()
+    model.loss(data)["loss"].backward()
+    assert state.grad is not None
+    assert (state.grad[:, :EARLIER] == 0).all() and (state.grad[:, EARLIER:] != 0).any()
+
+
+def test_a_number_of_steps_that_cannot_be_is_refused() -> None:
+    with pytest.raises((ValueError, UserError), match="burn_in=-1"):
+        Dreamer(observation_sizes={"state": 3}, action_dim=2, burn_in=-1)
