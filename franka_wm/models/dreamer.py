@@ -63,6 +63,7 @@ class Dreamer(ActorCritic):
         free_nats: divergences below this are not reduced further.
         dynamics_coef, representation_coef: weights of the prior's and the posterior's divergence.
         decoder_coef: weight of reconstruction; at 0 there is no decoder, and rewards, ends and values shape z.
+        vector_coef: weight of vectors in it, relative to images'.
         reward_coef, termination_coef, replay_value_coef: weights of these losses; the last is the critic's on
             recorded rewards.
         imagination: steps of an imagined trajectory.
@@ -87,7 +88,9 @@ class Dreamer(ActorCritic):
         **dict.fromkeys(
             ("free_nats", "dynamics_coef", "representation_coef", "decoder_coef", "reward_coef"), COEFFICIENT
         ),
-        **dict.fromkeys(("termination_coef", "replay_value_coef", "entropy_coef"), COEFFICIENT),
+        **dict.fromkeys(
+            ("vector_coef", "termination_coef", "replay_value_coef", "entropy_coef"), COEFFICIENT
+        ),
         "actor_critic_lr_scale": COEFFICIENT,
         "burn_in": Bounds(least=0, most=1000),
         **dict.fromkeys(("discount", "unimix"), Bounds(least=0, below=1)),
@@ -122,6 +125,7 @@ class Dreamer(ActorCritic):
         dynamics_coef: float = 1.0,
         representation_coef: float = 0.1,
         decoder_coef: float = 1.0,
+        vector_coef: float = 1.0,
         reward_coef: float = 1.0,
         termination_coef: float = 1.0,
         replay_value_coef: float = 0.3,
@@ -145,7 +149,7 @@ class Dreamer(ActorCritic):
         self.discount = discount_per_step(discount, episode_length, default=0.997)
         self.action_dim, self.terminates, self.free_nats = action_dim, terminates, free_nats
         self.dynamics_coef, self.representation_coef = dynamics_coef, representation_coef
-        self.decoder_coef, self.reward_coef = decoder_coef, reward_coef
+        self.decoder_coef, self.vector_coef, self.reward_coef = decoder_coef, vector_coef, reward_coef
         self.termination_coef, self.replay_value_coef = termination_coef, replay_value_coef
         self.burn_in = burn_in
         self.imagination, self.return_lambda, self.entropy_coef = imagination, return_lambda, entropy_coef
@@ -375,7 +379,7 @@ class Dreamer(ActorCritic):
         total = z.new_zeros(())
         if self.vector_decoder is not None:
             error = self.vector_decoder(z) - symlog(self.vectors(window))
-            total = total + error.square().sum(-1).mean()
+            total = total + self.vector_coef * error.square().sum(-1).mean()
         for key, decoder in self.image_decoders.items():
             error = decoder(z) - window.get(key).to(z.dtype) / 255.0
             total = total + error.square().sum((-3, -2, -1)).mean()

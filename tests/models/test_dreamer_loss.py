@@ -19,6 +19,8 @@ ENDED = 1
 """The window whose last step terminated its episode."""
 WEIGHTS = {"dynamics": 0.7, "representation": 0.3, "decoder": 0.2, "reward": 1.5, "termination": 0.6}
 WEIGHTS |= {"replay_value": 0.4}
+VECTORS = 1.7
+"""Weight of vectors in the reconstruction."""
 
 
 def small(burn_in: int) -> Dreamer:
@@ -27,7 +29,7 @@ def small(burn_in: int) -> Dreamer:
         observation_sizes={"state": 3, "joint_target": 2}, action_dim=2, discount=0.8, return_lambda=0.7,
         deter_dim=16, hidden_dim=16, codes=3, classes=4, blocks=2, encoder_layers=2, bins=21, imagination=K,
         value_low=-4.0, value_high=4.0, terminates=True, free_nats=0.9, entropy_coef=0.3,
-        burn_in=burn_in,
+        burn_in=burn_in, vector_coef=VECTORS,
         **{f"{name}_coef": weight for name, weight in WEIGHTS.items()},
     )  # fmt: skip
     with torch.no_grad():
@@ -104,7 +106,8 @@ class Plain:
             vectors = [*seen["state"].tolist(), *seen["joint_target"].tolist()]
             guessed = self.model.vector_decoder(self.z[t, b]).tolist()  # type: ignore[misc]
             squashed = [math.copysign(math.log1p(abs(x)), x) for x in vectors]
-            parts["decoder"].append(sum((x - y) ** 2 for x, y in zip(guessed, squashed, strict=True)))
+            errors = [(x - y) ** 2 for x, y in zip(guessed, squashed, strict=True)]
+            parts["decoder"].append(VECTORS * sum(errors))
         for b in range(B):
             after = first[H, b]
             for t in reversed(range(H)):  # step t leads from z[t] to z[t + 1]

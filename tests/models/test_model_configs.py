@@ -26,7 +26,8 @@ NOT_IN_FILES = {
 
 NOT_AS_PUBLISHED = {
     "lewm": {"encoder_depth", "predictor_depth", "predictor_heads", "predictor_mlp", "inverse_coef"},
-    "dreamer": {"actor_gradient", "actor_critic_lr_scale"},
+    "dreamer": {"actor_gradient", "actor_critic_lr_scale", "burn_in"},
+    "dreamer_pixels": {"burn_in", "vector_coef"},
     "tdmpc2_pixels": {"random_shift", "entropy_coef", "mode_targets"},
 }
 """What a run on a GPU takes otherwise, to learn more in its minutes."""
