@@ -24,7 +24,7 @@ from omegaconf.errors import OmegaConfBaseException
 from franka_wm import conf
 from franka_wm.commands import launching, several
 from franka_wm.commands.overrides import compose, explain, given
-from franka_wm.commands.sweep import Sweep, jobs, names
+from franka_wm.commands.sweep import Sweep, jobs, names, spread
 from franka_wm.console import program, quoted, resuming, say, terminal_log
 from franka_wm.errors import REFUSALS, FrankaError, machine_refused
 from franka_wm.interrupt import INTERRUPTED
@@ -233,7 +233,7 @@ def one_line_errors(main: Callable[[DictConfig], object]) -> Callable[[DictConfi
             if _sweep is not None:
                 with nullcontext() if _sweep.process == os.getpid() else terminal_log():
                     return _sweep.run(main, cfg)
-            several.spread(cfg, int(told.job.num) if told.mode == RunMode.MULTIRUN else 0)
+            spread(cfg, int(told.job.num) if told.mode == RunMode.MULTIRUN else 0)
             if several.goes_on(cfg):
                 several.go_on(cfg, Path(told.runtime.output_dir))
             with one_line_refusals():
@@ -418,7 +418,7 @@ def check_command(arguments: list[str], folder: Path | None = None) -> str | Non
     try:
         cfg = compose(arguments)
         typed = cfg.copy()
-        several.spread(cfg)
+        spread(cfg)
         import_plugins(cfg.plugins)
         if cfg.resume is not None:
             _, cfg = resumed(cfg, arguments)

@@ -208,22 +208,6 @@ def part(error: BaseException) -> None:
         processes.leave(1)
 
 
-def spread(cfg: DictConfig, job: int = 0) -> None:
-    """``device=spread``: jobs of a sweep take the GPUs of this host in turn.
-
-    Raises:
-        UserError: There is none.
-    """
-    if cfg.device != "spread":
-        return
-    import torch
-
-    there = torch.cuda.device_count() if torch.cuda.is_available() else 0
-    if not there:
-        raise UserError("device=spread: this machine has 0 usable CUDA devices; use device=cpu")
-    cfg.device = f"cuda:{job % there}"
-
-
 def speaks() -> bool:
     """Whether this process may say why it ends: alone, or as the first one of several to end."""
     if not started_by_torchrun():

@@ -18,7 +18,7 @@ from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 
 from franka_wm import conf
-from franka_wm.commands import launching, several
+from franka_wm.commands import launching
 from franka_wm.console import log_anew, say
 from franka_wm.errors import REFUSALS, FrankaError, UserError, machine_refused
 from franka_wm.interrupt import INTERRUPTED, interruptible
@@ -137,7 +137,7 @@ class Sweep:
             if left is not None:
                 say(f"{name} goes on where it stopped")
                 cfg.resume = str(folder)
-            several.spread(cfg, number)
+            spread(cfg, number)
             if cfg.gpus == 1:
                 return main(cfg)
             paths = [one for one in told.overrides.hydra if one.startswith("hydra.searchpath=")]
@@ -268,3 +268,19 @@ def _in_words(error: Exception) -> str:
     if refused is None:  # a mistake of ours, or of a plugin
         traceback.print_exc()
     return refused or str(FrankaError(f"{type(error).__name__}: {error}"))
+
+
+def spread(cfg: DictConfig, job: int = 0) -> None:
+    """``device=spread``: jobs of a sweep take the GPUs of this host in turn.
+
+    Raises:
+        UserError: There is none.
+    """
+    if cfg.device != "spread":
+        return
+    import torch
+
+    there = torch.cuda.device_count() if torch.cuda.is_available() else 0
+    if not there:
+        raise UserError("device=spread: this machine has 0 usable CUDA devices; use device=cpu")
+    cfg.device = f"cuda:{job % there}"

@@ -35,7 +35,7 @@ class CapturedSampling:
         self._crossing: torch.Tensor | None = None
 
     def __call__(self) -> TensorDictBase:
-        """A batch of batch size (batch_size, length); no host sync.
+        """A batch of batch size (batch_size, burn_in + length); no host sync.
 
         Raises:
             UserError: There are fewer steps than a window has.

@@ -39,9 +39,9 @@ class WindowSampler(Sampler):
         moved: Windows that would cross the end of an episode are moved to the side of it where they have more steps.
             Else the first and the last steps of an episode are in few windows, its very first and last in one.
         before: So many steps before each window must be kept as well: for stacked images.
-        burn_in: So many steps before each window are given in front of it, of whatever episode, for a memory to begin
+        burn_in: So many steps before each window are given in front of it, of any episode, for a memory to begin
             with. The oldest one that is kept stands for those that are not.
-        marks: Steps under ``("next", "overflow")`` are in no window: contacts were lost in them.
+        marks: Steps under ``("next", "overflow")`` are in no window, only in front of one: contacts were lost in them.
     """
 
     OVERSAMPLE = 4
@@ -58,8 +58,11 @@ class WindowSampler(Sampler):
         burn_in: int = 0,
         marks: bool = False,
     ):
-        if length < 1 or oversample < 1:
-            raise UserError(f"window length={length}, oversample={oversample}: both must be at least 1")
+        if length < 1 or oversample < 1 or burn_in < 0:
+            raise UserError(
+                f"window length={length}, oversample={oversample}, burn_in={burn_in}: the first two must be at least "
+                "1, the last at least 0"
+            )
         self.writer = writer
         self.length = length
         self.oversample = oversample
@@ -298,7 +301,7 @@ def make_replay(
         marks: The data says in which steps contacts were lost, see :class:`WindowSampler`.
 
     Returns:
-        A ``ReplayBuffer`` whose samples have batch size (batch_size, window).
+        A ``ReplayBuffer`` whose samples have batch size (batch_size, burn_in + window).
     """
     steps, before = capacity // num_envs, frame_stack - 1 if stacked else 0
     if steps <= window + before:

@@ -32,7 +32,8 @@ def training_diagnostics(model: WorldModel, batch: TensorDictBase) -> dict[str, 
 
     Args:
         model: Model of any family.
-        batch: Windows [B, H], as ``loss`` takes them.
+        batch: Windows [B, H], as ``loss`` takes them: with the model's ``burn_in`` steps in front, if it has any. A
+            model with memory sees all of them one after the other.
 
     Returns:
         ``latent/…``: everything of :func:`~franka_wm.evaluation.spectrum.latent_statistics`, of the first observation
@@ -45,23 +46,41 @@ def training_diagnostics(model: WorldModel, batch: TensorDictBase) -> dict[str, 
     """
     device = batch.device if batch.device is not None else batch.get("action").device
     keys = model.observation_keys
-    batch = cast(TensorDictBase, batch[:SAMPLES])
+    batch, skipped = cast(TensorDictBase, batch[:SAMPLES]), model.burn_in
     devices = [device] if device.type == "cuda" else []
     with evaluating(model), torch.random.fork_rng(devices=devices):
-        first = model.encode(batch.select(*keys)[:, 0])
+        first = _walked(model, model.encode(batch.select(*keys)[:, 0]), batch, 1, skipped + 1)
         embedded = embedding(model)(first).float()
         if embedded.shape[0] < 2 or not bool(torch.isfinite(embedded).all()):
             return {}
         out = {f"latent/{name}": value for name, value in latent_statistics(embedded).items()}
         reward = batch.get(("next", "reward"), None)
         if reward is not None and model.has_value:
-            last = model.encode(batch.get("next").select(*keys)[:, -1])
-            terminated = batch.get(("next", "terminated"))
-            whole = _within_an_episode(batch.get("is_init", None), terminated)
+            reached = batch.get("next").select(*keys)[:, -1]
+            if model.has_memory:
+                before = _walked(model, first, batch, skipped + 1, batch.shape[1])
+                never = torch.zeros(len(batch), 1, dtype=torch.bool, device=before.device)
+                last = model.observe(reached, before, batch.get("action")[:, -1], never)
+            else:
+                last = model.encode(reached)
+            window = cast(TensorDictBase, batch[:, skipped:])
+            reward, terminated = (window.get(("next", name)) for name in ("reward", "terminated"))
+            whole = _within_an_episode(window.get("is_init", None), terminated)
             out |= _value_consistency(
                 model, *(x if whole is None else x[whole] for x in (first, last, reward, terminated))
             )
     return out
+
+
+def _walked(model: WorldModel, z: Tensor, batch: TensorDictBase, start: int, stop: int) -> Tensor:
+    """Latents of windows (B, H) at step `stop` - 1 from those z (B, Z) at `start` - 1, of a model with memory."""
+    is_init = batch.get("is_init", None)
+    if is_init is None:
+        is_init = torch.zeros(*batch.shape, 1, dtype=torch.bool, device=z.device)
+    seen = batch.select(*model.observation_keys)
+    for t in range(start, stop):
+        z = model.observe(seen[:, t], z, batch.get("action")[:, t - 1], is_init[:, t])
+    return z
 
 
 def _within_an_episode(is_init: Tensor | None, terminated: Tensor) -> Tensor | None:

@@ -60,6 +60,9 @@ class WorldModel(nn.Module):
     moved_windows: bool = False
     """Whether its windows are so long that the first and last steps of episodes would be in few of them: windows that
     would cross the end of an episode are moved into it."""
+    burn_in: int = 0
+    """So many steps are in front of each window that `loss` takes, of any episode, for a memory to begin with. The
+    option of this name says it, to what makes batches and to the constructor."""
     replay_keys: tuple[str, ...] = ()
     """Entries that the acting policy writes and `loss` reads."""
     pretrained: bool = False
@@ -121,7 +124,8 @@ class WorldModel(nn.Module):
         """Entry `loss` () to differentiate, and metrics () to log.
 
         Args:
-            batch: windows [B, H] of contiguous transitions, with what follows each in `next`.
+            batch: windows [B, H] of contiguous transitions, with what follows each in `next`; [B, burn_in + H] where
+                the model asks for steps in front of them.
         """
         raise self._lacks("loss")
 

@@ -33,7 +33,8 @@ class Dreamer(ActorCritic):
 
     Deliberate differences from the paper (docs/models/dreamer.md):
       * A window lies within one episode. Its memory comes from the `burn_in` steps before it, as the model sees them
-        now, or is empty, not from states kept in the replay; the divergences of its first step are left out.
+        now (with `burn_in=0` it is empty), not from states kept in the replay. The divergences of its first step are
+        left out.
       * `encode`, `observe` and `next` take the likeliest codes: what acts and plans is deterministic. Training draws.
       * Vectors are standardised before symlog, see `set_observation_statistics`; the default is the identity.
       * AdamW with clipped gradient norms (of model, actor and critic apart) instead of LaProp with adaptive clipping.
@@ -63,7 +64,7 @@ class Dreamer(ActorCritic):
         free_nats: divergences below this are not reduced further.
         dynamics_coef, representation_coef: weights of the prior's and the posterior's divergence.
         decoder_coef: weight of reconstruction; at 0 there is no decoder, and rewards, ends and values shape z.
-        vector_coef: weight of vectors in it, relative to images'.
+        vector_coef: weight of the vectors' reconstruction relative to the images'.
         reward_coef, termination_coef, replay_value_coef: weights of these losses; the last is the critic's on
             recorded rewards.
         imagination: steps of an imagined trajectory.
@@ -247,7 +248,7 @@ class Dreamer(ActorCritic):
         Args:
             batch: batch size [B, burn_in + H]: H contiguous transitions, all of one episode, with the observation keys,
                 `action` (…, A), and in `next` the observation keys, `reward` (…, 1) and `terminated` (…, 1) bool. In
-                front of them `burn_in` steps, of whatever episode, from which the memory begins; with them, `is_init`
+                front of them `burn_in` steps, of any episode, from which the memory begins; with them, `is_init`
                 (…, 1) bool of all.
 
         Returns:
@@ -258,9 +259,14 @@ class Dreamer(ActorCritic):
             `terminates` also `loss_termination`.
 
         Raises:
-            ValueError: the batch size is not [B, H].
+            ValueError: the batch size is not [B, burn_in + H], or `is_init` is missing that `burn_in` needs.
         """
-        check_windows(batch)
+        count = check_windows(batch)[1]
+        if self.burn_in and (count <= self.burn_in or batch.get("is_init", None) is None):
+            raise ValueError(
+                f"burn_in={self.burn_in}: windows have so many steps in front and `is_init`, see make_replay and "
+                f"open_dataset; these have {count} steps in all"
+            )
         earlier = cast(TensorDictBase, batch[:, : self.burn_in])
         batch = cast(TensorDictBase, batch[:, self.burn_in :])
         # Time leads from here on: (H, B, ...).
@@ -375,7 +381,7 @@ class Dreamer(ActorCritic):
         return loss, parts
 
     def _reconstruction(self, z: Tensor, window: TensorDictBase) -> Tensor:
-        """Squared errors (), summed over an observation: of symlog vectors, and of images in [0, 1]."""
+        """Squared errors (), summed over an observation: of symlog vectors, weighted, and of images in [0, 1]."""
         total = z.new_zeros(())
         if self.vector_decoder is not None:
             error = self.vector_decoder(z) - symlog(self.vectors(window))

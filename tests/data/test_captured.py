@@ -65,6 +65,23 @@ def test_moved_windows_of_a_growing_buffer(device: str, kind: type[CapturedSampl
 
 
 @pytest.mark.parametrize(("device", "kind"), DEVICES)
+def test_steps_before_windows_of_a_growing_buffer(device: str, kind: type[CapturedSampling]) -> None:
+    torch.manual_seed(0)
+    sizes = {"capacity": WORLDS * STEPS, "num_envs": WORLDS, "window": WINDOW, "batch_size": 256}
+    replay = make_replay(**sizes, device=device, moved=True, burn_in=2)
+    sampling, end = kind(replay), 0
+    for until in (22, 40, 66):
+        replay.extend(experience(end, until).to(device))
+        end, oldest = until, max(0, until - STEPS)
+        for _ in range(4):
+            batch = sampling().to("cpu")
+            start = batch["time"][:, 2:3]
+            assert torch.equal(batch["time"], (start + torch.arange(-2, WINDOW)).clamp_min(oldest))
+            repeated = batch["time"].diff(dim=1) == 0
+            assert batch["is_init"][:, 1:][repeated].all() and not batch["is_init"][:, 3:].any()
+
+
+@pytest.mark.parametrize(("device", "kind"), DEVICES)
 def test_windows_of_a_growing_buffer(device: str, kind: type[CapturedSampling]) -> None:
     """Half full, full, wrapped around: every whole window of what is there, equally often, and nothing else."""
     torch.manual_seed(0)

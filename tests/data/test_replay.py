@@ -337,7 +337,9 @@ def test_on_a_gpu_missing_windows_are_kept_in_mind_until_asked_for() -> None:
     assert sampler._missing is None
 
 
-@pytest.mark.parametrize("options", [{"length": 0}, {"length": 2, "oversample": 0}])
+@pytest.mark.parametrize(
+    "options", [{"length": 0}, {"length": 2, "oversample": 0}, {"length": 2, "burn_in": -1}]
+)
 def test_impossible_sampler(options: dict[str, int]) -> None:
     with pytest.raises(UserError):
         WindowSampler(buffer(10, 2).writer, **options)

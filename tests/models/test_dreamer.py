@@ -208,7 +208,7 @@ def test_the_loss_is_the_weighted_sum_of_its_parts():
 
 
 def test_what_is_logged_is_what_it_says(monkeypatch):
-    model = randomise(small(image_sizes={"pixels": (40, 40, 3)}, channels=2))
+    model = randomise(small(image_sizes={"pixels": (40, 40, 3)}, channels=2, vector_coef=3.0))
     batch = windows(batch=4, horizon=2)
     for part in (batch, batch["next"]):
         part.set("pixels", torch.randint(0, 256, (4, 2, 40, 40, 3), dtype=torch.uint8))
@@ -218,7 +218,7 @@ def test_what_is_logged_is_what_it_says(monkeypatch):
     z = kept[0][0]
     frames = window_of(batch, model.observation_keys).transpose(0, 1)
     vectors = torch.cat((frames["state"], frames["joint_target"]), -1)
-    squared = (model.vector_decoder(z) - symlog(vectors)).square().sum(-1).mean()
+    squared = 3.0 * (model.vector_decoder(z) - symlog(vectors)).square().sum(-1).mean()
     squared += (model.image_decoders["pixels"](z) - frames["pixels"] / 255).square().sum((-3, -2, -1)).mean()
     torch.testing.assert_close(losses["loss_decoder"], squared.detach())
     guessed = model.two_hot.decode(model.reward_head(z[1:])).squeeze(-1)

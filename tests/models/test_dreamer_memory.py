@@ -7,6 +7,8 @@ import torch
 from tensordict import TensorDict
 
 from franka_wm.errors import UserError
+from franka_wm.evaluation.health import training_diagnostics
+from franka_wm.evaluation.spectrum import latent_statistics
 from franka_wm.models.dreamer import Dreamer
 from small_tdmpc2 import windows
 
@@ -20,7 +22,8 @@ def small() -> Dreamer:
         classes=4, blocks=2, encoder_layers=2, bins=21, imagination=2, burn_in=EARLIER,
     )  # fmt: skip
     with torch.no_grad():
-        model.reward_head[-1].weight.normal_()
+        for head in (model.reward_head, model.critic):
+            head[-1].weight.normal_()
     return model
 
 
@@ -79,3 +82,32 @@ def test_no_gradient_reaches_the_steps_before() -> None:
 def test_a_number_of_steps_that_cannot_be_is_refused() -> None:
     with pytest.raises((ValueError, UserError), match="burn_in=-1"):
         Dreamer(observation_sizes={"state": 3}, action_dim=2, burn_in=-1)
+
+
+def test_windows_without_the_steps_before_them_are_refused() -> None:
+    model, data = small(), batch()
+    with pytest.raises(
+        ValueError, match=r"burn_in=3: windows have so many steps in front.* these have 3 steps in all"
+    ):
+        model.loss(data[:, :EARLIER])
+    with pytest.raises(ValueError, match="these have 5 steps in all"):
+        model.loss(data.exclude("is_init"))
+
+
+def test_a_log_tells_of_latents_with_their_memory() -> None:
+    """Values at a window's start and end, and the latents' spread, are of what the model remembers there."""
+    model, data = small().eval(), batch()
+    with torch.no_grad():
+        z = [model.encode(data[:, 0])]
+        for t in range(1, EARLIER + H):
+            z.append(model.observe(data[:, t], z[-1], data["action"][:, t - 1], data["is_init"][:, t]))
+        never = torch.zeros(B, 1, dtype=torch.bool)
+        last = model.observe(data["next"][:, -1], z[-1], data["action"][:, -1], never)
+        reward = data["next", "reward"][:, EARLIER:]
+        target = reward[:, 0] + model.discount * (reward[:, 1] + model.discount * model.value(last))
+        value = model.value(z[EARLIER])
+    found = training_diagnostics(model, data)
+    assert found["value/mean"] == pytest.approx(float(value.mean()), abs=1e-5)
+    assert found["value/td_bias"] == pytest.approx(float((value - target).mean()), abs=1e-5)
+    expected = {f"latent/{name}": number for name, number in latent_statistics(z[EARLIER]).items()}
+    assert {name: found[name] for name in expected} == pytest.approx(expected)

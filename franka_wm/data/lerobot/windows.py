@@ -78,8 +78,8 @@ class Moments(NamedTuple):
 class RecordedWindows:
     """Windows of H transitions within one episode, uniform over all that there are.
 
-    A batch is a TensorDict (B, H): observations, ``action`` and ``is_init`` at its root; the observations that
-    followed and, where the dataset has them, ``reward`` (float32), ``done``, ``terminated``, ``truncated``,
+    A batch is a TensorDict (B, H), or (B, burn_in + H): observations, ``action`` and ``is_init`` at its root; the
+    observations that followed and, where the dataset has them, ``reward`` (float32), ``done``, ``terminated``, ``truncated``,
     ``success`` (bool), each (B, H, 1), under ``next``. Images are uint8 (B, H, h, w, 3), vectors float32,
     actions float32 (B, H, A) in [−1, 1] or int64 (B, H) where they are discrete.
 
@@ -131,6 +131,7 @@ class RecordedWindows:
     ):
         for name, value in (("window", window), ("batch_size", batch_size), ("frame_stack", frame_stack)):
             whole_rule(least=1).check(name, value)
+        whole_rule(least=0).check("burn_in", burn_in)
         if split not in SPLITS:
             raise UserError(f"split={split!r}: must be one of {', '.join(SPLITS)}")
         if not is_real(validation_fraction) or not 0 <= validation_fraction < 1:
