@@ -80,8 +80,8 @@ class RecordedWindows:
 
     A batch is a TensorDict (B, H), or (B, burn_in + H): observations, ``action`` and ``is_init`` at its root; the
     observations that followed and, where the dataset has them, ``reward`` (float32), ``done``, ``terminated``,
-    ``truncated``, ``success`` (bool), each (B, H, 1), under ``next``. Images are uint8 (B, H, h, w, 3), vectors float32,
-    actions float32 (B, H, A) in [−1, 1] or int64 (B, H) where they are discrete.
+    ``truncated``, ``success`` (bool), each (B, H, 1), under ``next``. Images are uint8 (B, H, h, w, 3), vectors
+    float32, actions float32 (B, H, A) in [−1, 1] or int64 (B, H) where they are discrete.
 
     So a window has H + 1 observations. Where the observation after an episode's last action is known (datasets
     of this package), the last action is in some window; elsewhere it is left out.

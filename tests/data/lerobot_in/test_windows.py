@@ -313,7 +313,13 @@ def test_refused(pictures: Path, foreign, tmp_path: Path, opened: Callable) -> N
     with pytest.raises(UserError, match="no window of 7 transitions fits: the longest episode of all has 6"):
         opened(pictures, window=7)
     assert len(opened(pictures, window=6)) == 1
-    for options in ({"window": 0}, {"batch_size": 0}, {"split": "test"}, {"validation_fraction": 1.0}):
+    for options in (
+        {"window": 0},
+        {"batch_size": 0},
+        {"burn_in": -1},
+        {"split": "test"},
+        {"validation_fraction": 1.0},
+    ):
         with pytest.raises(UserError):
             opened(pictures, **options)
     slow = foreign.make_foreign(tmp_path / "slow", fps=5)
