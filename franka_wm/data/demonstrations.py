@@ -8,7 +8,7 @@ import torch
 from tensordict import TensorDictBase
 
 from franka_wm.data.hindsight import Hindsight
-from franka_wm.data.image_storage import BOUNDARY, begin_where_repeated
+from franka_wm.data.image_storage import BOUNDARY
 from franka_wm.errors import UserError
 
 DEMONSTRATED = "demonstrated"
@@ -65,10 +65,9 @@ class Demonstrations:
         """Replaces windows of `batch` (B, H) in place, and marks them; no operation waits for the device."""
         device = self.transitions.device
         drawn = torch.randint(len(self._starts), (self.most,), device=device)
-        time = (self._starts[drawn].unsqueeze(1) + self._steps).clamp_min(0)
+        time = (self._starts[drawn].unsqueeze(1) + self._steps).clamp_min(0)  # an episode's first step, marked
         world = torch.zeros_like(time)
         windows: Any = self.transitions[time, world]
-        begin_where_repeated(windows, time)
         if self.hindsight is not None:
             self.hindsight(windows, self.transitions, time, world, len(self.transitions) - 1)
         mask = self._numbers < self._count
