@@ -65,7 +65,8 @@ class Demonstrations:
         """Replaces windows of `batch` (B, H) in place, and marks them; no operation waits for the device."""
         device = self.transitions.device
         drawn = torch.randint(len(self._starts), (self.most,), device=device)
-        time = (self._starts[drawn].unsqueeze(1) + self._steps).clamp_min(0)  # an episode's first step, marked
+        # The first one's first step, which is marked as such, stands for those before it.
+        time = (self._starts[drawn].unsqueeze(1) + self._steps).clamp_min(0)
         world = torch.zeros_like(time)
         windows: Any = self.transitions[time, world]
         if self.hindsight is not None:
