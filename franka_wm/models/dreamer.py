@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any, ClassVar, Literal, cast
+from typing import Any, ClassVar, Literal
 
 import torch
 from tensordict import TensorDict, TensorDictBase
@@ -267,8 +267,7 @@ class Dreamer(ActorCritic):
                 f"burn_in={self.burn_in}: windows have so many steps in front and `is_init`, see make_replay and "
                 f"open_dataset; these have {count} steps in all"
             )
-        earlier = cast(TensorDictBase, batch[:, : self.burn_in])
-        batch = cast(TensorDictBase, batch[:, self.burn_in :])
+        earlier, batch = batch.split([self.burn_in, count - self.burn_in], dim=1)
         # Time leads from here on: (H, B, ...).
         action, reward, terminated = (
             batch.get(key).transpose(0, 1) for key in ("action", ("next", "reward"), ("next", "terminated"))

@@ -1,6 +1,7 @@
 """What each family can do is what docs/models.md says, and what trainers, planners and evaluation ask."""
 
 import re
+from inspect import signature
 
 import pytest
 import torch
@@ -45,10 +46,13 @@ def test_the_page_tells_of_every_ability_and_of_nothing_else(page):
         "cross_episode",
         "moved_windows",
         "terminates",
+        "burn_in",
         "replay_keys",
     }
     assert set(NAMES.values()) == set(models._FAMILIES)
     assert page["terminates"] == {"tdmpc2", "dreamer"}
+    built = {name for name in NAMES.values() if "burn_in" in signature(models.family(name)).parameters}
+    assert built == page["burn_in"]
     asking = {name for name in NAMES.values() if models.family(name).replay_keys}
     assert asking == page["replay_keys"]
 

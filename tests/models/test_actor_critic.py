@@ -114,13 +114,14 @@ def test_a_gradient_that_there_is_not_is_refused():
         small("straight")
 
 
-@pytest.mark.parametrize("actor_gradient", ["reinforce", "dynamics"])
-def test_the_loss_compiles_as_one_graph(actor_gradient):
+@pytest.mark.parametrize(("actor_gradient", "burn_in"), [("reinforce", 0), ("dynamics", 0), ("reinforce", 2)])
+def test_the_loss_compiles_as_one_graph(actor_gradient, burn_in):
     """A break of the graph would cost time on a GPU, and a wrong one numbers."""
-    batch = windows(batch=3, horizon=4).exclude("joint_target", ("next", "joint_target"))
+    batch = windows(batch=3, horizon=4 + burn_in).exclude("joint_target", ("next", "joint_target"))
+    batch["is_init"] = torch.zeros(3, 4 + burn_in, 1, dtype=torch.bool)
     found = []
     for compiled in (False, True):
-        model = small(actor_gradient)
+        model = small(actor_gradient, burn_in=burn_in)
         loss = torch.compile(model.loss, backend="eager", fullgraph=True) if compiled else model.loss
         torch.manual_seed(1)
         losses = loss(batch)
