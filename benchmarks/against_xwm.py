@@ -17,6 +17,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import shutil
 import subprocess
 from functools import partial
 from importlib.resources import files
@@ -134,6 +135,8 @@ def main() -> None:
     )
     parser.add_argument("--out", help="JSON file")
     args = parser.parse_args()
+    if shutil.which(args.python) is None:
+        parser.error(f"--python {args.python}: there is no such program; install xwm as above")
     urdf = files("franka_wm.envs.robots") / "fr3.urdf"
     each = args.seconds / 3  # rate() takes the median of three measurements
     mine = learning(each, compile=args.compile, precision="float32")
