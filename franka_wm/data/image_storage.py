@@ -291,14 +291,6 @@ class _Ends:
         self._surely_free += more
 
 
-def begin_where_repeated(batch: Any, time: torch.Tensor) -> None:
-    """Marks steps of windows (B, H) as first ones of an episode where the step before them has the same time (B, H).
-
-    There the oldest step stands for those before it.
-    """
-    batch.get(BOUNDARY)[:, 1:] |= (time[:, 1:] == time[:, :-1]).unsqueeze(-1)
-
-
 def _words(images: torch.Tensor) -> torch.Tensor:
     """Kept images (a, b, …) as (a, b, words), in the same memory.
 

@@ -13,7 +13,7 @@ from torchrl.data.replay_buffers import RoundRobinWriter, Sampler
 from franka_wm.data.demonstrations import Demonstrations
 from franka_wm.data.future import FutureFrames
 from franka_wm.data.hindsight import Hindsight
-from franka_wm.data.image_storage import BOUNDARY, OVERFLOW, ImageStorage, begin_where_repeated
+from franka_wm.data.image_storage import BOUNDARY, OVERFLOW, ImageStorage
 from franka_wm.errors import UserError
 
 
@@ -253,6 +253,14 @@ class WindowReplay(ReplayBuffer):
             self.future(batch, storage, time, world, newest)
         if self.demonstrations is not None:
             self.demonstrations(batch)
+
+
+def begin_where_repeated(batch: Any, time: torch.Tensor) -> None:
+    """Marks steps of windows (B, H) as first ones of an episode where the step before them has the same time (B, H).
+
+    There the oldest step stands for those before it.
+    """
+    batch.get(BOUNDARY)[:, 1:] |= (time[:, 1:] == time[:, :-1]).unsqueeze(-1)
 
 
 def newest_step(replay: ReplayBuffer) -> int:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Literal
 
 import torch
@@ -95,17 +96,23 @@ class ActorCritic(WorldModel):
         )
         return self._value_loss(z[:-1], returns).mean()
 
-    def _imagine(self, z: Tensor) -> tuple[Tensor, Tensor]:
-        """States (K+1, N, Z) and actions (K, N, A), not clamped, of the actor from z (N, Z).
+    def _imagined_step(self, z: Tensor) -> tuple[Tensor, Tensor]:
+        """Actions (N, A) that the actor draws in z (N, Z), not clamped, and the next states that are drawn."""
+        mean, std = self.action_distribution(z.detach())
+        action = mean + std * torch.randn_like(mean)
+        return action, frozen(self.rssm, z, action.clamp(-1.0, 1.0))
+
+    def _imagine(self, z: Tensor, step: Callable[[Tensor], tuple[Tensor, Tensor]]) -> tuple[Tensor, Tensor]:
+        """States (K+1, N, Z) and actions (K, N, A) of K times `step`, which is `_imagined_step`, from z (N, Z).
 
         With `actor_gradient=dynamics` they have gradients to the actor, through nothing but its actions.
         """
         states, actions = [z], []
         with torch.set_grad_enabled(self.actor_gradient == "dynamics" and torch.is_grad_enabled()):
             for _ in range(self.imagination):
-                mean, std = self.action_distribution(states[-1].detach())
-                actions.append(mean + std * torch.randn_like(mean))
-                states.append(frozen(self.rssm, states[-1], actions[-1].clamp(-1.0, 1.0)))
+                action, z = step(z)
+                actions.append(action)
+                states.append(z)
             return torch.stack(states), torch.stack(actions)
 
     def _imagined_returns(self, imagined: Tensor, begun: Tensor) -> tuple[Tensor, Tensor, Tensor]:

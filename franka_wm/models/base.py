@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from types import MappingProxyType
 from typing import Any, ClassVar
 
@@ -224,9 +225,23 @@ class WorldModel(nn.Module):
     def after_update(self) -> None:
         """Move slow copies of weights, after each optimiser step; there are none by default."""
 
+    parts_of_loss: ClassVar[tuple[str, ...]] = ()
+    """Methods that `loss` calls and takes replacements of as `parts`; without any it is compiled as one program."""
+
     def compiled_loss(self) -> Callable[[TensorDictBase], TensorDict]:
-        """`loss`, compiled by `torch.compile`."""
-        return torch.compile(self.loss)
+        """`loss`, compiled by `torch.compile`: as a whole, or each of `parts_of_loss`."""
+        owner = next(cls for cls in type(self).__mro__ if "loss" in vars(cls))
+        names = vars(owner).get("parts_of_loss", ())  # a subclass with a loss of its own has none, or others
+        if not names:
+            return torch.compile(self.loss)
+        loss: Callable[..., TensorDict] = self.loss
+        return partial(
+            loss, parts={name: torch.compile(getattr(self, name), dynamic=False) for name in names}
+        )
+
+    def _parts(self, instead: Mapping[str, Callable[..., Any]] | None) -> dict[str, Callable[..., Any]]:
+        """`parts_of_loss` by name, those of `instead` in their place."""
+        return {name: getattr(self, name) for name in self.parts_of_loss} | dict(instead or {})
 
     def rebuild_overrides(self) -> dict[str, Any]:
         """Constructor arguments that replace those which read other files or depend on the environment.

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any, ClassVar, Literal
 
 import torch
@@ -206,7 +206,7 @@ class Dreamer(ActorCritic):
     def encode(self, observation: TensorDictBase) -> Tensor:
         """Latents z (..., latent_dim) of an episode's first observation."""
         embedded = self._embed(observation)
-        return self._see(self.rssm.begin(embedded), embedded, sample=False)
+        return self._see(self.rssm.begin(embedded), embedded, sample=False)[0]
 
     def observe(
         self, observation: TensorDictBase, previous_z: Tensor, action: Tensor, is_init: Tensor
@@ -214,7 +214,7 @@ class Dreamer(ActorCritic):
         """Latents z (E, latent_dim) after `action` led to `observation`, see `WorldModel.observe`."""
         embedded = self._embed(observation)
         h = torch.where(is_init, self.rssm.begin(embedded), self.rssm.recur(previous_z, action))
-        return self._see(h, embedded, sample=False)
+        return self._see(h, embedded, sample=False)[0]
 
     def next(self, z: Tensor, action: Tensor) -> Tensor:
         """Next latents (..., latent_dim), with the likeliest codes, after actions (..., action_dim)."""
@@ -240,7 +240,19 @@ class Dreamer(ActorCritic):
 
     # ------------------------------------------------------------------ training
 
-    def loss(self, batch: TensorDictBase) -> TensorDict:
+    parts_of_loss = (
+        "_embed",
+        "_step",
+        "_imagined_step",
+        "_model_loss",
+        "_actor_critic_loss",
+        "_replay_value_loss",
+    )
+    """Methods that `loss` calls, compiled one by one: all steps in one program would take minutes to compile."""
+
+    def loss(
+        self, batch: TensorDictBase, *, parts: Mapping[str, Callable[..., Any]] | None = None
+    ) -> TensorDict:
         """Losses of a batch of windows; call `backward` once on the entry `loss`.
 
         In training mode the running scale of returns is updated as well.
@@ -250,6 +262,7 @@ class Dreamer(ActorCritic):
                 `action` (…, A), and in `next` the observation keys, `reward` (…, 1) and `terminated` (…, 1) bool. In
                 front of them `burn_in` steps, of any episode, from which the memory begins; with them, `is_init`
                 (…, 1) bool of all.
+            parts: what to call instead of the methods that `parts_of_loss` names.
 
         Returns:
             batch size []: `loss` to differentiate, and detached: `loss_dynamics` and `loss_representation` [nat, not
@@ -261,7 +274,7 @@ class Dreamer(ActorCritic):
         Raises:
             ValueError: the batch size is not [B, burn_in + H], or `is_init` is missing that `burn_in` needs.
         """
-        count = check_windows(batch)[1]
+        count, call = check_windows(batch)[1], self._parts(parts)
         if self.burn_in and (count <= self.burn_in or batch.get("is_init", None) is None):
             raise ValueError(
                 f"burn_in={self.burn_in}: windows have so many steps in front and `is_init`, see make_replay and "
@@ -273,16 +286,16 @@ class Dreamer(ActorCritic):
             batch.get(key).transpose(0, 1) for key in ("action", ("next", "reward"), ("next", "terminated"))
         )
         window = window_of(batch, self.observation_keys).transpose(0, 1)
-        embedded = self._embed(window)
-        h = self._remember(earlier, batch[:, 0], embedded[0])
-        z, posterior = self._filter(h, embedded, action)  # (H+1, B, ...)
-        model_loss, parts_of_model = self._model_loss(z, posterior, window, reward, terminated)
-        imagined, actions = self._imagine(z.detach().flatten(0, 1))
+        embedded = call["_embed"](window)
+        h = self._remember(earlier, batch[:, 0], embedded[0], call)
+        z, posterior = self._filter(h, embedded, action, call["_step"])  # (H+1, B, ...)
+        model_loss, parts_of_model = call["_model_loss"](z, posterior, window, reward, terminated)
+        imagined, actions = self._imagine(z.detach().flatten(0, 1), call["_imagined_step"])
         begun = torch.cat((torch.ones_like(reward[:1]), (~terminated).to(reward.dtype)))
-        policy_loss, value_loss, entropy, returns, value = self._actor_critic_loss(
+        policy_loss, value_loss, entropy, returns, value = call["_actor_critic_loss"](
             imagined, actions, begun.flatten(0, 1)
         )
-        replay_value_loss = self._replay_value_loss(z, returns[0], reward, terminated)
+        replay_value_loss = call["_replay_value_loss"](z, returns[0], reward, terminated)
         metrics = {
             **parts_of_model,
             "loss_policy": policy_loss,
@@ -315,10 +328,23 @@ class Dreamer(ActorCritic):
             parts.append(self.vector_encoder(symlog(self.vectors(observation))))
         return torch.cat(parts, dim=-1)
 
-    def _see(self, h: Tensor, embedded: Tensor, *, sample: bool) -> Tensor:
-        return self.rssm.state(h, self.rssm.posterior(h, embedded), sample=sample)
+    def _see(self, h: Tensor, embedded: Tensor, *, sample: bool) -> tuple[Tensor, Tensor]:
+        """States (..., Z) and posteriors (..., codes, classes) of h and features (..., E)."""
+        posterior = self.rssm.posterior(h, embedded)
+        return self.rssm.state(h, posterior, sample=sample), posterior
 
-    def _remember(self, earlier: TensorDictBase, first: TensorDictBase, embedded: Tensor) -> Tensor:
+    def _step(self, h: Tensor, embedded: Tensor, action: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """What `_see` draws for h (B, deter_dim) and features (B, E), and the next h after actions (B, A)."""
+        z, posterior = self._see(h, embedded, sample=True)
+        return z, posterior, self.rssm.recur(z, action)
+
+    def _remember(
+        self,
+        earlier: TensorDictBase,
+        first: TensorDictBase,
+        embedded: Tensor,
+        call: Mapping[str, Callable[..., Any]],
+    ) -> Tensor:
         """h (B, deter_dim) of a window's `first` step (B,), whose features are (B, E), after `earlier` steps (B, K).
 
         No gradient reaches them: the burn-in of R2D2 (Kapturowski et al., 2019).
@@ -327,24 +353,27 @@ class Dreamer(ActorCritic):
         if not self.burn_in:
             return begin
         with torch.no_grad():
-            features, is_init = self._embed(earlier), earlier.get("is_init")
+            # Time leads, as in a window.
+            features = call["_embed"](earlier.select(*self.observation_keys).transpose(0, 1))
+            is_init, action = (earlier.get(key).transpose(0, 1) for key in ("is_init", "action"))
             for t in range(self.burn_in):
-                z = self._see(torch.where(is_init[:, t], begin, h), features[:, t], sample=True)
-                h = self.rssm.recur(z, earlier.get("action")[:, t])
+                _, _, h = call["_step"](torch.where(is_init[t], begin, h), features[t], action[t])
         return torch.where(first.get("is_init"), begin, h)
 
-    def _filter(self, h: Tensor, embedded: Tensor, action: Tensor) -> tuple[Tensor, Tensor]:
+    def _filter(
+        self, h: Tensor, embedded: Tensor, action: Tensor, step: Callable[..., Any]
+    ) -> tuple[Tensor, Tensor]:
         """States (H+1, B, Z) and posteriors (H+1, B, codes, classes) of features (H+1, B, E), actions (H, B, A).
 
         h (B, deter_dim) is the first step's.
         """
         states, posteriors = [], []
-        for t in range(embedded.shape[0]):
-            if t:
-                h = self.rssm.recur(states[-1], action[t - 1])
-            posteriors.append(self.rssm.posterior(h, embedded[t]))
-            states.append(self.rssm.state(h, posteriors[-1], sample=True))
-        return torch.stack(states), torch.stack(posteriors)
+        for t in range(action.shape[0]):
+            z, posterior, h = step(h, embedded[t], action[t])
+            states.append(z)
+            posteriors.append(posterior)
+        z, posterior = self._see(h, embedded[-1], sample=True)
+        return torch.stack((*states, z)), torch.stack((*posteriors, posterior))
 
     def _model_loss(
         self, z: Tensor, posterior: Tensor, window: TensorDictBase, reward: Tensor, terminated: Tensor

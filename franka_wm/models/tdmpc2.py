@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from functools import partial
 from pathlib import Path
 from typing import Any, ClassVar, Literal
 
@@ -307,7 +306,7 @@ class TDMPC2(SimplicialWorldModel):
             ValueError: the batch size is not [B, H].
         """
         check_windows(batch)
-        call = {name: getattr(self, name) for name in self.parts_of_loss} | dict(parts or {})
+        call = self._parts(parts)
         # Time leads from here on: (H, B, ...).
         action, reward, terminated = (
             batch.get(key).transpose(0, 1) for key in ("action", ("next", "reward"), ("next", "terminated"))
@@ -384,14 +383,6 @@ class TDMPC2(SimplicialWorldModel):
     def after_update(self) -> None:
         """Move the target Q-functions by `tau`; call once after each optimiser step."""
         self.q_ensemble.update_target(self.tau)
-
-    def compiled_loss(self) -> Callable[[TensorDictBase], TensorDict]:
-        """`loss` with each of `parts_of_loss` compiled."""
-        if type(self).loss is not TDMPC2.loss:  # a subclass with a loss of its own
-            return super().compiled_loss()
-        return partial(
-            self.loss, parts={name: torch.compile(getattr(self, name)) for name in self.parts_of_loss}
-        )
 
     # ------------------------------------------------------------------ pieces
 
