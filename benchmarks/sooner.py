@@ -13,10 +13,13 @@ never reaches the share has its best one and no time.
 from __future__ import annotations
 
 import argparse
+import os
 import subprocess
 import sys
 import tempfile
+import time
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -32,13 +35,30 @@ POWERS = {"same": 0.0, "root": 0.5, "linear": 1.0}
 """How the learning rate grows with the number of GPUs: Adam's usual rule is the root."""
 
 
-def learned(arguments: Sequence[str], folder: Path) -> list[dict[str, float]]:
-    """The rows that a whole job has logged."""
-    command = [sys.executable, str(ROOT / "train.py"), *arguments, f"hydra.run.dir={folder}"]
-    done = subprocess.run(command, capture_output=True, text=True, cwd=ROOT)
-    if done.returncode:
-        raise SystemExit(f"{' '.join(command)}\n{done.stdout[-2000:]}\n{done.stderr[-4000:]}")
+def learned(
+    arguments: Sequence[str], folder: Path, share: float, gpus: Sequence[int]
+) -> list[dict[str, float]]:
+    """The rows that a job on these GPUs has logged when an evaluation first reaches the share, or at its end."""
+    command = [sys.executable, str(ROOT / "train.py"), *arguments, "logger=files", f"hydra.run.dir={folder}"]
+    places = {"CUDA_VISIBLE_DEVICES": ",".join(map(str, gpus))} if gpus else {}
+    said, stopped = folder.with_suffix(".log"), False
+    with said.open("w") as file:
+        job = subprocess.Popen(command, stdout=file, stderr=file, cwd=ROOT, env=os.environ | places)
+        while job.poll() is None:
+            time.sleep(0.5)
+            if not stopped and max(evaluated(folder), default=-1.0) >= share:
+                job.terminate()  # it saves what it has logged
+                stopped = True
+    if job.returncode and not stopped:
+        raise SystemExit(f"{' '.join(command)}\n{said.read_text()[-6000:]}")
     return read_rows(load_checkpoint(latest_checkpoint(folder)))
+
+
+def evaluated(folder: Path) -> list[float]:
+    """The shares of successes that a job in this folder has logged."""
+    table = folder / "csv" / "scalars" / f"{SUCCESS}.csv"
+    lines = table.read_text().split() if table.exists() else []
+    return [float(line.split(",")[1]) for line in lines if line.count(",") == 1 and line[-1] != ","]
 
 
 def first(rows: Sequence[dict[str, float]], share: float) -> dict[str, float]:
@@ -66,9 +86,12 @@ def main() -> None:
     parser.add_argument("--scale", default="gpu")
     parser.add_argument("--out", help="JSON file")
     args = parser.parse_args()
-    there = torch.cuda.device_count() if args.device == "cuda" else 2
+    on_gpu = args.device == "cuda"
+    there = torch.cuda.device_count() if on_gpu else 2
     if not there:
         parser.error("--device cuda: there is no GPU here; use --device cpu")
+    if max(args.gpus or [1]) > there:
+        parser.error(f"--gpus {max(args.gpus)}: there are {there} here")
     arguments = [*args.arguments, f"scale={args.scale}", f"device={args.device}"]
     alone = compose(*arguments)
     if args.every >= alone.trainer.updates:
@@ -76,33 +99,38 @@ def main() -> None:
     rate = alone.trainer.lr or alone.model.lr
     rows: list[dict[str, Any]] = []
     for gpus in sorted(args.gpus or [n for n in (1, 2, 4, 8) if n <= there]):
-        for seed in args.seeds:
-            job = [*arguments, *grown(gpus, *arguments), f"seed={seed}", "logger=none"]
+        free = [list(range(k, k + gpus)) for k in range(0, there - gpus + 1, gpus)] if on_gpu else [[]]
+
+        def run(seed: int, gpus: int = gpus, free: list[list[int]] = free) -> dict[str, Any]:
+            job = [*arguments, *grown(gpus, *arguments), f"seed={seed}"]
             job += [
                 f"trainer.lr={rate * gpus ** POWERS[args.learning_rate]}",
                 "trainer.checkpoint_replay=false",
             ]
             job += ["evaluation.during=[planner]", f"evaluation.every={args.every}"]
             job += [f"evaluation.episodes={args.episodes}", "evaluation.during_episodes=null"]
-            print(f"GPUs {gpus}, seed {seed} …", flush=True)
+            place = free.pop(0)
             with tempfile.TemporaryDirectory() as folder:
-                found = first(
-                    learned([*job, "evaluation.video_episodes=0"], Path(folder) / "run"), args.share
-                )
+                job += ["evaluation.video_episodes=0"]
+                found = first(learned(job, Path(folder) / "run", args.share, place), args.share)
+            free.append(place)
             same = [row["training [s]"] for row in rows if row["seed"] == seed]
-            rows.append(
-                {
-                    "GPUs": gpus,
-                    "seed": seed,
-                    "batch": alone.replay.batch_size * gpus,
-                    "success [%]": 100 * found[SUCCESS],
-                    "training [s]": found["time_s"],
-                    "updates": found["updates"],
-                    "environment steps": found["env_steps"],
-                    "times sooner": (same or [found["time_s"]])[0] / found["time_s"],
-                }
-            )
-            print(rows[-1], flush=True)
+            row = {
+                "GPUs": gpus,
+                "seed": seed,
+                "batch": alone.replay.batch_size * gpus,
+                "success [%]": 100 * found[SUCCESS],
+                "training [s]": found["time_s"],
+                "updates": found["updates"],
+                "environment steps": found["env_steps"],
+                "times sooner": (same or [found["time_s"]])[0] / found["time_s"],
+            }
+            print(row, flush=True)
+            return row
+
+        print(f"GPUs {gpus}, seeds {' '.join(map(str, args.seeds))} …", flush=True)
+        with ThreadPoolExecutor(len(free)) as pool:
+            rows += list(pool.map(run, args.seeds))
     title = f"time until {100 * args.share:g} % of episodes end in success"
     publish(title, rows, args.out, device=args.device, ran=("franka_wm/", "train.py"))
 

@@ -6,6 +6,7 @@ import math
 import sys
 from importlib import import_module
 from pathlib import Path
+from threading import Barrier
 from types import ModuleType, SimpleNamespace
 from typing import Any
 
@@ -63,14 +64,16 @@ def test_each_gpu_has_the_work_of_one_and_the_learning_rate_grows(benchmark, mon
     sooner, rows = benchmark("sooner")
     asked = []
 
-    def learned(arguments: list[str], folder: Path) -> list[dict[str, float]]:
+    def learned(arguments: list[str], folder: Path, share: float, gpus: list[int]) -> list[dict[str, float]]:
         said = dict(word.split("=", 1) for word in arguments)  # of several the last counts
         asked.append(said)
+        assert share == 0.95 and gpus == list(range(int(said["gpus"])))
         seconds = 60.0 / int(said["gpus"])
         return [{sooner.SUCCESS: 1.0, "time_s": seconds, "updates": 10.0, "env_steps": 20.0}]
 
     monkeypatch.setattr(sooner, "learned", learned)
-    words = ["env=lift", "replay.batch_size=100", "trainer.lr=1e-3", "--gpus", "1", "4", "--device", "cpu"]
+    monkeypatch.setattr(torch.cuda, "device_count", lambda: 4)
+    words = ["env=lift", "replay.batch_size=100", "trainer.lr=1e-3", "--gpus", "1", "4"]
     monkeypatch.setattr(sys, "argv", ["sooner.py", *words, "--scale", "laptop"])
     sooner.main()
     one, four = asked
@@ -81,6 +84,55 @@ def test_each_gpu_has_the_work_of_one_and_the_learning_rate_grows(benchmark, mon
     assert float(four["trainer.lr"]) == pytest.approx(2e-3)
     assert [row["times sooner"] for row in rows] == [1.0, 4.0]
     assert [row["batch"] for row in rows] == [100, 400]
+
+
+def test_jobs_of_fewer_gpus_than_there_are_run_side_by_side(benchmark, monkeypatch) -> None:
+    sooner, rows = benchmark("sooner")
+    together, places = Barrier(2), []
+
+    def learned(arguments: list[str], folder: Path, share: float, gpus: list[int]) -> list[dict[str, float]]:
+        places.append(gpus)
+        together.wait(timeout=20)  # for another job
+        return [{sooner.SUCCESS: 1.0, "time_s": 6.0, "updates": 10.0, "env_steps": 20.0}]
+
+    monkeypatch.setattr(sooner, "learned", learned)
+    monkeypatch.setattr(torch.cuda, "device_count", lambda: 5)
+    monkeypatch.setattr(sys, "argv", ["sooner.py", "env=lift", "--gpus", "2", "--seeds", "3", "1", "2", "4"])
+    sooner.main()
+    assert sorted(places) == [[0, 1], [0, 1], [2, 3], [2, 3]]
+    assert [row["seed"] for row in rows] == [3, 1, 2, 4]
+    monkeypatch.setattr(sys, "argv", ["sooner.py", "env=lift", "--gpus", "8"])
+    with pytest.raises(SystemExit):
+        sooner.main()
+
+
+JOB = """
+import os, signal, sys, time
+from pathlib import Path
+folder = Path(next(word for word in sys.argv if word.startswith("hydra.run.dir=")).partition("=")[2])
+table = folder / "csv/scalars/eval/planner/success.csv"
+table.parent.mkdir(parents=True)
+table.write_text("10,0.5\\n20,0.96\\n30,1")
+(folder / "gpus").write_text(os.environ["CUDA_VISIBLE_DEVICES"])
+signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))
+time.sleep(SECONDS)
+sys.exit("error: no such task")
+"""
+
+
+def test_a_job_is_stopped_where_it_has_learned_and_says_why_it_failed(
+    benchmark, monkeypatch, tmp_path: Path
+) -> None:
+    sooner, _ = benchmark("sooner")
+    monkeypatch.setattr(sooner, "ROOT", tmp_path)
+    for name in ("latest_checkpoint", "load_checkpoint", "read_rows"):
+        monkeypatch.setattr(sooner, name, lambda folder: folder)
+    (tmp_path / "train.py").write_text(JOB.replace("SECONDS", "60"))
+    assert sooner.learned([], tmp_path / "run", 0.9, [2, 3]) == tmp_path / "run"
+    assert (tmp_path / "run" / "gpus").read_text() == "2,3"
+    (tmp_path / "train.py").write_text(JOB.replace("SECONDS", "0"))
+    with pytest.raises(SystemExit, match=r"env=lift (?s:.*)no such task"):
+        sooner.learned(["env=lift"], tmp_path / "other", 1.1, [2, 3])
 
 
 @pytest.mark.parametrize("mps", [False, True])
@@ -132,17 +184,3 @@ def test_a_sweep_runs_train_py_and_counts_what_finished(benchmark, monkeypatch) 
     lost.append("a run")
     with pytest.raises(SystemExit, match="said"):
         sweep.sweep(["env=lift"], 3, at_once, {"MINE": "1"})
-
-
-def test_a_job_that_fails_ends_the_benchmark_with_what_it_said(benchmark, monkeypatch, tmp_path) -> None:
-    sooner, _ = benchmark("sooner")
-    asked = []
-
-    def run(command: list[str], **kwargs: Any) -> SimpleNamespace:
-        asked.append(command)
-        return SimpleNamespace(returncode=1, stdout="", stderr="error: no such task")
-
-    monkeypatch.setattr(sooner.subprocess, "run", run)
-    with pytest.raises(SystemExit, match="no such task"):
-        sooner.learned(["env=lift"], tmp_path)
-    assert asked == [[sys.executable, str(TOP / "train.py"), "env=lift", f"hydra.run.dir={tmp_path}"]]
