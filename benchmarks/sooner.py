@@ -6,14 +6,16 @@
 
 Arguments beside the options are those of train.py for one GPU. While each job trains, its planner plays held-out
 episodes; *training [s]* is the time without these until the first evaluation in which the share of them that ends in
-success reaches --share, *updates* those until then. The last evaluation is --every updates before the end. A job that
-never reaches the share has its best one and no time.
+success reaches --share, *updates* those until then; there the job is stopped. The last evaluation is --every updates
+before the end. A job that never reaches the share has its best one and no time. As many jobs run at once as the host
+has GPUs for; they share its cores.
 """
 
 from __future__ import annotations
 
 import argparse
 import os
+import signal
 import subprocess
 import sys
 import tempfile
@@ -26,39 +28,46 @@ from typing import Any
 import torch
 from common import compose, grown, publish
 
+from franka_wm.interrupt import INTERRUPTED
 from franka_wm.training.checkpoint import latest_checkpoint, load_checkpoint
 from franka_wm.training.history import read_rows
 
 ROOT = Path(__file__).resolve().parents[1]
 SUCCESS = "eval/planner/success"
+STOPPED = (0, INTERRUPTED, -signal.SIGTERM, 128 + signal.SIGTERM)
+"""Exit statuses of a job that was told to stop: it had just ended, or it saved, alone or started by `gpus=`."""
 POWERS = {"same": 0.0, "root": 0.5, "linear": 1.0}
 """How the learning rate grows with the number of GPUs: Adam's usual rule is the root."""
 
 
 def learned(
-    arguments: Sequence[str], folder: Path, share: float, gpus: Sequence[int]
+    arguments: Sequence[str], folder: Path, share: float, gpus: Sequence[str]
 ) -> list[dict[str, float]]:
-    """The rows that a job on these GPUs has logged when an evaluation first reaches the share, or at its end."""
+    """The rows that a job has logged until an evaluation reached the share (0 to 1), or until its end.
+
+    Args:
+        gpus: as `CUDA_VISIBLE_DEVICES` names them; none on a CPU.
+    """
     command = [sys.executable, str(ROOT / "train.py"), *arguments, "logger=files", f"hydra.run.dir={folder}"]
-    places = {"CUDA_VISIBLE_DEVICES": ",".join(map(str, gpus))} if gpus else {}
-    said, stopped = folder.with_suffix(".log"), False
-    with said.open("w") as file:
-        job = subprocess.Popen(command, stdout=file, stderr=file, cwd=ROOT, env=os.environ | places)
+    visible = {"CUDA_VISIBLE_DEVICES": ",".join(gpus)} if gpus else {}
+    output, stopped = folder.with_suffix(".log"), False
+    with output.open("w") as file:
+        job = subprocess.Popen(command, stdout=file, stderr=file, cwd=ROOT, env=os.environ | visible)
         while job.poll() is None:
             time.sleep(0.5)
             if not stopped and max(evaluated(folder), default=-1.0) >= share:
                 job.terminate()  # it saves what it has logged
                 stopped = True
-    if job.returncode and not stopped:
-        raise SystemExit(f"{' '.join(command)}\n{said.read_text()[-6000:]}")
+    if job.returncode not in (STOPPED if stopped else (0,)):
+        raise SystemExit(f"{' '.join(command)}\n{output.read_text()[-6000:]}")
     return read_rows(load_checkpoint(latest_checkpoint(folder)))
 
 
 def evaluated(folder: Path) -> list[float]:
-    """The shares of successes that a job in this folder has logged."""
+    """The shares of successes that a job in this folder has logged, whole lines of them."""
     table = folder / "csv" / "scalars" / f"{SUCCESS}.csv"
-    lines = table.read_text().split() if table.exists() else []
-    return [float(line.split(",")[1]) for line in lines if line.count(",") == 1 and line[-1] != ","]
+    whole = table.read_text().rpartition("\n")[0] if table.exists() else ""
+    return [float(line.split(",")[1]) for line in whole.split()]
 
 
 def first(rows: Sequence[dict[str, float]], share: float) -> dict[str, float]:
@@ -87,10 +96,11 @@ def main() -> None:
     parser.add_argument("--out", help="JSON file")
     args = parser.parse_args()
     on_gpu = args.device == "cuda"
-    there = torch.cuda.device_count() if on_gpu else 2
+    there = torch.cuda.device_count() if on_gpu else 2  # ranks on a CPU, where none are asked for
     if not there:
         parser.error("--device cuda: there is no GPU here; use --device cpu")
-    if max(args.gpus or [1]) > there:
+    names = (os.environ.get("CUDA_VISIBLE_DEVICES") or ",".join(map(str, range(there)))).split(",")
+    if on_gpu and max(args.gpus or [1]) > there:
         parser.error(f"--gpus {max(args.gpus)}: there are {there} here")
     arguments = [*args.arguments, f"scale={args.scale}", f"device={args.device}"]
     alone = compose(*arguments)
@@ -99,9 +109,12 @@ def main() -> None:
     rate = alone.trainer.lr or alone.model.lr
     rows: list[dict[str, Any]] = []
     for gpus in sorted(args.gpus or [n for n in (1, 2, 4, 8) if n <= there]):
-        free = [list(range(k, k + gpus)) for k in range(0, there - gpus + 1, gpus)] if on_gpu else [[]]
+        free = [names[k : k + gpus] for k in range(0, there - gpus + 1, gpus)] if on_gpu else [[]]
+        at_once = min(len(free), len(args.seeds))
 
-        def run(seed: int, gpus: int = gpus, free: list[list[int]] = free) -> dict[str, Any]:
+        def run(
+            seed: int, gpus: int = gpus, free: list[list[str]] = free, at_once: int = at_once
+        ) -> dict[str, Any]:
             job = [*arguments, *grown(gpus, *arguments), f"seed={seed}"]
             job += [
                 f"trainer.lr={rate * gpus ** POWERS[args.learning_rate]}",
@@ -112,12 +125,15 @@ def main() -> None:
             place = free.pop(0)
             with tempfile.TemporaryDirectory() as folder:
                 job += ["evaluation.video_episodes=0"]
-                found = first(learned(job, Path(folder) / "run", args.share, place), args.share)
-            free.append(place)
+                try:
+                    found = first(learned(job, Path(folder) / "run", args.share, place), args.share)
+                finally:
+                    free.append(place)
             same = [row["training [s]"] for row in rows if row["seed"] == seed]
             row = {
                 "GPUs": gpus,
                 "seed": seed,
+                "jobs at once": at_once,
                 "batch": alone.replay.batch_size * gpus,
                 "success [%]": 100 * found[SUCCESS],
                 "training [s]": found["time_s"],

@@ -97,13 +97,13 @@ class ActorCritic(WorldModel):
         return self._value_loss(z[:-1], returns).mean()
 
     def _imagined_step(self, z: Tensor) -> tuple[Tensor, Tensor]:
-        """Actions (N, A) that the actor draws in z (N, Z), not clamped, and the next states that are drawn."""
+        """Actions (N, A) that the actor draws in z (N, Z), not clamped, and states (N, Z) drawn after them."""
         mean, std = self.action_distribution(z.detach())
         action = mean + std * torch.randn_like(mean)
         return action, frozen(self.rssm, z, action.clamp(-1.0, 1.0))
 
     def _imagine(self, z: Tensor, step: Callable[[Tensor], tuple[Tensor, Tensor]]) -> tuple[Tensor, Tensor]:
-        """States (K+1, N, Z) and actions (K, N, A) of K times `step`, which is `_imagined_step`, from z (N, Z).
+        """States (K+1, N, Z) and actions (K, N, A) from z (N, Z); `step` is `_imagined_step`, or that compiled.
 
         With `actor_gradient=dynamics` they have gradients to the actor, through nothing but its actions.
         """

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
+from inspect import signature
 from types import MappingProxyType
 from typing import Any, ClassVar
 
@@ -226,21 +227,21 @@ class WorldModel(nn.Module):
         """Move slow copies of weights, after each optimiser step; there are none by default."""
 
     parts_of_loss: ClassVar[tuple[str, ...]] = ()
-    """Methods that `loss` calls and takes replacements of as `parts`; without any it is compiled as one program."""
+    """Names of methods that a `loss` which takes `parts` calls through them, so that each is compiled by itself."""
 
     def compiled_loss(self) -> Callable[[TensorDictBase], TensorDict]:
-        """`loss`, compiled by `torch.compile`: as a whole, or each of `parts_of_loss`."""
-        owner = next(cls for cls in type(self).__mro__ if "loss" in vars(cls))
-        names = vars(owner).get("parts_of_loss", ())  # a subclass with a loss of its own has none, or others
-        if not names:
+        """`loss`, compiled by `torch.compile`: where it takes `parts`, each of `parts_of_loss`, else as one program.
+
+        Parts are compiled for every shape that they are called with; what else `loss` does runs as it is.
+        """
+        if "parts" not in signature(self.loss).parameters:
             return torch.compile(self.loss)
         loss: Callable[..., TensorDict] = self.loss
-        return partial(
-            loss, parts={name: torch.compile(getattr(self, name), dynamic=False) for name in names}
-        )
+        compiled = {name: torch.compile(part, dynamic=False) for name, part in self._parts(None).items()}
+        return partial(loss, parts=compiled)
 
     def _parts(self, instead: Mapping[str, Callable[..., Any]] | None) -> dict[str, Callable[..., Any]]:
-        """`parts_of_loss` by name, those of `instead` in their place."""
+        """Name -> method of `parts_of_loss`, or what `instead` has under the name."""
         return {name: getattr(self, name) for name in self.parts_of_loss} | dict(instead or {})
 
     def rebuild_overrides(self) -> dict[str, Any]:

@@ -248,7 +248,7 @@ class Dreamer(ActorCritic):
         "_actor_critic_loss",
         "_replay_value_loss",
     )
-    """Methods that `loss` calls, compiled one by one: all steps in one program would take minutes to compile."""
+    """Compiled one by one: all steps in one program would take minutes to compile."""
 
     def loss(
         self, batch: TensorDictBase, *, parts: Mapping[str, Callable[..., Any]] | None = None
@@ -289,7 +289,7 @@ class Dreamer(ActorCritic):
         embedded = call["_embed"](window)
         h = self._remember(earlier, batch[:, 0], embedded[0], call)
         z, posterior = self._filter(h, embedded, action, call["_step"])  # (H+1, B, ...)
-        model_loss, parts_of_model = call["_model_loss"](z, posterior, window, reward, terminated)
+        model_loss, model_metrics = call["_model_loss"](z, posterior, window, reward, terminated)
         imagined, actions = self._imagine(z.detach().flatten(0, 1), call["_imagined_step"])
         begun = torch.cat((torch.ones_like(reward[:1]), (~terminated).to(reward.dtype)))
         policy_loss, value_loss, entropy, returns, value = call["_actor_critic_loss"](
@@ -297,7 +297,7 @@ class Dreamer(ActorCritic):
         )
         replay_value_loss = call["_replay_value_loss"](z, returns[0], reward, terminated)
         metrics = {
-            **parts_of_model,
+            **model_metrics,
             "loss_policy": policy_loss,
             "loss_value": value_loss,
             "loss_replay_value": replay_value_loss,
@@ -334,7 +334,7 @@ class Dreamer(ActorCritic):
         return self.rssm.state(h, posterior, sample=sample), posterior
 
     def _step(self, h: Tensor, embedded: Tensor, action: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """What `_see` draws for h (B, deter_dim) and features (B, E), and the next h after actions (B, A)."""
+        """z (B, Z) and its posterior (B, codes, classes), as `_see` draws, and the next h (B, deter_dim)."""
         z, posterior = self._see(h, embedded, sample=True)
         return z, posterior, self.rssm.recur(z, action)
 
@@ -347,6 +347,7 @@ class Dreamer(ActorCritic):
     ) -> Tensor:
         """h (B, deter_dim) of a window's `first` step (B,), whose features are (B, E), after `earlier` steps (B, K).
 
+        `call` has the parts of the loss by name.
         No gradient reaches them: the burn-in of R2D2 (Kapturowski et al., 2019).
         """
         h = begin = self.rssm.begin(embedded)
@@ -365,7 +366,7 @@ class Dreamer(ActorCritic):
     ) -> tuple[Tensor, Tensor]:
         """States (H+1, B, Z) and posteriors (H+1, B, codes, classes) of features (H+1, B, E), actions (H, B, A).
 
-        h (B, deter_dim) is the first step's.
+        h (B, deter_dim) is the first step's; `step` is `_step`, or that compiled.
         """
         states, posteriors = [], []
         for t in range(action.shape[0]):

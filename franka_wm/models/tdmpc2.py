@@ -277,7 +277,7 @@ class TDMPC2(SimplicialWorldModel):
     # ------------------------------------------------------------------ training
 
     parts_of_loss = ("_encode_window", "_td_target", "_unroll", "_model_losses", "_policy_loss", "_metrics")
-    """Methods that `loss` calls, compiled one by one: what runs side by side on a GPU must not become one program."""
+    """Compiled one by one: what runs side by side on a GPU must not become one program."""
 
     def loss(
         self, batch: TensorDictBase, *, parts: Mapping[str, Callable[..., Any]] | None = None

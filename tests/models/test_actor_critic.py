@@ -123,7 +123,7 @@ def test_each_part_of_the_loss_compiles_as_one_graph(actor_gradient, burn_in):
     for compiled in (False, True):
         model = small(actor_gradient, burn_in=burn_in)
         fast = {
-            name: torch.compile(getattr(model, name), backend="eager", fullgraph=True)
+            name: torch.compile(getattr(model, name), backend="eager", fullgraph=True, dynamic=False)
             for name in model.parts_of_loss
         }
         torch.manual_seed(1)

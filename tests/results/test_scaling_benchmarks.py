@@ -64,10 +64,10 @@ def test_each_gpu_has_the_work_of_one_and_the_learning_rate_grows(benchmark, mon
     sooner, rows = benchmark("sooner")
     asked = []
 
-    def learned(arguments: list[str], folder: Path, share: float, gpus: list[int]) -> list[dict[str, float]]:
+    def learned(arguments: list[str], folder: Path, share: float, gpus: list[str]) -> list[dict[str, float]]:
         said = dict(word.split("=", 1) for word in arguments)  # of several the last counts
         asked.append(said)
-        assert share == 0.95 and gpus == list(range(int(said["gpus"])))
+        assert share == 0.95 and gpus == ["0", "1", "2", "3"][: int(said["gpus"])]
         seconds = 60.0 / int(said["gpus"])
         return [{sooner.SUCCESS: 1.0, "time_s": seconds, "updates": 10.0, "env_steps": 20.0}]
 
@@ -90,16 +90,20 @@ def test_jobs_of_fewer_gpus_than_there_are_run_side_by_side(benchmark, monkeypat
     sooner, rows = benchmark("sooner")
     together, places = Barrier(2), []
 
-    def learned(arguments: list[str], folder: Path, share: float, gpus: list[int]) -> list[dict[str, float]]:
+    def learned(arguments: list[str], folder: Path, share: float, gpus: list[str]) -> list[dict[str, float]]:
         places.append(gpus)
         together.wait(timeout=20)  # for another job
+        assert not {*places[-1]} & {*places[-2]}
+        together.wait(timeout=20)
         return [{sooner.SUCCESS: 1.0, "time_s": 6.0, "updates": 10.0, "env_steps": 20.0}]
 
     monkeypatch.setattr(sooner, "learned", learned)
     monkeypatch.setattr(torch.cuda, "device_count", lambda: 5)
+    monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "9,8,7,6,5")
     monkeypatch.setattr(sys, "argv", ["sooner.py", "env=lift", "--gpus", "2", "--seeds", "3", "1", "2", "4"])
     sooner.main()
-    assert sorted(places) == [[0, 1], [0, 1], [2, 3], [2, 3]]
+    assert sorted(places) == [["7", "6"], ["7", "6"], ["9", "8"], ["9", "8"]]
+    assert {row["jobs at once"] for row in rows} == {2}
     assert [row["seed"] for row in rows] == [3, 1, 2, 4]
     monkeypatch.setattr(sys, "argv", ["sooner.py", "env=lift", "--gpus", "8"])
     with pytest.raises(SystemExit):
@@ -110,11 +114,12 @@ JOB = """
 import os, signal, sys, time
 from pathlib import Path
 folder = Path(next(word for word in sys.argv if word.startswith("hydra.run.dir=")).partition("=")[2])
+folder.mkdir()
+(folder / "gpus").write_text(os.environ["CUDA_VISIBLE_DEVICES"])
+signal.signal(signal.SIGTERM, lambda *_: sys.exit(STATUS))
 table = folder / "csv/scalars/eval/planner/success.csv"
 table.parent.mkdir(parents=True)
 table.write_text("10,0.5\\n20,0.96\\n30,1")
-(folder / "gpus").write_text(os.environ["CUDA_VISIBLE_DEVICES"])
-signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))
 time.sleep(SECONDS)
 sys.exit("error: no such task")
 """
@@ -127,12 +132,19 @@ def test_a_job_is_stopped_where_it_has_learned_and_says_why_it_failed(
     monkeypatch.setattr(sooner, "ROOT", tmp_path)
     for name in ("latest_checkpoint", "load_checkpoint", "read_rows"):
         monkeypatch.setattr(sooner, name, lambda folder: folder)
-    (tmp_path / "train.py").write_text(JOB.replace("SECONDS", "60"))
-    assert sooner.learned([], tmp_path / "run", 0.9, [2, 3]) == tmp_path / "run"
+
+    def job(name: str, share: float, *, seconds: int, status: int = 143) -> Path:
+        text = JOB.replace("SECONDS", str(seconds)).replace("STATUS", str(status))
+        (tmp_path / "train.py").write_text(text)
+        return sooner.learned(["env=lift"], tmp_path / name, share, ["2", "3"])
+
+    assert job("run", 0.9, seconds=60) == tmp_path / "run"
     assert (tmp_path / "run" / "gpus").read_text() == "2,3"
-    (tmp_path / "train.py").write_text(JOB.replace("SECONDS", "0"))
+    assert sooner.evaluated(tmp_path / "run") == [0.5, 0.96]  # the last line is not whole yet
     with pytest.raises(SystemExit, match=r"env=lift (?s:.*)no such task"):
-        sooner.learned(["env=lift"], tmp_path / "other", 1.1, [2, 3])
+        job("failed", 1.1, seconds=0)
+    with pytest.raises(SystemExit, match="env=lift"):  # while it saved
+        job("lost", 0.9, seconds=60, status=1)
 
 
 @pytest.mark.parametrize("mps", [False, True])
