@@ -192,8 +192,12 @@ class Progress:
 
     def __init__(self, total: int, *, done: int = 0, env_steps: int = 0, every: float = 10.0):
         self.total, self.every = total, every
+        self.begin(done, env_steps)
+
+    def begin(self, updates: int, env_steps: int) -> None:
+        """Rates and time left count from here on: what came before happens once, as compiling does."""
         self._started = self._last = time.perf_counter()
-        self._first = self._previous = (done, env_steps)
+        self._first = self._previous = (updates, env_steps)
 
     def due(self) -> bool:
         """Whether it is time for a line."""

@@ -91,7 +91,11 @@ def test_a_task_with_a_gripper_is_its_measured_row(env: str) -> None:
 
 @pytest.mark.parametrize(("name", "scale"), list(product(options("experiment"), SCALES)))
 def test_every_experiment_at_every_scale(name: str, scale: str) -> None:
-    assert flat(compose(f"experiment={name}", f"scale={scale}"))["scale"] == scale
+    found = flat(compose(f"experiment={name}", f"scale={scale}"))
+    assert found["scale"] == scale
+    if scale == "smoke":  # everything once, in a minute
+        assert found["trainer.updates"] <= 30 and (found["collector.seed_updates"] or 0) <= 30
+        assert not found["trainer.compile"] and not found.get("planner.compile", False)
 
 
 def test_what_is_typed_wins_over_what_is_tuned() -> None:

@@ -248,6 +248,10 @@ def check_run(verb: str, option: str, folder: str) -> None:
         runs = sorted(one.name for one in place.iterdir() if (one / "checkpoints").is_dir())
         if runs and runs != ["pretrained"]:  # a run that ended in its first stage
             raise UserError(f"{verb}: {option}={folder}: holds runs; give one of {', '.join(runs)}")
+        if not runs:
+            raise UserError(
+                f"{verb}: {option}={folder}: is no run's folder; give one as train.py prints it last"
+            )
 
 
 def verb(name: str, **settings: Any) -> Callable[[Any], Verb]:

@@ -302,8 +302,10 @@ def check_folders(cfg: DictConfig) -> None:
         named = OmegaConf.select(cfg, option)
         for folder in named if isinstance(named, ListConfig) else [named]:
             if folder is not None and not Path(str(folder)).expanduser().is_dir():
-                hint = "; give that of a run, as train.py prints it last" if option == "resume" else ""
-                fail(f"{option}={folder}: no such folder{hint}")
+                wanted = "give that of a run, as train.py prints it last"
+                if option != "resume":
+                    wanted = "franka-wm collect out=FOLDER makes one"
+                fail(f"{option}={folder}: no such folder; {wanted}")
 
 
 def fail(message: str) -> NoReturn:

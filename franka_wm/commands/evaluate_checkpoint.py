@@ -107,8 +107,8 @@ def run(options: Options) -> dict[str, Any]:
         say(f"results of the episodes: {options.out}; diagnostics follow")
     imagined = None
     if options.open_loop or options.probes:
-        say("held-out episodes for the diagnostics …")
-        held = diagnose.hold_out(agent, images=options.open_loop)
+        with announced("held-out episodes for the diagnostics"):
+            held = diagnose.hold_out(agent, images=options.open_loop)
         if options.open_loop:
             imagined = _look_ahead(agent, held, evaluation, results, say)
         if options.probes:
@@ -152,12 +152,12 @@ def _look_ahead(
         ahead = {"not_measured": str(error)}
         say(f"warning: open loop not measured: {error}")
     results["open_loop"] = ahead
-    say("value calibration …")
-    value = results["calibration"] = diagnose.calibration(agent)
+    with announced("value calibration"):
+        value = results["calibration"] = diagnose.calibration(agent)
     if "not_measured" in value:
         say(f"warning: value calibration not measured: {value['not_measured']}")
     results["health"] = diagnose.health(agent, evaluation)
-    imagined = diagnose.imagine(agent, held, say=say)
+    imagined = diagnose.imagine(agent, held, announce=announced)
     if imagined is not None:
         ahead["decoder"] = imagined[2]
     return imagined

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, cast
 
@@ -226,13 +227,17 @@ def health(agent: Agent, evaluation: Evaluation | None) -> dict[str, Any]:
 
 
 def imagine(
-    agent: Agent, held: Held, *, steps: int = 8, say: Callable[[str], None] = lambda text: None
+    agent: Agent,
+    held: Held,
+    *,
+    steps: int = 8,
+    announce: Callable[[str], AbstractContextManager[None]] = nullcontext,
 ) -> tuple[Imagined, Decoder, dict[str, float]] | None:
     """Trains a decoder on the images and draws what the model imagines in an episode that it has not seen.
 
     Args:
         steps: Imagined, at most.
-        say: Called with one line when the training starts.
+        announce: What tells that the training goes on, called with one line.
 
     Returns:
         ``None`` without images or without ``next``; else strip and film, the decoder, and its errors on the
@@ -250,8 +255,8 @@ def imagine(
     known[fit:], unknown[:fit] = False, False
     latents, drawn = _starts(agent, decoder_size=images.shape[2])
     latents, drawn = torch.cat([seen[known.to(device)], latents]), torch.cat([images[known], drawn])
-    say(f"training a decoder on {len(drawn)} images; it is used for display only …")
-    decoder = train_decoder(latents, drawn)
+    with announce(f"training a decoder on {len(drawn)} images; it is used for display only"):
+        decoder = train_decoder(latents, drawn)
     errors = decoder_error(decoder, seen[unknown.to(device)], images[unknown])
     world = (
         count - 1 if count % 2 == 0 else count - 2

@@ -22,7 +22,8 @@ def read_evaluation(run: str | Path) -> Result:
     """
     found = results(run)
     if not found:
-        raise UserError(f"{run}: no evaluation.json; give folders of runs that were finished")
+        missing = "no evaluation.json" if Path(run).is_dir() else "no such folder"
+        raise UserError(f"{run}: {missing}; give folders of runs that were finished")
     return found[0]
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from contextlib import nullcontext
 from typing import TYPE_CHECKING
 
 import torch
@@ -10,6 +11,7 @@ from tensordict import TensorDictBase
 from torch import nn
 
 from franka_wm import processes
+from franka_wm.console import announced
 from franka_wm.errors import UserError
 from franka_wm.options import PRECISIONS
 from franka_wm.training.settings.groups import SCHEDULES
@@ -93,6 +95,7 @@ class Learner:
         self.rates = [float(group["lr"]) for group in self.optimizer.param_groups]
         self.precision = precision
         self._loss = model.compiled_loss() if compile else model.loss
+        self._compiled = compile
         self.updates = 0
         self._names: list[str] = []
         self._sums: torch.Tensor | None = None
@@ -113,22 +116,26 @@ class Learner:
             batch = self._kept(batch, static)
         if self._graph is None and self.capture and self._seen >= self.EAGER_UPDATES:
             self._record(batch)
-        if self._graph is None:
-            if self.capture:  # warm up on the kind of stream that the capture will use
-                stream = torch.cuda.Stream()
-                stream.wait_stream(torch.cuda.current_stream())
-                with torch.cuda.stream(stream):
-                    self.optimizer.zero_grad(set_to_none=True)
-                    self._eager(batch)
-                torch.cuda.current_stream().wait_stream(stream)
-            else:
-                self.optimizer.zero_grad(set_to_none=True)
-                self._eager(batch)
-        else:
+        if self._graph is not None:
             self._graph.replay()
+        else:
+            compiles = self._compiled and not self._seen
+            with announced("compiling the loss") if compiles else nullcontext():
+                self._warm_up(batch)
         self._seen += 1
         self._summed += 1
         self.updates += 1
+
+    def _warm_up(self, batch: TensorDictBase) -> None:
+        """An update that is not captured, on the kind of stream that a capture will use."""
+        self.optimizer.zero_grad(set_to_none=True)
+        if not self.capture:
+            return self._eager(batch)
+        stream = torch.cuda.Stream()
+        stream.wait_stream(torch.cuda.current_stream())
+        with torch.cuda.stream(stream):
+            self._eager(batch)
+        torch.cuda.current_stream().wait_stream(stream)
 
     def rate(self, update: int) -> float:
         """The learning rate at an update, relative to the one given."""

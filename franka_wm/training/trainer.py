@@ -36,9 +36,8 @@ from franka_wm.training.shards import save_together
 from franka_wm.training.spaces import Spaces
 from franka_wm.training.storage_budget import fill, filled_bytes, reason_to_leave_out
 
-EVALUATION_SHARE = 0.1
-"""Evaluations while training are left out once they have taken more than this share of the training's time, unless
-``evaluation.every`` asks for them. The weights are the same with and without."""
+EVALUATION_SHARE, EVALUATION_SECONDS = 0.1, 5.0
+"""Share of training's time, and seconds, after which evaluations are left out unless ``evaluation.every`` is given."""
 
 
 class Trainer:
@@ -161,6 +160,8 @@ class Trainer:
                         self.demonstrations.use(self.settings.demo_windows(self.learner.updates))
                     self._batch = self._draw()
                     self.learner.update(self._batch, static=self._static(self._batch))
+                    if self.learner.updates == updates + 1:
+                        progress.begin(updates + 1, self.env_steps)
                     if self._asks_at_once:
                         self.require_finite()
                 self.seconds = time.perf_counter() - started
@@ -267,12 +268,11 @@ class Trainer:
 
     def _too_long(self) -> bool:
         """Whether evaluations have taken more of the time than they may; where ``every`` is given, they may."""
-        if self.settings.evaluation.every is not None or self._evaluated <= EVALUATION_SHARE * self.seconds:
+        allowed = max(EVALUATION_SECONDS, EVALUATION_SHARE * self.seconds)
+        if self.settings.evaluation.every is not None or self._evaluated <= allowed:
             return False
         if not self._said_too_long:
-            say(
-                "  evaluations take long here: some are left out; evaluation.every=N plays them every N updates"
-            )
+            say("  evaluations take long: some are left out; evaluation.every=N plays them every N updates")
             self._said_too_long = True
         return True
 

@@ -154,7 +154,7 @@ WRONG: list[tuple[list[str], str]] = [
     # also for root, who may write anywhere
     (["evaluate", "checkpoint=x", "out=/proc/x"], "/proc is not writable"),
     (["collect", "out=/proc/x"], "/proc is not writable"),
-    (["export", "source=.", "out=/proc/x"], "/proc is not writable"),
+    (["export", "source=hf:me/run", "out=/proc/x"], "/proc is not writable"),
     (["view", "rerun=/proc/x.rrd"], "/proc is not writable"),
     (["report", "RUN", "out=/proc/x.html"], "/proc is not writable"),
     (["compare", "A", "B", "out=/proc/x.html"], "/proc is not writable"),
@@ -220,10 +220,18 @@ def test_bad_arguments_are_answered_before_anything_heavy_is_imported(
 
 def test_a_run_is_there_while_its_checkpoint_is_replaced(tmp_path: Path) -> None:
     """Killed between two renames, NAME is only there as NAME.old, which is read in its place."""
-    (tmp_path / "last.old").mkdir()
+    (tmp_path / "last.old" / "checkpoints").mkdir(parents=True)
     check_run("view", "checkpoint", f"{tmp_path}/last/")
     with pytest.raises(UserError, match="no such folder"):
         check_run("view", "checkpoint", str(tmp_path / "first"))
+
+
+def test_a_folder_that_is_no_runs_is_refused_before_anything_is_loaded(tmp_path: Path) -> None:
+    (tmp_path / "pictures").mkdir()
+    with pytest.raises(UserError, match=r"is no run.s folder; give one as train\.py prints it last"):
+        check_run("view", "checkpoint", str(tmp_path))
+    (tmp_path / "pretrained" / "checkpoints").mkdir(parents=True)  # a run that ended in its first stage
+    check_run("view", "checkpoint", str(tmp_path))
 
 
 def test_shells_complete_verbs_options_and_choices(monkeypatch: pytest.MonkeyPatch) -> None:

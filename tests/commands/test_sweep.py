@@ -174,7 +174,10 @@ def test_folders_are_not_looked_for_where_a_launcher_may_take_jobs_to_other_mach
     assert begun and capsys.readouterr().err == ""
     with pytest.raises(SystemExit):
         entry._run(lambda: pytest.fail("begun"), [*search, "replay.demos=elsewhere"])
-    assert capsys.readouterr().err == "error: replay.demos=elsewhere: no such folder\n"
+    assert (
+        capsys.readouterr().err
+        == "error: replay.demos=elsewhere: no such folder; franka-wm collect out=FOLDER makes one\n"
+    )
 
 
 @pytest.mark.parametrize("launcher", ["submitit_slurm", "ray"])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from collections import Counter
 from contextlib import nullcontext
 from types import SimpleNamespace
@@ -236,11 +237,12 @@ PARTED = {
 
 
 @pytest.mark.parametrize("family", PARTED)
-def test_parts_of_a_loss_are_compiled_one_by_one(family: str, monkeypatch) -> None:
+def test_parts_of_a_loss_are_compiled_one_by_one(family: str, monkeypatch, capsys) -> None:
     """Numbers are the same. As one program TD-MPC2 would not run side by side, Dreamer's steps compile for minutes."""
     torch.manual_seed(0)
     model: Any = models.make(family, observation_sizes={"state": 5}, action_dim=2, **PARTED[family])
     model.eval()  # no dropout: both losses draw the same
+    before = copy.deepcopy(model.state_dict())
     compiled: list[str] = []
 
     def noted(function: Any, *, dynamic: bool | None = None) -> Any:
@@ -278,6 +280,13 @@ def test_parts_of_a_loss_are_compiled_one_by_one(family: str, monkeypatch) -> No
     assert torch.equal(model.loss(data, parts=parts)["loss"], plain["loss"])
     assert called == dict.fromkeys(model.parts_of_loss, 1) | CALLS[family]
     torch.manual_seed(1)
+    learner.update(data)
+    assert "compiling the loss …" in capsys.readouterr().out
+    learner.update(data)
+    assert not capsys.readouterr().out
+    learner.metrics()
+    torch.manual_seed(1)
+    model.load_state_dict(before)
     learner.update(data)
     assert learner.metrics()["loss"] == pytest.approx(plain["loss"].item())
 

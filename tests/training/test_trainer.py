@@ -102,6 +102,21 @@ def test_a_run(make: Make) -> None:
     assert checkpoint.counters["updates"] == 20 and checkpoint.counters["env_steps"] == trainer.env_steps
 
 
+def test_rates_and_time_left_are_without_the_first_update(make: Make, monkeypatch, capsys) -> None:
+    """Compiling it may take minutes."""
+    update = Learner.update
+
+    def slowly(learner: Learner, *inputs: object, **options: bool) -> None:
+        if not learner.updates:
+            time.sleep(5.0)
+        update(learner, *inputs, **options)
+
+    monkeypatch.setattr(Learner, "update", slowly)
+    trainer = make(updates=10, log_every=0.1)
+    trainer.fit()
+    assert trainer.rows[0]["updates"] == 10 and trainer.rows[0]["updates_per_s"] > 3.0
+
+
 @pytest.mark.parametrize("low", [None, -0.01])
 def test_targets_outside_of_the_range_are_said(make: Make, capsys, low) -> None:
     make(model={"value_low": low}).fit()
@@ -287,17 +302,18 @@ def test_evaluation_while_training(make: Make, cfg: RunSettings) -> None:
     assert rows[0]["updates"] == 10
 
 
-def test_evaluations_that_take_long_are_left_out_unless_asked_for(make: Make, capsys) -> None:
+def test_evaluations_that_take_long_are_left_out_unless_asked_for(make: Make, capsys, monkeypatch) -> None:
     def slowly() -> dict[str, float]:
         time.sleep(2.0)
         return {"eval/policy/success": 0.5}
 
-    for every, count in ((None, 1), (10, 3)):
-        trainer = make(str(every), updates=40, evaluate=slowly)
+    for every, seconds, count in ((None, 1.0, 1), (10, 1.0, 3), (None, 9.0, 3)):
+        monkeypatch.setattr("franka_wm.training.trainer.EVALUATION_SECONDS", seconds)
+        trainer = make(f"{every}-{seconds}", updates=40, evaluate=slowly)
         trainer.settings = trainer.settings.changed(evaluation={"every": every})
         trainer.fit()
         assert sum("eval/policy/success" in row for row in trainer.rows) == count
-        assert capsys.readouterr().out.count("some are left out") == (every is None)
+        assert capsys.readouterr().out.count("some are left out") == (count == 1)
 
 
 def test_evaluation_at_environment_steps(make: Make, capsys) -> None:
