@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from franka_wm.console import log_to, program, terminal_log
+from franka_wm.console import Progress, log_to, program, terminal_log
 
 
 def test_what_is_printed_before_and_after_there_is_a_file(tmp_path: Path, capsys) -> None:
@@ -58,3 +58,17 @@ def test_what_to_type_is_a_path_where_the_shell_does_not_find_the_name(
     assert program() == "'my env/bin/franka-wm'"
     monkeypatch.setenv("PATH", str(beside.parent))
     assert program() == "franka-wm"
+
+
+def test_rates_and_time_left_count_from_the_last_beginning(monkeypatch: pytest.MonkeyPatch, capsys) -> None:
+    now = 0.0
+    monkeypatch.setattr("time.perf_counter", lambda: now)
+    progress = Progress(101, every=10.0)
+    now = 200.0  # the first update, which compiles
+    assert progress.due()
+    progress.begin(1, 40)
+    assert not progress.due()
+    now = 210.0
+    assert progress.due()
+    assert progress.line(21, 240) == {"updates_per_s": 2.0, "env_steps_per_s": 20.0}
+    assert "left 0:40" in capsys.readouterr().out  # 80 more, at 2 a second
