@@ -6,6 +6,7 @@ import io
 import os
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
@@ -62,7 +63,7 @@ def test_what_to_type_is_a_path_where_the_shell_does_not_find_the_name(
 
 def test_rates_and_time_left_count_from_the_last_beginning(monkeypatch: pytest.MonkeyPatch, capsys) -> None:
     now = 0.0
-    monkeypatch.setattr("time.perf_counter", lambda: now)
+    monkeypatch.setattr("franka_wm.console.time", SimpleNamespace(perf_counter=lambda: now))
     progress = Progress(101, every=10.0)
     now = 200.0  # the first update, which compiles
     assert progress.due()
