@@ -79,6 +79,8 @@ def test_a_closed_pipe_is_not_the_runs_fault(tmp_path, monkeypatch):
 def test_a_run_without_evaluation_is_refused(tmp_path, capsys):
     with pytest.raises(UserError, match="no evaluation"):
         read_evaluation(tmp_path)
+    with pytest.raises(UserError, match="nowhere: no such folder"):
+        read_evaluation(tmp_path / "nowhere")
     (tmp_path / "evaluation.json").write_text("{")
     with pytest.raises(UserError, match="cannot be read"):
         read_evaluation(tmp_path)
