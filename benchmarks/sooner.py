@@ -22,6 +22,7 @@ import tempfile
 import time
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -101,52 +102,46 @@ def main() -> None:
         parser.error("--device cuda: there is no GPU here; use --device cpu")
     names = (os.environ.get("CUDA_VISIBLE_DEVICES") or ",".join(map(str, range(there)))).split(",")
     if on_gpu and max(args.gpus or [1]) > there:
-        parser.error(f"--gpus {max(args.gpus)}: there are {there} here")
+        parser.error(f"--gpus {max(args.gpus)}: there are {there} here; give at most that")
     arguments = [*args.arguments, f"scale={args.scale}", f"device={args.device}"]
     alone = compose(*arguments)
     if args.every >= alone.trainer.updates:
         parser.error(f"--every {args.every}: must be less than trainer.updates={alone.trainer.updates}")
     rate = alone.trainer.lr or alone.model.lr
     rows: list[dict[str, Any]] = []
+
+    def run(gpus: int, free: list[list[str]], at_once: int, seed: int) -> dict[str, Any]:
+        job = [*arguments, *grown(gpus, *arguments), f"seed={seed}", "trainer.checkpoint_replay=false"]
+        job += [f"trainer.lr={rate * gpus ** POWERS[args.learning_rate]}", "evaluation.during=[planner]"]
+        job += [f"evaluation.every={args.every}", f"evaluation.episodes={args.episodes}"]
+        job += ["evaluation.during_episodes=null", "evaluation.video_episodes=0"]
+        place = free.pop(0)
+        with tempfile.TemporaryDirectory() as folder:
+            try:
+                found = first(learned(job, Path(folder) / "run", args.share, place), args.share)
+            finally:
+                free.append(place)
+        same = [row["training [s]"] for row in rows if row["seed"] == seed]
+        row = {
+            "GPUs": gpus,
+            "seed": seed,
+            "jobs at once": at_once,
+            "batch": alone.replay.batch_size * gpus,
+            "success [%]": 100 * found[SUCCESS],
+            "training [s]": found["time_s"],
+            "updates": found["updates"],
+            "environment steps": found["env_steps"],
+            "times sooner": (same or [found["time_s"]])[0] / found["time_s"],
+        }
+        print(row, flush=True)
+        return row
+
     for gpus in sorted(args.gpus or [n for n in (1, 2, 4, 8) if n <= there]):
         free = [names[k : k + gpus] for k in range(0, there - gpus + 1, gpus)] if on_gpu else [[]]
         at_once = min(len(free), len(args.seeds))
-
-        def run(
-            seed: int, gpus: int = gpus, free: list[list[str]] = free, at_once: int = at_once
-        ) -> dict[str, Any]:
-            job = [*arguments, *grown(gpus, *arguments), f"seed={seed}"]
-            job += [
-                f"trainer.lr={rate * gpus ** POWERS[args.learning_rate]}",
-                "trainer.checkpoint_replay=false",
-            ]
-            job += ["evaluation.during=[planner]", f"evaluation.every={args.every}"]
-            job += [f"evaluation.episodes={args.episodes}", "evaluation.during_episodes=null"]
-            place = free.pop(0)
-            with tempfile.TemporaryDirectory() as folder:
-                job += ["evaluation.video_episodes=0"]
-                try:
-                    found = first(learned(job, Path(folder) / "run", args.share, place), args.share)
-                finally:
-                    free.append(place)
-            same = [row["training [s]"] for row in rows if row["seed"] == seed]
-            row = {
-                "GPUs": gpus,
-                "seed": seed,
-                "jobs at once": at_once,
-                "batch": alone.replay.batch_size * gpus,
-                "success [%]": 100 * found[SUCCESS],
-                "training [s]": found["time_s"],
-                "updates": found["updates"],
-                "environment steps": found["env_steps"],
-                "times sooner": (same or [found["time_s"]])[0] / found["time_s"],
-            }
-            print(row, flush=True)
-            return row
-
-        print(f"GPUs {gpus}, seeds {' '.join(map(str, args.seeds))} …", flush=True)
+        print(f"GPUs {gpus}, seeds {' '.join(map(str, args.seeds))}, {at_once} at once …", flush=True)
         with ThreadPoolExecutor(len(free)) as pool:
-            rows += list(pool.map(run, args.seeds))
+            rows += list(pool.map(partial(run, gpus, free, at_once), args.seeds))
     title = f"time until {100 * args.share:g} % of episodes end in success"
     publish(title, rows, args.out, device=args.device, ran=("franka_wm/", "train.py"))
 

@@ -121,7 +121,7 @@ table = folder / "csv/scalars/eval/planner/success.csv"
 table.parent.mkdir(parents=True)
 table.write_text("10,0.5\\n20,0.96\\n30,1")
 time.sleep(SECONDS)
-sys.exit("error: no such task")
+sys.exit(END)
 """
 
 
@@ -133,8 +133,8 @@ def test_a_job_is_stopped_where_it_has_learned_and_says_why_it_failed(
     for name in ("latest_checkpoint", "load_checkpoint", "read_rows"):
         monkeypatch.setattr(sooner, name, lambda folder: folder)
 
-    def job(name: str, share: float, *, seconds: int, status: int = 143) -> Path:
-        text = JOB.replace("SECONDS", str(seconds)).replace("STATUS", str(status))
+    def job(name: str, share: float, *, seconds: int, status: int = 143, end: int | str = 0) -> Path:
+        text = JOB.replace("SECONDS", str(seconds)).replace("STATUS", str(status)).replace("END", repr(end))
         (tmp_path / "train.py").write_text(text)
         return sooner.learned(["env=lift"], tmp_path / name, share, ["2", "3"])
 
@@ -142,7 +142,9 @@ def test_a_job_is_stopped_where_it_has_learned_and_says_why_it_failed(
     assert (tmp_path / "run" / "gpus").read_text() == "2,3"
     assert sooner.evaluated(tmp_path / "run") == [0.5, 0.96]  # the last line is not whole yet
     with pytest.raises(SystemExit, match=r"env=lift (?s:.*)no such task"):
-        job("failed", 1.1, seconds=0)
+        job("failed", 1.1, seconds=0, end="error: no such task")
+    with pytest.raises(SystemExit, match="env=lift"):  # by somebody else
+        job("ended", 1.1, seconds=0, end=143)
     with pytest.raises(SystemExit, match="env=lift"):  # while it saved
         job("lost", 0.9, seconds=60, status=1)
 

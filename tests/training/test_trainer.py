@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import json
 import os
-import shutil
 import signal
 import time
 from collections.abc import Callable
@@ -16,17 +14,14 @@ import torch
 from tensordict import TensorDict
 
 from franka_wm import processes
-from franka_wm.data.lerobot.schema import GOAL, OBJECTS, PROVENANCE, SUCCESS
 from franka_wm.envs import FrankaEnv
 from franka_wm.errors import UserError
 from franka_wm.training import build, storage_budget
 from franka_wm.training.checkpoint import latest_checkpoint, load_checkpoint
 from franka_wm.training.learner import Learner
-from franka_wm.training.moment import worlds_now
-from franka_wm.training.resume import CUT_SHORT, restore
+from franka_wm.training.resume import restore
 from franka_wm.training.run import Run
 from franka_wm.training.settings import RunSettings
-from franka_wm.training.settings.groups import EnvSettings
 from franka_wm.training.trainer import Trainer, _of_all
 
 N, CAPACITY = 4, 50
@@ -307,9 +302,11 @@ def test_evaluations_that_take_long_are_left_out_unless_asked_for(make: Make, ca
         time.sleep(2.0)
         return {"eval/policy/success": 0.5}
 
-    for every, seconds, count in ((None, 1.0, 1), (10, 1.0, 3), (None, 9.0, 3)):
+    cases = ((None, 1.0, 0.1, 1), (10, 1.0, 0.1, 3), (None, 9.0, 0.1, 3), (None, 1.0, 99.0, 3))
+    for every, seconds, share, count in cases:
         monkeypatch.setattr("franka_wm.training.trainer.EVALUATION_SECONDS", seconds)
-        trainer = make(f"{every}-{seconds}", updates=40, evaluate=slowly)
+        monkeypatch.setattr("franka_wm.training.trainer.EVALUATION_SHARE", share)
+        trainer = make(f"{every}-{seconds}-{share}", updates=40, evaluate=slowly)
         trainer.settings = trainer.settings.changed(evaluation={"every": every})
         trainer.fit()
         assert sum("eval/policy/success" in row for row in trainer.rows) == count
@@ -423,42 +420,3 @@ def test_statistics_of_several_processes_are_means_over_their_episodes() -> None
         ]
     )
     assert found == {"episodes": 12, "success": 0.75, "success/lift": 0.25, "episodes/lift": 4, "overflow": 3}
-
-
-def test_a_run_that_exports_keeps_what_the_task_says(train, tmp_path: Path, monkeypatch, capsys) -> None:
-    """The dataset is for other models, too: objects that this one does not read, the task's own success, and which
-    episodes were cut short; of an older run, which did not keep that, the others."""
-    words = ("env=push", "env.substeps=1", "env.episode_length=8", "model.observations=[state,goal]")
-    words = (*words, "evaluation.during=[]", "export=lerobot", "export.workers=1")
-    run = train(*words, f"export.out={tmp_path}/set", folder=tmp_path / "run")
-    features = json.loads((tmp_path / "set" / "meta" / "info.json").read_text())["features"]
-    assert {SUCCESS, OBJECTS, GOAL} <= features.keys()
-    [session] = json.loads((tmp_path / "set" / PROVENANCE).read_text())["sessions"]
-    assert session["policy"] == "policy in a training run"  # and not collector.policy, which is auto
-    assert (replay := run.replay()) is not None and bool(replay["next", "truncated"].any())
-    kept = Trainer.kept.fget
-    assert kept is not None
-
-    def carried(*arguments):
-        (worlds := worlds_now(*arguments))["carry"].pop("overflow")
-        return worlds
-
-    with monkeypatch.context() as older:
-        older.setattr(Trainer, "kept", property(lambda self: [key for key in kept(self) if key != CUT_SHORT]))
-        older.setattr(EnvSettings, "marks_overflow", False)
-        older.setattr("franka_wm.training.trainer.worlds_now", carried)
-        train(*words, "trainer.updates=10", folder=tmp_path / "older")
-    assert "lost an object are missing" in (said := capsys.readouterr().out)
-    assert "nothing says which episodes" not in said
-    more = train(f"resume={tmp_path}/older", "trainer.updates=20", folder=tmp_path / "on").replay()
-    assert more is not None and bool(more["next", "truncated"].any())
-    assert not more["next", "overflow"].any()
-    assert (
-        "of the steps before this resume nothing says which episodes were cut short"
-        in capsys.readouterr().out
-    )
-    # In its own folder the dataset of the shorter run is in the way: said before anything is trained.
-    shutil.copytree(tmp_path / "older", tmp_path / "same")  # the lock of the other is this process's
-    train(f"resume={tmp_path}/same", "trainer.updates=20", folder=tmp_path / "same", status=1)
-    assert "same/dataset exists, from another run or from this one with other" in capsys.readouterr().err
-    assert (tmp_path / "same" / "finished.json").is_file()
