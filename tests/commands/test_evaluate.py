@@ -274,6 +274,7 @@ def test_results_that_cannot_be_written_are_refused_before_playing(out: str, tmp
 def test_shifting_what_is_no_arm_is_refused_before_playing(tmp_path: Path, monkeypatch, capsys) -> None:
     monkeypatch.setattr(evaluate_checkpoint, "load_agent", lambda *a, **k: SimpleNamespace(env=object()))
     monkeypatch.setattr(evaluate_checkpoint, "evaluate_agent", lambda *a, **k: pytest.fail("played"))
+    (tmp_path / "checkpoints").mkdir()
     arguments = [f"checkpoint={tmp_path}", f"out={tmp_path}/out", "robustness=true"]
     monkeypatch.setattr(evaluate_checkpoint, "protocol", lambda *a: pytest.fail("went on"))
     assert cli.main(["evaluate", *arguments]) == 1

@@ -78,6 +78,7 @@ def test_a_checkpoint_of_another_environment_is_refused_before_anything_is_built
     found = SimpleNamespace(config=OmegaConf.create({"env": {"kind": kind}}))
     monkeypatch.setattr("franka_wm.live.stage.find_checkpoint", lambda folder: found)
     monkeypatch.setattr("franka_wm.live.stage.load_agent", lambda *a, **k: pytest.fail("built"))
+    (tmp_path / "checkpoints").mkdir()
     assert cli.main(["view", f"checkpoint={tmp_path}"]) == 1
     captured = capsys.readouterr()
     assert what in captured.err and "the live page shows the arm only" in captured.err

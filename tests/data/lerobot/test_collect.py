@@ -254,6 +254,7 @@ def test_ctrl_c_leaves_a_dataset(tmp_path, load) -> None:
     ],
 )
 def test_bad_arguments_are_one_line(arguments, says, capsys, tmp_path, monkeypatch) -> None:
+    (tmp_path / "checkpoints").mkdir()  # "." is the folder of a run
     monkeypatch.chdir(tmp_path)
     assert main(["collect", *arguments]) == 1
     said = capsys.readouterr()
@@ -262,7 +263,7 @@ def test_bad_arguments_are_one_line(arguments, says, capsys, tmp_path, monkeypat
     assert error.count("\n") == 0
     for noise in ("provider=", "search path", "append", "hydra.cc"):
         assert noise not in error
-    assert list(tmp_path.iterdir()) == []
+    assert [one.name for one in tmp_path.rglob("*")] == ["checkpoints"]  # nothing was made
 
 
 # -- a replay ----------------------------------------------------------------------------------------------------
