@@ -152,7 +152,16 @@ def test_each_code_gathers_what_the_row_reads(measured: Path, monkeypatch: pytes
     """What lies in datasets/ may be of the code that the row was measured with, which says nothing of today's."""
     play(monkeypatch, torch.ones(2), torch.ones(2))
     gathered = []
-    monkeypatch.setattr(confirm, "prepare", lambda row, top, place, **_: gathered.append((top, place)))
-    confirm.confirm(ROW, measured)
-    (_, before), (top, now) = gathered
+    monkeypatch.setattr(
+        confirm, "prepare", lambda row, top, place, **_: gathered.append((row.prepares, top, place))
+    )
+    row = replace(
+        ROW, before="franka-wm collect out=a env=lift episodes=400\nfranka-wm collect episodes=4 out=b"
+    )
+    confirm.confirm(row, measured)
+    (few, _, before), (_, top, now) = gathered
+    assert few == [
+        (["collect", "out=a", "env=lift", "episodes=16"], "a"),
+        (["collect", "episodes=16", "out=b"], "b"),
+    ]
     assert top == source.ROOT and len({before, now, source.ROOT}) == 3
