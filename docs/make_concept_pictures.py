@@ -35,7 +35,7 @@ TITLES = {
     "planner": "planner",
     "policy": "policy alone",
     "noop": "doing nothing",
-    "random": "random smooth",
+    "random": "random motion",
     "ik": "inverse kinematics",
 }
 SIDE, PATCH = 32, 4

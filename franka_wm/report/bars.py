@@ -35,6 +35,7 @@ def bars_figure(
         label: of the horizontal axis.
         scale: what all values are multiplied with, such as 100 for percent.
         limits: of the horizontal axis, after scaling. A bar that goes beyond has an arrow and its number there.
+            Without them, and with one series, every bar has its number: the shortest can hardly be seen.
         colours: series, or group where there is one series only -> light colour; others take the palette in order.
 
     Raises:
@@ -65,6 +66,10 @@ def bars_figure(
         axes.barh(places, means, height=0.9 * thick, color=each, label=as_label(name))
         for place, mean in zip(places, means, strict=True):
             _say_if_cut(axes, place, mean, limits, theme)
+        if len(series) == 1 and limits is None:
+            for place, mean, end in zip(places, means, high, strict=True):
+                _say(axes, mean, (max(end, 0.0), place), theme)
+            axes.margins(x=0.1)
         whiskers = [
             [mean - a for mean, a in zip(means, low, strict=True)],
             [b - mean for mean, b in zip(means, high, strict=True)],
@@ -101,6 +106,19 @@ def bars_figure(
     axes.spines["left"].set_visible(False)
     axes.tick_params(axis="y", length=0)
     return figure
+
+
+def _say(axes: "Axes", value: float, end: tuple[float, float], theme: Theme) -> None:
+    """The number beside the end of its bar."""
+    axes.annotate(
+        f"{value:.3g}" if abs(value) < 1000 else f"{value:,.0f}",
+        end,
+        xytext=(5, 0),
+        textcoords="offset points",
+        va="center",
+        fontsize=8,
+        color=theme.colour(INK),
+    )
 
 
 def _say_if_cut(

@@ -306,6 +306,21 @@ def test_a_bar_that_the_axis_cuts_says_how_far_it_goes() -> None:
     assert not bars_figure(values).axes[0].texts
 
 
+def test_bars_of_one_series_have_their_numbers_beyond_their_whiskers() -> None:
+    values = {
+        "planner": {"": {"mean": 0.004, "low": 0.003, "high": 0.01}},
+        "noop": {"": 0.40617},
+        "random": {"": {"mean": -12.345, "low": -13.0, "high": -11.0}},
+    }
+    axes = bars_figure(values, scale=100).axes[0]
+    assert [(text.get_text(), text.xy) for text in axes.texts] == [
+        ("0.4", (1.0, 0)),
+        ("40.6", (pytest.approx(40.617), 1)),
+        ("-1,234", (0.0, 2)),
+    ]
+    assert not bars_figure({"a": {"": 0.5}}, limits=(0, 1)).axes[0].texts
+
+
 # -- calibration -------------------------------------------------------------------------------------------
 
 
