@@ -302,9 +302,8 @@ def check_folders(cfg: DictConfig) -> None:
         named = OmegaConf.select(cfg, option)
         for folder in named if isinstance(named, ListConfig) else [named]:
             if folder is not None and not Path(str(folder)).expanduser().is_dir():
-                wanted = "give that of a run, as train.py prints it last"
-                if option != "resume":
-                    wanted = "franka-wm collect out=FOLDER makes one"
+                makes = "franka-wm collect out=FOLDER makes one"
+                wanted = "give that of a run, as train.py prints it last" if option == "resume" else makes
                 fail(f"{option}={folder}: no such folder; {wanted}")
 
 
