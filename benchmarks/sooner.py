@@ -110,8 +110,8 @@ def main() -> None:
     rate = alone.trainer.lr or alone.model.lr
     rows: list[dict[str, Any]] = []
 
-    def run(gpus: int, free: list[list[str]], at_once: int, seed: int) -> dict[str, Any]:
-        job = [*arguments, *grown(gpus, *arguments), f"seed={seed}", "trainer.checkpoint_replay=false"]
+    def run(gpus: int, more: list[str], free: list[list[str]], at_once: int, seed: int) -> dict[str, Any]:
+        job = [*arguments, *more, f"seed={seed}", "trainer.checkpoint_replay=false"]
         job += [f"trainer.lr={rate * gpus ** POWERS[args.learning_rate]}", "evaluation.during=[planner]"]
         job += [f"evaluation.every={args.every}", f"evaluation.episodes={args.episodes}"]
         job += ["evaluation.during_episodes=null", "evaluation.video_episodes=0"]
@@ -140,8 +140,9 @@ def main() -> None:
         free = [names[k : k + gpus] for k in range(0, there - gpus + 1, gpus)] if on_gpu else [[]]
         at_once = min(len(free), len(args.seeds))
         print(f"GPUs {gpus}, seeds {' '.join(map(str, args.seeds))}, {at_once} at once …", flush=True)
+        more = grown(gpus, *arguments)  # here: Hydra composes in one thread alone
         with ThreadPoolExecutor(len(free)) as pool:
-            rows += list(pool.map(partial(run, gpus, free, at_once), args.seeds))
+            rows += list(pool.map(partial(run, gpus, more, free, at_once), args.seeds))
     title = f"time until {100 * args.share:g} % of episodes end in success"
     publish(title, rows, args.out, device=args.device, ran=("franka_wm/", "train.py"))
 

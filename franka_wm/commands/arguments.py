@@ -245,6 +245,8 @@ def check_run(verb: str, option: str, folder: str) -> None:
     if (place / "meta" / "info.json").is_file():
         raise UserError(f"{verb}: {option}={folder}: is a dataset; give the folder of a run")
     if place.is_dir() and not any((place / one).exists() for one in ("checkpoints", "manifest.json")):
+        if any((one / "manifest.json").is_file() for one in place.iterdir()):  # a run's folder of checkpoints
+            return
         runs = sorted(one.name for one in place.iterdir() if (one / "checkpoints").is_dir())
         if runs and runs != ["pretrained"]:  # a run that ended in its first stage
             raise UserError(f"{verb}: {option}={folder}: holds runs; give one of {', '.join(runs)}")

@@ -101,8 +101,8 @@ def launch_verb(command: list[str], gpus: int, device: str, advice: Callable[[],
             except ChildFailedError as error:
                 own = {rank: one for rank, one in error.failures.items() if rank not in stopped}
                 _end(own or error.failures, Path(told), advice)
-    except SignalException as stopped:  # the processes have saved, and said so
-        sys.exit(INTERRUPTED if stopped.sigval == signal.SIGINT else 128 + stopped.sigval)
+    except SignalException as signalled:  # the processes have saved, and said so
+        sys.exit(INTERRUPTED if signalled.sigval == signal.SIGINT else 128 + signalled.sigval)
     finally:
         for name in ("OMP_NUM_THREADS", "PYTHONPATH", "PYTHONWARNINGS", LAUNCHER, TOLD):
             os.environ.pop(name, None)

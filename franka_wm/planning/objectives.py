@@ -10,9 +10,9 @@ Objectives are classes rather than closures, so that a policy that holds one can
 
 from __future__ import annotations
 
+import copy
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from functools import partial
 from typing import Literal, Protocol, get_args
 
 import torch
@@ -130,9 +130,10 @@ class RewardPlusValue(Objective):
 
     def compiled(self) -> RewardPlusValue:
         """The same, with what it calls compiled by `torch.compile`."""
-        fast = partial(torch.compile, dynamic=False)
-        ends, arrival = (one and fast(one) for one in (self.terminated, self.arrival_reward))
-        return RewardPlusValue(fast(self.reward), fast(self.value), self.discount, ends, arrival)
+        made = copy.copy(self)
+        called = {name: getattr(self, name) for name in ("reward", "value", "terminated", "arrival_reward")}
+        made.__dict__ |= {name: one and torch.compile(one, dynamic=False) for name, one in called.items()}
+        return made
 
     def __call__(self, trajectory: Tensor, actions: Tensor) -> Tensor:
         horizon = actions.shape[2]
@@ -289,8 +290,7 @@ class Sum(Objective):
             raise ValueError("a Sum needs at least one (weight, objective)")
         for weight, objective in terms:
             if not math.isfinite(weight):
-                kind = type(objective).__name__
-                raise ValueError(f"the weight of {kind} in a Sum must be finite, got {weight}")
+                raise ValueError(f"the weight of {type(objective).__name__} must be finite, got {weight}")
         self.terms = [(float(weight), as_objective(objective)) for weight, objective in terms]
         self.in_keys = list(dict.fromkeys(key for _, objective in self.terms for key in objective.in_keys))
         self.coarse = all(objective.coarse for _, objective in self.terms)
@@ -383,7 +383,7 @@ class GoalPolicyPenalty(Objective):
     """
 
     def __init__(self, policy: Callable[[Tensor, Tensor], Tensor], reader: GoalImage, weight: float) -> None:
-        self.policy, self.reader, self.weight = policy, reader, _penalty("PolicyPenalty", weight)
+        self.policy, self.reader, self.weight = policy, reader, _penalty(type(self).__name__, weight)
         self.in_keys = reader.in_keys
 
     def bind(self, tensordict: TensorDictBase) -> PolicyPenalty:

@@ -230,7 +230,11 @@ def test_a_folder_that_is_no_runs_is_refused_before_anything_is_loaded(tmp_path:
     (tmp_path / "pictures").mkdir()
     with pytest.raises(UserError, match=r"is no run.s folder; give one as train\.py prints it last"):
         check_run("view", "checkpoint", str(tmp_path))
-    (tmp_path / "pretrained" / "checkpoints").mkdir(parents=True)  # a run that ended in its first stage
+    latest = tmp_path / "pretrained" / "checkpoints" / "latest"  # a run that ended in its first stage
+    latest.mkdir(parents=True)
+    (latest / "manifest.json").touch()
+    for one in (latest, latest.parent, latest.parent.parent):
+        check_run("view", "checkpoint", str(one))
     check_run("view", "checkpoint", str(tmp_path))
 
 

@@ -6,7 +6,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from franka_wm.envs import FrankaEnv
+from franka_wm.envs import FrankaEnv, Randomization
 from franka_wm.policies.expert import ExpertPolicy
 from franka_wm.training.settings import RunSettings
 
@@ -43,6 +43,20 @@ def test_a_cube_on_a_smaller_disc_is_a_success(make) -> None:
         relabelled = env.simulation.task.relabel(step.unsqueeze(1), step["goal"])
         assert torch.allclose(relabelled["next", "reward"][:, 0], observation["reward"], atol=1e-5)
     assert observation["success"].float().mean() > 0.9
+
+
+def test_steps_of_another_episode_in_front_do_not_tell_how_high_a_goal_lies(make) -> None:
+    """As a model with `burn_in` has them: their table may be another."""
+    env = make(randomization=Randomization(table_height=0.05))
+    steps = torch.stack([env.rand_step(env.reset()), env.rand_step(env.reset())], 1)  # two episodes
+    steps["is_init"] = torch.ones(64, 2, 1, dtype=torch.bool)
+    reached = steps["next", "objects"][:, 1, :3]
+    alone = env.simulation.task.relabel(steps[:, 1:], reached)
+    both = env.simulation.task.relabel(steps, reached)
+    assert torch.equal(both["next", "reward"][:, 1:], alone["next", "reward"])
+    assert torch.equal(both["goal"][:, 1:], alone["goal"])
+    assert torch.allclose(alone["goal"][:, 0, 2], steps["goal"][:, 1, 2], atol=1e-5)
+    assert not torch.allclose(steps["goal"][:, 0, 2], steps["goal"][:, 1, 2], atol=1e-3)
 
 
 def test_the_disc_is_drawn_as_large_as_it_is(make) -> None:

@@ -191,6 +191,10 @@ def test_a_browser_drags_an_object_while_paused_and_sees_contacts(page: Any, sta
                 lambda nodes=nodes: stacking.step() and len(page.scene._touching) == nodes,
                 f"contacts shown: {shown}",
             )
+        send({"type": "TransformControlsDragStartMessage", "name": name})
+        send(drag | {"position": ELSEWHERE})
+        wait(lambda: page.scene._dragged, "a drag was not heard")
+    wait(lambda: not page.scene._dragged, "who leaves while dragging lets go")
     assert stacking.error is None and not stacking.playing
 
 

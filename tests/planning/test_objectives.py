@@ -197,6 +197,19 @@ def test_nothing_counts_past_a_predicted_end():
     assert compiled.terminated is not None
 
 
+def test_an_objective_of_ones_own_is_compiled_as_what_it_is(trajectory, actions) -> None:
+    class Halved(RewardPlusValue):
+        def __call__(self, trajectory, actions):
+            return 0.5 * super().__call__(trajectory, actions)
+
+    own = Halved(lambda z, a: a[..., :1], lambda z: z[..., :1], 0.5)
+    own.coarse = True
+    compiled = own.compiled()
+    assert type(compiled) is Halved and compiled.coarse and compiled.terminated is None
+    assert compiled.reward is not own.reward and compiled.value is not own.value
+    torch.testing.assert_close(compiled(trajectory, actions), own(trajectory, actions))
+
+
 def test_objectives_can_be_copied():
     copied = copy.deepcopy(Sum([(1.0, RewardPlusValue(encode_goal, encode_goal, 0.9)), (1.0, Smoothness(1))]))
     assert len(copied.terms) == 2
@@ -262,7 +275,7 @@ def test_the_penalty_of_a_policy_towards_goals_is_that_of_the_decision_s_goal() 
     torch.testing.assert_close(bound(trajectory, actions), -2.0 * (actions[:, :, 0] - own).square().sum(-1))
     with pytest.raises(ValueError, match="no goal yet"):
         penalty(trajectory, actions)
-    with pytest.raises(ValueError, match="PolicyPenalty"):
+    with pytest.raises(ValueError, match="of GoalPolicyPenalty"):
         GoalPolicyPenalty(lambda z, goal: z, reader, -1.0)
 
 

@@ -6,7 +6,7 @@ import math
 import sys
 from importlib import import_module
 from pathlib import Path
-from threading import Barrier
+from threading import Barrier, current_thread, main_thread
 from types import ModuleType, SimpleNamespace
 from typing import Any
 
@@ -88,7 +88,13 @@ def test_each_gpu_has_the_work_of_one_and_the_learning_rate_grows(benchmark, mon
 
 def test_jobs_of_fewer_gpus_than_there_are_run_side_by_side(benchmark, monkeypatch) -> None:
     sooner, rows = benchmark("sooner")
-    together, places = Barrier(2), []
+    together, places, grown = Barrier(2), [], sooner.grown
+
+    def composed(*arguments: Any) -> list[str]:
+        assert current_thread() is main_thread(), "Hydra composes in one thread alone"
+        return grown(*arguments)
+
+    monkeypatch.setattr(sooner, "grown", composed)
 
     def learned(arguments: list[str], folder: Path, share: float, gpus: list[str]) -> list[dict[str, float]]:
         places.append(gpus)

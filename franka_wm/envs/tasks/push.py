@@ -126,7 +126,13 @@ class Push(GripperTask):
 
     def relabel(self, transitions: TensorDictBase, goal: torch.Tensor) -> TensorDictBase:
         # Where the cube was it may have been tilted; as in goal_was_set, the goal keeps the height of a lying one.
-        state = transitions.get("state")[:, 0]
+        # The first step of the window's episode tells it: steps of another, in front, may be of another table.
+        state, begun = transitions.get("state"), transitions.get("is_init", None)
+        first = torch.zeros(len(state), dtype=torch.long, device=state.device)
+        if begun is not None:
+            steps = torch.arange(state.shape[1], device=state.device)
+            first = (begun.squeeze(-1) * steps).amax(1)
+        state = state[torch.arange(len(state), device=state.device), first]
         height = state[:, 16:17] - state[:, 19:20]
         return relabel_place(self, self.in_torch, transitions, torch.cat([goal[:, :2], height], -1))
 
