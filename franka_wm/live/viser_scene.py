@@ -101,7 +101,6 @@ class ViserScene:
             )
             handle.on_update(self._drag)
         server.on_client_connect(_aim)
-        server.on_client_disconnect(lambda _: self._dragged.clear())  # it may leave while it drags
 
     def _stage(self, floor: float) -> None:
         scene = self._server.scene
