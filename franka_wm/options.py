@@ -33,6 +33,11 @@ OF_ONES_OWN = "; one of your own: plugins=[MODULE] imports its module, which mus
 """Ends the refusal of a task, model or planner that is not known."""
 
 
+def preset_of_ones_own(group: str, name: str) -> str:
+    """Ends the refusal of a preset that no configuration folder has."""
+    return f"; of your own: hydra.searchpath=[file://FOLDER], with {group}/{name}.yaml"
+
+
 def refuse_ours(name: str, ours: Iterable[str]) -> None:
     """Refuse to register a name that the package has.
 

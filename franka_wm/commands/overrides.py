@@ -9,6 +9,7 @@ from typing import Any
 from franka_wm import conf
 from franka_wm.commands.arguments import did_you_mean, no_such_option
 from franka_wm.errors import UserError
+from franka_wm.options import preset_of_ones_own
 
 
 def compose(overrides: Sequence[str], options: Sequence[str] = ()) -> Any:
@@ -86,7 +87,8 @@ def explain(message: str, *, allowed: Sequence[str] = ()) -> str:
         choices = [line for line in message.splitlines() if line.startswith("\t") and "provider=" not in line]
         names = [line.strip() for line in choices]
         extra = EXTRAS.get(missing[2]) if missing[1].startswith("hydra/") else None
-        hint = f"; pip install 'franka-wm[{extra}]'" if extra else did_you_mean(missing[2], names)
+        near = did_you_mean(missing[2], names) or preset_of_ones_own(missing[1], missing[2])
+        hint = f"; pip install 'franka-wm[{extra}]'" if extra else near
         return f"{missing[1]}={missing[2]}: must be one of {', '.join(names)}{hint}"
     if unknown is not None:
         return no_such_option(unknown, allowed)

@@ -101,14 +101,23 @@ def scale_of_files(*overrides: str) -> str | None:
 
 @contextmanager
 def _hydra() -> Iterator[None]:
-    """Hydra at these files."""
+    """Hydra at these files.
+
+    Raises:
+        UserError: A file is not YAML.
+    """
     import hydra
+    import yaml
     from hydra.core.global_hydra import GlobalHydra
 
     GlobalHydra.instance().clear()
     try:
         with hydra.initialize_config_dir(str(FOLDER), version_base="1.3"):
             yield
+    except yaml.MarkedYAMLError as error:
+        mark = error.problem_mark
+        where = f"{mark.name}, line {mark.line + 1}" if mark else "a configuration file"
+        raise UserError(f"{where}: not YAML ({error.problem})") from error
     finally:
         GlobalHydra.instance().clear()
 

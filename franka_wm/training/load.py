@@ -18,7 +18,7 @@ from franka_wm import conf
 from franka_wm.device import resolve_device
 from franka_wm.envs import Environment, FrankaConfig
 from franka_wm.errors import UserError
-from franka_wm.options import did_you_mean
+from franka_wm.options import did_you_mean, preset_of_ones_own
 from franka_wm.planning.base import Planner
 from franka_wm.planning.mcts import MCTS
 from franka_wm.training import build
@@ -119,10 +119,7 @@ def preset_of(planner: str, settings: RunSettings, *searchpath: str) -> dict[str
     except MissingConfigException as error:
         group, name = (error.missing_cfg_file or f"planner/{planner}").rsplit("/", 1)
         there = sorted(error.options or ())
-        near = (
-            did_you_mean(name, there)
-            or f"; of your own: hydra.searchpath=[file://FOLDER], with {group}/{name}.yaml"
-        )
+        near = did_you_mean(name, there) or preset_of_ones_own(group, name)
         raise UserError(f"{group}={name}: must be one of {', '.join(there)}{near}") from error
     except (HydraException, OmegaConfBaseException, ValueError) as error:
         given = " ".join((f"planner={planner}", *searchpath))

@@ -32,13 +32,15 @@ def unwritable(folder: Path, option: str = "hydra.run.dir") -> str | None:
 
 
 def occupied(folder: Path, resume: str | None) -> str | None:
-    """Why a run may not write into ``folder``: another one's weights are there; ``None`` if it may.
+    """Why a run may not write into ``folder``: another one's weights are there, or a dataset; ``None`` if it may.
 
     A run that goes on from there may.
     """
     place = folder.resolve()
     if resume is not None and place in (Path(resume).resolve(), *Path(resume).resolve().parents):
         return None
+    if (place / "meta" / "info.json").exists():
+        return f"hydra.run.dir={folder}: a dataset is there; choose another folder"
     try:
         found = latest_checkpoint(place)
     except UserError:  # there is none

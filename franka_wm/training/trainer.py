@@ -180,7 +180,7 @@ class Trainer:
                 )
                 if due:
                     self.log(progress)
-                if evaluates:
+                if evaluates and not stopping:
                     self.require_finite()
                     with self.aside("evaluation"):
                         numbers = self.evaluate()

@@ -83,3 +83,13 @@ def test_a_job_of_several_processes_finds_the_presets_of_its_sweep(
         lambda cfg: None, OmegaConf.create({"resume": None, "gpus": 2, "device": "cpu"})
     )
     assert started == [["env=kitchen", "gpus=2", path]]
+
+
+def test_a_preset_that_is_not_yaml_is_one_line_with_its_place(mine: list[str], capsys) -> None:
+    path = Path("my presets/env/kitchen.yaml")
+    path.write_text("fps: 20.0\n  horizon: [3\n")
+    with pytest.raises(SystemExit):
+        entry._run(lambda: pytest.fail("begun"), mine)
+    said = capsys.readouterr().err
+    assert said.startswith("error: ") and f"{path.resolve()}, line 2: not YAML (mapping values" in said
+    assert said.count("\n") == 1

@@ -155,6 +155,10 @@ def test_a_job_is_finished_once_it_has_exported(tmp_path: Path) -> None:
 def test_a_search_needs_its_plugin_and_its_direction(tmp_path: Path, capsys) -> None:
     said = explain("Could not find 'hydra/sweeper/optuna'\n\nAvailable options:\n\tbasic\n")
     assert said == "hydra/sweeper=optuna: must be one of basic; pip install 'franka-wm[optuna]'"
+    said = explain("Could not find 'planner/walk'\n\nAvailable options:\n\tcem\n\tmppi\n")
+    assert said.endswith(
+        "of cem, mppi; of your own: hydra.searchpath=[file://FOLDER], with planner/walk.yaml"
+    )
     with pytest.raises(SystemExit):
         entry.check_sweep(["hydra/sweeper=optuna", "hydra.sweeper.direction=minimize"])
     assert "better the higher; add hydra.sweeper.direction=maximize" in capsys.readouterr().err

@@ -17,7 +17,7 @@ from franka_wm.conf import compose
 from franka_wm.errors import FrankaError, UserError
 from franka_wm.training import build
 from franka_wm.training.checkpoint import load_checkpoint, save_checkpoint
-from franka_wm.training.place import left_by, make_absolute
+from franka_wm.training.place import left_by, make_absolute, occupied
 from franka_wm.training.run import Run, import_plugins, resumed
 from franka_wm.training.settings import RunSettings
 from franka_wm.training.spaces import Spaces
@@ -217,3 +217,11 @@ def test_files_anywhere_in_an_environment_are_named_from_the_root(tmp_path: Path
     make_absolute(cfg)
     scene["objects"][0]["file"] = str(tmp_path / "wedge.obj")
     assert OmegaConf.to_container(cfg.env) == {"robot": "embedded", "scene": scene, "goal": None}
+
+
+def test_a_run_does_not_write_into_a_dataset(tmp_path: Path) -> None:
+    """What it leaves would be published with that."""
+    assert occupied(tmp_path, None) is None
+    (tmp_path / "meta").mkdir()
+    (tmp_path / "meta" / "info.json").touch()
+    assert "a dataset is there; choose another folder" in (occupied(tmp_path, None) or "")

@@ -330,6 +330,17 @@ def test_evaluation_at_environment_steps(make: Make, capsys) -> None:
     assert [row["env_steps"] for row in rows] == [35 * N]
 
 
+def test_who_is_asked_to_stop_saves_before_anything_else(make: Make) -> None:
+    """Whoever asked may kill it soon: the evaluation that was due is left to the run that goes on."""
+    trainer = make(updates=40, evaluate=lambda: pytest.fail("evaluated"))
+    trainer.settings = trainer.settings.changed(evaluation={"every": 10})
+    draw = trainer._draw
+    trainer._draw = lambda: (os.kill(os.getpid(), signal.SIGTERM), draw())[1]  # type: ignore[method-assign]
+    trainer.fit()
+    assert trainer.interrupted and trainer.learner.updates == 10
+    assert latest_checkpoint(trainer.folder).is_dir()
+
+
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_a_signal_ends_the_run_with_everything_saved(make: Make, number: int) -> None:
     before = signal.getsignal(number)

@@ -195,9 +195,11 @@ def other_scene(
     not, nor do folders of files, nor colours where no images are read. Scenes whose files or tasks are not known here
     are not compared: a dataset may come from another machine.
     """
+    from franka_wm.envs.tasks import TASKS
+
     for session in sessions:
         recorded = session.get("config", {}).get("env", {})
-        if "scene" in recorded and "scene" in env:
+        if "scene" in recorded and "scene" in env and recorded.get("task", env["task"]) in TASKS:
             try:
                 there = _shown(recorded["scene"], recorded.get("task", env["task"]), images, moves)
             except UserError:

@@ -284,6 +284,18 @@ RewardInTorch = Callable[
 the action, and (…,) bool success."""
 
 
+def first_of_episode(transitions: TensorDictBase) -> torch.Tensor:
+    """State (B, S) of the first step of each window's episode, of (B, H): steps of another may stand in front.
+
+    With these there is `is_init`, see `Dreamer.burn_in`.
+    """
+    state, begun = transitions.get("state"), transitions.get("is_init", None)
+    if begun is None:
+        return state[:, 0]
+    windows, steps = (torch.arange(size, device=state.device) for size in state.shape[:2])
+    return state[windows, (begun.squeeze(-1) * steps).amax(1)]
+
+
 def relabel_place(
     task: GripperTask, reward_and_success: RewardInTorch, transitions: TensorDictBase, goal: torch.Tensor
 ) -> TensorDictBase:

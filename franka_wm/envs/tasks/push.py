@@ -15,6 +15,7 @@ from franka_wm.envs.tasks.experts import Aim, Sight, moved
 from franka_wm.envs.tasks.manipulation import (
     GripperTask,
     effort,
+    first_of_episode,
     near_in_torch,
     nearness,
     place_of,
@@ -67,11 +68,10 @@ class Push(GripperTask):
 
     **Scene**: a table and a cube of 4 cm and 50 g. **Randomization**: the cube stands within 7 cm in x and 15 cm in y
     of (0.42, 0) m. **Goal**: the middle of a disc of 10 cm radius (``disc_radius``), 20 cm in front of where the cube
-    stood, ``disc_spread`` more or less.
-    **Success**: the cube lies on the table with its centre on the disc (ManiSkill3's PushCube: Tao et al. 2024).
-    **Reward**, dense, in [0, 1]: on the disc 0.8 to 1, by the distance to its middle; else 0.3 for the tool's nearness
-    to where it can push, 1 − tanh(5 · distance), and half for the cube's to the goal; sparse: 1 where it succeeds.
-    Both minus ``action_penalty`` · mean(action²).
+    stood, ``disc_spread`` more or less. **Success**: the cube lies on the table with its centre on the disc
+    (ManiSkill3's PushCube: Tao et al. 2024). **Reward**, dense, in [0, 1]: on the disc 0.8 to 1, by the distance to its
+    middle; else 0.3 for the tool's nearness to where it can push, 1 − tanh(5 · distance), and half for the cube's to
+    the goal; sparse: 1 where it succeeds. Both minus ``action_penalty`` · mean(action²).
     """
 
     scene = Scene(objects=(Body(name="cube", at=(0.42, 0.0), spread=(0.07, 0.15)),))
@@ -126,15 +126,9 @@ class Push(GripperTask):
 
     def relabel(self, transitions: TensorDictBase, goal: torch.Tensor) -> TensorDictBase:
         # Where the cube was it may have been tilted; as in goal_was_set, the goal keeps the height of a lying one.
-        # The first step of the window's episode tells it: steps of another, in front, may be of another table.
-        state, begun = transitions.get("state"), transitions.get("is_init", None)
-        first = torch.zeros(len(state), dtype=torch.long, device=state.device)
-        if begun is not None:
-            steps = torch.arange(state.shape[1], device=state.device)
-            first = (begun.squeeze(-1) * steps).amax(1)
-        state = state[torch.arange(len(state), device=state.device), first]
-        height = state[:, 16:17] - state[:, 19:20]
-        return relabel_place(self, self.in_torch, transitions, torch.cat([goal[:, :2], height], -1))
+        state = first_of_episode(transitions)
+        lying = torch.cat([goal[:, :2], state[:, 16:17] - state[:, 19:20]], -1)
+        return relabel_place(self, self.in_torch, transitions, lying)
 
     def measures(self, sim: "Simulation") -> dict[str, torch.Tensor]:
         way = sim.tensors.next_true_objects[:, :2] - sim.tensors.next_goal[:, :2]

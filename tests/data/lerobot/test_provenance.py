@@ -2,7 +2,15 @@
 
 from dataclasses import fields
 
-from franka_wm.data.lerobot.provenance import DYNAMICS, LOOKS, MEANING, VIEWS, other_option, told
+from franka_wm.data.lerobot.provenance import (
+    DYNAMICS,
+    LOOKS,
+    MEANING,
+    VIEWS,
+    other_option,
+    other_scene,
+    told,
+)
 from franka_wm.envs import FrankaConfig
 from franka_wm.envs.ranges import Randomization
 
@@ -54,3 +62,11 @@ def test_a_recording_from_before_an_option_had_what_it_does_by_itself() -> None:
     assert other_option([{"config": {"env": now}}], now) is None
     assert other_option([{"config": {"env": now}}], {**now, "disc_radius": 0.05}) == ("disc_radius", 0.1)
     assert other_option([{}], now) is None, "nothing is known of how it was recorded"
+
+
+def test_the_scene_of_a_task_that_is_not_known_here_is_not_compared() -> None:
+    """The plugin that has it may be on another machine; of a known one other bodies are told apart."""
+    env = {"task": "push", "scene": None}
+    for task, other in (("hover", False), ("stack", True), ("push", False)):
+        there = [{"config": {"env": {"task": task, "scene": None}}}]
+        assert other_scene(there, env, images=False) is other
