@@ -38,6 +38,11 @@ LEGEND = (
     "Raised numbers: see below the tables."
 )
 """What README says of its tables' words."""
+ALIKE = (
+    "Rows of learning without ¹ were measured with today's code, or with an earlier commit that docs/results.md names: "
+    "then a short run on a CPU gives the same weights and episodes, bit for bit, with that code and with today's. Such "
+    "a run cannot see what only a GPU or a long run shows; times are those of the commit."
+)
 HEAD = """# Results
 
 Written by `make results` from the files in [results/](results), which the runs wrote themselves; no measured
@@ -287,7 +292,8 @@ def _cells(rows: Sequence[Mapping[str, Any]], names: Sequence[str] | None = None
 
 def readme_tables(rows: Mapping[str, Row], place: Path = PLACE) -> str:
     """README's part: the arm, other environments, speed; rows of several seeds that belong together."""
-    arm, manipulation, others, speed = [], [], [], []
+    arm, manipulation, others = [], [], []
+    speed: dict[tuple[str, ...], list[list[str]]] = {}
     episodes: set[int] = set()
     aged = alike = chosen = False
     for row in rows.values():
@@ -296,18 +302,19 @@ def readme_tables(rows: Mapping[str, Row], place: Path = PLACE) -> str:
         if kind in ("missing", "mixed") or (row.script is None and len(records) < 2):
             continue
         same = kind == "stale" and confirmed(row, records, place) is not None
-        mark = "" if kind != "stale" else "²" if same else "¹"
-        aged, alike = aged or mark == "¹", alike or mark == "²"
+        mark = "¹" if kind == "stale" and not same else ""
+        aged, alike = aged or mark == "¹", alike or same
         if isinstance(row.readme, list):
             titles = ["machine", *row.readme]
             who = f"{machine(records[0])}{company(records, beside=row.beside)}, {records[0]['date']}{mark}"
-            cells = [[who, *line] for line in _cells(records[0]["rows"], row.readme)]
-            speed += [table(titles, cells), ""]
+            speed.setdefault(tuple(titles), []).extend(
+                [who, *line] for line in _cells(records[0]["rows"], row.readme)
+            )
             continue
         policy = row.acting(records[0]["policies"])
         of = f" of {len(row.seeds)}" if unmeasured(row, records) else ""
         where, runs = cores(row, records), f"{len(records)}{of} seeds"
-        who = row.title + " ".join([*mark, *"³" * row.chosen])
+        who = row.title + " ".join([*mark, *"²" * row.chosen])
         chosen = chosen or row.chosen
         missed = "; ".join(_missed(row, records) + _missed_by_others(rows, row, place)) or "–"
         if columns(records) == [RETURN]:
@@ -338,7 +345,8 @@ def readme_tables(rows: Mapping[str, Row], place: Path = PLACE) -> str:
         parts += [table([*titles, "within 5 cm, worst seed", "doing nothing", "missed"], arm), ""]
         many = " or ".join(map(str, sorted(episodes)))
         parts += [
-            f"*Whole command*: start, training, and the evaluation of each policy on {many} episodes, without a film.",
+            f"*Whole command*: start, training, and the evaluation of each policy on {many} episodes, without a film. "
+            "Gathering demonstrations is not counted.",
             "",
         ]
     if manipulation:
@@ -363,20 +371,24 @@ def readme_tables(rows: Mapping[str, Row], place: Path = PLACE) -> str:
             "*Collector*: through TorchRL's, resets included. *raw*: Newton's physics, and images where there are "
             "some, alone in one graph, without task, resets and TorchRL; measured in the same run"
         )
-        parts += [f"Environment steps per second. {text}:", "", *speed]
+        parts += [f"Environment steps per second. {text}:", ""]
+        parts += [line for titles, cells in speed.items() for line in (table(titles, cells), "")]
     if aged:
         parts += ["¹ Measured before changes of the code; docs/results.md names them.", ""]
-    if alike:
-        text = "gave the same weights and episodes, bit for bit, with that code and with today's"
-        unseen = "it cannot see what only a GPU or a long run shows"
-        parts += [f"² Measured with an earlier commit, times too; a short run on a CPU {text}; {unseen}.", ""]
     if chosen:
-        parts += ["³ A setting was chosen after runs of these seeds; docs/results.md says which.", ""]
+        parts += ["² A setting was chosen after runs of these seeds; docs/results.md says which.", ""]
+    if alike:
+        parts += [ALIKE, ""]
     return "\n".join(parts or ["Not measured yet.", ""])
 
 
 def _missed(row: Row, records: Sequence[Record]) -> list[str]:
-    return [what for what, _, enough in verdicts(row, records) if not enough]
+    return [f"{what}: {_briefly(found)}" for what, found, enough in verdicts(row, records) if not enough]
+
+
+def _briefly(reached: str) -> str:
+    """What was reached, without how it was measured."""
+    return reached.split(";")[0].split(", ")[0]
 
 
 def _missed_by_others(rows: Mapping[str, Row], row: Row, place: Path) -> list[str]:
@@ -386,9 +398,7 @@ def _missed_by_others(rows: Mapping[str, Row], row: Row, place: Path) -> list[st
     if others is None or state(others, records)[0] in ("missing", "mixed"):
         return []
     judged = verdicts(others, records)
-    return [
-        f"other seeds: {what}, is {reached.split(';')[0]}" for what, reached, enough in judged if not enough
-    ]
+    return [f"other seeds: {what}: {_briefly(found)}" for what, found, enough in judged if not enough]
 
 
 def with_tables(readme: str, tables: str) -> str:
