@@ -62,6 +62,8 @@ a `+` had changes that were not committed. Where code has changed since, a short
 updates that are not compiled, was made with both versions; *bit for bit* is said where it gave the same. What only a
 GPU or a long run shows, it does not see; times are those of the commit that is named.
 """
+MOST_FILES = 12
+"""That are named where they have changed."""
 POLICIES = {
     "planner": "planner",
     "policy": "policy alone",
@@ -115,7 +117,7 @@ def part(row: Row, records: Sequence[Record], judged: tuple[str, list[str]], pla
         )
     lines += [_provenance(row, records), ""]
     if kind == "stale":
-        lines += [_since(reasons, confirmed(row, records, place)), ""]
+        lines += [_since(reasons, confirmed(row, records, place), _commit(records[0])), ""]
     if missing := unmeasured(row, records):
         one = "seed" if len(missing) == 1 else "seeds"
         lines += [
@@ -142,8 +144,8 @@ def _judged(judgement: Sequence[tuple[str, str, bool]], yes: str = "yes") -> str
     return table(["wanted", "measured", "reached"], cells)
 
 
-def _since(reasons: Sequence[str], same: Record | None) -> str:
-    """What has changed since a row was measured, and whether a short run showed anything of it."""
+def _since(reasons: Sequence[str], same: Record | None, commit: str) -> str:
+    """What has changed since a row was measured with ``commit``, and whether a short run showed anything of it."""
     files, values = apart(reasons)
     changed = changed_told(reasons)
     if same:
@@ -156,8 +158,9 @@ def _since(reasons: Sequence[str], same: Record | None) -> str:
         text = f"**Measured before changes of {changed}.**"
     if values:
         text += f" Of the configuration: {', '.join(f'`{value}`' for value in values)}."
-    named = ", ".join(f"`{name}`" for name in files)
-    return text + (f" <details><summary>Files</summary>{named}</details>" if files else "")
+    if len(files) > MOST_FILES:
+        return f"{text} `git diff --stat {commit.rstrip('+')}` names them."
+    return text + (f" {', '.join(f'`{name}`' for name in files)}." if files else "")
 
 
 def changed_told(reasons: Sequence[str]) -> str:

@@ -190,10 +190,10 @@ def test_changed_values_are_no_files_and_stand_unfolded(tmp_path: Path) -> None:
     old = {"files": {"gone.py": "1"}, "config": {"scale": "other", "old": 1}}
     text = render.page({"reach": ROW}, place(tmp_path, *(record(seed, **old) for seed in ROW.seeds)))
     assert "**Measured before changes of one file and 2 values of its configuration.**" in text
-    assert " Of the configuration: `old 1 → –`, `scale other → smoke`. <details>" in text
-    assert "<summary>Files</summary>`gone.py`</details>" in text
+    assert " Of the configuration: `old 1 → –`, `scale other → smoke`. `gone.py`" in text
+    assert "`gone.py`." in text
     assert render.changed_told(["a 1 → 2"]) == "one value of its configuration"
-    assert "<details>" not in render._since(["a 1 → 2"], None)
+    assert render._since(["a 1 → 2"], None, "abc").endswith(" Of the configuration: `a 1 → 2`.")
 
 
 # -- what README says of returns ---------------------------------------------------------------------------
