@@ -23,6 +23,10 @@ from result_rows import ROW as TWO_SEEDS
 
 ROW = replace(TWO_SEEDS, seeds=(100, 101, 102), wanted={"minutes": 1})
 SPEED = Row(name="speed", section=CPU, title="Speed", script="benchmarks/x.py", readme=["batch"])
+MACHINE = {
+    "python": "3", "torch": "2", "newton": "1", "processor": "p", "cores": 2, "threads": 2,
+    "device": "cpu", "started": "2026-01-02T03:04:05+00:00", "source": {},
+}  # fmt: skip
 INTERVAL = {"mean": 0.01, "low": 0.01, "high": 0.02}
 POLICY = {
     "final_distance": INTERVAL,
@@ -91,13 +95,9 @@ def test_rows_whose_text_tells_of_other_work_declare_it() -> None:
 
 
 def test_what_runs_beside_a_benchmark_is_recorded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    made = {
-        "python": "3", "torch": "2", "newton": "1", "processor": "p", "cores": 2, "threads": 2,
-        "device": "cpu", "started": "2026-01-02T03:04:05+00:00", "source": {},
-    }  # fmt: skip
 
     def call(command: list[str], environment: Any, log: Path) -> None:
-        Path(command[-1]).write_text(json.dumps({"machine": made, "rows": [{"batch": 32}]}))
+        Path(command[-1]).write_text(json.dumps({"machine": MACHINE, "rows": [{"batch": 32}]}))
 
     monkeypatch.setattr(running, "_call", call)
     machine = running.Machine(threads=1, beside=2)
@@ -240,3 +240,28 @@ def test_readme_tells_what_the_row_of_other_seeds_misses(tmp_path: Path) -> None
     assert "| 475 | other seeds: return ≥ 475 on average: 400 |" in both
     without = render.readme_tables({"reach": replace(row, chosen=False)}, tmp_path)
     assert "²" not in without
+
+
+def test_readme_marks_what_was_not_confirmed_and_says_so_of_the_rest(tmp_path: Path, monkeypatch) -> None:
+    old = {"files": {"gone.py": "1"}}
+    row = replace(ROW, seeds=(100, 101), wanted={"minutes": 0.4}, beside=True)
+    place(tmp_path, *(record(seed, **old) for seed in row.seeds))
+    alone = render.readme_tables({"reach": row}, tmp_path)
+    assert "One fixed goal¹ |" in alone and "¹ Measured before" in alone and render.ALIKE not in alone
+    assert "| ≤ 0.4 min of training: 31 s |" in alone  # not what ran beside it
+    assert "Gathering demonstrations is not counted." in alone
+    same = {"date": "2026-01-03", "command": "python train.py"}
+    monkeypatch.setattr(render, "confirmed", lambda *_: same)
+    confirmed = render.readme_tables({"reach": row}, tmp_path)
+    assert "One fixed goal |" in confirmed and "¹ Measured" not in confirmed and render.ALIKE in confirmed
+
+
+def test_speeds_of_the_same_columns_are_one_table(tmp_path: Path) -> None:
+    rows = {name: replace(SPEED, name=name) for name in ("one", "two")}
+    for name, row in rows.items():
+        file = tmp_path / "out.json"
+        file.write_text(json.dumps({"machine": MACHINE, "rows": [{"batch": name}]}))
+        records.write(records.record_benchmark(row, file, commit="abc"), tmp_path)
+    readme = render.readme_tables(rows, tmp_path)
+    assert readme.count("| machine | batch |") == 1
+    assert "2026-01-02 | one |\n| p, 2 threads, 2026-01-02 | two |" in readme
