@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import Literal
 
 import torch
@@ -102,15 +101,15 @@ class ActorCritic(WorldModel):
         action = mean + std * torch.randn_like(mean)
         return action, frozen(self.rssm, z, action.clamp(-1.0, 1.0))
 
-    def _imagine(self, z: Tensor, step: Callable[[Tensor], tuple[Tensor, Tensor]]) -> tuple[Tensor, Tensor]:
-        """States (K+1, N, Z) and actions (K, N, A) from z (N, Z); `step` is `_imagined_step`, or that compiled.
+    def _imagine(self, z: Tensor) -> tuple[Tensor, Tensor]:
+        """States (K+1, N, Z) and actions (K, N, A) from z (N, Z).
 
         With `actor_gradient=dynamics` they have gradients to the actor, through nothing but its actions.
         """
         states, actions = [z], []
         with torch.set_grad_enabled(self.actor_gradient == "dynamics" and torch.is_grad_enabled()):
             for _ in range(self.imagination):
-                action, z = step(z)
+                action, z = self._imagined_step(z)
                 actions.append(action)
                 states.append(z)
             return torch.stack(states), torch.stack(actions)

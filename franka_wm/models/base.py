@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from functools import partial
-from inspect import signature
 from types import MappingProxyType
 from typing import Any, ClassVar
 
@@ -227,22 +225,36 @@ class WorldModel(nn.Module):
         """Move slow copies of weights, after each optimiser step; there are none by default."""
 
     parts_of_loss: ClassVar[tuple[str, ...]] = ()
-    """Names of methods that a `loss` which takes `parts` calls through them, so that each is compiled by itself."""
+    """Methods that `loss` calls and that are compiled one by one, rather than `loss` as one program."""
+    repeated: ClassVar[tuple[str, ...]] = ()
+    """Modules whose weights `loss` multiplies by again and again: in low precision they are cast once for all."""
 
     def compiled_loss(self) -> Callable[[TensorDictBase], TensorDict]:
-        """`loss`, compiled by `torch.compile`: where it takes `parts`, each of `parts_of_loss`, else as one program.
+        """`loss`, compiled by `torch.compile`: each of `parts_of_loss`, else as one program.
 
-        Parts are compiled for every shape that they are called with; what else `loss` does runs as it is.
+        Parts are compiled for every shape that they are called with; what else `loss` does runs as it is. A subclass
+        with a loss of its own has the parts that it names itself.
         """
-        if "parts" not in signature(self.loss).parameters:
-            return torch.compile(self.loss)
-        loss: Callable[..., TensorDict] = self.loss
-        compiled = {name: torch.compile(part, dynamic=False) for name, part in self._parts(None).items()}
-        return partial(loss, parts=compiled)
+        loss, parts = self.loss, self.__class__._parts()
+        if not parts:
+            return torch.compile(loss)
+        compiled = {name: torch.compile(getattr(self, name), dynamic=False) for name in parts}
 
-    def _parts(self, instead: Mapping[str, Callable[..., Any]] | None) -> dict[str, Callable[..., Any]]:
-        """Name -> method of `parts_of_loss`, or what `instead` has under the name."""
-        return {name: getattr(self, name) for name in self.parts_of_loss} | dict(instead or {})
+        def of_parts(batch: TensorDictBase) -> TensorDict:
+            vars(self).update(compiled)  # what `loss` finds under these names, before the class's
+            try:
+                return loss(batch)
+            finally:
+                for name in compiled:
+                    del vars(self)[name]
+
+        return of_parts
+
+    @classmethod
+    def _parts(cls) -> tuple[str, ...]:
+        """`parts_of_loss` of the class that defines `loss`, or of a subclass that names its own."""
+        owner = next(kind for kind in cls.__mro__ if {"loss", "parts_of_loss"}.intersection(vars(kind)))
+        return vars(owner).get("parts_of_loss", ())
 
     def rebuild_overrides(self) -> dict[str, Any]:
         """Constructor arguments that replace those which read other files or depend on the environment.

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from typing import Any, ClassVar, Literal
 
 import torch
@@ -18,6 +18,7 @@ from franka_wm.models.layers import TwoHotSymlog, symlog
 from franka_wm.models.normalizer import ObservationNormalizer
 from franka_wm.models.returns import RunningScale, discount_per_step, value_range
 from franka_wm.models.rssm import RSSM, divergence, network
+from franka_wm.models.streams import side_stream
 from franka_wm.models.vision import ConvDecoder, ConvEncoder
 from franka_wm.models.windows import check_windows, window_of
 from franka_wm.options import COEFFICIENT, DEPTH, FRACTION, POSITIVE, Bounds, with_defaults
@@ -249,10 +250,9 @@ class Dreamer(ActorCritic):
         "_replay_value_loss",
     )
     """Compiled one by one: all steps in one program would take minutes to compile."""
+    repeated = ("rssm", "actor")
 
-    def loss(
-        self, batch: TensorDictBase, *, parts: Mapping[str, Callable[..., Any]] | None = None
-    ) -> TensorDict:
+    def loss(self, batch: TensorDictBase) -> TensorDict:
         """Losses of a batch of windows; call `backward` once on the entry `loss`.
 
         In training mode the running scale of returns is updated as well.
@@ -262,7 +262,6 @@ class Dreamer(ActorCritic):
                 `action` (…, A), and in `next` the observation keys, `reward` (…, 1) and `terminated` (…, 1) bool. In
                 front of them `burn_in` steps, of any episode, from which the memory begins; with them, `is_init`
                 (…, 1) bool of all.
-            parts: what to call instead of the methods that `parts_of_loss` names.
 
         Returns:
             batch size []: `loss` to differentiate, and detached: `loss_dynamics` and `loss_representation` [nat, not
@@ -274,7 +273,7 @@ class Dreamer(ActorCritic):
         Raises:
             ValueError: the batch size is not [B, burn_in + H], or `is_init` is missing that `burn_in` needs.
         """
-        count, call = check_windows(batch)[1], self._parts(parts)
+        count = check_windows(batch)[1]
         if self.burn_in and (count <= self.burn_in or batch.get("is_init", None) is None):
             raise ValueError(
                 f"burn_in={self.burn_in}: windows have so many steps in front and `is_init`, see make_replay and "
@@ -286,16 +285,22 @@ class Dreamer(ActorCritic):
             batch.get(key).transpose(0, 1) for key in ("action", ("next", "reward"), ("next", "terminated"))
         )
         window = window_of(batch, self.observation_keys).transpose(0, 1)
-        embedded = call["_embed"](window)
-        h = self._remember(earlier, batch[:, 0], embedded[0], call)
-        z, posterior = self._filter(h, embedded, action, call["_step"])  # (H+1, B, ...)
-        model_loss, model_metrics = call["_model_loss"](z, posterior, window, reward, terminated)
-        imagined, actions = self._imagine(z.detach().flatten(0, 1), call["_imagined_step"])
+        observed = [window.get(key) for key in self.observation_keys]
+        # On CUDA what needs each other's inputs only runs side by side.
+        with side_stream(*observed) as seen:
+            embedded = self._embed(window)
+        h = self._remember(earlier, batch[:, 0], embedded[0])
+        seen.join(embedded)
+        z, posterior = self._filter(h, embedded, action)  # (H+1, B, ...)
+        with side_stream(z, posterior, *observed, reward, terminated) as model:
+            model_loss, model_metrics = self._model_loss(z, posterior, window, reward, terminated)
+        imagined, actions = self._imagine(z.detach().flatten(0, 1))
         begun = torch.cat((torch.ones_like(reward[:1]), (~terminated).to(reward.dtype)))
-        policy_loss, value_loss, entropy, returns, value = call["_actor_critic_loss"](
+        policy_loss, value_loss, entropy, returns, value = self._actor_critic_loss(
             imagined, actions, begun.flatten(0, 1)
         )
-        replay_value_loss = call["_replay_value_loss"](z, returns[0], reward, terminated)
+        replay_value_loss = self._replay_value_loss(z, returns[0], reward, terminated)
+        model.join(model_loss, *model_metrics.values())
         metrics = {
             **model_metrics,
             "loss_policy": policy_loss,
@@ -338,16 +343,9 @@ class Dreamer(ActorCritic):
         z, posterior = self._see(h, embedded, sample=True)
         return z, posterior, self.rssm.recur(z, action)
 
-    def _remember(
-        self,
-        earlier: TensorDictBase,
-        first: TensorDictBase,
-        embedded: Tensor,
-        call: Mapping[str, Callable[..., Any]],
-    ) -> Tensor:
+    def _remember(self, earlier: TensorDictBase, first: TensorDictBase, embedded: Tensor) -> Tensor:
         """h (B, deter_dim) of a window's `first` step (B,), whose features are (B, E), after `earlier` steps (B, K).
 
-        `call` has the parts of the loss by name.
         No gradient reaches them: the burn-in of R2D2 (Kapturowski et al., 2019).
         """
         h = begin = self.rssm.begin(embedded)
@@ -355,22 +353,20 @@ class Dreamer(ActorCritic):
             return begin
         with torch.no_grad():
             # Time leads, as in a window.
-            features = call["_embed"](earlier.select(*self.observation_keys).transpose(0, 1))
+            features = self._embed(earlier.select(*self.observation_keys).transpose(0, 1))
             is_init, action = (earlier.get(key).transpose(0, 1) for key in ("is_init", "action"))
             for t in range(self.burn_in):
-                _, _, h = call["_step"](torch.where(is_init[t], begin, h), features[t], action[t])
+                _, _, h = self._step(torch.where(is_init[t], begin, h), features[t], action[t])
         return torch.where(first.get("is_init"), begin, h)
 
-    def _filter(
-        self, h: Tensor, embedded: Tensor, action: Tensor, step: Callable[..., Any]
-    ) -> tuple[Tensor, Tensor]:
+    def _filter(self, h: Tensor, embedded: Tensor, action: Tensor) -> tuple[Tensor, Tensor]:
         """States (H+1, B, Z) and posteriors (H+1, B, codes, classes) of features (H+1, B, E), actions (H, B, A).
 
-        h (B, deter_dim) is the first step's; `step` is `_step`, or that compiled.
+        h (B, deter_dim) is the first step's.
         """
         states, posteriors = [], []
         for t in range(action.shape[0]):
-            z, posterior, h = step(h, embedded[t], action[t])
+            z, posterior, h = self._step(h, embedded[t], action[t])
             states.append(z)
             posteriors.append(posterior)
         z, posterior = self._see(h, embedded[-1], sample=True)

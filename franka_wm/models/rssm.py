@@ -136,7 +136,12 @@ class BlockLinear(nn.Module):
     def forward(self, x: Tensor) -> Tensor:
         leading, blocks = x.shape[:-1], self.weight.shape[0]
         grouped = x.reshape(-1, blocks, self.weight.shape[1]).transpose(0, 1)
-        return torch.baddbmm(self.bias, grouped, self.weight).transpose(0, 1).reshape(*leading, -1)
+        if torch.compiler.is_compiling():  # what follows adds the bias, which baddbmm copies first
+            product = torch.bmm(grouped, self.weight)
+            product = product + self.bias.to(product.dtype)
+        else:
+            product = torch.baddbmm(self.bias, grouped, self.weight)
+        return product.transpose(0, 1).reshape(*leading, -1)
 
 
 def layer(in_features: int, out_features: int) -> nn.Sequential:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, ClassVar, Literal
 
@@ -279,9 +279,7 @@ class TDMPC2(SimplicialWorldModel):
     parts_of_loss = ("_encode_window", "_td_target", "_unroll", "_model_losses", "_policy_loss", "_metrics")
     """Compiled one by one: what runs side by side on a GPU must not become one program."""
 
-    def loss(
-        self, batch: TensorDictBase, *, parts: Mapping[str, Callable[..., Any]] | None = None
-    ) -> TensorDict:
+    def loss(self, batch: TensorDictBase) -> TensorDict:
         """Losses of a batch of windows; call `backward` once on the entry `loss`.
 
         The policy's parameters then hold the gradient of the policy loss alone, all others that of the model losses
@@ -294,7 +292,6 @@ class TDMPC2(SimplicialWorldModel):
                 (B, H, 1) bool. The observations after steps 0..H-2 are read from the root of the following
                 step; only the last one is read from `next`, and it must be the true one, also where the
                 episode ended. A truncated episode is bootstrapped, a terminated one is not.
-            parts: what to call instead of the methods that `parts_of_loss` names.
 
         Returns:
             batch size []: `loss` to differentiate, and detached: `loss_consistency`, `loss_reward`,
@@ -306,7 +303,6 @@ class TDMPC2(SimplicialWorldModel):
             ValueError: the batch size is not [B, H].
         """
         check_windows(batch)
-        call = self._parts(parts)
         # Time leads from here on: (H, B, ...).
         action, reward, terminated = (
             batch.get(key).transpose(0, 1) for key in ("action", ("next", "reward"), ("next", "terminated"))
@@ -314,17 +310,17 @@ class TDMPC2(SimplicialWorldModel):
         steps = torch.arange(action.shape[0] + 1, device=action.device, dtype=action.dtype)
         weight = self.rho ** steps.view(-1, 1, 1)
 
-        encoded = call["_encode_window"](batch)  # (H+1, B, D), one call
+        encoded = self._encode_window(batch)  # (H+1, B, D), one call
         after = encoded[1:].detach()
         # Targets, model and policy need each other's inputs only: on CUDA they run side by side.
         with side_stream(after, reward, terminated) as targets, torch.no_grad():
-            target = call["_td_target"](after, reward, terminated)
-        predicted = call["_unroll"](encoded[0], action)  # (H+1, B, D)
+            target = self._td_target(after, reward, terminated)
+        predicted = self._unroll(encoded[0], action)  # (H+1, B, D)
         detached = predicted.detach()
         with side_stream(detached, weight, lane=1) as policy:
-            policy_loss, entropy = call["_policy_loss"](detached, weight)
+            policy_loss, entropy = self._policy_loss(detached, weight)
         targets.join(target)
-        consistency, reward_loss, value_loss, q_logits, reward_logits = call["_model_losses"](
+        consistency, reward_loss, value_loss, q_logits, reward_logits = self._model_losses(
             predicted, after, action, reward, target, weight[:-1]
         )
         policy.join(policy_loss, entropy)
@@ -349,7 +345,7 @@ class TDMPC2(SimplicialWorldModel):
             loss = F.binary_cross_entropy_with_logits(logits, terminated.to(logits.dtype))
             total, ends = total + self.termination_coef * loss, {"loss_termination": loss.detach()}
         with torch.no_grad():
-            q_mean, q_target_mean, latent_norm, reward_error, outside = call["_metrics"](
+            q_mean, q_target_mean, latent_norm, reward_error, outside = self._metrics(
                 q_logits.detach(), reward_logits.detach(), target, encoded.detach(), reward
             )
         metrics = {

@@ -13,6 +13,7 @@ from torch import nn
 from franka_wm import processes
 from franka_wm.console import announced
 from franka_wm.errors import UserError
+from franka_wm.models.precision import lowered
 from franka_wm.options import PRECISIONS
 from franka_wm.training.settings.groups import SCHEDULES
 
@@ -186,7 +187,8 @@ class Learner:
     def _eager(self, batch: TensorDictBase) -> None:
         low = self.precision == "bfloat16"
         # No cache of cast weights: it would hold tensors of one captured update into the next.
-        with torch.autocast(self.device.type, torch.bfloat16, enabled=low, cache_enabled=False):
+        casts = torch.autocast(self.device.type, torch.bfloat16, enabled=low, cache_enabled=False)
+        with casts, lowered(self.model, torch.bfloat16) if low else nullcontext():
             losses = self._loss(batch)
         if not isinstance(losses, TensorDictBase) or losses.get("loss", None) is None:
             raise UserError(

@@ -1,5 +1,6 @@
 """Which way the actor's gradient goes: by what actions paid, or back through the model that imagined them."""
 
+from functools import partial
 from typing import Any
 
 import pytest
@@ -30,7 +31,7 @@ def small(actor_gradient: Any, **overrides: Any) -> Dreamer:
 def policy_loss(model: Dreamer) -> tuple[torch.Tensor, torch.Tensor]:
     """Loss of the actor, and what it imagined, with the same noise at each call."""
     torch.manual_seed(1)
-    imagined, actions = model._imagine(torch.randn(STATES, model.latent_dim), model._imagined_step)
+    imagined, actions = model._imagine(torch.randn(STATES, model.latent_dim))
     return model._actor_critic_loss(imagined, actions, torch.ones(STATES, 1))[0], imagined
 
 
@@ -115,19 +116,18 @@ def test_a_gradient_that_there_is_not_is_refused():
 
 
 @pytest.mark.parametrize(("actor_gradient", "burn_in"), [("reinforce", 0), ("dynamics", 0), ("reinforce", 2)])
-def test_each_part_of_the_loss_compiles_as_one_graph(actor_gradient, burn_in):
+def test_each_part_of_the_loss_compiles_as_one_graph(actor_gradient, burn_in, monkeypatch):
     """A break of the graph would cost time on a GPU, and a wrong one numbers."""
     batch = windows(batch=3, horizon=4 + burn_in).exclude("joint_target", ("next", "joint_target"))
     batch["is_init"] = torch.zeros(3, 4 + burn_in, 1, dtype=torch.bool)
     found = []
     for compiled in (False, True):
         model = small(actor_gradient, burn_in=burn_in)
-        fast = {
-            name: torch.compile(getattr(model, name), backend="eager", fullgraph=True, dynamic=False)
-            for name in model.parts_of_loss
-        }
+        if compiled:
+            monkeypatch.setattr(torch, "compile", partial(torch.compile, backend="eager", fullgraph=True))
+        loss = model.compiled_loss() if compiled else model.loss
         torch.manual_seed(1)
-        losses = model.loss(batch, parts=fast if compiled else None)
+        losses = loss(batch)
         losses["loss"].backward()
         grads = {f"of {name}": p.grad for name, p in model.named_parameters() if p.grad is not None}
         found.append({**losses.detach(), **grads})

@@ -88,7 +88,7 @@ def test_windows_are_filtered_as_observe_does_step_by_step(monkeypatch):
     frames = window_of(batch, model.observation_keys)
     embedded = model._embed(frames.transpose(0, 1))
     action = batch["action"].transpose(0, 1)
-    found, posterior = model._filter(model.rssm.begin(embedded[0]), embedded, action, model._step)
+    found, posterior = model._filter(model.rssm.begin(embedded[0]), embedded, action)
     z = model.encode(frames[:, 0])
     for t in range(5):
         if t:
@@ -293,7 +293,7 @@ def test_imagined_trajectories_follow_prior_and_actor(monkeypatch):
         model.rssm, "state", lambda h, p, *, sample: drawn.append(sample) or state(h, p, sample=sample)
     )
     torch.manual_seed(5)
-    states, actions = model._imagine(torch.randn(9, model.latent_dim), model._imagined_step)
+    states, actions = model._imagine(torch.randn(9, model.latent_dim))
     assert states.shape == (5, 9, model.latent_dim) and actions.shape == (4, 9, 2)
     for k in range(4):
         torch.testing.assert_close(

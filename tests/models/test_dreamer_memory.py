@@ -37,7 +37,7 @@ def batch() -> TensorDict:
 
 def first_memory(model: Dreamer, data: TensorDict) -> torch.Tensor:
     first = data[:, EARLIER]
-    return model._remember(data[:, :EARLIER], first, model._embed(first), model._parts(None))
+    return model._remember(data[:, :EARLIER], first, model._embed(first))
 
 
 def test_a_windows_memory_is_that_of_acting(monkeypatch) -> None:

@@ -244,11 +244,12 @@ def test_parts_of_a_loss_are_compiled_one_by_one(family: str, monkeypatch, capsy
     model.eval()  # no dropout: both losses draw the same
     before = copy.deepcopy(model.state_dict())
     compiled: list[str] = []
+    called: Counter[str] = Counter()
 
     def noted(function: Any, *, dynamic: bool | None = None) -> Any:
         assert dynamic is False  # windows of images and those before them have two shapes, not any
         compiled.append(function.__name__)
-        return function
+        return lambda *inputs: (called.update([function.__name__]), function(*inputs))[1]
 
     monkeypatch.setattr(torch, "compile", noted)
     learner = Learner(model, compile=True)
@@ -269,16 +270,13 @@ def test_parts_of_a_loss_are_compiled_one_by_one(family: str, monkeypatch, capsy
         },
         batch_size=[4, 3],
     )
-    called: Counter[str] = Counter()
-    parts = {
-        name: lambda *inputs, name=name: (called.update([name]), getattr(model, name)(*inputs))[1]
-        for name in model.parts_of_loss
-    }
     torch.manual_seed(1)
     plain = model.loss(data)
+    called.clear()
     torch.manual_seed(1)
-    assert torch.equal(model.loss(data, parts=parts)["loss"], plain["loss"])
+    assert torch.equal(model.compiled_loss()(data)["loss"], plain["loss"])
     assert called == dict.fromkeys(model.parts_of_loss, 1) | CALLS[family]
+    assert not vars(model).keys() & set(model.parts_of_loss)
     torch.manual_seed(1)
     learner.update(data)
     assert "compiling the loss …" in capsys.readouterr().out
