@@ -24,7 +24,7 @@ from torch.autograd import DeviceType  # pyright: ignore[reportPrivateImportUsag
 from torch.profiler import ProfilerActivity, profile
 
 from franka_wm.data.lerobot.windows import RecordedWindows
-from franka_wm.device import resolve_device
+from franka_wm.device import prefer_speed, resolve_device
 from franka_wm.training import build
 from franka_wm.training.check import check
 from franka_wm.training.learner import Learner
@@ -45,8 +45,7 @@ def make_trainer(arguments: Sequence[str], folder: Path) -> Trainer:
     check(settings)
     run = Run(settings, folder)
     torch.manual_seed(0)
-    if run.device.type == "cuda":
-        torch.set_float32_matmul_precision("high")
+    prefer_speed(run.device)
     env, _ = run.build_environments()
     replay, spaces = run.build_experience(env)
     model = build.make_model(settings, spaces, run.device)

@@ -24,7 +24,7 @@ from planners import make_observation, make_planner
 
 from franka_wm.data.captured import CapturedSampling
 from franka_wm.data.replay import make_replay
-from franka_wm.device import resolve_device
+from franka_wm.device import prefer_speed, resolve_device
 from franka_wm.envs import FrankaEnv
 from franka_wm.policies import PlannerPolicy
 from franka_wm.training.learner import Learner
@@ -101,8 +101,7 @@ def main() -> None:
     arguments = parser.parse_args()
     device = resolve_device(arguments.device)
     cuda = device.type == "cuda"
-    if cuda:
-        torch.set_float32_matmul_precision("high")
+    prefer_speed(device)
     rows = []
     for what in arguments.what:
         for size in SIZES[what][cuda]:

@@ -15,7 +15,7 @@ from tensordict import TensorDict
 
 from franka_wm.data.captured import CapturedSampling
 from franka_wm.data.replay import make_replay
-from franka_wm.device import resolve_device
+from franka_wm.device import prefer_speed, resolve_device
 from franka_wm.training.learner import Learner
 
 SIZES = {  # latent, encoder, hidden, batch
@@ -60,8 +60,7 @@ def main() -> None:
     parser.add_argument("--out")
     arguments = parser.parse_args()
     device = resolve_device(arguments.device)
-    if device.type == "cuda":
-        torch.set_float32_matmul_precision("high")
+    prefer_speed(device)
     rows = []
     for name in arguments.sizes:
         latent, encoder, hidden, batch = SIZES[name]

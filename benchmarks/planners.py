@@ -21,7 +21,7 @@ from omegaconf import OmegaConf
 from tensordict import TensorDict
 
 from franka_wm import models
-from franka_wm.device import resolve_device
+from franka_wm.device import prefer_speed, resolve_device
 from franka_wm.planning import CEM, ICEM, MPPI, GoalImage, GradientPlanner
 from franka_wm.policies import PlannerPolicy
 
@@ -105,8 +105,7 @@ def main() -> None:
     arguments = parser.parse_args()
     device = resolve_device(arguments.device)
     cuda = device.type == "cuda"
-    if cuda:
-        torch.set_float32_matmul_precision("high")
+    prefer_speed(device)
     rows = []
     for size in arguments.sizes:
         model = make_model(size).to(device)

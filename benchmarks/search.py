@@ -18,7 +18,7 @@ from common import publish, rate
 from tensordict import TensorDict
 
 from franka_wm import models
-from franka_wm.device import resolve_device
+from franka_wm.device import prefer_speed, resolve_device
 from franka_wm.planning import MCTS
 from franka_wm.policies import SearchPolicy
 
@@ -43,8 +43,7 @@ def main() -> None:
     parser.add_argument("--out")
     arguments = parser.parse_args()
     device = resolve_device(arguments.device)
-    if device.type == "cuda":
-        torch.set_float32_matmul_precision("high")
+    prefer_speed(device)
     model = models.make("muzero", observation_sizes={"state": 20, "joint_target": 7}, num_actions=MOVES).to(
         device
     )

@@ -27,7 +27,7 @@ from franka_wm.data.hindsight import Hindsight
 from franka_wm.data.lerobot.export import check_export_place, export_run
 from franka_wm.data.lerobot.windows import RecordedWindows
 from franka_wm.data.replay import WindowReplay
-from franka_wm.device import resolve_device
+from franka_wm.device import prefer_speed, resolve_device
 from franka_wm.envs import Environment
 from franka_wm.envs.multitask_config import MultiTaskConfig
 from franka_wm.errors import FrankaError, UserError, trying
@@ -263,8 +263,7 @@ def start(cfg: DictConfig) -> Run:
         raise UserError("trainer.capture=true: needs device=cuda; null captures where it is possible")
     logging.getLogger("torchrl").setLevel(logging.WARNING)
     torch.manual_seed(derive_seed("weights", settings.seed))
-    if device.type == "cuda":
-        torch.set_float32_matmul_precision("high")
+    prefer_speed(device)
     if not processes.is_first():
         return Run(settings, folder, checkpoint)  # the first one writes
     lock_run_dir(folder)

@@ -14,6 +14,7 @@ import torch
 from omegaconf import OmegaConf
 
 from franka_wm.conf import compose
+from franka_wm.device import prefer_speed
 from franka_wm.errors import FrankaError, UserError
 from franka_wm.training import build
 from franka_wm.training.checkpoint import load_checkpoint, save_checkpoint
@@ -154,9 +155,10 @@ def test_a_value_means_the_same_with_resume(tmp_path: Path) -> None:
         merged("~trainer.schedule")
 
 
-def test_the_first_steps_are_learned_before_more_is_gathered(train, tmp_path: Path) -> None:
+def test_the_first_steps_are_learned_before_more_is_gathered(train, tmp_path: Path, monkeypatch) -> None:
     """Three batches of five steps of three worlds, each before ten updates; the second is not gathered."""
-    gathered = []
+    gathered, fast = [], []
+    monkeypatch.setattr("franka_wm.training.run.prefer_speed", fast.append)
     for updates in (0, 11):  # the second in whole batches of updates
         words = (f"collector.seed_updates={updates}", "evaluation.during=[]")
         saved = train(*words, folder=tmp_path / f"{updates}")
@@ -165,6 +167,16 @@ def test_the_first_steps_are_learned_before_more_is_gathered(train, tmp_path: Pa
         assert saved.counters["env_steps"] == run.collector.num_envs * run.planned_steps()
         gathered.append(saved.counters["env_steps"])
     assert gathered[0] - gathered[1] == 3 * 5
+    assert fast == [torch.device("cpu")] * 2
+
+
+@pytest.mark.parametrize(("device", "fast"), [("cuda:0", True), ("cpu", False)])
+def test_what_a_gpu_may_round_and_try(device: str, fast: bool, monkeypatch) -> None:
+    asked: list[str] = []
+    monkeypatch.setattr(torch, "set_float32_matmul_precision", asked.append)
+    monkeypatch.setattr(torch.backends.cudnn, "benchmark", False)
+    prefer_speed(torch.device(device))
+    assert (asked, torch.backends.cudnn.benchmark) == (["high"] * fast, fast)
 
 
 @pytest.mark.parametrize(
