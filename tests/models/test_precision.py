@@ -47,9 +47,9 @@ def test_weights_of_products_are_cast_and_come_back() -> None:
 def gradients(*, once: bool) -> dict[str, torch.Tensor]:
     model = small()
     torch.manual_seed(1)
-    with torch.autocast("cpu", torch.bfloat16, cache_enabled=False):
-        with lowered(model, torch.bfloat16) if once else nullcontext():
-            loss = model.loss(batch())["loss"]
+    casts = lowered(model, torch.bfloat16) if once else nullcontext()
+    with torch.autocast("cpu", torch.bfloat16, cache_enabled=False), casts:
+        loss = model.loss(batch())["loss"]
     loss.backward()
     return {name: p.grad for name, p in model.named_parameters() if p.grad is not None}
 
