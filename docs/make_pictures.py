@@ -14,13 +14,6 @@ FOLDER = Path(__file__).parent / "images"
 
 
 def main() -> None:
-    config = FrankaConfig(
-        observations=("state",), enable_shadows=True, gravity_compensation=True, pose_noise=0.5
-    )
-    arms = FrankaEnv(config, num_envs=6, device="cpu", seed=11)
-    arms.reset()
-    write_png(tile_frames(arms.render(320, samples=3).unsqueeze(0), columns=3)[0], FOLDER / "arms.png")
-
     # What a model sees: 64 × 64, enlarged without smoothing.
     seen = FrankaEnv(FrankaConfig(pose_noise=0.5), num_envs=12, device="cpu", seed=5)
     pixels = seen.reset()["pixels"]

@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import benchmarks.results
-from benchmarks.results import confirm, plots, records, render, running
+from benchmarks.results import confirm, headlines, plots, records, render, running
 from benchmarks.results.rows import Row, choose, load_rows
 from benchmarks.results.state import state, unmeasured
 from franka_wm.errors import FrankaError
@@ -17,6 +17,9 @@ from franka_wm.source import ROOT
 
 SHOWN = 3
 """Of the files that changed since a row was measured."""
+
+
+README = ROOT / "README.md"
 
 
 def overview(rows: Mapping[str, Row], place: Path) -> str:
@@ -54,15 +57,20 @@ def is_fresh(row: Row, place: Path) -> bool:
     return state(row, records.read(row, place))[0] == "fresh"
 
 
+def with_results(readme: str, rows: Mapping[str, Row], place: Path) -> str:
+    """README with its two parts of results."""
+    first = render.with_tables(readme, headlines.headlines(rows, place), headlines.BEGIN, headlines.END)
+    return render.with_tables(first, render.readme_tables(rows, place))
+
+
 def write_pages(rows: Mapping[str, Row], place: Path) -> None:
     """docs/results.md, its pictures and README's tables."""
     for row in rows.values():
         if row.plot and (found := records.read(row, place)):
             plots.write(row, found[0], place)
-    readme = ROOT / "README.md"
     for path, text in (
         (ROOT / "docs" / "results.md", render.page(rows, place)),
-        (readme, render.with_tables(readme.read_text(), render.readme_tables(rows, place))),
+        (README, with_results(README.read_text(), rows, place)),
     ):
         with atomic_write(path) as temporary:
             temporary.write_text(text)

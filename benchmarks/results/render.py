@@ -404,13 +404,13 @@ def _missed_by_others(rows: Mapping[str, Row], row: Row, place: Path) -> list[st
     return [f"other seeds: {what}: {_briefly(found)}" for what, found, enough in judged if not enough]
 
 
-def with_tables(readme: str, tables: str) -> str:
-    """README with its tables in their place.
+def with_tables(readme: str, tables: str, begin: str = BEGIN, end: str = END) -> str:
+    """README with its tables in their place, between the lines `begin` and `end`.
 
     Raises:
         UserError: The place is not marked.
     """
-    if readme.count(BEGIN) != 1 or readme.count(END) != 1:
-        raise UserError(f"README.md needs the lines {BEGIN} and {END} once each, around its tables")
-    before, rest = readme.split(BEGIN)
-    return f"{before}{BEGIN}\n\n{tables}\n{END}{rest.split(END)[1]}"
+    if readme.count(begin) != 1 or readme.count(end) != 1:
+        raise UserError(f"README.md needs the lines {begin} and {end} once each, around its tables")
+    before, rest = readme.split(begin)
+    return f"{before}{begin}\n\n{tables}\n{end}{rest.split(end)[1]}"

@@ -63,6 +63,7 @@ class Row:
     plot: Mapping[str, str] | None = None
     beside: bool = False
     chosen: bool = False
+    headline: bool = False
 
     @property
     def words(self) -> list[str]:

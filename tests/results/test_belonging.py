@@ -14,6 +14,7 @@ import yaml
 
 from benchmarks.results import records, render, running, times
 from benchmarks.results.__main__ import main, overview
+from benchmarks.results.headlines import headlines
 from benchmarks.results.rows import Row, load_rows
 from benchmarks.results.state import composed, mixed, state
 from franka_wm import source
@@ -265,3 +266,24 @@ def test_speeds_of_the_same_columns_are_one_table(tmp_path: Path) -> None:
     readme = render.readme_tables(rows, tmp_path)
     assert readme.count("| machine | batch |") == 1
     assert "2026-01-02 | one |\n| p, 2 threads, 2026-01-02 | two |" in readme
+
+
+def test_readme_begins_with_the_worst_seed_of_rows_that_are_whole(tmp_path: Path, monkeypatch) -> None:
+    row = replace(ROW, seeds=(100, 101), headline=True)
+    lucky, poor = record(100), record(101)
+    rate = {"mean": 0.0, "low": 0.0, "high": 0.1}
+    poor["policies"] = poor["policies"] | {
+        "planner": POLICY | {"success": dict.fromkeys(("0.05", "0.025", "0.01"), rate)}
+    }
+    place(tmp_path, lucky)
+    assert headlines({"reach": row}, tmp_path) == ""  # one seed is missing
+    place(tmp_path, poor)
+    assert "| One fixed goal | Two CPU cores | 30 s | 0 % within 5 cm, 2 seeds |" in headlines(
+        {"reach": row}, tmp_path
+    )
+    assert "One fixed goal² |" in headlines({"reach": replace(row, chosen=True)}, tmp_path)
+    assert headlines({"reach": replace(row, headline=False)}, tmp_path) == ""
+    place(tmp_path, *(one | {"code": {**one["code"], "files": {"gone.py": "1"}}} for one in (lucky, poor)))
+    assert "One fixed goal¹ |" in headlines({"reach": row}, tmp_path)
+    monkeypatch.setattr("benchmarks.results.headlines.confirmed", lambda *_: {"date": "2026-01-03"})
+    assert "One fixed goal |" in headlines({"reach": row}, tmp_path)

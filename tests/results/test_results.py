@@ -13,7 +13,7 @@ import pytest
 import yaml
 
 from benchmarks.results import records, render
-from benchmarks.results.__main__ import overview
+from benchmarks.results.__main__ import overview, with_results
 from benchmarks.results.rows import Row, Section, load_rows
 from benchmarks.results.state import composed, state
 from franka_wm import source
@@ -426,7 +426,7 @@ def test_committed_pages_are_what_the_files_say() -> None:
     rows = load_rows()
     assert (source.ROOT / "docs" / "results.md").read_text() == render.page(rows), "run `make results`"
     readme = (source.ROOT / "README.md").read_text()
-    assert readme == render.with_tables(readme, render.readme_tables(rows)), "run `make results`"
+    assert readme == with_results(readme, rows, records.PLACE), "run `make results`"
 
 
 def test_readme_without_its_place_is_refused() -> None:
