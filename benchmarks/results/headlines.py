@@ -17,7 +17,7 @@ BEGIN, END = "<!-- headlines: written by `make results` -->", "<!-- end of headl
 
 
 def headlines(rows: Mapping[str, Row], place: Path = PLACE) -> str:
-    """A table of the rows with `headline` of which every seed was measured; marks are those of README's other tables."""
+    """A table of the rows with `headline` whose every seed was measured; marked as README's other tables."""
     found = []
     for row in rows.values():
         records = read(row, place) if row.headline else []
@@ -29,8 +29,7 @@ def headlines(rows: Mapping[str, Row], place: Path = PLACE) -> str:
         worst = min(measure.of(record, policy) for record in records)
         timing = timed(records, beside=row.beside)
         took = duration(mean([seconds(record) for record in timing])) + company(records, beside=row.beside)
-        chosen = "²" * row.chosen
-        found.append(
-            [row.title + chosen, cores(row, records), took, f"{worst:.0f} % {what}, {len(records)} seeds"]
-        )
+        aged = kind == "stale" and confirmed(row, records, place) is None
+        title = row.title + " ".join([*"¹" * aged, *"²" * row.chosen])
+        found.append([title, cores(row, records), took, f"{worst:.0f} % {what}, {len(records)} seeds"])
     return table(["task", "machine", "training", "worst seed"], found) + "\n" if found else ""
