@@ -84,9 +84,17 @@ def test_readme_collects(tmp_path: Path) -> None:
     assert len(lines) == 10 and all("torch.Size([2, 16, 64, 64, 3])" in line for line in lines)
 
 
+def test_environment_page_steps() -> None:
+    code, *_ = blocks("docs/environment-names.md", "python")
+    scope: dict[str, Any] = {}
+    exec(compile(code, "docs/environment-names.md", "exec"), scope)
+    pixels, reward = (scope["step"]["next", key] for key in ("pixels", "reward"))
+    assert pixels.shape == (8, 64, 64, 3) and reward.shape == (8, 1)
+
+
 def test_environment_page_samples_windows() -> None:
     """Two worlds in place of 64."""
-    code, _ = blocks("docs/environment-names.md", "python")
+    _, code, _ = blocks("docs/environment-names.md", "python")
     scope: dict[str, Any] = {}
     exec(compile(code.replace("64", "2"), "docs/environment-names.md", "exec"), scope)
     batch = scope["batch"]
