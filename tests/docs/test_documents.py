@@ -9,6 +9,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
+import click
 import pytest
 import torch
 from hydra.core.override_parser.overrides_parser import OverridesParser
@@ -84,9 +85,17 @@ def test_readme_collects(tmp_path: Path) -> None:
     assert len(lines) == 10 and all("torch.Size([2, 16, 64, 64, 3])" in line for line in lines)
 
 
+def test_environment_page_steps() -> None:
+    code, *_ = blocks("docs/environment-names.md", "python")
+    scope: dict[str, Any] = {}
+    exec(compile(code, "docs/environment-names.md", "exec"), scope)
+    pixels, reward = (scope["step"]["next", key] for key in ("pixels", "reward"))
+    assert pixels.shape == (8, 64, 64, 3) and reward.shape == (8, 1)
+
+
 def test_environment_page_samples_windows() -> None:
     """Two worlds in place of 64."""
-    code, _ = blocks("docs/environment-names.md", "python")
+    _, code, _ = blocks("docs/environment-names.md", "python")
     scope: dict[str, Any] = {}
     exec(compile(code.replace("64", "2"), "docs/environment-names.md", "exec"), scope)
     batch = scope["batch"]
@@ -125,12 +134,21 @@ def test_reports_page_draws(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> 
 
 
 def commands(program: str) -> Iterator[tuple[str, list[str]]]:
-    """(document, arguments) of every documented call of ``program``, comments and continuations resolved."""
+    """(document, arguments) of every documented call of ``program``, comments and continuations resolved.
+
+    Also of calls within a sentence or an indented block, unless they are cut short by ``…``.
+    """
+    span = re.compile(rf"`({program}\s[^`…]+)`|^ {{4,}}({program} [^…\n]+)$", re.MULTILINE)
     for name in NAMES:
+        lines = [
+            " ".join("".join(found).split())
+            for found in span.findall(FENCE.sub("", (ROOT / name).read_text()))
+        ]
         for code in blocks(name, "bash"):
-            for line in code.replace("\\\n", " ").splitlines():
-                if line.startswith(program + " "):
-                    yield name, shlex.split(line, comments=True)[len(program.split()) :]
+            lines += code.replace("\\\n", " ").splitlines()
+        for line in dict.fromkeys(lines):
+            if line.startswith(program + " "):
+                yield name, shlex.split(line, comments=True)[len(program.split()) :]
 
 
 PLUGINS = {
@@ -141,7 +159,11 @@ PLUGINS = {
 }
 """Packages that Hydra finds its launchers and sweepers in."""
 
-TRAIN = [*commands("python train.py"), *commands("franka-wm train")]
+TRAIN = [
+    (name, arguments)
+    for name, arguments in [*commands("python train.py"), *commands("franka-wm train")]
+    if not any(a.startswith(("--config-dir", "--cfg")) for a in arguments)  # presets elsewhere; no training
+]
 VERBS = list(commands("franka-wm"))
 
 
@@ -180,11 +202,26 @@ def test_documented_training_composes(
         assert "env" in composed(*chosen)
 
 
-def test_documented_verbs_exist() -> None:
+def test_documented_verbs_take_their_words(composed: Callable[..., Any]) -> None:
     from franka_wm.commands.main import VERBS as known
+    from franka_wm.commands.main import program
 
-    assert len(VERBS) > 20
-    assert {f"{name}: {a[0]}" for name, a in VERBS if a[0] not in known and not a[0].startswith("-")} == set()
+    calls = [(name, a) for name, a in VERBS if a[0] not in ("train", "VERB") and not a[0].startswith("-")]
+    assert len(calls) > 40
+    wrong = []
+    for name, (verb, *words) in calls:
+        try:
+            assert verb in known, "no such verb"
+            command = program.get_command(click.Context(program), verb)
+            needed = {one.name for one in command.params if one.required}
+            whole = words and "--help" not in words and needed <= {word.partition("=")[0] for word in words}
+            # A sentence may name a verb with some of its words: values are checked of whole calls, names of all.
+            context = command.make_context(verb, words, resilient_parsing=not whole)
+            if verb == "collect" and not any(word.startswith("hydra.") for word in words):
+                composed(*context.params["overrides"])
+        except Exception as error:  # all are told together
+            wrong.append(f"{name}: {verb} {' '.join(words)}: {error}")
+    assert wrong == []
 
 
 def test_documented_make_targets_exist() -> None:
