@@ -91,21 +91,6 @@ def covariance_loss(x: Tensor) -> Tensor:
     return (off / x.shape[-1]).mean()
 
 
-def vicreg(
-    a: Tensor,
-    b: Tensor,
-    *,
-    invariance_coef: float = 25.0,
-    variance_coef: float = 25.0,
-    covariance_coef: float = 1.0,
-) -> Tensor:
-    """Variance-invariance-covariance loss of two views (..., n, D) -> () (arXiv:2105.04906)."""
-    a, b = a.float(), b.float()
-    variance = 0.5 * (variance_loss(a) + variance_loss(b))
-    covariance = covariance_loss(a) + covariance_loss(b)
-    return invariance_coef * F.mse_loss(a, b) + variance_coef * variance + covariance_coef * covariance
-
-
 def info_nce(queries: Tensor, keys: Tensor, *, temperature: float = 0.1) -> Tensor:
     """InfoNCE of matching rows (n, D) against all others, both ways, on cosines -> () (arXiv:1807.03748).
 
@@ -250,22 +235,11 @@ def feature_std(x: Tensor) -> Tensor:
 def participation_ratio(x: Tensor) -> Tensor:
     """How many directions the samples (..., D) spread over: tr(C)² / tr(C²) of their covariance -> ().
 
-    From 1 (a line) to D (a ball); 0 where all samples agree. Unlike `effective_rank` it needs no
-    decomposition, which would wait for the host, so that losses can report it.
+    From 1 (a line) to D (a ball); 0 where all samples agree. It needs no decomposition, which would wait for the
+    host, so that losses can report it.
     """
     x = x.detach().float().reshape(-1, x.shape[-1])
     x = x - x.mean(0)
     with torch.autocast(x.device.type, enabled=False):
         covariance = x.mT @ x / x.shape[0]
     return covariance.trace().square() / covariance.square().sum().clamp_min(1e-30)
-
-
-def effective_rank(x: Tensor) -> Tensor:
-    """exp of the entropy of the normalised singular values of samples (..., D) -> () (arXiv:2210.02885).
-
-    For evaluation: the decomposition waits for the host.
-    """
-    x = x.detach().float().reshape(-1, x.shape[-1])
-    values = torch.linalg.svdvals(x - x.mean(0))
-    p = values / values.sum().clamp_min(1e-30)
-    return torch.exp(-(p * (p + 1e-30).log()).sum())
