@@ -58,6 +58,7 @@ SHOWN = 48
 """Number of them whose images are taken."""
 
 HORIZON = 10
+IMAGINED = 8
 POINTS = 600
 
 
@@ -80,7 +81,7 @@ class Held:
     reaches: bool = False
 
 
-def hold_out(agent: Agent, *, images: bool = True, seed: int = ROLLOUT_SEED) -> Held:
+def hold_out(agent: Agent, *, images: bool) -> Held:
     """Plays the episodes that the diagnostics look at: smooth random and the model's own behaviour, in turns."""
     env, model = agent.env, agent.model
     keys = model.observation_keys
@@ -88,7 +89,7 @@ def hold_out(agent: Agent, *, images: bool = True, seed: int = ROLLOUT_SEED) -> 
     episodes, seen = gather_episodes(
         env,
         mixture(agent.policies, env),
-        seed=seed,
+        seed=ROLLOUT_SEED,
         keys=keys,
         image_size=image_size(model),
         images=shown,
@@ -168,7 +169,7 @@ def representation(held: Held, model: WorldModel) -> tuple[dict[str, object], di
     return seen, latents
 
 
-def calibration(agent: Agent, *, episodes: int = 32) -> dict[str, Any]:
+def calibration(agent: Agent) -> dict[str, Any]:
     """The value against true discounted returns of the policy that it is the value of.
 
     Played in episodes that are long enough for what is cut off to weigh less than 2 %, since a value looks
@@ -184,7 +185,7 @@ def calibration(agent: Agent, *, episodes: int = 32) -> dict[str, Any]:
     length = agent.env.config.episode_length
     tail = steps_until_forgotten(model.discount)
     env = build.make_evaluation_env(
-        agent.settings, num_envs=min(episodes, agent.env.num_envs), episode_length=length + tail
+        agent.settings, num_envs=min(32, agent.env.num_envs), episode_length=length + tail
     )
     keys = model.observation_keys
     played, _ = gather_episodes(env, agent.policies["policy"], keys=keys)
@@ -230,13 +231,11 @@ def imagine(
     agent: Agent,
     held: Held,
     *,
-    steps: int = 8,
     announce: Callable[[str], AbstractContextManager[None]] = nullcontext,
 ) -> tuple[Imagined, Decoder, dict[str, float]] | None:
     """Trains a decoder on the images and draws what the model imagines in an episode that it has not seen.
 
     Args:
-        steps: Imagined, at most.
         announce: What tells that the training goes on, called with one line.
 
     Returns:
@@ -261,7 +260,7 @@ def imagine(
     world = (
         count - 1 if count % 2 == 0 else count - 2
     )  # odd: the model's own behaviour, which moves with a purpose
-    steps = min(steps, int(valid[world].sum()) - 1)
+    steps = min(IMAGINED, int(valid[world].sum()) - 1)
     actions = held.episodes.get("action")[world, :steps]
     shown = imagined_beside_real(
         agent.model, decoder, held.latents[world, 0], actions, images[world, : steps + 1]
@@ -269,16 +268,16 @@ def imagine(
     return shown, decoder, errors
 
 
-def _starts(agent: Agent, *, decoder_size: int, rounds: int = 6, steps: int = 8) -> tuple[Tensor, Tensor]:
+def _starts(agent: Agent, *, decoder_size: int) -> tuple[Tensor, Tensor]:
     """Latents (n, D) and images of the first steps of many more episodes: more poses than a few long ones show."""
     keys = agent.model.observation_keys
     latents, images = [], []
-    for k in range(rounds):
+    for k in range(6):
         episodes, seen = gather_episodes(
             agent.env,
             mixture(agent.policies, agent.env),
             seed=derive_seed("diagnostics", 0, "starts", k),
-            steps=steps,
+            steps=8,
             keys=keys,
             image_size=decoder_size,
             images=min(64, agent.env.num_envs),
