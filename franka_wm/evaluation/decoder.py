@@ -8,8 +8,6 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from franka_wm.evaluation.rollouts import embedding
-
 if TYPE_CHECKING:
     from franka_wm.models.base import WorldModel
 
@@ -162,7 +160,7 @@ def imagined_beside_real(
     imagined = [latent.unsqueeze(0)]
     for t in range(steps):
         imagined.append(model.next(imagined[-1], actions[t : t + 1]))
-    drawn = decoder.draw(embedding(model)(torch.cat(imagined))).cpu()
+    drawn = decoder.draw(model.embed(torch.cat(imagined))).cpu()
     real = images.cpu()
     strip = torch.cat([row.permute(1, 0, 2, 3).reshape(size, -1, 3) for row in (real, drawn)])
     return Imagined(strip, torch.cat([real, drawn], 2))

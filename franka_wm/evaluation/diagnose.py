@@ -34,7 +34,6 @@ from franka_wm.evaluation.protocol import Evaluation
 from franka_wm.evaluation.rollouts import (
     ROLLOUT_SEED,
     discounted_returns,
-    embedding,
     encode_episodes,
     encoded_validly,
     followed,
@@ -121,7 +120,7 @@ def open_loop(agent: Agent, held: Held, *, horizon: int = HORIZON) -> dict[str, 
         out |= horizon_error(model, held.latents, actions, horizon=horizon, valid=held.valid)
     if "physical" in held.episodes.keys():  # noqa: SIM118
         positions = held.episodes.get("physical")[..., 14:17]
-        ranks = cost_ranks(held.latents[:, :-1], positions, embed=embedding(model), valid=held.valid[:, :-1])
+        ranks = cost_ranks(held.latents[:, :-1], positions, embed=model.embed, valid=held.valid[:, :-1])
         out["rank_correlation"] = ranks["within"]
         out["rank_correlation_across_episodes"] = ranks["across"]
     return out
@@ -149,7 +148,7 @@ def probes(held: Held, model: WorldModel) -> dict[str, Any]:
 def representation(held: Held, model: WorldModel) -> tuple[dict[str, object], dict[str, object]]:
     """Spectrum with collapse warning, and the latents along their two main directions for an image."""
     use = held.valid[:, :-1]
-    embedded = embedding(model)(held.latents[:, :-1])[use].float()
+    embedded = model.embed(held.latents[:, :-1])[use].float()
     seen = spectrum(embedded)
     plane = principal_components(embedded.cpu().numpy())
     every = max(1, len(embedded) // POINTS)
@@ -247,7 +246,7 @@ def imagine(
     images = held.images
     count, length = images.shape[:2]
     device = held.latents.device
-    seen = embedding(agent.model)(held.latents[:count, :length]).float()
+    seen = agent.model.embed(held.latents[:count, :length]).float()
     fit = count - max(2, count // 6)
     valid = held.valid[:count, :length].cpu()
     known, unknown = valid.clone(), valid.clone()
@@ -285,7 +284,7 @@ def _starts(agent: Agent, *, decoder_size: int) -> tuple[Tensor, Tensor]:
         assert seen is not None
         episodes = cast(TensorDict, episodes[: len(seen)])
         with torch.no_grad():
-            embedded = embedding(agent.model)(encode_episodes(agent.model, episodes)[:, :-1]).float()
+            embedded = agent.model.embed(encode_episodes(agent.model, episodes)[:, :-1]).float()
         use = episodes.get("valid")
         latents.append(embedded[use])
         images.append(seen[use.cpu()])

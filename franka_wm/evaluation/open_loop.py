@@ -11,7 +11,6 @@ from torch import Tensor
 
 from franka_wm.evaluation.calibration import calibration_bins
 from franka_wm.evaluation.intervals import Interval, bootstrap_ratio
-from franka_wm.evaluation.rollouts import embedding
 
 if TYPE_CHECKING:
     from franka_wm.models.base import WorldModel
@@ -63,7 +62,7 @@ def horizon_error(
     if horizon < 1 or steps < 1:
         raise ValueError(f"horizon={horizon} over {steps} steps: both must be at least 1")
     horizon = min(horizon, steps)
-    embed = embedding(model)
+    embed = model.embed
     valid = torch.ones(envs, steps + 1, dtype=torch.bool, device=latents.device) if valid is None else valid
     truth = embed(latents)
     predicted = latents[:, :-1]
