@@ -6,8 +6,7 @@ from collections.abc import Callable, Sequence
 
 import torch
 from tensordict import TensorDict, TensorDictBase
-from tensordict.nn import InteractionType, TensorDictModuleBase
-from tensordict.nn.probabilistic import interaction_type
+from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
 
 from franka_wm.models.base import WorldModel
@@ -15,7 +14,7 @@ from franka_wm.planning.mcts import MCTS
 from franka_wm.planning.tree import CompiledRecurrent, Recurrent
 from franka_wm.policies.capture import GraphCache
 from franka_wm.policies.graph_key import graph_key
-from franka_wm.policies.planner import allow_recompiles, captures
+from franka_wm.policies.planner import allow_recompiles, captures, explores
 from franka_wm.seeding import share_of_worlds
 
 
@@ -111,7 +110,7 @@ class SearchPolicy(TensorDictModuleBase):
         """
         if len(tensordict.batch_size) != 1:
             raise ValueError(f"expected batch size [E], got {list(tensordict.batch_size)}")
-        explore = interaction_type() is InteractionType.RANDOM if self.explore is None else self.explore
+        explore = explores(self.explore)
         inputs = tensordict.select(*self.in_keys)
         if not captures(self.capture, inputs[self.in_keys[0]]):
             return tensordict.update(self._decide(inputs, explore))
