@@ -121,14 +121,14 @@ def dataset() -> None:
 
 def contract(run: str) -> None:
     """What `encode` says of an episode, and what `next` imagines from some of its steps."""
-    from franka_wm.evaluation.rollouts import embedding, encode_episodes, gather_episodes
+    from franka_wm.evaluation.rollouts import encode_episodes, gather_episodes
     from franka_wm.training.load import load_agent
 
     agent = load_agent(run, num_envs=1, device="cpu")
     episode, _ = gather_episodes(
         agent.env, agent.policies["planner"], keys=list(agent.model.observation_sizes)
     )
-    embed = embedding(agent.model)
+    embed = agent.model.embed
     with torch.no_grad():
         real = encode_episodes(agent.model, episode)[0]
         branches = {}

@@ -8,13 +8,14 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from franka_wm.evaluation.rollouts import embedding
-
 if TYPE_CHECKING:
     from franka_wm.models.base import WorldModel
 
 SIZES = (32, 64)
 """Sides of the images that it can draw [px]."""
+
+WIDTH = 96
+"""Channels at 4 × 4; halved at every doubling, at least 24."""
 
 
 class Decoder(nn.Module):
@@ -25,7 +26,6 @@ class Decoder(nn.Module):
     Args:
         latent_dim: D.
         size: Side of the image [px], 32 or 64.
-        width: Channels at 4 × 4; halved at every doubling, at least 24.
 
     Raises:
         ValueError: Another size.
@@ -35,19 +35,19 @@ class Decoder(nn.Module):
     std: Tensor
     background: Tensor
 
-    def __init__(self, latent_dim: int, *, size: int = 64, width: int = 96):
+    def __init__(self, latent_dim: int, *, size: int):
         super().__init__()
         if size not in SIZES:
             raise ValueError(f"size={size}: must be one of {SIZES}")
-        self.size, self.width = size, width
+        self.size = size
         self.register_buffer("mean", torch.zeros(latent_dim))
         self.register_buffer("std", torch.ones(latent_dim))
         self.register_buffer("background", torch.zeros(3, size, size))
         self.start = nn.Sequential(
-            nn.Linear(latent_dim, 256), nn.SiLU(), nn.Linear(256, width * 16), nn.SiLU()
+            nn.Linear(latent_dim, 256), nn.SiLU(), nn.Linear(256, WIDTH * 16), nn.SiLU()
         )
         layers: list[nn.Module] = []
-        channels, side = width, 4
+        channels, side = WIDTH, 4
         while 2 * side < size:
             narrower, side = max(24, channels // 2), side * 2
             layers += [nn.Upsample(scale_factor=2), nn.Conv2d(channels, narrower, 3, padding=1), nn.SiLU()]
@@ -57,7 +57,7 @@ class Decoder(nn.Module):
 
     def forward(self, z: Tensor) -> Tensor:
         """(n, D) → (n, 3, S, S), about [0, 1], not clipped."""
-        x = self.start((z - self.mean) / self.std).view(-1, self.width, 4, 4)
+        x = self.start((z - self.mean) / self.std).view(-1, WIDTH, 4, 4)
         return self.background + self.grow(x)
 
     @torch.no_grad()
@@ -68,23 +68,13 @@ class Decoder(nn.Module):
         return images.reshape(*z.shape[:-1], self.size, self.size, 3)
 
 
-def train_decoder(
-    latents: Tensor,
-    images: Tensor,
-    *,
-    steps: int = 600,
-    batch_size: int = 16,
-    lr: float = 6e-3,
-    seed: int = 0,
-) -> Decoder:
+def train_decoder(latents: Tensor, images: Tensor, *, steps: int = 600) -> Decoder:
     """Fits a decoder to pairs of latent and image. The latents are taken as they are: no gradient leaves here.
 
     Args:
         latents: (n, D).
         images: (n, S, S, 3) uint8, S as in :data:`SIZES`.
         steps: Updates; 600 take some 10 to 20 s on two CPU cores at 64 × 64.
-        batch_size, lr: Batch size and learning rate of Adam, with a cosine to 0.
-        seed: Seed of weights and batches.
 
     Returns:
         In evaluation mode.
@@ -100,16 +90,16 @@ def train_decoder(
     device = latents.device
     z = latents.detach().float()
     with torch.random.fork_rng(devices=[device] if device.type == "cuda" else []), torch.enable_grad():
-        torch.manual_seed(seed)
+        torch.manual_seed(0)
         decoder = Decoder(z.shape[-1], size=images.shape[1]).to(device)
         decoder.mean.copy_(z.mean(0))
         decoder.std.copy_(z.std(0).clamp_min(1e-4))
         pixels = images.to(device).permute(0, 3, 1, 2)
         decoder.background.copy_(pixels.float().mean(0) / 255)
-        optimizer = torch.optim.Adam(decoder.parameters(), lr=lr)
+        optimizer = torch.optim.Adam(decoder.parameters(), lr=6e-3)
         schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, steps)
         for _ in range(steps):
-            index = torch.randint(len(z), (batch_size,), device=device)
+            index = torch.randint(len(z), (16,), device=device)
             loss = F.mse_loss(decoder(z[index]), pixels[index].float() / 255)
             optimizer.zero_grad()
             loss.backward()
@@ -170,7 +160,7 @@ def imagined_beside_real(
     imagined = [latent.unsqueeze(0)]
     for t in range(steps):
         imagined.append(model.next(imagined[-1], actions[t : t + 1]))
-    drawn = decoder.draw(embedding(model)(torch.cat(imagined))).cpu()
+    drawn = decoder.draw(model.embed(torch.cat(imagined))).cpu()
     real = images.cpu()
     strip = torch.cat([row.permute(1, 0, 2, 3).reshape(size, -1, 3) for row in (real, drawn)])
     return Imagined(strip, torch.cat([real, drawn], 2))

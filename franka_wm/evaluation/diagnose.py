@@ -34,7 +34,6 @@ from franka_wm.evaluation.protocol import Evaluation
 from franka_wm.evaluation.rollouts import (
     ROLLOUT_SEED,
     discounted_returns,
-    embedding,
     encode_episodes,
     encoded_validly,
     followed,
@@ -58,6 +57,7 @@ SHOWN = 48
 """Number of them whose images are taken."""
 
 HORIZON = 10
+IMAGINED = 8
 POINTS = 600
 
 
@@ -80,7 +80,7 @@ class Held:
     reaches: bool = False
 
 
-def hold_out(agent: Agent, *, images: bool = True, seed: int = ROLLOUT_SEED) -> Held:
+def hold_out(agent: Agent, *, images: bool) -> Held:
     """Plays the episodes that the diagnostics look at: smooth random and the model's own behaviour, in turns."""
     env, model = agent.env, agent.model
     keys = model.observation_keys
@@ -88,7 +88,7 @@ def hold_out(agent: Agent, *, images: bool = True, seed: int = ROLLOUT_SEED) -> 
     episodes, seen = gather_episodes(
         env,
         mixture(agent.policies, env),
-        seed=seed,
+        seed=ROLLOUT_SEED,
         keys=keys,
         image_size=image_size(model),
         images=shown,
@@ -120,7 +120,7 @@ def open_loop(agent: Agent, held: Held, *, horizon: int = HORIZON) -> dict[str, 
         out |= horizon_error(model, held.latents, actions, horizon=horizon, valid=held.valid)
     if "physical" in held.episodes.keys():  # noqa: SIM118
         positions = held.episodes.get("physical")[..., 14:17]
-        ranks = cost_ranks(held.latents[:, :-1], positions, embed=embedding(model), valid=held.valid[:, :-1])
+        ranks = cost_ranks(held.latents[:, :-1], positions, embed=model.embed, valid=held.valid[:, :-1])
         out["rank_correlation"] = ranks["within"]
         out["rank_correlation_across_episodes"] = ranks["across"]
     return out
@@ -148,7 +148,7 @@ def probes(held: Held, model: WorldModel) -> dict[str, Any]:
 def representation(held: Held, model: WorldModel) -> tuple[dict[str, object], dict[str, object]]:
     """Spectrum with collapse warning, and the latents along their two main directions for an image."""
     use = held.valid[:, :-1]
-    embedded = embedding(model)(held.latents[:, :-1])[use].float()
+    embedded = model.embed(held.latents[:, :-1])[use].float()
     seen = spectrum(embedded)
     plane = principal_components(embedded.cpu().numpy())
     every = max(1, len(embedded) // POINTS)
@@ -168,7 +168,7 @@ def representation(held: Held, model: WorldModel) -> tuple[dict[str, object], di
     return seen, latents
 
 
-def calibration(agent: Agent, *, episodes: int = 32) -> dict[str, Any]:
+def calibration(agent: Agent) -> dict[str, Any]:
     """The value against true discounted returns of the policy that it is the value of.
 
     Played in episodes that are long enough for what is cut off to weigh less than 2 %, since a value looks
@@ -184,7 +184,7 @@ def calibration(agent: Agent, *, episodes: int = 32) -> dict[str, Any]:
     length = agent.env.config.episode_length
     tail = steps_until_forgotten(model.discount)
     env = build.make_evaluation_env(
-        agent.settings, num_envs=min(episodes, agent.env.num_envs), episode_length=length + tail
+        agent.settings, num_envs=min(32, agent.env.num_envs), episode_length=length + tail
     )
     keys = model.observation_keys
     played, _ = gather_episodes(env, agent.policies["policy"], keys=keys)
@@ -230,13 +230,11 @@ def imagine(
     agent: Agent,
     held: Held,
     *,
-    steps: int = 8,
     announce: Callable[[str], AbstractContextManager[None]] = nullcontext,
 ) -> tuple[Imagined, Decoder, dict[str, float]] | None:
     """Trains a decoder on the images and draws what the model imagines in an episode that it has not seen.
 
     Args:
-        steps: Imagined, at most.
         announce: What tells that the training goes on, called with one line.
 
     Returns:
@@ -248,7 +246,7 @@ def imagine(
     images = held.images
     count, length = images.shape[:2]
     device = held.latents.device
-    seen = embedding(agent.model)(held.latents[:count, :length]).float()
+    seen = agent.model.embed(held.latents[:count, :length]).float()
     fit = count - max(2, count // 6)
     valid = held.valid[:count, :length].cpu()
     known, unknown = valid.clone(), valid.clone()
@@ -261,7 +259,7 @@ def imagine(
     world = (
         count - 1 if count % 2 == 0 else count - 2
     )  # odd: the model's own behaviour, which moves with a purpose
-    steps = min(steps, int(valid[world].sum()) - 1)
+    steps = min(IMAGINED, int(valid[world].sum()) - 1)
     actions = held.episodes.get("action")[world, :steps]
     shown = imagined_beside_real(
         agent.model, decoder, held.latents[world, 0], actions, images[world, : steps + 1]
@@ -269,16 +267,16 @@ def imagine(
     return shown, decoder, errors
 
 
-def _starts(agent: Agent, *, decoder_size: int, rounds: int = 6, steps: int = 8) -> tuple[Tensor, Tensor]:
+def _starts(agent: Agent, *, decoder_size: int) -> tuple[Tensor, Tensor]:
     """Latents (n, D) and images of the first steps of many more episodes: more poses than a few long ones show."""
     keys = agent.model.observation_keys
     latents, images = [], []
-    for k in range(rounds):
+    for k in range(6):
         episodes, seen = gather_episodes(
             agent.env,
             mixture(agent.policies, agent.env),
             seed=derive_seed("diagnostics", 0, "starts", k),
-            steps=steps,
+            steps=8,
             keys=keys,
             image_size=decoder_size,
             images=min(64, agent.env.num_envs),
@@ -286,7 +284,7 @@ def _starts(agent: Agent, *, decoder_size: int, rounds: int = 6, steps: int = 8)
         assert seen is not None
         episodes = cast(TensorDict, episodes[: len(seen)])
         with torch.no_grad():
-            embedded = embedding(agent.model)(encode_episodes(agent.model, episodes)[:, :-1]).float()
+            embedded = agent.model.embed(encode_episodes(agent.model, episodes)[:, :-1]).float()
         use = episodes.get("valid")
         latents.append(embedded[use])
         images.append(seen[use.cpu()])

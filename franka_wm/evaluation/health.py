@@ -13,7 +13,6 @@ from torch import Tensor
 from franka_wm.evaluation.closed_loop import evaluating
 from franka_wm.evaluation.intervals import bootstrap_mean
 from franka_wm.evaluation.open_loop import correlation
-from franka_wm.evaluation.rollouts import embedding
 from franka_wm.evaluation.spectrum import collapse_warning, latent_statistics
 from franka_wm.policies import PlannerPolicy
 
@@ -50,7 +49,7 @@ def training_diagnostics(model: WorldModel, batch: TensorDictBase) -> dict[str, 
     devices = [device] if device.type == "cuda" else []
     with evaluating(model), torch.random.fork_rng(devices=devices):
         first = _walked(model, model.encode(batch.select(*keys)[:, 0]), batch, 1, skipped + 1)
-        embedded = embedding(model)(first).float()
+        embedded = model.embed(first).float()
         if embedded.shape[0] < 2 or not bool(torch.isfinite(embedded).all()):
             return {}
         out = {f"latent/{name}": value for name, value in latent_statistics(embedded).items()}

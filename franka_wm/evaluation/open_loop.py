@@ -11,7 +11,6 @@ from torch import Tensor
 
 from franka_wm.evaluation.calibration import calibration_bins
 from franka_wm.evaluation.intervals import Interval, bootstrap_ratio
-from franka_wm.evaluation.rollouts import embedding
 
 if TYPE_CHECKING:
     from franka_wm.models.base import WorldModel
@@ -63,7 +62,7 @@ def horizon_error(
     if horizon < 1 or steps < 1:
         raise ValueError(f"horizon={horizon} over {steps} steps: both must be at least 1")
     horizon = min(horizon, steps)
-    embed = embedding(model)
+    embed = model.embed
     valid = torch.ones(envs, steps + 1, dtype=torch.bool, device=latents.device) if valid is None else valid
     truth = embed(latents)
     predicted = latents[:, :-1]
@@ -104,9 +103,7 @@ def correlation(x: Tensor, y: Tensor) -> float:
     return max(-1.0, min(1.0, float((a * b).sum()) / size)) if size > 0 else math.nan
 
 
-def grouped_spearman(
-    x: Tensor, y: Tensor, groups: Tensor, *, resamples: int = RESAMPLES, seed: int = 0
-) -> Interval:
+def grouped_spearman(x: Tensor, y: Tensor, groups: Tensor, *, seed: int = 0) -> Interval:
     """Spearman's rank correlation of pairs of states, with a 95 % interval that draws whole episodes.
 
     Many pairs from few episodes are not independent: each resample draws as many episodes as there are, with
@@ -117,7 +114,6 @@ def grouped_spearman(
     Args:
         x, y: (n,), n ≥ 4.
         groups: (n, 2) the episodes, from 0, that the two states of each pair are from.
-        resamples: How many.
         seed: Seed of the draw.
 
     Returns:
@@ -142,8 +138,8 @@ def grouped_spearman(
     places = [torch.unique(v, return_inverse=True) for v in (x, y)]
     generator = torch.Generator().manual_seed(seed)
     found = []
-    for start in range(0, resamples, _DRAWN_AT_ONCE):
-        count = min(_DRAWN_AT_ONCE, resamples - start)
+    for start in range(0, RESAMPLES, _DRAWN_AT_ONCE):
+        count = min(_DRAWN_AT_ONCE, RESAMPLES - start)
         drawn = torch.randint(names.numel(), (count, names.numel()), generator=generator)
         copies = torch.zeros(count, names.numel(), dtype=torch.double)
         copies.scatter_add_(1, drawn, torch.ones_like(drawn, dtype=torch.double))
@@ -221,20 +217,19 @@ def cost_ranks(
     return {"across": measured(one, two, three, four), "within": measured(one, two, one, four)}
 
 
-def value_calibration(predicted: Tensor, returns: Tensor, *, bins: int = 10) -> dict[str, object]:
+def value_calibration(predicted: Tensor, returns: Tensor) -> dict[str, object]:
     """Predicted values against true discounted returns.
 
     Args:
         predicted: (n,).
         returns: (n,), true.
-        bins: Number of bins of equal count along the prediction, for the curve.
 
     Returns:
         ``slope`` and ``intercept`` of the line return = slope · value + intercept: 1 and 0 for an exact value;
         ``bias``: mean of value − return, above 0 for an optimist; ``error``: root mean square of that;
-        ``correlation`` (Pearson); ``samples``; and of each bin the means ``predicted`` and ``true``, the middle
-        half of the returns ``low`` and ``high``, and the ``count``. Slope, intercept and correlation are NaN
-        where the value never varies.
+        ``correlation`` (Pearson); ``samples``; and of bins of equal count along the prediction the means ``predicted``
+        and ``true``, the middle half of the returns ``low`` and ``high``, and the ``count``. Slope, intercept and
+        correlation are NaN where the value never varies.
 
     Raises:
         ValueError: Other shapes or no values.
@@ -254,12 +249,12 @@ def value_calibration(predicted: Tensor, returns: Tensor, *, bins: int = 10) -> 
         "error": float((p - r).square().mean().sqrt()),
         "correlation": correlation(p, r),
         "samples": p.numel(),
-        **calibration_bins(p.numpy(), r.numpy(), bins=bins),
+        **calibration_bins(p.numpy(), r.numpy()),
     }
 
 
-def steps_until_forgotten(discount: float, *, rest: float = 0.02, most: int = 400) -> int:
-    """Steps after which rewards weigh less than ``rest`` in a discounted return; at most ``most``."""
+def steps_until_forgotten(discount: float) -> int:
+    """Steps after which rewards weigh less than 2 % in a discounted return; at most 400."""
     if discount <= 0:
         return 1
-    return most if discount >= 1 else min(most, math.ceil(math.log(rest) / math.log(discount)))
+    return 400 if discount >= 1 else min(400, math.ceil(math.log(0.02) / math.log(discount)))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 
 import torch
 from torch import Tensor
@@ -14,7 +14,7 @@ NOISE = 1e-6
 """A target whose standard deviation [m, rad, m/s or rad/s] is smaller does not vary: it is what rounding leaves."""
 
 NEIGHBOURS = 5
-"""k of the nearest-neighbour probe."""
+"""k of the nearest-neighbour probe; fewer where there are fewer steps to look up."""
 
 
 def ridge(x: Tensor, y: Tensor, alpha: float) -> tuple[Tensor, Tensor]:
@@ -83,7 +83,7 @@ def r_squared(truth: Tensor, predicted: Tensor) -> float | None:
     return float((1 - error.square().sum(0)[varies] / total[varies]).mean())
 
 
-def split_by_episode(count: int, *, seed: int = 0) -> tuple[Tensor, Tensor, Tensor]:
+def split_by_episode(count: int) -> tuple[Tensor, Tensor, Tensor]:
     """Episodes to fit (60 %), to choose the penalty by (20 %) and to test on (20 %), at least one each.
 
     Neighbouring steps of an episode are nearly the same: a split by step would let a probe look its answers up.
@@ -99,18 +99,14 @@ def split_by_episode(count: int, *, seed: int = 0) -> tuple[Tensor, Tensor, Tens
     """
     if count < 3:
         raise ValueError(f"{count} episodes cannot be split into fit, validation and test; use at least 3")
-    order = torch.randperm(count, generator=torch.Generator().manual_seed(seed))
+    order = torch.randperm(count, generator=torch.Generator().manual_seed(0))
     test = validation = max(1, round(0.2 * count))
     fit = count - test - validation
     return order[:fit], order[fit : fit + validation], order[fit + validation :]
 
 
 def ridge_probe(
-    fit: tuple[Tensor, Tensor],
-    validation: tuple[Tensor, Tensor],
-    test: Tensor,
-    *,
-    alphas: Sequence[float] = ALPHAS,
+    fit: tuple[Tensor, Tensor], validation: tuple[Tensor, Tensor], test: Tensor
 ) -> tuple[Tensor, float]:
     """Predictions (m, T) of a ridge probe for ``test`` (m, D), and the penalty chosen on ``validation``.
 
@@ -127,19 +123,14 @@ def ridge_probe(
         # In units of each target's own deviation, so that none rules the choice by its unit.
         return float((residual / fit[1].double().std(0).clamp_min(1e-8)).square().mean())
 
-    alpha = min(alphas, key=error)
+    alpha = min(ALPHAS, key=error)
     x, y = (torch.cat(pair) for pair in zip(fit, validation, strict=True))
     weights, offset = ridge(scaled(x), y, alpha)
     return scaled(test) @ weights + offset, alpha
 
 
 def probe(
-    latents: Tensor,
-    targets: Mapping[str, Tensor],
-    *,
-    valid: Tensor | None = None,
-    neighbours: int = NEIGHBOURS,
-    seed: int = 0,
+    latents: Tensor, targets: Mapping[str, Tensor], *, valid: Tensor | None = None
 ) -> dict[str, dict[str, float | None]]:
     """How well each target can be read off the latents, on episodes that no probe was fitted to.
 
@@ -147,14 +138,12 @@ def probe(
         latents: (E, T, D), E ≥ 3 episodes.
         targets: Name → (E, T, K).
         valid: (E, T) bool, which steps to use; all if not given.
-        neighbours: k of the nearest-neighbour probe; fewer where there are fewer steps to look up.
-        seed: Seed of the split of episodes.
 
     Returns:
         Name → ``ridge`` and ``neighbours``, both R² on the test episodes; ``None`` where the target does not vary.
     """
     valid = torch.ones(latents.shape[:2], dtype=torch.bool) if valid is None else valid
-    parts = [index.to(latents.device) for index in split_by_episode(latents.shape[0], seed=seed)]
+    parts = [index.to(latents.device) for index in split_by_episode(latents.shape[0])]
 
     def split(values: Tensor) -> list[Tensor]:
         return [values[index][valid.to(values.device)[index]].double() for index in parts]
@@ -170,7 +159,7 @@ def probe(
             (known - mean) / std,
             torch.cat((y_fit, y_validation)),
             (x_test - mean) / std,
-            k=min(neighbours, len(known)),
+            k=min(NEIGHBOURS, len(known)),
         )
         results[name] = {"ridge": r_squared(y_test, linear), "neighbours": r_squared(y_test, near)}
     return results

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any, cast
 
 import torch
@@ -153,11 +153,6 @@ def encoded_validly(episodes: TensorDictBase) -> Tensor:
     """Which latents of :func:`encode_episodes` are of the first episode: (E, T + 1) bool."""
     valid = episodes.get("valid")
     return torch.cat([valid, valid[:, -1:]], 1)
-
-
-def embedding(model: WorldModel) -> Callable[[Tensor], Tensor]:
-    """What distances between latents are measured on: ``model.embed``, or the latent itself."""
-    return model.embed
 
 
 def discounted_returns(reward: Tensor, ended: Tensor, discount: float) -> Tensor:

@@ -19,19 +19,19 @@ LEAST_SAMPLES = 16
 """Fewer latents than this say nothing."""
 
 
-def rankme(latents: Tensor, *, eps: float = 1e-7) -> float:
+def rankme(latents: Tensor) -> float:
     """RankMe: exp of the entropy of the singular values (Garrido et al., arXiv:2210.02885, equation 1).
 
-    p_k = σ_k / ‖σ‖₁ + ``eps``; exp(−Σ p_k log p_k). Of the raw latents, as published: a common offset counts as
+    p_k = σ_k / ‖σ‖₁ + ε, ε = 1e-7; exp(−Σ p_k log p_k). Of the raw latents, as published: a common offset counts as
     a direction.
 
     Args:
         latents: (n, D).
 
     Returns:
-        Between 1 and min(n, D), up to ``eps``; 0 if all latents are 0.
+        Between 1 and min(n, D), up to ε; 0 if all latents are 0.
     """
-    return _exp_entropy(torch.linalg.svdvals(latents.double()), eps)
+    return _exp_entropy(torch.linalg.svdvals(latents.double()), 1e-7)
 
 
 def effective_rank(latents: Tensor) -> float:

@@ -50,7 +50,6 @@ class Session:
         policies: By name; TensorDict modules that write ``action``.
         policy: Who acts first; ``planner``, ``ik`` or ``noop``, whichever there is, if not given.
         seed: Seed of poses and goals.
-        keep_goal: Whether a goal set by hand outlives the episode.
 
     Raises:
         UserError: More than one world, or a policy that is not there.
@@ -63,14 +62,14 @@ class Session:
         *,
         policy: str | None = None,
         seed: int = 0,
-        keep_goal: bool = False,
     ):
         self.env = env
         self.arm: FrankaEnv = env if isinstance(env, FrankaEnv) else env.base_env
         if self.arm.num_envs != 1:
             raise UserError(f"a live session simulates one world, the environment has {self.arm.num_envs}")
         self.policies = dict(policies)
-        self.keep_goal, self.seed = keep_goal, seed
+        self.seed = seed
+        self.keep_goal = False  # whether a goal set by hand outlives the episode
         self.show_contacts = False
         self._touching = False  # whether what the solver holds of contacts is of the present state
         self._speed = 1.0

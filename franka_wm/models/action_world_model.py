@@ -224,13 +224,8 @@ class ActionWorldModel(HistoryWorldModel):
     def rebuild_overrides(self) -> dict[str, Any]:
         """Constructor arguments that replace those which read other files, so that the model's own weights
         rebuild it: JSON-able."""
-        overrides: dict[str, Any] = {"freeze_encoder": self.frozen}
-        if isinstance(self.encoder, Backbone):
-            own = self.encoder.rebuild()
-            if "architecture" in own:
-                own["encoder_architecture"] = own.pop("architecture")
-            overrides |= own
-        return overrides
+        own = self.encoder.rebuild() if isinstance(self.encoder, Backbone) else {}
+        return {"freeze_encoder": self.frozen} | own
 
     # ------------------------------------------------------------------ what a planner uses
 

@@ -150,9 +150,9 @@ class Backbone(nn.Module):
         return x.flatten(2).mT
 
     def rebuild(self) -> dict[str, Any]:
-        """What to construct it with, so that no other file than its weights is needed: JSON-able."""
+        """Arguments of a model that make it anew from no other file than its weights: JSON-able."""
         if isinstance(self.network, ViT):
-            return {"encoder_from": None, "architecture": self.network.architecture.tolist()}
+            return {"encoder_from": None, "encoder_architecture": self.network.architecture.tolist()}
         if isinstance(self.network, HuggingFaceEncoder):
             return {"huggingface": None, "huggingface_config": self.network.config}
         return {}

@@ -142,10 +142,7 @@ class DINOWM(HistoryWorldModel):
 
     def rebuild_overrides(self) -> dict[str, Any]:
         """Constructor arguments that replace those which read other files: JSON-able."""
-        own = self.encoder.rebuild()
-        if "architecture" in own:
-            own["encoder_architecture"] = own.pop("architecture")
-        return own
+        return self.encoder.rebuild()
 
     # ------------------------------------------------------------------ what a planner uses
 

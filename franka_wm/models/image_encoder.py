@@ -8,6 +8,7 @@ import torch
 from torch import Tensor, nn
 
 from franka_wm.models.backbone import Backbone
+from franka_wm.models.images import shared_image_size
 from franka_wm.models.layers import NormedLinear, SimNorm, initialize
 from franka_wm.models.vision import ConvEncoder
 
@@ -48,14 +49,8 @@ class ImageEncoder(nn.Module):
         self.keys, self.frozen = list(image_sizes), freeze
         self.backbone = self.convolutions = None
         if encoder_from is not None or architecture is not None:
-            sizes = set(image_sizes.values())
-            if len(sizes) > 1:
-                raise ValueError(
-                    f"all images must have one size to share an encoder, got {dict(image_sizes)}"
-                )
-            self.backbone = Backbone(
-                sizes.pop(), grid=grid, encoder_from=encoder_from, architecture=architecture
-            )
+            size = shared_image_size(image_sizes)
+            self.backbone = Backbone(size, grid=grid, encoder_from=encoder_from, architecture=architecture)
             features = len(self.keys) * self.backbone.tokens * self.backbone.width
             if freeze:
                 self.backbone.requires_grad_(False).eval()
@@ -104,7 +99,4 @@ class ImageEncoder(nn.Module):
 
     def rebuild(self) -> dict[str, Any]:
         """Arguments of TD-MPC2 that rebuild this without the pretrained checkpoint."""
-        if self.backbone is None:
-            return {}
-        own = self.backbone.rebuild()
-        return {"encoder_from": None, "encoder_architecture": own["architecture"]}
+        return {} if self.backbone is None else self.backbone.rebuild()

@@ -119,35 +119,19 @@ def _as_made(module: nn.Module, kind: type[nn.Module]) -> bool:
 
 
 class NormedLinear(nn.Module):
-    """Linear, dropout (optional), LayerNorm, activation: (..., in_features) -> (..., out_features).
+    """Linear, LayerNorm, activation (Mish when None): (..., in_features) -> (..., out_features)."""
 
-    Args:
-        activation: Mish when None.
-        dropout: probability, applied before the LayerNorm, in training mode only.
-    """
-
-    def __init__(
-        self,
-        in_features: int,
-        out_features: int,
-        *,
-        activation: nn.Module | None = None,
-        dropout: float = 0.0,
-    ) -> None:
+    def __init__(self, in_features: int, out_features: int, *, activation: nn.Module | None = None) -> None:
         super().__init__()
         self.linear = Linear(in_features, out_features)
         self.norm = nn.LayerNorm(out_features)
         self.activation = nn.Mish() if activation is None else activation
-        self.dropout = dropout
 
     def forward(self, x: Tensor) -> Tensor:
         if fused.applies() and (group := self._fuses) is not None:
             own = (self.linear.weight, self.linear.bias, self.norm.weight, self.norm.bias)
             return fused.normed_linear(x, *own, group_size=group, eps=self.norm.eps)
-        x = self.linear(x)
-        if self.dropout:
-            x = F.dropout(x, self.dropout, self.training)
-        return self.activation(self.norm(x))
+        return self.activation(self.norm(self.linear(x)))
 
     @property
     def _fuses(self) -> int | None:
@@ -157,7 +141,7 @@ class NormedLinear(nn.Module):
             and _as_made(self.norm, nn.LayerNorm)
             and fused.suits(self.linear.weight)
         )
-        if not own or (self.dropout and self.training):
+        if not own:
             return None
         if isinstance(self.activation, SimNorm) and _as_made(self.activation, SimNorm):
             group = self.activation.group_size
@@ -171,18 +155,14 @@ def mlp(
     out_features: int,
     *,
     output: nn.Module | None = None,
-    dropout: float = 0.0,
 ) -> nn.Sequential:
     """`NormedLinear` hidden layers and an output layer: (..., in_features) -> (..., out_features).
 
     Args:
         hidden: width of each hidden layer.
         output: activation of the output layer, which is then normalised, too (`SimNorm`); None: a linear layer.
-        dropout: probability on the first layer only, as published.
     """
-    layers: list[nn.Module] = []
-    for i, (a, b) in enumerate(pairwise((in_features, *hidden))):
-        layers.append(NormedLinear(a, b, dropout=dropout if i == 0 else 0.0))
+    layers: list[nn.Module] = [NormedLinear(a, b) for a, b in pairwise((in_features, *hidden))]
     last = hidden[-1] if hidden else in_features
     layers.append(
         Linear(last, out_features) if output is None else NormedLinear(last, out_features, activation=output)
@@ -276,7 +256,7 @@ class Ensemble(nn.Module):
     Args:
         members: number of networks.
         hidden: width of each hidden layer.
-        dropout: probability on the first layer, applied only where `forward` is asked for it.
+        dropout: probability on the first layer, as published, applied only where `forward` is asked for it.
 
     Raises:
         ValueError: `members` is not positive.

@@ -15,6 +15,14 @@ from torch import Tensor
 
 _FAR = 1e6
 
+# As published in I-JEPA and V-JEPA.
+ASPECT = (0.75, 1.5)
+"""Range of height / width of blocks to predict."""
+CONTEXT = 0.925
+"""Part of the places that I-JEPA's context block is drawn around."""
+TUBES = 4
+"""Blocks whose union V-JEPA predicts."""
+
 
 class Masks(NamedTuple):
     """Token indices: `context` (N, n) seen, `targets` (N, M, k) to predict, in M groups; never both."""
@@ -73,24 +81,14 @@ class MultiBlock(Sampler):
         grid: (time slots, rows, columns).
         targets: number of target blocks.
         target_scale: part of the places that each has.
-        target_aspect: range of height / width.
-        context_scale: part of the places that the context block is drawn around.
 
     Raises:
         ValueError: blocks that leave no context.
     """
 
-    def __init__(
-        self,
-        grid: tuple[int, int, int],
-        *,
-        targets: int = 4,
-        target_scale: float = 0.175,
-        target_aspect: tuple[float, float] = (0.75, 1.5),
-        context_scale: float = 0.925,
-    ) -> None:
+    def __init__(self, grid: tuple[int, int, int], *, targets: int = 4, target_scale: float = 0.175) -> None:
         super().__init__(grid)
-        self.blocks, self.aspect, self.context_scale = targets, target_aspect, context_scale
+        self.blocks = targets
         self.block = max(1, round(target_scale * self.places))
         # What is left if no two blocks overlap: as many can always be seen, whatever was drawn.
         self.seen = self.places - targets * self.block
@@ -101,9 +99,9 @@ class MultiBlock(Sampler):
             )
 
     def __call__(self, count: int, device: torch.device | str) -> Masks:
-        near = self._distances(count, self.blocks, self.block, self.aspect, device)
+        near = self._distances(count, self.blocks, self.block, ASPECT, device)
         targets = near.topk(self.block, dim=-1, largest=False).indices  # (N, M, k)
-        context = self._distances(count, 1, self.context_scale * self.places, (1.0, 1.0), device).squeeze(1)
+        context = self._distances(count, 1, CONTEXT * self.places, (1.0, 1.0), device).squeeze(1)
         hidden = torch.zeros_like(context).scatter_(1, targets.flatten(1), _FAR)
         # Inside the context block all places are equally good; those outside it come last.
         order = (context - 0.5).clamp_min(0.0) + torch.rand_like(context) * 1e-3 + hidden
@@ -114,54 +112,40 @@ class MultiBlock(Sampler):
 class Tube(Sampler):
     """V-JEPA's masks (arXiv:2404.08471): blocks of places hidden for the whole clip.
 
-    The union of `blocks` random blocks, grown or cut to exactly `ratio` of the places, is predicted from
+    The union of `TUBES` random blocks, grown or cut to exactly `ratio` of the places, is predicted from
     the rest.
 
     Raises:
         ValueError: a ratio that hides all places or none.
     """
 
-    def __init__(
-        self,
-        grid: tuple[int, int, int],
-        *,
-        ratio: float = 0.75,
-        blocks: int = 4,
-        aspect: tuple[float, float] = (0.75, 1.5),
-    ) -> None:
+    def __init__(self, grid: tuple[int, int, int], *, ratio: float = 0.75) -> None:
         super().__init__(grid)
-        self.blocks, self.aspect = blocks, aspect
         self.hidden = _part(ratio, self.places, "places")
 
     def __call__(self, count: int, device: torch.device | str) -> Masks:
-        area = max(1.0, self.hidden / self.blocks)
-        near = self._distances(count, self.blocks, area, self.aspect, device).amin(1)
+        area = max(1.0, self.hidden / TUBES)
+        near = self._distances(count, TUBES, area, ASPECT, device).amin(1)
         places = near.argsort(dim=-1)
         hidden, seen = places[:, : self.hidden], places[:, self.hidden :]
         return Masks(self._over_time(seen), self._over_time(hidden).unsqueeze(1))
 
 
 class Temporal(Sampler):
-    """Predict whole time slots from the others.
-
-    Args:
-        ratio: part of the slots to predict.
-        future: always the last ones; otherwise drawn.
+    """Predict `ratio` of the time slots, drawn, from the others.
 
     Raises:
         ValueError: a single time slot, or a ratio that hides all or none.
     """
 
-    def __init__(self, grid: tuple[int, int, int], *, ratio: float = 0.5, future: bool = False) -> None:
+    def __init__(self, grid: tuple[int, int, int], *, ratio: float = 0.5) -> None:
         super().__init__(grid)
         if self.slots < 2:
             raise ValueError("temporal masks need clips of at least two time slots (tubelets)")
-        self.future, self.hidden = future, _part(ratio, self.slots, "time slots")
+        self.hidden = _part(ratio, self.slots, "time slots")
 
     def __call__(self, count: int, device: torch.device | str) -> Masks:
-        order = torch.arange(self.slots, device=device).expand(count, -1)
-        if not self.future:
-            order = torch.rand(count, self.slots, device=device).argsort(-1)
+        order = torch.rand(count, self.slots, device=device).argsort(-1)
         place = torch.arange(self.places, device=device)
         tokens = order.unsqueeze(-1) * self.places + place  # (N, slots, places)
         cut = self.slots - self.hidden

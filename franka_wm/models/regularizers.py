@@ -70,11 +70,11 @@ class SIGReg(nn.Module):
             return (error @ self.weight).mean() * (x.shape[-2] * processes.count())
 
 
-def variance_loss(x: Tensor, *, target: float = 1.0, eps: float = 1e-4) -> Tensor:
-    """VICReg's hinge on the standard deviation of each feature over n samples (..., n, D) -> ()."""
+def variance_loss(x: Tensor) -> Tensor:
+    """VICReg's hinge at 1 on the standard deviation of each feature over n samples (..., n, D) -> ()."""
     centred, samples = _centred(x.float())
-    std = (processes.mean(centred.square().sum(-2)) / samples + eps).sqrt()
-    return F.relu(target - std).mean()
+    std = (processes.mean(centred.square().sum(-2)) / samples + 1e-4).sqrt()
+    return F.relu(1.0 - std).mean()
 
 
 def _centred(x: Tensor) -> tuple[Tensor, float]:
@@ -91,32 +91,11 @@ def covariance_loss(x: Tensor) -> Tensor:
     return (off / x.shape[-1]).mean()
 
 
-def vicreg(
-    a: Tensor,
-    b: Tensor,
-    *,
-    invariance_coef: float = 25.0,
-    variance_coef: float = 25.0,
-    covariance_coef: float = 1.0,
-) -> Tensor:
-    """Variance-invariance-covariance loss of two views (..., n, D) -> () (arXiv:2105.04906)."""
-    a, b = a.float(), b.float()
-    variance = 0.5 * (variance_loss(a) + variance_loss(b))
-    covariance = covariance_loss(a) + covariance_loss(b)
-    return invariance_coef * F.mse_loss(a, b) + variance_coef * variance + covariance_coef * covariance
-
-
-def info_nce(queries: Tensor, keys: Tensor, *, temperature: float = 0.1) -> Tensor:
-    """InfoNCE of matching rows (n, D) against all others, both ways, on cosines -> () (arXiv:1807.03748).
-
-    Raises:
-        ValueError: `temperature` is not positive.
-    """
-    if not temperature > 0.0:
-        raise ValueError(f"temperature must be positive, got {temperature}")
+def info_nce(queries: Tensor, keys: Tensor) -> Tensor:
+    """InfoNCE of matching rows (n, D) against all others, both ways, on cosines -> () (arXiv:1807.03748)."""
     with torch.autocast(queries.device.type, enabled=False):
         queries, keys = (processes.gather(F.normalize(x.float(), dim=-1)) for x in (queries, keys))
-        logits = queries @ keys.mT / temperature
+        logits = queries @ keys.mT / 0.1  # the temperature
         own = torch.arange(logits.shape[0], device=logits.device)
         return 0.5 * (F.cross_entropy(logits, own) + F.cross_entropy(logits.mT, own))
 
@@ -163,44 +142,40 @@ class ProjectionMLP(nn.Module):
 
     Args:
         hidden: width of the hidden layer; 4 × `outputs` when None.
-        normalized: end with a BatchNorm as well.
     """
 
-    def __init__(
-        self, inputs: int, outputs: int, *, hidden: int | None = None, normalized: bool = False
-    ) -> None:
+    def __init__(self, inputs: int, outputs: int, *, hidden: int | None = None) -> None:
         super().__init__()
         hidden = 4 * outputs if hidden is None else hidden
         self.up, self.norm = nn.Linear(inputs, hidden), BatchNorm(hidden)
         self.down = nn.Linear(hidden, outputs)
-        self.last = BatchNorm(outputs) if normalized else None
         for layer in (self.up, self.down):  # of unit gain: embeddings start spread, not near a point
             nn.init.xavier_uniform_(layer.weight)
             nn.init.zeros_(layer.bias)
 
     def forward(self, x: Tensor, *, batch_statistics: bool) -> Tensor:
         h = F.gelu(self.norm(self.up(x), batch_statistics=batch_statistics))
-        h = self.down(h)
-        return h if self.last is None else self.last(h, batch_statistics=batch_statistics)
+        return self.down(h)
 
 
 class BatchNorm(nn.Module):
     """Batch normalisation of the last dimension, whose statistics are chosen at each call.
 
     Over all leading dimensions; with `batch_statistics` those of the batch, which also move the running ones
-    by `momentum`; otherwise the running ones.
+    by `MOMENTUM`; otherwise the running ones.
 
-    The default `momentum` is five times the usual one: what is normalised drifts with every update, and running
+    `MOMENTUM` is five times the usual one: what is normalised drifts with every update, and running
     statistics that lag ten updates behind can be far from those of the present weights (seen in training:
     errors a hundredfold of those with the batch's own). Batches hold hundreds of frames, enough for these.
     """
 
+    MOMENTUM, EPS = 0.5, 1e-5
+
     running_mean: Tensor
     running_var: Tensor
 
-    def __init__(self, features: int, *, momentum: float = 0.5, eps: float = 1e-5) -> None:
+    def __init__(self, features: int) -> None:
         super().__init__()
-        self.momentum, self.eps = momentum, eps
         self.weight, self.bias = nn.Parameter(torch.ones(features)), nn.Parameter(torch.zeros(features))
         self.register_buffer("running_mean", torch.zeros(features))
         self.register_buffer("running_var", torch.ones(features))
@@ -216,8 +191,8 @@ class BatchNorm(nn.Module):
             self.weight,
             self.bias,
             training=batch_statistics,
-            momentum=self.momentum,
-            eps=self.eps,
+            momentum=self.MOMENTUM,
+            eps=self.EPS,
         )
         return y.reshape(x.shape)
 
@@ -233,9 +208,9 @@ class BatchNorm(nn.Module):
         mean = mean + near
         with torch.no_grad():
             samples = len(flat) * processes.count()
-            self.running_mean.lerp_(mean, self.momentum)
-            self.running_var.lerp_(var * (samples / (samples - 1)), self.momentum)
-        y = (wide - mean) * (var + self.eps).rsqrt() * self.weight + self.bias
+            self.running_mean.lerp_(mean, self.MOMENTUM)
+            self.running_var.lerp_(var * (samples / (samples - 1)), self.MOMENTUM)
+        y = (wide - mean) * (var + self.EPS).rsqrt() * self.weight + self.bias
         return y.to(flat.dtype)
 
 
@@ -250,22 +225,11 @@ def feature_std(x: Tensor) -> Tensor:
 def participation_ratio(x: Tensor) -> Tensor:
     """How many directions the samples (..., D) spread over: tr(C)² / tr(C²) of their covariance -> ().
 
-    From 1 (a line) to D (a ball); 0 where all samples agree. Unlike `effective_rank` it needs no
-    decomposition, which would wait for the host, so that losses can report it.
+    From 1 (a line) to D (a ball); 0 where all samples agree. It needs no decomposition, which would wait for the
+    host, so that losses can report it.
     """
     x = x.detach().float().reshape(-1, x.shape[-1])
     x = x - x.mean(0)
     with torch.autocast(x.device.type, enabled=False):
         covariance = x.mT @ x / x.shape[0]
     return covariance.trace().square() / covariance.square().sum().clamp_min(1e-30)
-
-
-def effective_rank(x: Tensor) -> Tensor:
-    """exp of the entropy of the normalised singular values of samples (..., D) -> () (arXiv:2210.02885).
-
-    For evaluation: the decomposition waits for the host.
-    """
-    x = x.detach().float().reshape(-1, x.shape[-1])
-    values = torch.linalg.svdvals(x - x.mean(0))
-    p = values / values.sum().clamp_min(1e-30)
-    return torch.exp(-(p * (p + 1e-30).log()).sum())

@@ -130,11 +130,11 @@ class ConvDecoder(nn.Module):
 # -- the vision transformer ------------------------------------------------------------------------------
 
 
-def sincos(positions: Tensor, width: int, *, period: float = 10_000.0) -> Tensor:
+def sincos(positions: Tensor, width: int) -> Tensor:
     """Sine and cosine codes: positions (...) -> (..., width), `width` even (arXiv:1706.03762)."""
     half = width // 2
     exponents = torch.arange(half, device=positions.device, dtype=torch.float32) / half
-    angles = positions.float().unsqueeze(-1) * torch.exp(-math.log(period) * exponents)
+    angles = positions.float().unsqueeze(-1) * torch.exp(-math.log(10_000.0) * exponents)
     return torch.cat((angles.sin(), angles.cos()), dim=-1)
 
 

@@ -11,7 +11,7 @@ from torch import Tensor
 from franka_wm.errors import UserError
 from franka_wm.options import Bounds
 from franka_wm.planning.base import ContinuousPlanner, Query
-from franka_wm.planning.sampling import gaussian_candidates
+from franka_wm.planning.sampling import gaussian_candidates, take
 
 
 @dataclass(kw_only=True, eq=False)
@@ -99,9 +99,7 @@ class GradientPlanner(ContinuousPlanner):
         best_actions, best_score = self._keep(best_actions, best_score, actions, score)
 
         winner = best_score.argmax(1, keepdim=True)  # (E, 1)
-        plan = best_actions.gather(
-            1, winner[..., None, None].expand(-1, -1, self.horizon, self.action_dim)
-        ).squeeze(1)
+        plan = take(best_actions, winner).squeeze(1)
         value = best_score.gather(1, winner)
         value = torch.where(torch.isfinite(value), value, torch.zeros_like(value))
         return self.result(query, plan[:, 0], self.explore_std, plan=plan, value=value)

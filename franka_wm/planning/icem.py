@@ -11,8 +11,7 @@ from torch import Tensor
 from franka_wm.options import FRACTION, Bounds
 from franka_wm.planning.base import Query
 from franka_wm.planning.cem import CEM
-from franka_wm.planning.sampling import best, refit, require_is_init, take
-from franka_wm.seeding import of_worlds
+from franka_wm.planning.sampling import best, normal, refit, require_is_init, take
 
 
 def coloured_noise(
@@ -36,10 +35,7 @@ def coloured_noise(
     length = shape[-1]
     k = torch.arange(length // 2 + 1, device=device)
     amplitude = (k.clamp(min=1).to(dtype or torch.get_default_dtype()) / length) ** (-0.5 * exponent)
-    parts = of_worlds(
-        lambda drawn: torch.randn(drawn, device=device, dtype=amplitude.dtype, generator=generator),
-        (*shape[:-1], k.shape[0], 2),
-    )
+    parts = normal((*shape[:-1], k.shape[0], 2), amplitude, generator)
     # The series is real: at frequency 0 and, for an even length, at the highest one, so is the spectrum, and
     # its single part has the power of two. All others also stand for their negative frequency.
     alone = (k == 0) | (2 * k == length)

@@ -3,8 +3,8 @@
 E environments, S candidates, H steps, A action components, D the size of a latent.
 """
 
-from collections.abc import Callable
-from typing import NamedTuple
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -16,6 +16,12 @@ def require_is_init(is_init: Tensor, envs: int) -> None:
     """Raises ValueError unless `is_init` is (E, 1)."""
     if is_init.shape != (envs, 1):
         raise ValueError(f"is_init must have shape (E, 1) = {(envs, 1)}, got {tuple(is_init.shape)}")
+
+
+def normal(shape: Sequence[int], like: Tensor, generator: torch.Generator | None) -> Tensor:
+    """Normal numbers of this shape (E, ...), of the type and device of `like`, as `of_worlds` gives them."""
+    kind: dict[str, Any] = {"device": like.device, "dtype": like.dtype}
+    return of_worlds(lambda drawn: torch.randn(drawn, generator=generator, **kind), shape)
 
 
 # ---------------------------------------------------------------------- candidates
@@ -40,11 +46,7 @@ def gaussian_candidates(
     mean: Tensor, std: Tensor, samples: int, *, low: float, high: float, generator: torch.Generator | None
 ) -> Tensor:
     """Draws of independent Gaussians: mean and std (E, H, A) -> (E, samples, H, A), clamped."""
-    envs, horizon, action_dim = mean.shape
-    like = {"device": mean.device, "dtype": mean.dtype}
-    noise = of_worlds(
-        lambda shape: torch.randn(shape, generator=generator, **like), (envs, samples, horizon, action_dim)
-    )
+    noise = normal((mean.shape[0], samples, *mean.shape[1:]), mean, generator)
     return (mean.unsqueeze(1) + std.unsqueeze(1) * noise).clamp(low, high)
 
 
@@ -59,9 +61,7 @@ def explored(
 ) -> Tensor:
     """The action (E, A) within its bounds, with Gaussian noise of `std` if `explore`."""
     if explore:
-        like: dict = {"device": action.device, "dtype": action.dtype}
-        noise = of_worlds(lambda shape: torch.randn(shape, generator=generator, **like), action.shape)
-        action = action + std * noise
+        action = action + std * normal(action.shape, action, generator)
     return action.clamp(low, high)
 
 

@@ -97,7 +97,7 @@ class Tree:
         max_depth: the longest path in actions; None: no limit.
     """
 
-    def __init__(self, slots: int, value: Tensor, embedding: Tensor, max_depth: int | None = None) -> None:
+    def __init__(self, slots: int, value: Tensor, embedding: Tensor, max_depth: int | None) -> None:
         envs, device, dtype = value.shape[0], value.device, value.dtype
 
         def numbers(*shape: int, of: torch.dtype = dtype) -> Tensor:

@@ -332,13 +332,13 @@ class KernelTree:
         max_depth: int | None,
         tiny: float,
         options: tuple[float, float],
-        considered: list[int] | None = None,
+        considered: list[int] | None,
     ) -> None:
         start_warp()
         (envs, actions), slots, device = prior.shape, simulations + 1, prior.device
 
-        def numbers(*shape: int, fill: float = 0.0) -> Tensor:
-            return torch.full((envs, *shape), fill, device=device, dtype=torch.float64)
+        def numbers(*shape: int) -> Tensor:
+            return torch.zeros(envs, *shape, device=device, dtype=torch.float64)
 
         def integers(*shape: int, fill: int = 0) -> Tensor:
             return torch.full((envs, *shape), fill, device=device, dtype=torch.int32)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import OrderedDict
-from collections.abc import Callable, Hashable, Sequence
+from collections.abc import Callable, Hashable
 from contextlib import suppress
 from typing import NamedTuple
 
@@ -30,8 +30,7 @@ class GraphCache:
     place, as optimisers do, and what else decides on the operations (settings, modes) belongs into `key`. Work that
     reads values on the host cannot be captured.
 
-    Noise of the default generator goes on from where it stands, and follows `torch.manual_seed`, in a graph too; other
-    generators must be named.
+    Noise of the default generator goes on from where it stands, and follows `torch.manual_seed`, in a graph too.
 
     Args:
         keep: how many graphs are kept; the one not used for longest goes first.
@@ -54,7 +53,6 @@ class GraphCache:
         *,
         key: Hashable = None,
         held: tuple[object, ...] = (),
-        generators: Sequence[torch.Generator] = (),
     ) -> TensorDict:
         """`work(inputs)`; from the third call of a kind on, by replaying a graph.
 
@@ -62,7 +60,6 @@ class GraphCache:
             inputs: on a CUDA device; names, shapes and dtypes are part of the kind.
             key: what else is.
             held: objects that the graph reads from: the same objects are part of the kind, and are kept alive.
-            generators: sources of noise besides the default one.
 
         Returns:
             Entries of their own memory: the next call does not overwrite them.
@@ -83,7 +80,7 @@ class GraphCache:
                     self._seen.clear()
                 self._seen[kind] = seen + 1, held
                 return _beside(work, inputs)
-            found = self._graphs[kind] = _record(work, inputs, held, generators)
+            found = self._graphs[kind] = _record(work, inputs, held)
             del self._seen[kind]
             while len(self._graphs) > self.keep:
                 self._graphs.popitem(last=False)
@@ -118,16 +115,12 @@ def _device(inputs: TensorDictBase) -> torch.device:
     return next(iter(inputs.values())).device
 
 
-def _record(
-    work: Work, inputs: TensorDictBase, held: tuple[object, ...], generators: Sequence[torch.Generator]
-) -> _Graph:
+def _record(work: Work, inputs: TensorDictBase, held: tuple[object, ...]) -> _Graph:
     static = TensorDict({name: x.clone() for name, x in inputs.items()}, batch_size=inputs.batch_size)
     graph, pool = torch.cuda.CUDAGraph(), torch.cuda.graph_pool_handle()
     device = _device(static)
-    default = torch.cuda.default_generators[device.index or 0]
-    noise = [generator.get_state() for generator in (default, *generators)]
-    for generator in generators:
-        graph.register_generator_state(generator)
+    generator = torch.cuda.default_generators[device.index or 0]
+    noise = generator.get_state()
     try:
         # Other threads (a live page, a data loader) may allocate meanwhile.
         with torch.cuda.device(device), torch.cuda.graph(graph, pool, capture_error_mode="thread_local"):
@@ -136,11 +129,10 @@ def _record(
         # A capture that could not be ended goes on taking memory from its pool, which nobody frees.
         with suppress(RuntimeError):
             torch._C._cuda_endAllocateToPool(device.index or 0, pool)  # pyright: ignore[reportAttributeAccessIssue]
-        # Generators believe that they are still being captured, and would refuse to draw from now on.
-        for generator, state in zip((default, *generators), noise, strict=True):
-            fresh = torch.Generator(device)
-            fresh.set_state(state)
-            generator.graphsafe_set_state(fresh.graphsafe_get_state())
+        # The generator believes that it is still being captured, and would refuse to draw from now on.
+        fresh = torch.Generator(device)
+        fresh.set_state(noise)
+        generator.graphsafe_set_state(fresh.graphsafe_get_state())
         if isinstance(error, torch.OutOfMemoryError):
             raise
         raise CaptureError(

@@ -142,7 +142,8 @@ def _guide(model: WorldModel, objective: Objective) -> Prior | GoalGuide | None:
     return guide if {*guide.in_keys} <= {*objective.in_keys} else None
 
 
-def _explores(explore: bool | None) -> bool:
+def explores(explore: bool | None) -> bool:
+    """Whether a policy explores: as it was told, else as TorchRL's exploration type says."""
     return interaction_type() is InteractionType.RANDOM if explore is None else explore
 
 
@@ -283,8 +284,8 @@ class PlannerPolicy(TensorDictModuleBase):
             raise ValueError(
                 "a plan is carried but is_init is missing: append torchrl.envs.InitTracker to the env"
             )
-        explore = _explores(self.explore)
-        if self._captures(inputs):
+        explore = explores(self.explore)
+        if captures(self.capture, inputs[self.in_keys[0]]):
             training = None if self.model is None else self.model.training
             modes = (explore, self.precision, training, share_of_worlds())
             held = (self.planner, self.encode, self.next, self.objective, self.observe, self.prior)
@@ -306,9 +307,6 @@ class PlannerPolicy(TensorDictModuleBase):
         """The same for a search: none towards a goal where no candidate is the policy's, as images would be encoded."""
         unread = isinstance(self.prior, GoalGuide) and getattr(self.planner, "num_policy_samples", None) == 0
         return None if unread else self.bound_prior(tensordict)
-
-    def _captures(self, inputs: TensorDictBase) -> bool:
-        return captures(self.capture, inputs[self.in_keys[0]])
 
     def _decide(self, tensordict: TensorDictBase, explore: bool) -> TensorDict:
         """What the policy writes."""
@@ -399,7 +397,7 @@ class ModelPolicy(TensorDictModuleBase):
         """Write `action`."""
         z = latent_of(tensordict, self.encode, self.observe)
         goal = () if self.goals is None else (self.goals.goal(tensordict),)
-        action = self.policy(z, *goal, deterministic=not _explores(self.explore))
+        action = self.policy(z, *goal, deterministic=not explores(self.explore))
         if self.observe is not None:
             tensordict.set("context", z).set("context_action", action)
         return tensordict.set("action", action)

@@ -6,8 +6,7 @@ from collections.abc import Callable, Sequence
 
 import torch
 from tensordict import TensorDict, TensorDictBase
-from tensordict.nn import InteractionType, TensorDictModuleBase
-from tensordict.nn.probabilistic import interaction_type
+from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
 
 from franka_wm.models.base import WorldModel
@@ -15,7 +14,7 @@ from franka_wm.planning.mcts import MCTS
 from franka_wm.planning.tree import CompiledRecurrent, Recurrent
 from franka_wm.policies.capture import GraphCache
 from franka_wm.policies.graph_key import graph_key
-from franka_wm.policies.planner import allow_recompiles, captures
+from franka_wm.policies.planner import allow_recompiles, captures, explores
 from franka_wm.seeding import share_of_worlds
 
 
@@ -35,7 +34,6 @@ class SearchPolicy(TensorDictModuleBase):
         explore: noise at the root and, with PUCT, drawn actions; None follows TorchRL's exploration type.
         model: the module behind the callables, so that collectors find its parameters and move it along. If
             the policy is to be copied, pass bound methods, not closures.
-        generator: source of the noise.
         capture: replay decisions as CUDA graphs, see `PlannerPolicy`; None: where the observations are on CUDA.
         compile: `torch.compile` what is done once for each simulation: read a latent from the tree, `recurrent`, pack
             the answer. The first decision of each number of environments waits for the compiler.
@@ -54,7 +52,6 @@ class SearchPolicy(TensorDictModuleBase):
         observation_keys: Sequence[str],
         explore: bool | None = None,
         model: nn.Module | None = None,
-        generator: torch.Generator | None = None,
         capture: bool | None = None,
         compile: bool = False,
     ) -> None:
@@ -64,7 +61,7 @@ class SearchPolicy(TensorDictModuleBase):
             recurrent = CompiledRecurrent(recurrent)
         self.in_keys = list(observation_keys)
         self.out_keys = ["action", "search_policy", "search_value"]
-        self.search, self.explore, self.model, self.generator = search, explore, model, generator
+        self.search, self.explore, self.model = search, explore, model
         self.encode, self.prediction, self.recurrent = encode, prediction, recurrent
         self.capture, self._graphs = capture, GraphCache()
 
@@ -75,7 +72,6 @@ class SearchPolicy(TensorDictModuleBase):
         search: MCTS,
         *,
         explore: bool | None = None,
-        generator: torch.Generator | None = None,
         capture: bool | None = None,
         compile: bool = False,
     ) -> SearchPolicy:
@@ -101,7 +97,6 @@ class SearchPolicy(TensorDictModuleBase):
             observation_keys=model.observation_keys,
             explore=explore,
             model=model,
-            generator=generator,
             capture=capture,
             compile=compile,
         )
@@ -115,7 +110,7 @@ class SearchPolicy(TensorDictModuleBase):
         """
         if len(tensordict.batch_size) != 1:
             raise ValueError(f"expected batch size [E], got {list(tensordict.batch_size)}")
-        explore = interaction_type() is InteractionType.RANDOM if self.explore is None else self.explore
+        explore = explores(self.explore)
         inputs = tensordict.select(*self.in_keys)
         if not captures(self.capture, inputs[self.in_keys[0]]):
             return tensordict.update(self._decide(inputs, explore))
@@ -126,7 +121,6 @@ class SearchPolicy(TensorDictModuleBase):
                 inputs,
                 key=(modes, graph_key(self.search)),
                 held=(self.search, self.encode, self.prediction, self.recurrent),
-                generators=() if self.generator is None else (self.generator,),
             )
         )
 
@@ -134,9 +128,7 @@ class SearchPolicy(TensorDictModuleBase):
         """What the policy writes."""
         z = self.encode(tensordict)
         logits, value = self.prediction(z)
-        found = self.search.search(
-            logits, value, z, self.recurrent, explore=explore, generator=self.generator
-        )
+        found = self.search.search(logits, value, z, self.recurrent, explore=explore)
         return TensorDict(
             {
                 "action": found.get("action"),

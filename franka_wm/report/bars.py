@@ -24,7 +24,6 @@ def bars_figure(
     scale: float = 1.0,
     limits: tuple[float, float] | None = None,
     colours: Mapping[str, str] | None = None,
-    title: str = "",
     theme: Theme = LIGHT,
 ) -> "Figure":
     """Lying bars in groups, with a whisker from low to high: names stay readable however long they are.
@@ -90,7 +89,7 @@ def bars_figure(
     axes.invert_yaxis()
     if limits is not None:
         axes.set_xlim(*limits)
-    finish_axes(axes, x=label, title=title, theme=theme, legend=False, grid="x")
+    finish_axes(axes, x=label, theme=theme, legend=False, grid="x")
     if len(series) > 1:
         axes.legend(
             frameon=False,
@@ -100,9 +99,6 @@ def bars_figure(
             bbox_to_anchor=(0.5, 1.0),
             ncols=min(3, len(series)),
         )
-        axes.set_title("")
-        if title:
-            figure.suptitle(as_label(title), fontsize=10, color=theme.colour(INK))
     axes.spines["left"].set_visible(False)
     axes.tick_params(axis="y", length=0)
     return figure

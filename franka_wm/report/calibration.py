@@ -11,12 +11,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 
-def calibration_figure(
-    bins: Mapping[str, Sequence[float]],
-    *,
-    title: str = "value against the return that followed",
-    theme: Theme = LIGHT,
-) -> "Figure":
+def calibration_figure(bins: Mapping[str, Sequence[float]], *, theme: Theme = LIGHT) -> "Figure":
     """What `calibration_bins` gives, beside the line on which a perfect value lies.
 
     Raises:
@@ -34,5 +29,6 @@ def calibration_figure(
             predicted, bins["low"], bins["high"], color=colour, alpha=0.2, linewidth=0, label="middle 50 %"
         )
     axes.plot(predicted, true, color=colour, marker="o", markersize=4, linewidth=1.6, label="this value")
+    title = "value against the return that followed"
     finish_axes(axes, x="predicted", y="true", title=title, theme=theme)
     return figure

@@ -17,7 +17,6 @@ from franka_wm.report.figure import (
     new_figure,
     save_figure,
     shortened,
-    title_figure,
 )
 from franka_wm.report.style import LIGHT, Theme
 
@@ -64,8 +63,6 @@ def plot_learning_curves(
     *,
     x: str = "env_steps",
     success_distance: float | None = 0.05,
-    title: str | None = None,
-    theme: Theme = LIGHT,
 ) -> Path:
     """Draw the logged rows of a run into one figure: distance, or return where there is none, success rate, losses.
 
@@ -79,8 +76,6 @@ def plot_learning_curves(
         path: ends in .png, .pdf or .svg; its folder is made.
         x: the key of the horizontal axis; rows without it are not drawn.
         success_distance: marked in the distance panel [m]; None for no mark.
-        title: above the panels.
-        theme: colours.
 
     Returns:
         `path`.
@@ -93,11 +88,10 @@ def plot_learning_curves(
     first = "final_distance" if _keys(placed, "final_distance") or not _keys(placed, "return") else "return"
     # Not every simulator tells success; every run has losses and one of the others.
     quantities = [first, "success"] if _keys(placed, "success") else [first]
-    figure, axes = new_figure(columns=len(quantities) + 1, width=4.0, height=3.8, theme=theme, sharex=True)
+    figure, axes = new_figure(columns=len(quantities) + 1, width=4.0, height=3.8, sharex=True)
     for one, quantity in zip(axes[:-1], quantities, strict=True):
-        _draw_quantity(one, placed, x, quantity, success_distance, theme)
-    _draw_values(axes[-1], placed, x, _loss_keys(placed), "losses", theme)
-    title_figure(figure, title, theme=theme)
+        _draw_quantity(one, placed, x, quantity, success_distance)
+    _draw_values(axes[-1], placed, x, _loss_keys(placed), "losses")
     return save_figure(figure, path)
 
 
@@ -107,7 +101,6 @@ def panel_figure(
     *,
     x: str = "env_steps",
     success_distance: float | None = 0.05,
-    theme: Theme = LIGHT,
 ) -> "Figure | None":
     """One of `panels` of a run as a figure of its own; None where no row holds anything for it.
 
@@ -124,11 +117,11 @@ def panel_figure(
     keys, title = values.get(panel, (_keys(placed, panel), ""))
     if not keys:
         return None
-    figure, (axes,) = new_figure(theme=theme)
+    figure, (axes,) = new_figure()
     if panel in values:
-        _draw_values(axes, placed, x, keys, title, theme)
+        _draw_values(axes, placed, x, keys, title)
     else:
-        _draw_quantity(axes, placed, x, panel, success_distance, theme)
+        _draw_quantity(axes, placed, x, panel, success_distance)
     _share_x(axes, [placed], x)
     return figure
 
@@ -215,38 +208,34 @@ def seeds_figure(
 # -- drawing ---------------------------------------------------------------------------------------------
 
 
-def _draw_quantity(
-    axes: "Axes", rows: Rows, x: str, leaf: str, success_distance: float | None, theme: Theme
-) -> None:
+def _draw_quantity(axes: "Axes", rows: Rows, x: str, leaf: str, success_distance: float | None) -> None:
     title, scale = quantity(leaf)
     keys = _keys(rows, leaf)
     for key in keys:
-        _draw_policy(axes, rows, x, key, scale, theme)
+        _draw_policy(axes, rows, x, key, scale)
     if success_distance is not None and leaf == "final_distance" and keys:
         label = f"success: {style.centimetres(success_distance)}"
-        axes.axhline(
-            100 * success_distance, color=theme.colour(style.GREY), linestyle=":", linewidth=1, label=label
-        )
-    _finish(axes, x, title, theme, leaf)
+        axes.axhline(100 * success_distance, color=style.GREY, linestyle=":", linewidth=1, label=label)
+    _finish(axes, x, title, LIGHT, leaf)
 
 
-def _draw_values(axes: "Axes", rows: Rows, x: str, keys: Sequence[str], title: str, theme: Theme) -> None:
+def _draw_values(axes: "Axes", rows: Rows, x: str, keys: Sequence[str], title: str) -> None:
     values = []
     for index, key in enumerate(keys):
-        light, dashes = style.series_style(index)
+        colour, dashes = style.series_style(index)
         xs, ys = _points(rows, x, key, 1)
         values += [y for y in ys if not math.isnan(y)]
         axes.plot(
             xs,
             ys,
-            color=theme.colour(light),
+            color=colour,
             linestyle=dashes,
             linewidth=1.2,
             label=as_label(_short(key)),
             marker="o" if len(xs) == 1 else None,
             markersize=3.5,
         )
-    _finish(axes, x, title, theme)
+    _finish(axes, x, title, LIGHT)
     if values and min(values) > 0:
         axes.set_yscale("log")
     elif any(values):
@@ -255,14 +244,14 @@ def _draw_values(axes: "Axes", rows: Rows, x: str, keys: Sequence[str], title: s
         axes.set_yscale("symlog", linthresh=linear_to)
 
 
-def _draw_policy(axes: "Axes", rows: Rows, x: str, key: str, scale: float, theme: Theme) -> None:
+def _draw_policy(axes: "Axes", rows: Rows, x: str, key: str, scale: float) -> None:
     policy = key.split("/")[-2] if "/" in key else "train"
     xs, ys = _points(rows, x, key, scale)
     training = policy == "train"
     axes.plot(
         xs,
         ys,
-        color=theme.colour(style.policy_colour(policy)),
+        color=style.policy_colour(policy),
         linewidth=1.0 if training else 1.8,
         zorder=2 if training else 3,
         marker="o" if len(xs) <= 40 else None,

@@ -78,7 +78,8 @@ def finish_axes(
     if grid:
         axes.grid(axis=grid, color=theme.colour(FAINT), linewidth=0.6)  # pyright: ignore[reportArgumentType]
     if not axes.has_data():
-        empty(axes, theme=theme)
+        grey = theme.colour(GREY)
+        axes.text(0.5, 0.5, "nothing logged", transform=axes.transAxes, ha="center", color=grey)
     elif legend and (count := len(axes.get_legend_handles_labels()[1])):
         small, columns = count > 10, 1 + (count - 1) // MOST_IN_COLUMN
         drawn = axes.legend(frameon=False, fontsize=6 if small else 8, labelcolor=ink, ncols=columns)
@@ -100,17 +101,6 @@ def as_label(text: str) -> str:
     return (" " if text.startswith("_") else "") + text.replace("$", r"\$")
 
 
-def empty(axes: "Axes", text: str = "nothing logged", *, theme: Theme = LIGHT) -> None:
-    """Says in the middle of a panel why it is empty."""
-    axes.text(0.5, 0.5, text, transform=axes.transAxes, ha="center", color=theme.colour(GREY))
-
-
-def title_figure(figure: "Figure", title: str | None, *, theme: Theme = LIGHT) -> None:
-    """A title above all panels; None for none."""
-    if title:
-        figure.suptitle(title, fontsize=11, color=theme.colour(INK))
-
-
 def check_format(path: str | Path) -> str:
     """The format that a path's ending asks for.
 
@@ -124,7 +114,7 @@ def check_format(path: str | Path) -> str:
     return kind
 
 
-def save_figure(figure: "Figure", path: str | Path, *, dpi: int = 150) -> Path:
+def save_figure(figure: "Figure", path: str | Path) -> Path:
     """Write a figure; its folder is made.
 
     Returns:
@@ -135,7 +125,7 @@ def save_figure(figure: "Figure", path: str | Path, *, dpi: int = 150) -> Path:
     """
     kind = check_format(path)
     with atomic_write(path) as temporary:
-        figure.savefig(temporary, format=kind, dpi=dpi, facecolor=figure.get_facecolor())
+        figure.savefig(temporary, format=kind, dpi=150, facecolor=figure.get_facecolor())
     return Path(path)
 
 

@@ -15,20 +15,12 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 
-def strip_figure(
-    rows: Mapping[str, Tensor],
-    *,
-    columns: int = 8,
-    title: str | None = None,
-    step: int = 1,
-    theme: Theme = LIGHT,
-) -> "Figure":
+def strip_figure(rows: Mapping[str, Tensor], *, columns: int = 8, theme: Theme = LIGHT) -> "Figure":
     """A contact sheet: one row of frames for each rollout, evenly taken from first to last.
 
     Args:
         rows: label -> (T, H, W, 3) uint8; all of one shape.
         columns: frames of each row, at most T.
-        step: steps from one frame to the next, for the captions (`t = …`).
 
     Raises:
         UserError: no row, or shapes that differ.
@@ -47,7 +39,7 @@ def strip_figure(
             axes.imshow(video[k].cpu().numpy(), interpolation="nearest")
             axes.set_axis_off()
             if row == 0:
-                axes.set_title(f"t = {k * step}", fontsize=8, color=theme.colour(INK))
+                axes.set_title(f"t = {k}", fontsize=8, color=theme.colour(INK))
             if column == 0:
                 axes.text(
                     -0.06,
@@ -60,8 +52,6 @@ def strip_figure(
                     fontsize=9,
                     color=theme.colour(INK),
                 )
-    if title:
-        figure.suptitle(title, fontsize=10, color=theme.colour(INK))
     return figure
 
 
@@ -103,9 +93,7 @@ def hide_patches(frame: Tensor, hidden: Tensor, *, keep: float = 0.12, shade: in
     return torch.where(cover > 0.5, veiled, frame.float()).round().to(torch.uint8)
 
 
-def mask_figure(
-    frame: Tensor, masks: Mapping[str, Tensor], *, title: str | None = None, theme: Theme = LIGHT
-) -> "Figure":
+def mask_figure(frame: Tensor, masks: Mapping[str, Tensor], *, theme: Theme = LIGHT) -> "Figure":
     """A frame, and beside it what each mask leaves of it.
 
     Args:
@@ -123,8 +111,6 @@ def mask_figure(
         axes.imshow(image.cpu().numpy(), interpolation="nearest")
         axes.set_axis_off()
         axes.set_title(name, fontsize=9, color=theme.colour(INK))
-    if title:
-        figure.suptitle(title, fontsize=10, color=theme.colour(INK))
     return figure
 
 

@@ -27,7 +27,6 @@ def horizon_figure(
     *,
     steps: Sequence[float] | None = None,
     unit: str = "error",
-    title: str = "open-loop error by horizon",
     theme: Theme = LIGHT,
 ) -> "Figure":
     """Error against steps ahead, with intervals; the axis follows the lines where an interval goes far beyond them.
@@ -72,6 +71,7 @@ def horizon_figure(
             )
     highest, reach = (_highest(curves, part) for part in ("mean", "high"))
     cut = reach > FAR * highest > 0
+    title = "open-loop error by horizon"
     if cut:
         title += f"\n(intervals are cut; they reach {reach:,.4g})"
     finish_axes(axes, x="steps ahead", y=as_label(unit), title=title, theme=theme)

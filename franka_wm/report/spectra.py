@@ -22,7 +22,6 @@ def spectrum_figure(
     spectra: Mapping[str, Sequence[float]],
     *,
     marks: Mapping[str, float] | None = None,
-    title: str = "singular values of the latents",
     theme: Theme = LIGHT,
 ) -> "Figure":
     """Singular values by rank, relative to the largest, on a log scale.
@@ -60,6 +59,7 @@ def spectrum_figure(
             rank, color=theme.colour(GREY), linestyle=":", linewidth=1.2, label=as_label(f"{name} {rank:.1f}")
         )
     axes.set_yscale("log")
+    title = "singular values of the latents"
     finish_axes(axes, x="rank", y="relative to the largest", title=title, theme=theme)
     return figure
 
@@ -70,7 +70,6 @@ def latent_figure(
     *,
     label: str,
     explained: Sequence[float] | None = None,
-    title: str = "latents along their main directions",
     theme: Theme = LIGHT,
 ) -> "Figure":
     """Points of `principal_components`, coloured by a quantity such as the distance to the goal.
@@ -98,6 +97,7 @@ def latent_figure(
     bar.ax.tick_params(colors=theme.colour(INK), labelsize=8)
     bar.outline.set_visible(False)  # pyright: ignore[reportCallIssue]
     shares = ["", ""] if explained is None else [f" ({100 * share:.0f} %)" for share in explained]
+    title = "latents along their main directions"
     finish_axes(axes, x=f"first{shares[0]}", y=f"second{shares[1]}", title=title, theme=theme, grid="")
     axes.set_xticks([])
     axes.set_yticks([])

@@ -86,7 +86,6 @@ DARK = Theme(
         FAINT: "#3D444D",
     },
 )
-THEMES = {theme.name: theme for theme in (LIGHT, DARK)}
 
 
 POLICY_COLOURS = {

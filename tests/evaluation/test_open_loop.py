@@ -209,6 +209,6 @@ def test_a_constant_value_has_no_slope() -> None:
 
 def test_rewards_are_forgotten_in_time() -> None:
     for discount in (0.9, 0.95, 0.99):
-        steps = steps_until_forgotten(discount, rest=0.02)
+        steps = steps_until_forgotten(discount)
         assert discount**steps <= 0.02 < discount ** (steps - 1)
     assert steps_until_forgotten(1.0) == 400

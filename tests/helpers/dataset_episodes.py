@@ -5,8 +5,9 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
+import pyarrow.parquet as pq
 
-from franka_wm.data.lerobot.terminal import read_terminals
+from franka_wm.data.lerobot.terminal import TERMINAL_FOLDER, read_terminals
 
 
 def as_picture(tensor) -> np.ndarray:
@@ -32,6 +33,13 @@ def compare(dataset, schema, episodes, *, pictures: bool = True) -> None:
             for name in schema.images if pictures else ():
                 assert np.array_equal(as_picture(item[name]), episode.rows[name][t]), (name, index)
             index += 1
+
+
+def keys_there(out: Path) -> set[int]:
+    """Keys of the episodes on disk: of the dataset, and of the shards that a kill has left of a writing."""
+    roots = [out, *Path(f"{out}.writing").glob("shards/shard-*[0-9]")]
+    files = [file for root in roots for file in (root / TERMINAL_FOLDER).glob("*.parquet")]
+    return {key for file in files for key in pq.read_table(file)["episode_key"].to_pylist()}
 
 
 def check_terminals(root: Path, schema, episodes) -> None:

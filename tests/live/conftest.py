@@ -29,6 +29,8 @@ def make_session(small_env) -> Callable[..., Session]:
             "random": SmoothRandomPolicy(env.action_dim),
             "noop": NoopPolicy(env.action_dim),
         }
-        return Session(env, policies, policy=policy, seed=seed, keep_goal=keep_goal)
+        session = Session(env, policies, policy=policy, seed=seed)
+        session.keep_goal = keep_goal
+        return session
 
     return make

@@ -11,11 +11,9 @@ from franka_wm.models.regularizers import (
     ProjectionMLP,
     SIGReg,
     covariance_loss,
-    effective_rank,
     feature_std,
     info_nce,
     participation_ratio,
-    vicreg,
 )
 
 
@@ -129,12 +127,12 @@ def test_two_processes_see_the_statistic_of_both(tmp_path):
     torch.testing.assert_close(torch.tensor(ga + gb) / 2, whole.grad, rtol=1e-3, atol=1e-5)
 
 
-def test_vicreg_spreads_and_decorrelates():
+def test_the_guard_of_vicreg_spreads_and_decorrelates():
     x = (0.01 * torch.randn(128, 4)).requires_grad_()
-    optimiser = torch.optim.Adam([x], lr=0.02)
+    guard, optimiser = CollapseGuard("vicreg"), torch.optim.Adam([x], lr=0.02)
     for _ in range(200):
         optimiser.zero_grad()
-        vicreg(x, x).backward()
+        guard(x).backward()
         optimiser.step()
     covariance = torch.cov(x.detach().T)
     assert covariance.diagonal().min() > 0.8
@@ -145,8 +143,6 @@ def test_info_nce_rewards_the_match():
     x = torch.randn(32, 16)
     matched = info_nce(x, x + 0.01 * torch.randn_like(x))
     assert matched < 0.1 < 3.0 < info_nce(x, x.roll(1, 0))
-    with pytest.raises(ValueError, match="temperature"):
-        info_nce(x, x, temperature=0.0)
     unit = torch.nn.functional.normalize(x.double(), dim=-1)
     logits = unit @ unit.roll(1, 0).mT / 0.1
     expected = -0.5 * (logits.log_softmax(0) + logits.log_softmax(1)).diagonal().mean()
@@ -159,8 +155,7 @@ def test_collapse_is_seen():
     assert feature_std(ball) == pytest.approx(1.0, abs=0.05) and feature_std(point) == 0
     assert participation_ratio(ball) > 7.9 and participation_ratio(line) == pytest.approx(1.0, abs=1e-3)
     assert participation_ratio(point) == 0
-    assert effective_rank(ball) > 7.9 and effective_rank(line) == pytest.approx(1.0, abs=0.05)
-    for measure in (feature_std, participation_ratio, effective_rank):
+    for measure in (feature_std, participation_ratio):
         assert measure(ball.view(64, 64, 8)).item() == pytest.approx(measure(ball).item(), rel=1e-5)
 
 

@@ -205,15 +205,6 @@ def test_a_compiled_search_stays_compiled_for_many_numbers_of_worlds(monkeypatch
             assert policy(TensorDict({"state": torch.ones(worlds, 1)}, [worlds]))["action"].shape == (worlds,)
 
 
-def test_its_own_generator_makes_actions_repeat():
-    start = TensorDict({"state": torch.full((200, 1), 3.0)}, [200])
-    first, second = (
-        acting(explore=True, generator=torch.Generator().manual_seed(7))(start.clone())["action"]
-        for _ in range(2)
-    )
-    assert torch.equal(first, second)
-
-
 def test_mistakes_are_named():
     with pytest.raises(ValueError, match=r"batch size \[E\]"):
         acting()(TensorDict({"state": torch.zeros(2, 3, 1)}, [2, 3]))

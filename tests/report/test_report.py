@@ -124,7 +124,7 @@ def logged_rows() -> list[dict[str, float]]:
 
 
 def test_curves_are_drawn_and_are_not_blank(tmp_path: Path) -> None:
-    path = plot_learning_curves(logged_rows(), tmp_path / "plots" / "curves.png", title="reach")
+    path = plot_learning_curves(logged_rows(), tmp_path / "plots" / "curves.png")
     with Image.open(path) as picture:
         pixels = np.asarray(picture.convert("RGB"))
     assert pixels.shape[1] > 1200

@@ -165,7 +165,7 @@ class RecordedWindows:
         self.episodes = list(zip(dataset.tolist(), (chosen - first).tolist(), strict=True))
         self._all_lengths = recording.episodes[:, 2] + recording.episodes[:, 3] - 1
         self.episode_length = int(self._all_lengths.max())
-        self._starts, self._lengths = start, length
+        self._starts = start
         transitions = length + known - 1
         windows = np.maximum(transitions - window + 1, 0)
         self._count = int(windows.sum())

@@ -42,7 +42,6 @@ from franka_wm.data.lerobot.shard_workers import (
     wait_for_orphans,
 )
 from franka_wm.data.lerobot.source import MOST_ROWS, check_finite
-from franka_wm.data.lerobot.terminal import TERMINAL_FOLDER
 from franka_wm.errors import UserError
 from franka_wm.files import unwritable
 from franka_wm.options import is_whole, whole_rule
@@ -231,14 +230,6 @@ class DatasetWriter:
         path = self.working / "writer.json"
         path.with_suffix(".new").write_text(json.dumps(state, indent=1), encoding="utf-8")
         path.with_suffix(".new").replace(path)
-
-    def keys(self) -> set[int]:
-        """Keys of the episodes that are on disk: shards are finished out of order, so a kill may leave a gap."""
-        import pyarrow.parquet as pq
-
-        roots = ([self.out] if self.out.exists() else []) + _shards(self.working)
-        files = [file for root in roots for file in (root / TERMINAL_FOLDER).glob("*.parquet")]
-        return {key for file in files for key in pq.read_table(file)["episode_key"].to_pylist()}
 
     # -- during ------------------------------------------------------------------------------------------------
 

@@ -17,7 +17,7 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 
-from dataset_episodes import check_terminals, compare
+from dataset_episodes import check_terminals, compare, keys_there
 from forks import Fork
 from franka_wm.data.lerobot.merge import merge
 from franka_wm.data.lerobot.provenance import describe, other_option, read_provenance
@@ -276,7 +276,7 @@ def _write(given: Path, out: Path) -> None:
     with DatasetWriter(out, schema, provenance={"policy": "p"}, **options) as writer:
         writer.start(wait=True)
         print("ready", flush=True)
-        there = writer.keys()
+        there = keys_there(out)
         writer.add(episode for episode in episodes if episode.key not in there)
         writer.finish()
 
@@ -305,7 +305,7 @@ def _kill_and_go_on(tmp_path, schema, episodes, load, moments: list[float]) -> N
         finished = max(finished, len(shards))
     with DatasetWriter(out, schema, provenance={}, workers=0, resume=True) as writer:
         assert writer.resumed >= finished  # at least an episode in each of the shards that were there
-        there = writer.keys()
+        there = keys_there(out)
         writer.add(episode for episode in episodes if episode.key not in there)
         writer.finish()
     dataset = load(out)
