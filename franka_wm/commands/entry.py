@@ -247,8 +247,8 @@ def one_line_errors(main: Callable[[DictConfig], object]) -> Callable[[DictConfi
         except KeyboardInterrupt:
             folder = Path(HydraConfig.get().runtime.output_dir)
             values = cast(dict[str, object], OmegaConf.to_container(cfg))
-            saved = f"what was written is in {folder}"
-            if (folder / "checkpoints" / "latest").exists():
+            saved = f"there is no checkpoint to go on from yet; what was written is in {folder}"
+            if any((folder / stage / "checkpoints" / "latest").exists() for stage in ("", "pretrained")):
                 saved = f"go on from what was saved: {resuming(folder, values)}"
             gone = _discard()  # of several processes the first one made the folder, and knows
             if int(os.environ.get("RANK") or 0) == 0 or not several.started_by_torchrun():
