@@ -357,7 +357,10 @@ def with_scale(arguments: list[str], stream: TextIO | None = None, *, quiet: boo
                 stream,
             )
         return arguments
-    device = next((a.split("=", 1)[1] for a in arguments if a.startswith("device=")), "auto")
+    device = next((a.split("=", 1)[1] for a in arguments if a.startswith("device=")), None)
+    if device is None:
+        named = [a for a in arguments if a != chosen] if any(map(_may_choose, arguments)) else []
+        device = str(compose(next(swept(named))).device) if named else "auto"
     launcher = given(arguments, "hydra/launcher")
     here = (
         launcher == "ray" and given(arguments, "hydra.launcher.ray.init.address") is None
@@ -376,9 +379,14 @@ def with_scale(arguments: list[str], stream: TextIO | None = None, *, quiet: boo
     return [a for a in arguments if a != chosen] + [f"scale={scale}"]
 
 
+def _may_choose(argument: str) -> bool:
+    """Whether files that it names may choose what is chosen on the command line."""
+    return argument.startswith(("experiment=", "hydra.searchpath="))
+
+
 def _scales_of_files(arguments: list[str]) -> set[str | None]:
     """What experiments on the command line choose, of a sweep all of them; ``None`` of one that chooses nothing."""
-    if not any(a.startswith(("experiment=", "hydra.searchpath=")) for a in arguments):
+    if not any(map(_may_choose, arguments)):
         return {None}  # no file of this package chooses one unasked
     try:
         return {conf.scale_of_files(*one) for one in swept(arguments)}

@@ -93,3 +93,23 @@ def test_a_preset_that_is_not_yaml_is_one_line_with_its_place(mine: list[str], c
     said = capsys.readouterr().err
     assert said.startswith("error: ") and f"{path.resolve()}, line 2: not YAML (mapping values" in said
     assert said.count("\n") == 1
+
+
+def test_what_an_experiment_of_ones_own_sets_at_the_top_counts(
+    mine: list[str], registries_as_before: None
+) -> None:
+    """Among it the modules to import: without them its task would not be known."""
+    Path("own_box.py").write_text(
+        "from franka_wm.envs.tasks import Reach, register\nregister('own_box', type('Box', (Reach,), {}))\n"
+    )
+    Path("my presets/experiment").mkdir()
+    Path("my presets/experiment/own.yaml").write_text(
+        "# @package _global_\nplugins: [own_box]\nseed: 7\nsize: smoke\nenv: {task: own_box}\n"
+    )
+    begun = []
+    words = [mine[0], "experiment=own", "device=cpu"]
+    entry._run(lambda: begun.append(entry.compose(sys.argv[2:])), words)
+    [cfg] = begun
+    assert cfg.plugins == ["own_box"] and (cfg.seed, cfg.size, cfg.env.task) == (7, "smoke", "own_box")
+    entry._run(lambda: begun.append(entry.compose(sys.argv[2:])), [*words, "seed=3"])
+    assert begun[-1].seed == 3
