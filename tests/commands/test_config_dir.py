@@ -62,6 +62,14 @@ def test_what_cannot_be_is_one_line(words: list[str], said: str, mine: list[str]
         entry._run(lambda: pytest.fail("begun"), [*mine, *words])
     err = capsys.readouterr().err
     assert said in err and err.count("\n") == 1
+    for path in ("file://nowhere", "nowhere", "file://my presets/env/kitchen.yaml"):
+        with pytest.raises(SystemExit):
+            entry._run(
+                lambda: pytest.fail("begun"), ["device=cpu", "env=kitchen", f"hydra.searchpath=['{path}']"]
+            )
+        folder = path.removeprefix("file://")
+        said = f"error: hydra.searchpath: {folder}: no such folder; looked for from {Path.cwd()}\n"
+        assert capsys.readouterr().err == said
     with pytest.raises(SystemExit):
         entry._run(lambda: pytest.fail("begun"), ["--config-dir=nowhere"])
     assert capsys.readouterr().err == "error: --config-dir=nowhere: no such folder\n"
