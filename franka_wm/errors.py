@@ -56,6 +56,12 @@ def trying(what: str, *but: type[Exception]) -> Iterator[None]:
 
 def where(error: BaseException) -> str:
     """Kind and first line of an error, and the last line of the user's own that led to it."""
+    reason = (str(error).strip() or "no reason given").splitlines()[0]
+    return f"{type(error).__name__}: {reason}{place(error)}"
+
+
+def place(error: BaseException) -> str:
+    """`` (FILE, line N)`` of the last line of the user's own that led to an error; empty where there is none."""
     others = (
         str(Path(__file__).parent),
         sysconfig.get_paths()["purelib"],
@@ -65,11 +71,8 @@ def where(error: BaseException) -> str:
     frames = traceback.extract_tb(error.__traceback__)
     own = [one for one in frames if not one.filename.startswith(others)]
     # A SyntaxError says it itself.
-    place = (
-        f" ({own[-1].filename}, line {own[-1].lineno})" if own and not isinstance(error, SyntaxError) else ""
-    )
-    reason = (str(error).strip() or "no reason given").splitlines()[0]
-    return f"{type(error).__name__}: {reason}{place}"
+    said = own and not isinstance(error, SyntaxError)
+    return f" ({own[-1].filename}, line {own[-1].lineno})" if said else ""
 
 
 _LOOP = "a link leads to itself; remove it"

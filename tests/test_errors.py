@@ -6,7 +6,7 @@ import errno
 
 import pytest
 
-from franka_wm.errors import machine_refused
+from franka_wm.errors import UserError, machine_refused
 
 
 def caused(error: Exception, by: Exception) -> Exception:
@@ -36,3 +36,20 @@ MAPPED = "warp.so: failed to map segment from shared object"
 def test_only_what_the_machine_refuses(error: Exception, says: str | None) -> None:
     found = machine_refused(error)
     assert found is None if says is None else says in str(found)
+
+
+@pytest.mark.parametrize("part", ["model", "planner"])
+def test_what_fails_inside_a_constructor_of_ones_own_says_where(part: str, settled, monkeypatch) -> None:
+    from franka_wm.training import build
+
+    def make(*_: object, **given: object) -> None:
+        len(given["episode_length" if part == "model" else "horizon"])  # type: ignore[arg-type]
+
+    monkeypatch.setattr(build.models if part == "model" else build.registry, "make", make)
+    run = settled("scale=smoke", "device=cpu")
+    said = rf"^{part}=\w+: object of type 'int' has no len\(\) \({__file__}, line \d+\)$"
+    with pytest.raises(UserError, match=said):
+        if part == "model":
+            build.make_model(run, build.Spaces.of_config(run.env.arm))
+        else:
+            build.make_planner(run, 7)

@@ -74,13 +74,31 @@ def collect(gpus: int, overrides: Sequence[str], **options: Any) -> int:
         _in_a_job(overrides, options)
     check_out(options["out"], resume=options["resume"])
     if gpus == 1:
-        return _collect(overrides, **options)
+        try:
+            return _collect(overrides, **options)
+        except KeyboardInterrupt:  # the second one, or before the first episode
+            return _stopped_at_once(options["out"])
     check_policy(options["policy"], options["checkpoint"], overrides, noise=options["noise"])
     _require_worlds(options["num_envs"] or options["episodes"], gpus)
     launching.launch_verb(
         ["collect", *_typed()], gpus, _device(overrides), lambda: "collect goes on with resume=true"
     )
     return 0
+
+
+def _stopped_at_once(out: str) -> int:
+    """Says what is left of a dataset that could not be finished; the exit status."""
+    from franka_wm.data.lerobot.writer import episodes_there
+
+    working = Path(f"{Path(out).absolute()}.writing")
+    if working.exists():
+        say(
+            f"stopped at once; {episodes_there(out)} whole episodes are kept, no dataset was made of what is in "
+            f"{working}; go on with resume=true"
+        )
+    else:
+        say("stopped; nothing was written")
+    return INTERRUPTED
 
 
 def _typed() -> list[str]:

@@ -247,8 +247,8 @@ def one_line_errors(main: Callable[[DictConfig], object]) -> Callable[[DictConfi
         except KeyboardInterrupt:
             folder = Path(HydraConfig.get().runtime.output_dir)
             values = cast(dict[str, object], OmegaConf.to_container(cfg))
-            saved = f"what was written is in {folder}"
-            if (folder / "checkpoints" / "latest").exists():
+            saved = f"there is no checkpoint to go on from yet; what was written is in {folder}"
+            if any((folder / stage / "checkpoints" / "latest").exists() for stage in ("", "pretrained")):
                 saved = f"go on from what was saved: {resuming(folder, values)}"
             gone = _discard()  # of several processes the first one made the folder, and knows
             if int(os.environ.get("RANK") or 0) == 0 or not several.started_by_torchrun():
@@ -357,7 +357,10 @@ def with_scale(arguments: list[str], stream: TextIO | None = None, *, quiet: boo
                 stream,
             )
         return arguments
-    device = next((a.split("=", 1)[1] for a in arguments if a.startswith("device=")), "auto")
+    device = next((a.split("=", 1)[1] for a in arguments if a.startswith("device=")), None)
+    if device is None:
+        named = [a for a in arguments if a != chosen] if any(map(_may_choose, arguments)) else []
+        device = str(compose(next(swept(named))).device) if named else "auto"
     launcher = given(arguments, "hydra/launcher")
     here = (
         launcher == "ray" and given(arguments, "hydra.launcher.ray.init.address") is None
@@ -376,9 +379,14 @@ def with_scale(arguments: list[str], stream: TextIO | None = None, *, quiet: boo
     return [a for a in arguments if a != chosen] + [f"scale={scale}"]
 
 
+def _may_choose(argument: str) -> bool:
+    """Whether files that it names may choose what is chosen on the command line."""
+    return argument.startswith(("experiment=", "hydra.searchpath="))
+
+
 def _scales_of_files(arguments: list[str]) -> set[str | None]:
     """What experiments on the command line choose, of a sweep all of them; ``None`` of one that chooses nothing."""
-    if not any(a.startswith(("experiment=", "hydra.searchpath=")) for a in arguments):
+    if not any(map(_may_choose, arguments)):
         return {None}  # no file of this package chooses one unasked
     try:
         return {conf.scale_of_files(*one) for one in swept(arguments)}

@@ -9,8 +9,10 @@ from typing import Any
 import click
 
 from franka_wm.commands.arguments import FLAG, TYPED, check_run, plugins, verb, whole, word
+from franka_wm.console import say
 from franka_wm.errors import UserError
 from franka_wm.files import unwritable
+from franka_wm.interrupt import INTERRUPTED
 
 
 @verb(
@@ -41,7 +43,7 @@ from franka_wm.files import unwritable
 @word("probes", "joints, tool and goal predicted from the latents by probes; spectrum", FLAG, True)
 @word("robustness", "the same in shifted worlds: looks, camera, dynamics, delay, noise", FLAG, False)
 @plugins
-def evaluate(checkpoint: str, out: str | None, overrides: Sequence[str] = (), **options: Any) -> None:
+def evaluate(checkpoint: str, out: str | None, overrides: Sequence[str] = (), **options: Any) -> int:
     """Evaluate a checkpoint on held-out episodes. Success, predictions, latents, robustness.
 
     Writes evaluation.json and evaluation.md (the same twice on a CPU), timing.json, imagined.png, imagined.mp4.
@@ -63,7 +65,36 @@ def evaluate(checkpoint: str, out: str | None, overrides: Sequence[str] = (), **
     context = click.get_current_context(silent=True)
     typed = () if context is None else tuple(context.meta[TYPED])
     words = {"overrides": tuple(overrides), "planned_with": planned_with, "typed": typed}
-    run(Options(checkpoint=checkpoint, out=place, **words, **options))
+    before = _written(place)
+    try:
+        run(Options(checkpoint=checkpoint, out=place, **words, **options))
+    except KeyboardInterrupt:
+        say(f"stopped; {_told(place, before)}")
+        return INTERRUPTED
+    return 0
+
+
+def _written(folder: Path) -> int | None:
+    """When the result there was written [ns]; ``None`` where there is none."""
+    file = folder / "evaluation.json"
+    return file.stat().st_mtime_ns if file.is_file() else None
+
+
+def _told(folder: Path, before: int | None) -> str:
+    """What an evaluation that was stopped has written.
+
+    Args:
+        folder: Where its results go.
+        before: What :func:`_written` said when it began.
+    """
+    now = _written(folder)
+    if now is not None and now != before:
+        return (
+            f"{folder} has the results of all episodes, not those of the diagnostics; evaluate again for them"
+        )
+    return (
+        f"nothing was written{f'; the result that was in {folder} is still there' if now is not None else ''}"
+    )
 
 
 def default_folder(checkpoint: str) -> Path:

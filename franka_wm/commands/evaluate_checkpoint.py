@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import shlex
+import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from franka_wm.commands.overrides import changes
-from franka_wm.console import announced, program, say
+from franka_wm.console import announced, duration, program, say
 from franka_wm.errors import UserError
 from franka_wm.evaluation import diagnose
 from franka_wm.evaluation.decoder import Imagined
@@ -85,10 +86,9 @@ def run(options: Options) -> dict[str, Any]:
     own = agent.folder.parents[1] if agent.folder.parent.name == "checkpoints" else agent.folder
     within = options.out.resolve() == own / "evaluation"
     of_run = None if within or options.out.resolve() == own else _of_run(agent, options)
-    say(f"{options.episodes} held-out episodes for each of {', '.join(agent.policies)} …")
-    evaluation = evaluate_agent(
-        agent, episodes=options.episodes, report=lambda name, r: say(describe(name, r))
-    )
+    with announced(f"{options.episodes} held-out episodes for each of {', '.join(agent.policies)}"):
+        report = _progress(len(agent.policies))
+        evaluation = evaluate_agent(agent, episodes=options.episodes, report=report)
     described = protocol(agent.settings, agent.env, evaluation, by=COMMAND, counters=agent.counters)
     planned = {OTHERWISE: options.planned_with} if options.planned_with else {}
     results = {
@@ -125,6 +125,22 @@ def run(options: Options) -> dict[str, Any]:
         f"a page of them: {program()} report {shlex.quote(str(options.out.parent if within else options.out))}"
     )
     return results
+
+
+def _progress(policies: int) -> Callable[[str, Mapping[str, Any]], None]:
+    """What says of each policy how it did, how long that took, and about how long the others will take."""
+    started = before = time.perf_counter()
+    done = 0
+
+    def report(name: str, summary: Mapping[str, Any]) -> None:
+        nonlocal before, done
+        took, before = time.perf_counter() - before, time.perf_counter()
+        done += 1
+        left = (before - started) / done * (policies - done)
+        more = f"; {done} of {policies}, left {duration(left)}" if done < policies else ""
+        say(f"{describe(name, summary)}   ({took:.1f} s{more})")
+
+    return report
 
 
 def _of_run(agent: Agent, options: Options) -> dict[str, Any]:

@@ -7,6 +7,7 @@ the top of a checkout is this one.
 from __future__ import annotations
 
 import re
+import warnings
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -104,7 +105,7 @@ def _hydra() -> Iterator[None]:
     """Hydra at these files.
 
     Raises:
-        UserError: A file is not YAML.
+        UserError: A file is not YAML, or a folder of ``hydra.searchpath`` is not there, which Hydra only warns of.
     """
     import hydra
     import yaml
@@ -112,8 +113,15 @@ def _hydra() -> Iterator[None]:
 
     GlobalHydra.instance().clear()
     try:
-        with hydra.initialize_config_dir(str(FOLDER), version_base="1.3"):
-            yield
+        with warnings.catch_warnings():
+            warnings.filterwarnings("error", r"provider=hydra\.searchpath .* is not available", UserWarning)
+            with hydra.initialize_config_dir(str(FOLDER), version_base="1.3"):
+                yield
+    except UserWarning as error:
+        folder = str(error).partition(" path=")[2].removesuffix(" is not available.")
+        raise UserError(
+            f"hydra.searchpath: {folder}: no such folder; looked for from {Path.cwd()}"
+        ) from error
     except yaml.MarkedYAMLError as error:
         mark = error.problem_mark
         where = f"{mark.name}, line {mark.line + 1}" if mark else "a configuration file"

@@ -26,7 +26,7 @@ from franka_wm.envs.camera import Camera, as_torch, camera_framing
 from franka_wm.envs.config import FrankaConfig
 from franka_wm.envs.frames import FrameStack
 from franka_wm.envs.simulation import Simulation
-from franka_wm.envs.specs import LOST, MARKS, goals_given, observation_spec
+from franka_wm.envs.specs import LOST, MARKS, check_state, goals_given, observation_spec
 from franka_wm.envs.start import check_arguments, check_robot, check_task
 from franka_wm.envs.tasks import Task, goal_distance
 from franka_wm.errors import UserError
@@ -254,13 +254,10 @@ class FrankaEnv(EnvBase):
         own number: branches are alike until the first of them.
 
         Raises:
-            UserError: The state is of another config or number of worlds; nothing is changed then.
+            UserError: It is no state, or one of another config or number of worlds; nothing is changed then.
         """
         sim = self.simulation
-        if state.batch_size != self.batch_size:
-            raise UserError(
-                f"set_state: {tuple(state.batch_size)} worlds for {self.num_envs}; index or expand the state first"
-            )
+        check_state(state, self.batch_size)
         frames = {key: state.get(f"frames_{key}", None) for key in self._stacked}
         for key, stacked in frames.items():
             spec = self.observation_spec[key]

@@ -18,7 +18,7 @@ from torchrl.envs import EnvBase
 from franka_wm.device import resolve_device
 from franka_wm.envs.franka import FLAGS, FrankaEnv, own_seed
 from franka_wm.envs.multitask_config import MultiTaskConfig
-from franka_wm.envs.specs import MARKS
+from franka_wm.envs.specs import MARKS, check_state
 from franka_wm.envs.start import check_arguments
 from franka_wm.errors import UserError
 from franka_wm.seeding import derive_seed
@@ -232,8 +232,11 @@ class MultiTaskEnv(EnvBase):
         """Puts all worlds where :meth:`get_state` found them.
 
         Raises:
-            UserError: The state is of other tasks or numbers of worlds.
+            UserError: It is no state, or one of other tasks or numbers of worlds.
         """
+        check_state(state)
+        for name in state.keys():  # noqa: SIM118  (a TensorDict iterates over its worlds)
+            check_state(state.get(name))
         if set(state.keys()) != set(self.envs):
             raise UserError(
                 f"set_state: of {', '.join(map(str, state.keys()))}; these worlds are of {', '.join(self.envs)}"

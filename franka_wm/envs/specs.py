@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from typing import Any
 
 import torch
+from tensordict import TensorDictBase
 from torchrl.data import Binary, Bounded, Composite, Unbounded
 
 from franka_wm.envs.config import FrankaConfig
@@ -83,3 +84,19 @@ def goals_given(goal: Any, n: int, device: torch.device, lowest: float) -> torch
             f"set_goal: has a goal {low:.3g} m high; this task keeps them at {lowest:g} m or above"
         )
     return goals.expand(n, 3)
+
+
+def check_state(state: object, batch_size: torch.Size | None = None) -> None:
+    """Refuses what no ``get_state`` gave.
+
+    Raises:
+        UserError: No TensorDict, or, where ``batch_size`` is given, one of another number of worlds.
+    """
+    if not isinstance(state, TensorDictBase):
+        raise UserError(
+            f"set_state: got {type(state).__name__}; it must be the TensorDict that get_state() gives"
+        )
+    if batch_size is not None and state.batch_size != batch_size:
+        raise UserError(
+            f"set_state: {tuple(state.batch_size)} worlds for {batch_size.numel()}; index or expand the state first"
+        )

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from typing import Any, cast
 
@@ -192,7 +192,13 @@ class _Motion:
         succeeds = after.get("success").squeeze(-1)
         self.success = torch.where(running, succeeds, self.success)
         self.once |= running & succeeds
-        for name, value in self.task.measures(sim).items():
+        found: object = self.task.measures(sim)
+        if not isinstance(found, Mapping):
+            raise UserError(
+                f"{type(self.task).__name__}.measures gave {type(found).__name__}; it must give a dictionary, "
+                f"such as {{'height [m]': a tensor ({len(running)},)}}"
+            )
+        for name, value in found.items():
             if not isinstance(value, Tensor) or value.shape != running.shape:
                 given = tuple(value.shape) if isinstance(value, Tensor) else repr(value)
                 raise UserError(
@@ -236,9 +242,17 @@ def summarize(episodes: TensorDictBase, *, thresholds: Sequence[float] = THRESHO
         where there are distances and thresholds, else one rate each, as the task judges; ``task_success`` by task;
         ``return``; ``measures`` of the task's own, by name; ``path_length``, ``action_change``, ``jerk``, ``length``,
         each with its interval; and ``episodes``, the count.
+
+    Raises:
+        UserError: A return, or another number, is not finite.
     """
     present = {str(name): episodes.get(name).cpu() for name in episodes.keys()}  # noqa: SIM118
     count = episodes.numel()
+
+    def mean(name: str, values: Tensor, whose: str) -> dict[str, Any]:
+        if odd := int((~values.isfinite()).sum()):
+            raise UserError(f"{name}: not finite in {odd} of {count} episodes; mend the task's {whose}")
+        return bootstrap_mean(values).as_dict()
 
     def means(*names: str) -> dict[str, Any]:
         return {name: bootstrap_mean(present[name]).as_dict() for name in names if name in present}
@@ -250,7 +264,7 @@ def summarize(episodes: TensorDictBase, *, thresholds: Sequence[float] = THRESHO
         return {name: wilson(int(present[name].sum()), count).as_dict()} if name in present else {}
 
     own = present.get("measures", {})
-    own = {str(name): bootstrap_mean(own[name]).as_dict() for name in own.keys()}  # noqa: SIM118
+    own = {str(name): mean(str(name), own[name], "measures") for name in own.keys()}  # noqa: SIM118
     tasks = present.get("task_success", {})
     tasks = {str(name): tasks[name][~tasks[name].isnan()] for name in tasks.keys()}  # noqa: SIM118
     tasks = {name: wilson(int(x.sum()), len(x)).as_dict() for name, x in tasks.items() if len(x)}
@@ -259,7 +273,7 @@ def summarize(episodes: TensorDictBase, *, thresholds: Sequence[float] = THRESHO
         **rates("success", "final_distance"),
         **({"task_success": tasks} if tasks else {}),
         **rates("success_once", "closest_distance"),
-        **means("return"),
+        **({"return": mean("return", present["return"], "reward")} if "return" in present else {}),
         **({"measures": own} if own else {}),
         **means("path_length", "action_change", "jerk", "length"),
         "episodes": count,

@@ -5,8 +5,9 @@ file in `conf/planner` with `name:` and the constructor's arguments.
 """
 
 from collections.abc import Mapping
+from dataclasses import fields
 from importlib import import_module
-from inspect import signature
+from inspect import get_annotations, signature
 from typing import Any
 
 from franka_wm.errors import UserError
@@ -63,7 +64,7 @@ def register(name: str, cls: type, *, search: bool = False, line: str = "") -> N
 
     Raises:
         UserError: the package has this name, or the class has no `plan` that can be called as `Planner.plan` is
-            (no `search`, if it searches).
+            (no `search`, if it searches or is a `ContinuousPlanner`), or fields that no `@dataclass` reads.
     """
     refuse_ours(name, _PLANNERS)
     if isinstance(cls, type):  # else a function that makes one
@@ -124,9 +125,27 @@ def _check_class(name: str, cls: type, search: bool) -> None:
         raise UserError(f"{said}: has no {'search' if search else 'plan'}; see docs/planning.md")
     if search:
         return
+    _check_continuous(said, cls)
     try:
         signature(method).bind("self", "z", "next", "objective", **dict.fromkeys(PLAN_KEYWORDS))
     except TypeError as error:
         raise UserError(
             f"{said}: plan must take z, next, objective, and by keyword {', '.join(PLAN_KEYWORDS)}: {error}"
         ) from error
+
+
+def _check_continuous(said: str, cls: type) -> None:
+    """Refuses a subclass of `ContinuousPlanner` that has no search, or fields that its constructor does not take."""
+    from franka_wm.planning.base import ContinuousPlanner
+
+    if not issubclass(cls, ContinuousPlanner):
+        return
+    if cls.plan is ContinuousPlanner.plan and cls.search is ContinuousPlanner.search:
+        raise UserError(f"{said}: must define search(query), which plans; see docs/planning.md")
+    known = {one.name for one in fields(cls)}
+    own = [name for name, kind in get_annotations(cls).items() if "ClassVar" not in str(kind)]
+    if "__init__" not in vars(cls) and (unread := [name for name in own if name not in known]):
+        raise UserError(
+            f"{said}: write @dataclass(kw_only=True, eq=False) above the class: without it {', '.join(unread)} "
+            "cannot be set; see docs/planning.md"
+        )

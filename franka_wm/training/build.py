@@ -25,7 +25,7 @@ from franka_wm.envs.external import ExternalEnv
 from franka_wm.envs.external_config import ExternalConfig
 from franka_wm.envs.multitask_config import MultiTaskConfig
 from franka_wm.envs.tasks import make_task
-from franka_wm.errors import UserError
+from franka_wm.errors import UserError, place
 from franka_wm.planning import registry
 from franka_wm.planning.base import Planner
 from franka_wm.planning.mcts import MCTS
@@ -145,7 +145,7 @@ def make_model(
             name, **sizes, **actions, episode_length=spaces.episode_length, **further, **values
         )
     except (TypeError, ValueError, ModuleNotFoundError) as error:
-        raise UserError(f"model={name}: {error}") from error
+        raise UserError(f"model={name}: {error}{place(error)}") from error
     return model.to(device)
 
 
@@ -168,7 +168,7 @@ def make_planner(run: RunSettings, actions: int) -> Planner | MCTS:
     except (TypeError, ValueError) as error:
         if isinstance(error, UserError):
             raise
-        raise UserError(f"planner={name}: {error}") from error
+        raise UserError(f"planner={name}: {error}{place(error)}") from error
 
 
 def make_objective(run: RunSettings, model: WorldModel) -> Objective | None:

@@ -26,6 +26,7 @@ from franka_wm.interrupt import interruptible
 from franka_wm.models import WorldModel
 from franka_wm.policies.exploration import ActingPolicy
 from franka_wm.seeding import derive_seed, seeded
+from franka_wm.training.broken import odd_rewards, why
 from franka_wm.training.build import arm_of, explore
 from franka_wm.training.history import columns_of
 from franka_wm.training.learner import Learner
@@ -391,28 +392,24 @@ class Trainer:
         """Ends a run that cannot recover; waits for the device.
 
         Args:
-            weights: Look at them, too, not at losses and gradients alone.
+            weights: Look at them, too, not at rewards, losses and gradients alone.
 
         Raises:
             UserError: Something is not finite.
         """
-        broken = self.learner.broken()
-        if weights and not broken:
+        rewards = odd_rewards(self._batch)
+        broken = [] if rewards else self.learner.broken()
+        if weights and not (rewards or broken):
             kept = [x for x in self.model.state_dict().values() if isinstance(x, torch.Tensor)]
             finite = torch.stack([x.isfinite().all() for x in kept if x.is_floating_point()]).all()
             broken = [] if bool(finite) else ["weights"]
-        if not broken:
+        if not (rewards or broken):
             return
         latest, before = self.folder / "checkpoints" / "latest", self.settings.resume
         saved = "no checkpoint was written" + (f"; what it went on from is whole: {before}" if before else "")
         if latest.exists():
             saved = f"the last checkpoint before is whole: {latest}"
-        own = "whole_run" in self.settings.values and self.settings.trainer.lr is None  # of a first stage
-        raise UserError(
-            f"training broke: {', '.join(broken[:3])} not finite at update {self.learner.updates}; lower "
-            f"{'pretrain.model.lr' if own else 'trainer.lr'} ({self.learner.lr:g}) or trainer.grad_clip "
-            f"({self.learner.grad_clip:g}); {saved}"
-        )
+        raise UserError(f"training broke: {why(rewards, broken, self.learner, self.settings)}; {saved}")
 
     def moment(self) -> dict[str, object]:
         """Where worlds, policies and recorded windows stand."""

@@ -62,6 +62,14 @@ def test_what_cannot_be_is_one_line(words: list[str], said: str, mine: list[str]
         entry._run(lambda: pytest.fail("begun"), [*mine, *words])
     err = capsys.readouterr().err
     assert said in err and err.count("\n") == 1
+    for path in ("file://nowhere", "nowhere", "file://my presets/env/kitchen.yaml"):
+        with pytest.raises(SystemExit):
+            entry._run(
+                lambda: pytest.fail("begun"), ["device=cpu", "env=kitchen", f"hydra.searchpath=['{path}']"]
+            )
+        folder = path.removeprefix("file://")
+        said = f"error: hydra.searchpath: {folder}: no such folder; looked for from {Path.cwd()}\n"
+        assert capsys.readouterr().err == said
     with pytest.raises(SystemExit):
         entry._run(lambda: pytest.fail("begun"), ["--config-dir=nowhere"])
     assert capsys.readouterr().err == "error: --config-dir=nowhere: no such folder\n"
@@ -93,3 +101,23 @@ def test_a_preset_that_is_not_yaml_is_one_line_with_its_place(mine: list[str], c
     said = capsys.readouterr().err
     assert said.startswith("error: ") and f"{path.resolve()}, line 2: not YAML (mapping values" in said
     assert said.count("\n") == 1
+
+
+def test_what_an_experiment_of_ones_own_sets_at_the_top_counts(
+    mine: list[str], registries_as_before: None
+) -> None:
+    """Among it the modules to import: without them its task would not be known."""
+    Path("own_box.py").write_text(
+        "from franka_wm.envs.tasks import Reach, register\nregister('own_box', type('Box', (Reach,), {}))\n"
+    )
+    Path("my presets/experiment").mkdir()
+    Path("my presets/experiment/own.yaml").write_text(
+        "# @package _global_\nplugins: [own_box]\nseed: 7\nsize: smoke\nenv: {task: own_box}\n"
+    )
+    begun = []
+    words = [mine[0], "experiment=own", "device=cpu"]
+    entry._run(lambda: begun.append(entry.compose(sys.argv[2:])), words)
+    [cfg] = begun
+    assert cfg.plugins == ["own_box"] and (cfg.seed, cfg.size, cfg.env.task) == (7, "smoke", "own_box")
+    entry._run(lambda: begun.append(entry.compose(sys.argv[2:])), [*words, "seed=3"])
+    assert begun[-1].seed == 3

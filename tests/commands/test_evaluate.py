@@ -99,6 +99,41 @@ def test_what_was_played_is_kept_when_the_rest_is_interrupted(
     assert kept("episodes=7")["protocol"]["episodes"] == 7  # of earlier weights
 
 
+def test_what_is_stopped_says_what_was_written(tmp_path: Path, capsys, monkeypatch) -> None:
+    (tmp_path / "run" / "checkpoints").mkdir(parents=True)
+    file = tmp_path / "run" / "evaluation" / "evaluation.json"
+
+    def stopped(writes: bool) -> str:
+        def run(_: object) -> None:
+            if writes:
+                file.parent.mkdir(exist_ok=True)
+                file.write_text("{}")
+            raise KeyboardInterrupt
+
+        monkeypatch.setattr(evaluate_checkpoint, "run", run)
+        assert cli.main(["evaluate", str(tmp_path / "run")]) == 130
+        return capsys.readouterr().out
+
+    monkeypatch.setattr("franka_wm.commands.evaluate.check_run", lambda *_: None)
+    assert stopped(False) == "stopped; nothing was written\n"
+    assert f"stopped; {file.parent} has the results of all episodes, not those of the diag" in stopped(True)
+    assert (
+        stopped(False)
+        == f"stopped; nothing was written; the result that was in {file.parent} is still there\n"
+    )
+
+
+def test_each_policy_says_how_long_it_took_and_what_is_left(capsys, monkeypatch) -> None:
+    now = iter((0.0, 4.0, 4.0, 10.0, 10.0))
+    monkeypatch.setattr(evaluate_checkpoint.time, "perf_counter", lambda: next(now))
+    report = evaluate_checkpoint._progress(2)
+    for name in ("planner", "noop"):
+        report(name, {"return": {"mean": -1.0}})
+    first, last = capsys.readouterr().out.splitlines()
+    assert first == "  planner: return -1.00   (4.0 s; 1 of 2, left 0:04)"
+    assert last == "  noop: return -1.00   (6.0 s)"
+
+
 @pytest.mark.parametrize(
     ("arguments", "says"),
     [

@@ -89,20 +89,21 @@ def test_what_training_has_begun_to_log_stays(refused: Refused, tmp_path: Path) 
     assert (tmp_path / "run" / "train.log").is_file()
 
 
-@pytest.mark.parametrize("saved", [False, True])
-def test_what_is_stopped_says_what_there_is(saved: bool, refused: Refused, tmp_path: Path) -> None:
-    """Under Ctrl-C, with a module of one's own that going on needs, too."""
+@pytest.mark.parametrize("saved", [None, "", "pretrained"])
+def test_what_is_stopped_says_what_there_is(saved: str | None, refused: Refused, tmp_path: Path) -> None:
+    """Under Ctrl-C, in the first of two stages, too, with a module of one's own that going on needs, too."""
 
     def begin(folder: Path) -> None:
         Run.keep(None)  # type: ignore[arg-type]
-        if saved:
-            (folder / "checkpoints" / "latest").mkdir(parents=True)
+        if saved is not None:
+            (folder / saved / "checkpoints" / "latest").mkdir(parents=True)
 
     (tmp_path / "mine.py").touch()
     words = ("hydra.run.dir=run", "plugins=[mine]")
     said = refused(*words, error=KeyboardInterrupt(), status=130, first=begin)
     on = f"go on from what was saved: franka-wm train resume={tmp_path}/run 'plugins=[mine]'"
-    assert f"stopped; {on if saved else f'what was written is in {tmp_path}/run'}\n" in said
+    lost = f"there is no checkpoint to go on from yet; what was written is in {tmp_path}/run"
+    assert f"stopped; {lost if saved is None else on}\n" in said
 
 
 def test_a_file_of_the_users_stays(refused: Refused, tmp_path: Path) -> None:

@@ -53,6 +53,16 @@ def test_the_scale_of_an_experiment_goes_before_the_devices_and_the_users_before
     assert "some experiments of this sweep choose a scale" in capsys.readouterr().err
 
 
+def test_a_device_of_an_experiment_is_that_of_the_scale(monkeypatch, tmp_path: Path) -> None:
+    found = experiment(tmp_path, "mine", None)
+    with (tmp_path / "experiment" / "mine.yaml").open("a") as file:
+        file.write("device: cpu\n")
+    monkeypatch.setattr("torch.cuda.is_available", lambda: True)
+    for words in ((), ("scale=auto",)):
+        assert with_scale([found, "experiment=mine", *words])[-1] == "scale=laptop"
+    assert with_scale([found, "experiment=mine", "device=cuda"])[-1] == "scale=gpu"
+
+
 def test_a_scale_as_a_value_beside_numbers_of_another_is_refused(tmp_path: Path) -> None:
     found = experiment(tmp_path, "wrong", None)
     with (tmp_path / "experiment" / "wrong.yaml").open("a") as file:

@@ -136,6 +136,9 @@ def test_worlds_go_on_from_a_state(env) -> None:
     for a, expected in zip(actions()[2:4], first, strict=True):
         found = env.step(TensorDict({"action": a}, [5]))["next"]
         assert all(torch.equal(found[key], expected[key]) for key in ("state", "objects", "reward"))
+    for wrong in ({}, state.clone().set("push", torch.zeros(2))):
+        with pytest.raises(UserError, match="must be the TensorDict that get_state"):
+            env.set_state(wrong)
     with pytest.raises(UserError, match="these worlds are of reach, push"):
         env.set_state(state.exclude("push"))
     with pytest.raises(UserError, match="push has another number of worlds"):

@@ -5,7 +5,9 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -14,7 +16,7 @@ import torch
 import warp as wp
 
 from franka_wm.envs import FrankaConfig, FrankaEnv
-from franka_wm.envs.robots import load_robot
+from franka_wm.envs.robots import SOURCES, Source, load_robot
 from franka_wm.envs.scene import Scene
 from franka_wm.envs.start import _box, _hand, _link_frames, _overlap, check_robot, check_start
 from franka_wm.envs.tasks import Lift, Peg, Push, Task, TorchTask, register
@@ -250,6 +252,62 @@ def test_rewards_that_a_task_in_torch_does_not_have_are_refused(registries_as_be
     with pytest.raises(UserError, match="reward='sparse': must be one of dense"):
         FrankaConfig(task="mine", reward="sparse")
     assert not FrankaConfig(task="mine").fixed_goal
+
+
+# -- a robot of one's own -------------------------------------------------------------------------------------
+
+
+def test_a_robot_of_the_package_cannot_be_replaced() -> None:
+    before = SOURCES["embedded"]
+    for replace_it in (
+        lambda: SOURCES.__setitem__("embedded", Source(lambda config: Path())),
+        lambda: SOURCES.update(embedded=Source(lambda config: Path())),
+    ):
+        with pytest.raises(
+            UserError, match=r"^SOURCES\['embedded'\]: the package has this robot; choose another"
+        ):
+            replace_it()
+    assert SOURCES["embedded"] is before
+
+
+@pytest.mark.parametrize(
+    ("make", "says"),
+    [
+        (
+            lambda: SOURCES.__setitem__("mine", lambda config: Path()),
+            r"SOURCES\['mine'\]=<.*: must be Source\(",
+        ),
+        (
+            lambda: Source("arm.urdf"),
+            r"Source\('arm.urdf'\): must be a function .* \('arm.urdf' is not a callable",
+        ),
+        (
+            lambda: Source(lambda: Path()),
+            r"must be a function that .* for a FrankaConfig \(too many positional",
+        ),
+        (lambda: Source(lambda config: Path(), cell="fine"), r"cell='fine'\): must be a length in metres"),
+    ],
+)
+def test_what_is_no_robot_is_one_line(make: Callable[[], Any], says: str) -> None:
+    with pytest.raises(UserError, match=says):
+        make()
+    assert "mine" not in SOURCES
+
+
+@pytest.mark.parametrize(
+    ("given", "says"),
+    [
+        (None, "NoneType"),
+        (Path("no_such.urdf"), "'no_such.urdf'"),
+        ("<robot name='arm'/>", "\"<robot name='arm'/>\""),
+    ],
+)
+def test_a_robots_function_that_gives_no_file_is_named(given: object, says: str, monkeypatch) -> None:
+    monkeypatch.setitem(SOURCES, "mine", Source(lambda config: given))
+    with pytest.raises(
+        UserError, match=f"^robot=mine: its function in SOURCES gave {says}; it must give the path"
+    ):
+        FrankaEnv(FrankaConfig(robot="mine"), device="cpu")
 
 
 # -- what a name or a hand must not change --------------------------------------------------------------------

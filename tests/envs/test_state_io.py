@@ -144,6 +144,13 @@ def test_another_number_of_worlds_is_refused(env: FrankaEnv, random_actions) -> 
         refused(env, wrong)
 
 
+@pytest.mark.parametrize("wrong", [{}, None, torch.zeros(N)], ids=["dictionary", "nothing", "tensor"])
+def test_what_is_no_state_is_refused(env: FrankaEnv, wrong: Any) -> None:
+    refused(env, wrong)
+    with pytest.raises(UserError, match="must be the TensorDict that get_state"):
+        env.set_state(wrong)
+
+
 def test_a_missing_entry_is_refused(env: FrankaEnv, random_actions) -> None:
     env.reset(seed=8)
     state = env.get_state()

@@ -9,7 +9,7 @@ import pytest
 import torch
 from tensordict import TensorDictBase
 
-from franka_wm.envs import FrankaConfig, FrankaEnv, TransformedFrankaEnv
+from franka_wm.envs import FrankaConfig, FrankaEnv, TransformedFrankaEnv, tasks
 from franka_wm.envs.tasks import Reach, Task, TorchTask
 from franka_wm.errors import UserError
 
@@ -202,6 +202,45 @@ def test_a_function_of_another_shape_or_type_is_one_line(make, task: type[Task])
     ) as caught:
         env.step(env.reset().set("action", torch.zeros(N, 7)))
     assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("name", ["goal", "reward", "success"])
+@pytest.mark.parametrize("given", [None, 1.0], ids=["nothing", "a number"])
+def test_a_function_that_gives_no_tensor_is_one_line(make, name: str, given: float | None) -> None:
+    task = type("Wrong", (Wrong,), {name: lambda self, *_: given})
+    said = rf"^Wrong\.{name} gave {type(given).__name__}, not a tensor; for 4 worlds it must give \(4,"
+    with pytest.raises(UserError, match=said):
+        env = make(task=task)
+        env.step(env.reset().set("action", torch.zeros(N, 7)))
+
+
+def test_an_error_inside_a_function_is_the_tasks_own(make) -> None:
+    task = type("Wrong", (Wrong,), {"reward": lambda self, state, action: state[..., 99]})
+    env = make(task=task)
+    with pytest.raises(IndexError):
+        env.step(env.reset().set("action", torch.zeros(N, 7)))
+
+
+def test_a_constructor_that_a_run_cannot_call_is_refused_by_register() -> None:
+    def wants_more(self, config: FrankaConfig, more: int) -> None: ...
+
+    said = r"register\('mine', Mine\): Mine\(config\) builds it, .*\(missing a required argument: 'more'\)"
+    with pytest.raises(UserError, match=said):
+        tasks.register("mine", type("Mine", (Wrong,), {"__init__": wants_more}))
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "wanted"),
+    [
+        ("num_draws", "8", "a whole number of at least 0"),
+        ("reward_bounds", 3, "the least and the largest reward of a step"),
+        ("reward_bounds", (0.0, -1.0), "the least and the largest reward of a step"),
+        ("reward_bounds", ("a", "b"), "the least and the largest reward of a step"),
+    ],
+)
+def test_a_class_attribute_of_another_kind_is_one_line(name: str, value: object, wanted: str) -> None:
+    with pytest.raises(UserError, match=rf"^Mine\.{name}=.*: must be {wanted}"):
+        type("Mine", (Wrong,), {name: value})
 
 
 def test_hindsight_reads_the_objects_where_there_are_any(box) -> None:

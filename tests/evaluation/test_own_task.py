@@ -8,13 +8,14 @@ from types import ModuleType
 
 import pytest
 import torch
+from tensordict import NestedKey, TensorDict
 
 from franka_wm.commands.main import main
 from franka_wm.envs import FrankaConfig, FrankaEnv
 from franka_wm.envs.tasks import Reach, TorchTask, Track
 from franka_wm.errors import UserError
 from franka_wm.evaluation import diagnose, robustness
-from franka_wm.evaluation.closed_loop import play_episodes, success_distance
+from franka_wm.evaluation.closed_loop import play_episodes, success_distance, summarize
 from franka_wm.evaluation.protocol import (
     Evaluation,
     describe,
@@ -225,3 +226,18 @@ def test_a_measure_of_another_shape_is_named(given: object, said: str, env: Fran
     line = rf"RaiseTool\.measures gave 'height \[m\]' as {said}; it must be a tensor \(6,\), one number for each world"
     with pytest.raises(UserError, match=line):
         play_episodes(env, NoopPolicy(), seed=2)
+
+
+def test_measures_that_are_no_dictionary_are_named(env: FrankaEnv, monkeypatch) -> None:
+    monkeypatch.setattr(env.simulation.task, "measures", lambda sim: [1.0])
+    with pytest.raises(UserError, match=r"RaiseTool\.measures gave list; it must give a dictionary, such as"):
+        play_episodes(env, NoopPolicy(), seed=2)
+
+
+@pytest.mark.parametrize(("name", "mend"), [("return", "reward"), (("measures", "a"), "measures")])
+def test_what_is_not_finite_is_named(name: NestedKey, mend: str) -> None:
+    episodes = TensorDict({"return": torch.zeros(3), "measures": {"a": torch.zeros(3)}}, batch_size=[3])
+    episodes[name] = torch.tensor([0.0, torch.inf, torch.nan])
+    label = name if isinstance(name, str) else name[-1]
+    with pytest.raises(UserError, match=rf"^{label}: not finite in 2 of 3 episodes; mend the task's {mend}"):
+        summarize(episodes)

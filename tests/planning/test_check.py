@@ -1,6 +1,7 @@
 """A planner of one's own is held against what `Planner` promises."""
 
-from typing import Any
+from dataclasses import dataclass
+from typing import Any, ClassVar
 
 import pytest
 import torch
@@ -8,6 +9,7 @@ from tensordict import TensorDict
 
 from franka_wm.errors import UserError
 from franka_wm.planning import CEM, ICEM, MPPI, GradientPlanner, registry
+from franka_wm.planning.base import ContinuousPlanner
 from franka_wm.planning.check import check_planner
 
 SIZES = {"action_dim": 3, "horizon": 4, "num_samples": 8, "iterations": 2}
@@ -154,6 +156,37 @@ def test_what_cannot_plan_is_not_registered(registered):
         with pytest.raises(UserError, match=says):
             registry.register(name, cls, search=search)
     assert set(registry._REGISTERED) == {"function"}
+
+
+def test_a_continuous_planner_says_what_it_lacks(registered):
+    class Idle(ContinuousPlanner):
+        pass
+
+    class Undecorated(ContinuousPlanner):
+        spread: float = 0.5
+        names: ClassVar = ()
+
+        def search(self, query):
+            return query
+
+    @dataclass(kw_only=True, eq=False)
+    class Own(Idle):
+        spread: float = 0.5
+
+        def search(self, query):
+            return query
+
+    for cls, says in (
+        (
+            Undecorated,
+            r"Undecorated\): write @dataclass\(kw_only=True, eq=False\) .* without it spread cannot be set",
+        ),
+        (Idle, r"Idle\): must define search\(query\), which plans; see docs/planning.md"),
+    ):
+        with pytest.raises(UserError, match=says):
+            registry.register("own", cls)
+    registry.register("own", Own)
+    registry.register("child", type("Child", (Own,), {}))  # no fields of its own: nothing is missing
 
 
 def test_an_unknown_planner_may_be_of_ones_own():

@@ -11,7 +11,7 @@ from types import SimpleNamespace
 
 import pytest
 import torch
-from tensordict import TensorDict
+from tensordict import TensorDict, TensorDictBase
 
 from franka_wm import processes
 from franka_wm.envs import FrankaEnv
@@ -396,7 +396,24 @@ def test_a_first_stage_that_breaks_names_its_own_option(settled, tmp_path: Path)
     for more, names in (((), "pretrain.model.lr"), (("trainer.lr=1e-3",), "trainer.lr")):
         stage = settled(*words, "device=cpu", *more).first_stage()
         with pytest.raises(UserError, match=rf"; lower {names} \(0\.001\)"):
-            Trainer.require_finite(SimpleNamespace(learner=learner, folder=tmp_path, settings=stage))  # type: ignore[arg-type]
+            given = {"learner": learner, "folder": tmp_path, "settings": stage, "_batch": None}
+            Trainer.require_finite(SimpleNamespace(**given))  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("reward", [torch.nan, -torch.inf])
+def test_rewards_that_are_not_finite_are_not_blamed_on_the_learning_rate(make: Make, reward: float) -> None:
+    """Of -inf losses stay finite where a model clips its targets."""
+    trainer = make(updates=10)
+    draw = trainer._draw
+
+    def spoiled() -> TensorDictBase:
+        batch = draw()
+        batch["next", "reward"].fill_(reward)
+        return batch
+
+    trainer._draw = spoiled
+    with pytest.raises(UserError, match=r"broke: (\d+) of \1 rewards .* update 1; mend the reward of reach"):
+        trainer.fit()
 
 
 def test_weights_that_are_not_finite_are_not_saved(make: Make) -> None:

@@ -7,10 +7,12 @@ from __future__ import annotations
 
 import math
 import os
+from collections import UserDict
 from collections.abc import Callable
 from dataclasses import dataclass
 from importlib.metadata import PackageNotFoundError, distribution
 from importlib.resources import files
+from inspect import signature
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -18,6 +20,7 @@ import newton
 
 from franka_wm.envs.mesh_solids import INSTALL
 from franka_wm.errors import UserError
+from franka_wm.options import is_real
 
 if TYPE_CHECKING:
     from franka_wm.envs.config import FrankaConfig
@@ -40,10 +43,42 @@ class Source:
         find: From the config to the URDF file; raises ``UserError`` if it cannot be had.
         cell: Details of meshes smaller than this are not drawn [m]; 0 draws every triangle. ``None``: as the config's
             ``mesh_detail`` says, see :func:`detail`.
+
+    Raises:
+        UserError: ``find`` is no function of the config alone, or ``cell`` no length.
     """
 
     find: Callable[[FrankaConfig], Path]
     cell: float | None = None
+
+    def __post_init__(self) -> None:
+        try:
+            signature(self.find).bind("config")
+        except TypeError as error:
+            raise UserError(
+                f"Source({self.find!r}): must be a function that gives the path of a URDF for a FrankaConfig ({error})"
+            ) from error
+        if not (self.cell is None or (is_real(self.cell) and self.cell >= 0)):
+            raise UserError(f"Source(…, cell={self.cell!r}): must be a length in metres, 0 for all, or None")
+
+
+class Sources(UserDict[str, Source]):
+    """Robots by name; those of the package stay what they are.
+
+    Raises:
+        UserError: One of them would be replaced, or the value is no :class:`Source`.
+    """
+
+    def __setitem__(self, name: str, source: Source) -> None:
+        if not isinstance(source, Source):
+            raise UserError(f"SOURCES[{name!r}]={source!r}: must be Source(FUNCTION), see docs/robots.md")
+        if name in OURS and self.get(name, source) is not source:
+            raise UserError(f"SOURCES[{name!r}]: the package has this robot; choose another name")
+        super().__setitem__(name, source)
+
+
+OURS = ("embedded", "newton_asset", "panda_meshes", "panda_meshes_full", "urdf")
+"""Robots of the package."""
 
 
 def embedded(config: FrankaConfig) -> Path:
@@ -89,13 +124,15 @@ def urdf(config: FrankaConfig) -> Path:
     raise UserError("robot=urdf needs urdf_path=…, the URDF to load; or use robot=embedded")
 
 
-SOURCES: dict[str, Source] = {
-    "embedded": Source(embedded),
-    "newton_asset": Source(newton_asset),
-    "panda_meshes": Source(panda_meshes),
-    "panda_meshes_full": Source(panda_meshes, cell=0.0),
-    "urdf": Source(urdf),
-}
+SOURCES = Sources(
+    {
+        "embedded": Source(embedded),
+        "newton_asset": Source(newton_asset),
+        "panda_meshes": Source(panda_meshes),
+        "panda_meshes_full": Source(panda_meshes, cell=0.0),
+        "urdf": Source(urdf),
+    }
+)
 """The robots that ``robot=`` takes."""
 
 
@@ -106,7 +143,14 @@ def urdf_source(config: FrankaConfig, urdf_path: str | Path | None) -> Path:
         UserError: If it does not exist or cannot be had; the message names the alternatives.
     """
     if urdf_path is None:
-        return SOURCES[config.robot].find(config)
+        found: object = SOURCES[config.robot].find(config)
+        if not isinstance(found, str | Path) or not os.path.isfile(found):
+            given = repr(str(found)) if isinstance(found, str | Path) else type(found).__name__
+            raise UserError(
+                f"robot={config.robot}: its function in SOURCES gave {given}; it must give the path of a URDF file "
+                "that is there"
+            )
+        return Path(found)
     if not isinstance(urdf_path, str | Path) or not urdf_path:
         raise UserError(f"urdf_path={urdf_path!r}: must be the path of a URDF, or null")
     path = Path(urdf_path).expanduser()

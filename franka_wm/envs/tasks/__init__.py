@@ -6,6 +6,7 @@ batched tensors; ``docs/tasks.md`` walks through both. :func:`register` gives it
 
 from __future__ import annotations
 
+from inspect import signature
 from typing import TYPE_CHECKING
 
 from franka_wm.envs.tasks.base import Task
@@ -83,13 +84,21 @@ def register(name: str, task: type[Task]) -> None:
         task: Built with the config alone.
 
     Raises:
-        UserError: It is not a subclass of :class:`Task`, lacks what a task must define, or has other ``own_options``
-            than those that tasks of the package read; or the package has the name.
+        UserError: It is not a subclass of :class:`Task`, lacks what a task must define, cannot be built with the
+            config alone, or has other ``own_options`` than those that tasks of the package read; or the package has
+            the name.
     """
     if not (isinstance(task, type) and issubclass(task, Task)):
         raise UserError(f"register({name!r}, {task!r}): must be a class, a subclass of Task or TorchTask")
     refuse_ours(name, _BUILT_IN)
     task.check_defined()
+    try:
+        signature(task).bind("config")
+    except TypeError as error:
+        raise UserError(
+            f"register({name!r}, {task.__name__}): {task.__name__}(config) builds it, and its constructor asks for "
+            f"other arguments ({error}); give those a default"
+        ) from error
     for option in task.own_options:
         if option not in (known := own_options()):
             raise UserError(

@@ -15,6 +15,7 @@ from franka_wm.envs.constants import NUM_JOINTS
 from franka_wm.envs.scene import Scene
 from franka_wm.envs.task_options import check_defaults
 from franka_wm.errors import UserError
+from franka_wm.options import check_whole, is_real
 
 if TYPE_CHECKING:
     from franka_wm.envs.config import FrankaConfig
@@ -75,6 +76,20 @@ class Task:
                 raise UserError(
                     f"{cls.__name__}.{name}={words!r}: must be a tuple of words, such as {getattr(Task, name)}{hint}"
                 )
+        draws, bounds = vars(cls).get("num_draws", 0), vars(cls).get("reward_bounds")
+        if not hasattr(draws, "__get__"):  # a property says it later
+            check_whole(f"{cls.__name__}.num_draws", draws, least=0)
+        ordered = (
+            isinstance(bounds, tuple | list)
+            and len(bounds) == 2
+            and all(map(is_real, bounds))
+            and bounds[0] < bounds[1]
+        )
+        if not (ordered or bounds is None or hasattr(bounds, "__get__")):
+            raise UserError(
+                f"{cls.__name__}.reward_bounds={bounds!r}: must be the least and the largest reward of a step, such as "
+                "(-1.0, 0.0), or None"
+            )
         if cls.scene is not None:
             cls.scene = Scene.of(cls.scene)
         if cls.home is not None and len(cls.home) != NUM_JOINTS:

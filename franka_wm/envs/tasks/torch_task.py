@@ -106,15 +106,19 @@ class TorchTask(Task):
         t.success.copy_(success.unsqueeze(-1))
 
     def _checked(
-        self, name: str, value: torch.Tensor, shape: tuple[int, ...], *, boolean: bool = False
+        self, name: str, value: object, shape: tuple[int, ...], *, boolean: bool = False
     ) -> torch.Tensor:
-        right = value.dtype == torch.bool if boolean else value.dtype.is_floating_point
-        if value.shape != shape or not right:
-            raise UserError(
-                f"{type(self).__name__}.{name} gave {tuple(value.shape)} {value.dtype}; for {shape[0]} worlds it must "
-                f"give {shape} {'bool' if boolean else 'float'}"
-            )
-        return value.detach()
+        if isinstance(value, torch.Tensor):
+            right = value.dtype == torch.bool if boolean else value.dtype.is_floating_point
+            if value.shape == shape and right:
+                return value.detach()
+            given = f"{tuple(value.shape)} {value.dtype}"
+        else:
+            given = f"{type(value).__name__}, not a tensor"
+        raise UserError(
+            f"{type(self).__name__}.{name} gave {given}; for {shape[0]} worlds it must "
+            f"give {shape} {'bool' if boolean else 'float'}"
+        )
 
 
 def _seen(state: torch.Tensor, objects: torch.Tensor | None) -> torch.Tensor:

@@ -35,6 +35,25 @@ def test_as_many_worlds_as_episodes_are_missing(tmp_path: Path, capsys, monkeypa
     assert [session["episodes"] for session in sessions] == [3, 2, 1, 2] and episodes_there(out) == 8
 
 
+def test_ctrl_c_twice_says_what_is_left(tmp_path: Path, capsys, monkeypatch) -> None:
+    """As where the second one comes while the dataset is finished, and before there was anything."""
+
+    def stop(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    words = ["collect", f"out={tmp_path / 'set'}", "episodes=3", "shard_frames=1", *ARM]
+    with monkeypatch.context() as patch:
+        patch.setattr("franka_wm.data.lerobot.writer.DatasetWriter.finish", stop)
+        assert main(words) == 130
+    said = capsys.readouterr().out.splitlines()[-1]
+    assert said.startswith("stopped at once; 3 whole episodes are kept, no dataset was made of what is in ")
+    assert said.endswith(f"{tmp_path / 'set.writing'}; go on with resume=true")
+    assert main([*words, "resume=true"]) == 0 and episodes_there(tmp_path / "set") == 3
+    monkeypatch.setattr(verb, "open_source", lambda *_, **__: stop())
+    assert main([*words[:1], f"out={tmp_path / 'other'}", *words[2:]]) == 130
+    assert capsys.readouterr().out.splitlines()[-1] == "stopped; nothing was written"
+
+
 def test_a_kill_while_the_dataset_moves_leaves_its_episodes_counted_once(tmp_path: Path) -> None:
     out, working = tmp_path / "set", tmp_path / "set.writing"
     assert main(["collect", f"out={out}", "episodes=2", *ARM]) == 0

@@ -1,0 +1,34 @@
+"""Why training broke, in words: rewards first, since what they spoil looks as if the learning rate were too high."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from tensordict import TensorDictBase
+
+from franka_wm.training.learner import Learner
+from franka_wm.training.settings import RunSettings
+
+
+def odd_rewards(batch: TensorDictBase | None) -> str:
+    """``3 of 64 rewards`` of a batch that are not finite; empty if all are. Waits for the device."""
+    reward = None if batch is None else batch.get(("next", "reward"), None)
+    odd = 0 if reward is None else int((~reward.isfinite()).sum())
+    return "" if reward is None or not odd else f"{odd} of {reward.numel()} rewards"
+
+
+def why(rewards: str, broken: Sequence[str], learner: Learner, settings: RunSettings) -> str:
+    """What is not finite, and what to change.
+
+    Args:
+        rewards: As :func:`odd_rewards` says them.
+        broken: What else is not finite.
+    """
+    at = f"not finite at update {learner.updates}"
+    if rewards:
+        return f"{rewards} of a batch {at}; mend the reward of {settings.env.label}: whatever learns from it breaks"
+    own = "whole_run" in settings.values and settings.trainer.lr is None  # of a first stage
+    return (
+        f"{', '.join(broken[:3])} {at}; lower {'pretrain.model.lr' if own else 'trainer.lr'} ({learner.lr:g}) or "
+        f"trainer.grad_clip ({learner.grad_clip:g})"
+    )
