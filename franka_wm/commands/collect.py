@@ -96,6 +96,8 @@ def _stopped_at_once(out: str) -> int:
             f"stopped at once; {episodes_there(out)} whole episodes are kept, no dataset was made of what is in "
             f"{working}; go on with resume=true"
         )
+    elif Path(out).exists():
+        say(f"stopped at once; the dataset in {out} is whole")
     else:
         say("stopped; nothing was written")
     return INTERRUPTED

@@ -120,7 +120,7 @@ def _hydra() -> Iterator[None]:
     except UserWarning as error:
         folder = str(error).partition(" path=")[2].removesuffix(" is not available.")
         raise UserError(
-            f"hydra.searchpath: {folder}: no such folder; looked for from {Path.cwd()}"
+            f"hydra.searchpath: {folder}: no such folder (looked for from {Path.cwd()}), and no such package"
         ) from error
     except yaml.MarkedYAMLError as error:
         mark = error.problem_mark

@@ -240,11 +240,12 @@ def summarize(episodes: TensorDictBase, *, thresholds: Sequence[float] = THRESHO
     Returns:
         What there is: ``final_distance`` [m]; ``success`` at the end and ``success_once`` at any step, by threshold
         where there are distances and thresholds, else one rate each, as the task judges; ``task_success`` by task;
-        ``return``; ``measures`` of the task's own, by name; ``path_length``, ``action_change``, ``jerk``, ``length``,
+        ``return``; ``measures`` of the task's own, by name, over the episodes where they are not NaN;
+        ``path_length``, ``action_change``, ``jerk``, ``length``,
         each with its interval; and ``episodes``, the count.
 
     Raises:
-        UserError: A return, or another number, is not finite.
+        UserError: A return is not finite, or a measure infinite.
     """
     present = {str(name): episodes.get(name).cpu() for name in episodes.keys()}  # noqa: SIM118
     count = episodes.numel()
@@ -264,7 +265,8 @@ def summarize(episodes: TensorDictBase, *, thresholds: Sequence[float] = THRESHO
         return {name: wilson(int(present[name].sum()), count).as_dict()} if name in present else {}
 
     own = present.get("measures", {})
-    own = {str(name): mean(str(name), own[name], "measures") for name in own.keys()}  # noqa: SIM118
+    own = {str(name): own[name][~own[name].isnan()] for name in own.keys()}  # noqa: SIM118
+    own = {name: mean(name, values, "measures") for name, values in own.items() if len(values)}
     tasks = present.get("task_success", {})
     tasks = {str(name): tasks[name][~tasks[name].isnan()] for name in tasks.keys()}  # noqa: SIM118
     tasks = {name: wilson(int(x.sum()), len(x)).as_dict() for name, x in tasks.items() if len(x)}

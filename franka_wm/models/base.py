@@ -11,6 +11,7 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor, nn
 
+from franka_wm.errors import UserError
 from franka_wm.models.groups import ParameterGroup, decay_groups
 from franka_wm.options import Bounds, check_arguments
 
@@ -241,12 +242,15 @@ class WorldModel(nn.Module):
         compiled = {name: torch.compile(getattr(self, name), dynamic=False) for name in parts}
 
         def of_parts(batch: TensorDictBase) -> TensorDict:
-            vars(self).update(compiled)  # what `loss` finds under these names, before the class's
+            own = vars(self)
+            before = {name: own[name] for name in compiled if name in own}
+            own.update(compiled)  # what `loss` finds under these names, before the class's
             try:
                 return loss(batch)
             finally:
                 for name in compiled:
-                    del vars(self)[name]
+                    own.pop(name, None)
+                own.update(before)
 
         return of_parts
 
@@ -254,7 +258,13 @@ class WorldModel(nn.Module):
     def _parts(cls) -> tuple[str, ...]:
         """`parts_of_loss` of the class that defines `loss`, or of a subclass that names its own."""
         owner = next(kind for kind in cls.__mro__ if {"loss", "parts_of_loss"}.intersection(vars(kind)))
-        return vars(owner).get("parts_of_loss", ())
+        parts = vars(owner).get("parts_of_loss", ())
+        missing = [name for name in parts if not hasattr(cls, name)]
+        if missing:
+            raise UserError(
+                f"{cls.__name__}.parts_of_loss names {missing[0]}, which is no method of the class"
+            )
+        return parts
 
     def rebuild_overrides(self) -> dict[str, Any]:
         """Constructor arguments that replace those which read other files or depend on the environment.

@@ -292,7 +292,9 @@ class Dreamer(ActorCritic):
         h = self._remember(earlier, batch[:, 0], embedded[0])
         seen.join(embedded)
         z, posterior = self._filter(h, embedded, action)  # (H+1, B, ...)
-        with side_stream(z, posterior, *observed, reward, terminated) as model:
+        # Also weights that were cast for this update alone.
+        read = (z, posterior, *observed, reward, terminated, *self.rssm.prior_head.parameters())
+        with side_stream(*read) as model:
             model_loss, model_metrics = self._model_loss(z, posterior, window, reward, terminated)
         imagined, actions = self._imagine(z.detach().flatten(0, 1))
         begun = torch.cat((torch.ones_like(reward[:1]), (~terminated).to(reward.dtype)))

@@ -29,9 +29,9 @@ def lowered(model: WorldModel, dtype: torch.dtype) -> Iterator[None]:
         if isinstance(layer, PRODUCTS)
         for name, weight in layer.named_parameters(recurse=False)
     ]
-    for parameters, name, weight in kept:
-        parameters[name] = weight.to(dtype)  # pyright: ignore[reportArgumentType]
     try:
+        for parameters, name, weight in kept:
+            parameters[name] = weight.to(dtype)  # pyright: ignore[reportArgumentType]
         yield
     finally:
         for parameters, name, weight in kept:

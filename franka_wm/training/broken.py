@@ -6,13 +6,15 @@ from collections.abc import Sequence
 
 from tensordict import TensorDictBase
 
+from franka_wm.models import WorldModel
 from franka_wm.training.learner import Learner
 from franka_wm.training.settings import RunSettings
 
 
-def odd_rewards(batch: TensorDictBase | None) -> str:
-    """``3 of 64 rewards`` of a batch that are not finite; empty if all are. Waits for the device."""
-    reward = None if batch is None else batch.get(("next", "reward"), None)
+def odd_rewards(model: WorldModel, steps: TensorDictBase | None) -> str:
+    """``3 of 64 rewards`` of steps that are not finite; empty if all are, or the model learns from none. It waits."""
+    learned = model.has_reward or model.has_value
+    reward = steps.get(("next", "reward"), None) if learned and steps is not None else None
     odd = 0 if reward is None else int((~reward.isfinite()).sum())
     return "" if reward is None or not odd else f"{odd} of {reward.numel()} rewards"
 
@@ -26,7 +28,7 @@ def why(rewards: str, broken: Sequence[str], learner: Learner, settings: RunSett
     """
     at = f"not finite at update {learner.updates}"
     if rewards:
-        return f"{rewards} of a batch {at}; mend the reward of {settings.env.label}: whatever learns from it breaks"
+        return f"{rewards} {at}; mend the reward of {settings.env.label}: whatever learns from it breaks"
     own = "whole_run" in settings.values and settings.trainer.lr is None  # of a first stage
     return (
         f"{', '.join(broken[:3])} {at}; lower {'pretrain.model.lr' if own else 'trainer.lr'} ({learner.lr:g}) or "

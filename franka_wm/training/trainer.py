@@ -397,7 +397,7 @@ class Trainer:
         Raises:
             UserError: Something is not finite.
         """
-        rewards = odd_rewards(self._batch)
+        rewards = odd_rewards(self.model, self._batch)
         broken = [] if rewards else self.learner.broken()
         if weights and not (rewards or broken):
             kept = [x for x in self.model.state_dict().values() if isinstance(x, torch.Tensor)]
@@ -405,6 +405,8 @@ class Trainer:
             broken = [] if bool(finite) else ["weights"]
         if not (rewards or broken):
             return
+        if self.env is not None and not rewards:  # of a batch before, perhaps
+            rewards = odd_rewards(self.model, self.replay.storage._storage)
         latest, before = self.folder / "checkpoints" / "latest", self.settings.resume
         saved = "no checkpoint was written" + (f"; what it went on from is whole: {before}" if before else "")
         if latest.exists():

@@ -68,7 +68,8 @@ def test_what_cannot_be_is_one_line(words: list[str], said: str, mine: list[str]
                 lambda: pytest.fail("begun"), ["device=cpu", "env=kitchen", f"hydra.searchpath=['{path}']"]
             )
         folder = path.removeprefix("file://")
-        said = f"error: hydra.searchpath: {folder}: no such folder; looked for from {Path.cwd()}\n"
+        there = f"(looked for from {Path.cwd()})"
+        said = f"error: hydra.searchpath: {folder}: no such folder {there}, and no such package\n"
         assert capsys.readouterr().err == said
     with pytest.raises(SystemExit):
         entry._run(lambda: pytest.fail("begun"), ["--config-dir=nowhere"])

@@ -262,6 +262,7 @@ def test_a_robot_of_the_package_cannot_be_replaced() -> None:
     for replace_it in (
         lambda: SOURCES.__setitem__("embedded", Source(lambda config: Path())),
         lambda: SOURCES.update(embedded=Source(lambda config: Path())),
+        lambda: SOURCES.__ior__({"embedded": Source(lambda config: Path())}),
     ):
         with pytest.raises(
             UserError, match=r"^SOURCES\['embedded'\]: the package has this robot; choose another"
@@ -273,6 +274,7 @@ def test_a_robot_of_the_package_cannot_be_replaced() -> None:
 @pytest.mark.parametrize(
     ("make", "says"),
     [
+        (lambda: Source(str), r"Source\(<class 'str'>\): must be a function that gives the path"),  # type: ignore[arg-type]
         (
             lambda: SOURCES.__setitem__("mine", lambda config: Path()),
             r"SOURCES\['mine'\]=<.*: must be Source\(",

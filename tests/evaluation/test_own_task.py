@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib
 import json
 from types import ModuleType
+from typing import Any
 
 import pytest
 import torch
@@ -234,10 +235,18 @@ def test_measures_that_are_no_dictionary_are_named(env: FrankaEnv, monkeypatch) 
         play_episodes(env, NoopPolicy(), seed=2)
 
 
-@pytest.mark.parametrize(("name", "mend"), [("return", "reward"), (("measures", "a"), "measures")])
-def test_what_is_not_finite_is_named(name: NestedKey, mend: str) -> None:
+def test_a_measure_that_does_not_apply_to_an_episode_is_left_out_there() -> None:
+    measures = {"a": torch.tensor([2.0, torch.nan, 4.0]), "b": torch.full((3,), torch.nan)}
+    found: Any = summarize(TensorDict({"measures": measures}, batch_size=[3]))
+    assert found["measures"].keys() == {"a"} and found["measures"]["a"]["mean"] == 3.0
+
+
+@pytest.mark.parametrize(
+    ("name", "mend", "odd"), [("return", "reward", torch.nan), (("measures", "a"), "measures", torch.inf)]
+)
+def test_what_is_not_finite_is_named(name: NestedKey, mend: str, odd: float) -> None:
     episodes = TensorDict({"return": torch.zeros(3), "measures": {"a": torch.zeros(3)}}, batch_size=[3])
-    episodes[name] = torch.tensor([0.0, torch.inf, torch.nan])
+    episodes[name] = torch.tensor([0.0, torch.inf, odd])
     label = name if isinstance(name, str) else name[-1]
     with pytest.raises(UserError, match=rf"^{label}: not finite in 2 of 3 episodes; mend the task's {mend}"):
         summarize(episodes)

@@ -301,6 +301,33 @@ def test_a_loss_of_a_subclass_is_compiled_as_a_whole(monkeypatch) -> None:
     assert Other(**options).compiled_loss() == "loss"
 
 
+def test_parts_that_an_instance_had_come_back_also_after_an_error(monkeypatch) -> None:
+    monkeypatch.setattr(torch, "compile", lambda function, **_: function)
+    options: dict[str, Any] = {"observation_sizes": {"state": 5}, "action_dim": 2, **PARTED["tdmpc2"]}
+    model: Any = models.make("tdmpc2", **options)
+    model._unroll = own = model._unroll
+    with pytest.raises((ValueError, KeyError, AttributeError)):
+        model.compiled_loss()(TensorDict({}, batch_size=[4, 3]))
+    assert vars(model).keys() & set(model.parts_of_loss) == {"_unroll"} and model._unroll is own
+
+
+def test_a_subclass_names_the_parts_of_its_own_loss(monkeypatch) -> None:
+    class Other(models.family("tdmpc2")):
+        parts_of_loss = ("_unroll",)
+
+        def loss(self, batch: TensorDict) -> TensorDict:
+            return TensorDict({"loss": self._unroll(batch)})
+
+    compiled: list[str] = []
+    monkeypatch.setattr(torch, "compile", lambda function, **_: compiled.append(function.__name__))
+    options: dict[str, Any] = {"observation_sizes": {"state": 5}, "action_dim": 2, **PARTED["tdmpc2"]}
+    Other(**options).compiled_loss()
+    assert compiled == ["_unroll"]
+    Other.parts_of_loss = ("_unrol",)
+    with pytest.raises(UserError, match=r"Other\.parts_of_loss names _unrol, which is no method"):
+        Other(**options).compiled_loss()
+
+
 def test_a_batch_in_new_memory_is_captured_anew() -> None:
     """A replay that grew draws into other memory; frames of goals are views there, which nothing can be copied into."""
     learner = Learner(Line())

@@ -384,22 +384,6 @@ def test_a_run_that_breaks_stops_and_keeps_the_last_whole_checkpoint(
     assert all(x.isfinite().all() for x in trainer.model.state_dict().values() if isinstance(x, torch.Tensor))
 
 
-def test_a_first_stage_that_breaks_names_its_own_option(settled, tmp_path: Path) -> None:
-    words = (
-        "env=reach_goal_image",
-        "model=action_world_model",
-        "planner=cem",
-        "pretrain=jepa",
-        "scale=smoke",
-    )
-    learner = SimpleNamespace(broken=lambda: ["loss"], updates=3, lr=1e-3, grad_clip=20.0)
-    for more, names in (((), "pretrain.model.lr"), (("trainer.lr=1e-3",), "trainer.lr")):
-        stage = settled(*words, "device=cpu", *more).first_stage()
-        with pytest.raises(UserError, match=rf"; lower {names} \(0\.001\)"):
-            given = {"learner": learner, "folder": tmp_path, "settings": stage, "_batch": None}
-            Trainer.require_finite(SimpleNamespace(**given))  # type: ignore[arg-type]
-
-
 @pytest.mark.parametrize("reward", [torch.nan, -torch.inf])
 def test_rewards_that_are_not_finite_are_not_blamed_on_the_learning_rate(make: Make, reward: float) -> None:
     """Of -inf losses stay finite where a model clips its targets."""

@@ -14,7 +14,7 @@ from importlib.metadata import PackageNotFoundError, distribution
 from importlib.resources import files
 from inspect import signature
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, Self
 
 import newton
 
@@ -54,7 +54,7 @@ class Source:
     def __post_init__(self) -> None:
         try:
             signature(self.find).bind("config")
-        except TypeError as error:
+        except (TypeError, ValueError) as error:  # ValueError: a built-in type
             raise UserError(
                 f"Source({self.find!r}): must be a function that gives the path of a URDF for a FrankaConfig ({error})"
             ) from error
@@ -68,6 +68,10 @@ class Sources(UserDict[str, Source]):
     Raises:
         UserError: One of them would be replaced, or the value is no :class:`Source`.
     """
+
+    def __ior__(self, others: Any) -> Self:
+        self.update(others)  # UserDict's own goes past `__setitem__`
+        return self
 
     def __setitem__(self, name: str, source: Source) -> None:
         if not isinstance(source, Source):

@@ -228,6 +228,7 @@ class Task:
     def measures(self, sim: Simulation) -> dict[str, torch.Tensor]:
         """What else evaluation reports, by names with their units: (N,) each, after a step; the episode's last counts.
 
+        NaN: it does not apply to this episode, which the mean then leaves out.
         Computed with torch, outside the captured step, from ``sim.tensors.next_true_state`` (N, 20): finished worlds
         have been reset already.
         """

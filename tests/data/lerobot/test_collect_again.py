@@ -38,7 +38,7 @@ def test_as_many_worlds_as_episodes_are_missing(tmp_path: Path, capsys, monkeypa
 def test_ctrl_c_twice_says_what_is_left(tmp_path: Path, capsys, monkeypatch) -> None:
     """As where the second one comes while the dataset is finished, and before there was anything."""
 
-    def stop(*_: object) -> None:
+    def stop(*_: object, **__: object) -> None:
         raise KeyboardInterrupt
 
     words = ["collect", f"out={tmp_path / 'set'}", "episodes=3", "shard_frames=1", *ARM]
@@ -49,6 +49,13 @@ def test_ctrl_c_twice_says_what_is_left(tmp_path: Path, capsys, monkeypatch) -> 
     assert said.startswith("stopped at once; 3 whole episodes are kept, no dataset was made of what is in ")
     assert said.endswith(f"{tmp_path / 'set.writing'}; go on with resume=true")
     assert main([*words, "resume=true"]) == 0 and episodes_there(tmp_path / "set") == 3
+    with monkeypatch.context() as patch:  # after the dataset has its name
+        patch.setattr(verb, "_collect", stop)
+        assert main([*words, "resume=true"]) == 130
+    assert (
+        capsys.readouterr().out.splitlines()[-1]
+        == f"stopped at once; the dataset in {tmp_path / 'set'} is whole"
+    )
     monkeypatch.setattr(verb, "open_source", lambda *_, **__: stop())
     assert main([*words[:1], f"out={tmp_path / 'other'}", *words[2:]]) == 130
     assert capsys.readouterr().out.splitlines()[-1] == "stopped; nothing was written"
