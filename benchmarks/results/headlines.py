@@ -11,9 +11,14 @@ from benchmarks.results.records import PLACE, read
 from benchmarks.results.render import table
 from benchmarks.results.rows import Row
 from benchmarks.results.state import state, unmeasured
-from benchmarks.results.times import company, cores, duration, seconds, timed
+from benchmarks.results.times import cores, duration, seconds, timed
 
 BEGIN, END = "<!-- headlines: written by `make results` -->", "<!-- end of headlines -->"
+
+NOTES = {
+    "¹": "¹ Measured before changes of the code.",
+    "²": "² A setting was chosen after runs of these seeds.",
+}
 
 
 def headlines(rows: Mapping[str, Row], place: Path = PLACE) -> str:
@@ -28,8 +33,12 @@ def headlines(rows: Mapping[str, Row], place: Path = PLACE) -> str:
         measure, what = (SUCCESS, "success") if SUCCESS in columns(records) else (WITHIN["5"], "within 5 cm")
         worst = min(measure.of(record, policy) for record in records)
         timing = timed(records, beside=row.beside)
-        took = duration(mean([seconds(record) for record in timing])) + company(records, beside=row.beside)
+        took = duration(mean([seconds(record) for record in timing]))
         aged = kind == "stale" and confirmed(row, records, place) is None
         title = row.title + " ".join([*"¹" * aged, *"²" * row.chosen])
         found.append([title, cores(row, records), took, f"{worst:.0f} % {what}, {len(records)} seeds"])
-    return table(["task", "machine", "training", "worst seed"], found) + "\n" if found else ""
+    if not found:
+        return ""
+    titles = " ".join(title for title, *_ in found)
+    notes = [note for mark, note in NOTES.items() if mark in titles]
+    return "\n".join([table(["task", "machine", "training", "worst seed"], found), "", *notes, ""])

@@ -284,6 +284,7 @@ def test_readme_begins_with_the_worst_seed_of_rows_that_are_whole(tmp_path: Path
     assert "One fixed goal² |" in headlines({"reach": replace(row, chosen=True)}, tmp_path)
     assert headlines({"reach": replace(row, headline=False)}, tmp_path) == ""
     place(tmp_path, *(one | {"code": {**one["code"], "files": {"gone.py": "1"}}} for one in (lucky, poor)))
-    assert "One fixed goal¹ |" in headlines({"reach": row}, tmp_path)
+    aged = headlines({"reach": row}, tmp_path)
+    assert "One fixed goal¹ |" in aged and "¹ Measured before changes" in aged and "²" not in aged
     monkeypatch.setattr("benchmarks.results.headlines.confirmed", lambda *_: {"date": "2026-01-03"})
     assert "One fixed goal |" in headlines({"reach": row}, tmp_path)
