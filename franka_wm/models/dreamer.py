@@ -286,13 +286,13 @@ class Dreamer(ActorCritic):
         )
         window = window_of(batch, self.observation_keys).transpose(0, 1)
         observed = [window.get(key) for key in self.observation_keys]
-        # On CUDA what needs each other's inputs only runs side by side.
+        # On CUDA, parts that do not wait for each other's results run side by side.
         with side_stream(*observed) as seen:
             embedded = self._embed(window)
         h = self._remember(earlier, batch[:, 0], embedded[0])
         seen.join(embedded)
         z, posterior = self._filter(h, embedded, action)  # (H+1, B, ...)
-        # Also weights that were cast for this update alone.
+        # Its weights too: in low precision they were cast for this update alone, see `lowered`.
         read = (z, posterior, *observed, reward, terminated, *self.rssm.prior_head.parameters())
         with side_stream(*read) as model:
             model_loss, model_metrics = self._model_loss(z, posterior, window, reward, terminated)

@@ -44,6 +44,24 @@ def test_weights_of_products_are_cast_and_come_back() -> None:
     assert all(after[name] is weight for name, weight in before.items()) and after.keys() == before.keys()
 
 
+def test_weights_come_back_where_a_cast_fails(monkeypatch: pytest.MonkeyPatch) -> None:
+    """As where memory runs out after some of them."""
+    model, cast, calls = small(), torch.Tensor.to, []
+    before = dict(model.named_parameters())
+
+    def to(tensor: torch.Tensor, *kind: Any) -> torch.Tensor:
+        calls.append(kind)
+        if len(calls) == 3:
+            raise torch.OutOfMemoryError
+        return cast(tensor, *kind)
+
+    monkeypatch.setattr(torch.Tensor, "to", to)
+    with pytest.raises(torch.OutOfMemoryError), lowered(model, torch.bfloat16):
+        pass
+    after = dict(model.named_parameters())
+    assert all(after[name] is weight for name, weight in before.items()) and after.keys() == before.keys()
+
+
 def gradients(*, once: bool) -> dict[str, torch.Tensor]:
     model = small()
     torch.manual_seed(1)
