@@ -22,6 +22,7 @@ from torchrl.envs.transforms import (
     BatchSizeTransform,
     CatTensors,
     Compose,
+    DeviceCastTransform,
     DoubleToFloat,
     InitTracker,
     RewardSum,
@@ -93,14 +94,19 @@ class ExternalEnv(TransformedEnv):
             # Daemons end with this process, however it ends. It keeps its threads: TorchRL would take one for each
             # worker, and with fewer the learner is slower and rounds otherwise.
             keeps = {"daemon": True, "num_threads": torch.get_num_threads()}
-            base = ParallelEnv(workers, share, device=device, **keeps)
+            base = ParallelEnv(workers, share, device="cpu", **keeps)
             base.start()
             processes = list(base._workers)
             flat = BatchSizeTransform(reshape_fn=_flat)
             flat.enable_inv_on_reset = True  # masks of a reset, too
             base = TransformedEnv(base, flat)
         else:
-            base = SerialEnv(num_envs, make, device=device)
+            base = SerialEnv(num_envs, make, device="cpu")
+        # All entries of all worlds are copied at once: many small copies take longer than the worlds.
+        if device is not None and torch.device(device).type != "cpu" and not ray:
+            cast = DeviceCastTransform(device, orig_device="cpu")
+            cast.enable_inv_on_reset = True  # masks of a reset, too
+            transforms.append(cast)
         super().__init__(base, Compose(*transforms))
         self.config, self.num_envs = config, num_envs
         self._totals = torch.zeros(3, device=device)

@@ -58,7 +58,7 @@ class RSSM(nn.Module):
         self.of_codes = layer(codes * classes, hidden_dim)
         self.of_action = layer(action_dim, hidden_dim)
         self.mix = BlockLinear(deter_dim + 3 * hidden_dim * blocks, deter_dim, blocks)
-        self.mix_norm = nn.RMSNorm(deter_dim, eps=EPS)
+        self.mix_norm = RMSNorm(deter_dim, eps=EPS)
         self.gates = BlockLinear(deter_dim, 3 * deter_dim, blocks)
         self.prior_head = network(deter_dim, (hidden_dim, hidden_dim), codes * classes)
         self.posterior_head = network(deter_dim + embed_dim, (hidden_dim,), codes * classes)
@@ -124,6 +124,13 @@ EPS = 1e-4
 """Epsilon of the normalisations, as published."""
 
 
+class RMSNorm(nn.RMSNorm):
+    """In the precision of its weights under autocast, too: torch's one kernel takes no other."""
+
+    def forward(self, x: Tensor) -> Tensor:
+        return super().forward(x.to(self.weight.dtype))
+
+
 class BlockLinear(nn.Module):
     """Linear layer whose matrix has `blocks` blocks on its diagonal: (..., in_features) -> (..., out_features)."""
 
@@ -149,7 +156,7 @@ def layer(in_features: int, out_features: int) -> nn.Sequential:
     linear = Linear(in_features, out_features)
     spread(linear.weight, in_features)
     nn.init.zeros_(linear.bias)
-    return nn.Sequential(linear, nn.RMSNorm(out_features, eps=EPS), nn.SiLU())
+    return nn.Sequential(linear, RMSNorm(out_features, eps=EPS), nn.SiLU())
 
 
 def network(

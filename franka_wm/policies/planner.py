@@ -346,7 +346,8 @@ class PlannerPolicy(TensorDictModuleBase):
 class ModelPolicy(TensorDictModuleBase):
     """The policy network alone: observations in, `action` (E, A) out. No gradient is recorded.
 
-    Of a model with memory the last latent and the action taken in it travel along, as with `PlannerPolicy`.
+    Of a model with memory the last latent and the action taken in it travel along, as with `PlannerPolicy`. Decisions
+    are captured as graphs, as there.
 
     Args:
         encode: observation TensorDict -> latents (..., D).
@@ -354,7 +355,7 @@ class ModelPolicy(TensorDictModuleBase):
         observation_keys: what `encode` reads.
         observe: (observation, latent before, action, is_init) -> latents (E, D), of a model with memory.
         explore: True samples, False takes the mode; None follows TorchRL's exploration type.
-        model: see `PlannerPolicy`.
+        model, capture: see `PlannerPolicy`.
         goals: reads the images of the goal, for a policy towards goals.
     """
 
@@ -368,6 +369,7 @@ class ModelPolicy(TensorDictModuleBase):
         explore: bool | None = None,
         model: nn.Module | None = None,
         goals: GoalImage | None = None,
+        capture: bool | None = None,
     ) -> None:
         super().__init__()
         remembers = observe is not None
@@ -376,10 +378,13 @@ class ModelPolicy(TensorDictModuleBase):
         self.in_keys = [*observation_keys, *read, *(["is_init"] if remembers else [])]
         self.out_keys = ["action", *(CONTEXT if remembers else ())]
         self.encode, self.policy, self.explore, self.model = encode, policy, explore, model
-        self.observe = observe
+        self.observe, self.capture = observe, capture
+        self._graphs = GraphCache()
 
     @classmethod
-    def for_model(cls, model: WorldModel, *, explore: bool | None = None) -> ModelPolicy:
+    def for_model(
+        cls, model: WorldModel, *, explore: bool | None = None, capture: bool | None = None
+    ) -> ModelPolicy:
         """The policy of a model that has one, or its policy towards goals."""
         towards = None if model.has_policy else GoalGuide(model)
         return cls(
@@ -390,14 +395,33 @@ class ModelPolicy(TensorDictModuleBase):
             observe=model.observe if model.has_memory else None,
             explore=explore,
             model=model,
+            capture=capture,
         )
 
     @torch.no_grad()
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write `action`."""
+        read = (*self.in_keys, *(CONTEXT if self.observe is not None else ()))
+        inputs = TensorDict(
+            {key: value for key in read if (value := tensordict.get(key, None)) is not None},
+            batch_size=tensordict.batch_size,
+        )
+        explore = explores(self.explore)
+        if not captures(self.capture, inputs.get(self.in_keys[0])):
+            return tensordict.update(self._decide(inputs, explore))
+        training = None if self.model is None else self.model.training
+        decision = self._graphs(
+            lambda entries: self._decide(entries, explore),
+            inputs,
+            key=(explore, training, share_of_worlds()),
+            held=(self.encode, self.policy, self.observe, self.goals),
+        )
+        return tensordict.update(decision)
+
+    def _decide(self, tensordict: TensorDictBase, explore: bool) -> TensorDict:
+        """What the policy writes."""
         z = latent_of(tensordict, self.encode, self.observe)
         goal = () if self.goals is None else (self.goals.goal(tensordict),)
-        action = self.policy(z, *goal, deterministic=not explores(self.explore))
-        if self.observe is not None:
-            tensordict.set("context", z).set("context_action", action)
-        return tensordict.set("action", action)
+        action = self.policy(z, *goal, deterministic=not explore)
+        memory = {} if self.observe is None else {"context": z, "context_action": action}
+        return TensorDict({"action": action, **memory}, batch_size=tensordict.batch_size)

@@ -249,7 +249,7 @@ def make_policies(
         )
     goals = {*goal_images(model.image_sizes).values()}
     if model.has_policy or (model.has_goal_policy and set() < goals <= {*env.observation_spec.keys()}):
-        policies["policy"] = ModelPolicy.for_model(model)
+        policies["policy"] = ModelPolicy.for_model(model, capture=capture)
     return policies | make_scripted_policies(env, seed=seed, smoothness=smoothness)
 
 

@@ -124,14 +124,26 @@ def test_actions_that_no_model_chooses_are_one_line(actions: Any, monkeypatch: p
             make(config)
 
 
+def test_worlds_stay_on_the_cpu_and_their_entries_are_copied_at_once() -> None:
+    """With a device that every machine has in place of a GPU."""
+    device = torch.device("meta")
+    env = ExternalEnv(ExternalConfig(kind="gym", name="CartPole-v1"), num_envs=3, device=device)
+    assert (env.base_env.device, env.device) == (torch.device("cpu"), device)
+
+
 @pytest.mark.gpu
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
-def test_episodes_end_and_begin_on_the_gpu_as_on_the_cpu() -> None:
+@pytest.mark.parametrize("workers", [0, 1])
+def test_episodes_end_and_begin_on_the_gpu_as_on_the_cpu(workers: int) -> None:
     """The simulator stays on the CPU, also for the masks of a reset."""
     rollouts = []
     for device in ("cpu", "cuda"):
         env = ExternalEnv(
-            ExternalConfig(kind="gym", name="CartPole-v1"), num_envs=3, seed=1, device=torch.device(device)
+            ExternalConfig(kind="gym", name="CartPole-v1"),
+            num_envs=3,
+            seed=1,
+            device=torch.device(device),
+            workers=workers,
         )
         tensordict, rows = env.reset(), []
         for _ in range(30):
@@ -140,6 +152,7 @@ def test_episodes_end_and_begin_on_the_gpu_as_on_the_cpu() -> None:
             rows.append(step["next", "state"].cpu())
             assert step["next", "state"].device.type == tensordict["state"].device.type == device
         rollouts.append(torch.stack(rows))
+        env.close()
     torch.testing.assert_close(*rollouts)
 
 

@@ -12,7 +12,7 @@ from franka_wm import models
 from franka_wm.errors import CaptureError
 from franka_wm.planning import CEM, MCTS, MPPI
 from franka_wm.planning.objectives import ActionPenalty, GoalDistance, Sum
-from franka_wm.policies import PlannerPolicy, SearchPolicy, capture
+from franka_wm.policies import ModelPolicy, PlannerPolicy, SearchPolicy, capture
 from franka_wm.policies.capture import GraphCache
 from franka_wm.seeding import drawing_for
 
@@ -205,6 +205,28 @@ def test_a_policy_captures_anew_when_its_objective_changes(recorded, monkeypatch
     assert torch.equal(decide(), first) and len(recorded) == 3  # kept
 
 
+def test_an_actor_is_captured_anew_for_another_mode_or_share_of_the_worlds(recorded, monkeypatch):
+    monkeypatch.setattr("franka_wm.policies.planner.captures", lambda *_: True)
+    model = small_model()
+    actor, found = ModelPolicy.for_model(model, explore=False), []
+
+    def decide():
+        found.extend(actor(observation(4))["action"] for _ in range(3))
+        return len(recorded)
+
+    assert (decide(), decide()) == (1, 1)
+    with torch.no_grad():
+        for parameter in model.parameters():
+            parameter.add_(0.1)
+    assert decide() == 1 and not torch.equal(found[-1], found[0])  # it reads the weights of now
+    actor.explore = True
+    assert decide() == 2
+    model.eval()
+    assert decide() == 3
+    with drawing_for(0, 4, 8):
+        assert decide() == 4
+
+
 class Held:
     """Something that a graph reads from."""
 
@@ -272,6 +294,31 @@ def test_captured_plans_are_the_eager_ones(explore):
         for key in ("action", "plan"):
             torch.testing.assert_close(found[key], expected[key], rtol=1e-3, atol=1e-4)
     assert len(captured._graphs._graphs) == 1
+
+
+@pytest.mark.gpu
+@on_gpu
+@pytest.mark.parametrize("explore", [False, True])
+@pytest.mark.parametrize("name", ["tdmpc2", "dreamer"])
+def test_captured_actors_are_the_eager_ones(name, explore):
+    """Dreamer's carries its memory from decision to decision."""
+    model = small_model("cuda")
+    if name == "dreamer":
+        sizes = dict(deter_dim=16, hidden_dim=16, codes=3, classes=4, blocks=2, bins=41)
+        model = models.make(name, observation_sizes={"state": 6}, action_dim=2, discount=0.9, **sizes).cuda()
+    found = []
+    for wanted in (False, True):
+        actor, carried, actions = ModelPolicy.for_model(model, explore=explore, capture=wanted), None, []
+        for seed in range(6):
+            seen = observation(8, "cuda", seed)
+            if carried is not None:
+                seen.update(carried.select("context", "context_action", strict=False))
+            torch.manual_seed(seed)
+            carried = actor(seen)
+            actions.append(carried["action"])
+        found.append(torch.stack(actions))
+        assert len(actor._graphs._graphs) == int(wanted)
+    torch.testing.assert_close(found[1], found[0], rtol=1e-3, atol=1e-4)
 
 
 @pytest.mark.gpu
