@@ -4,7 +4,7 @@ import pytest
 import torch
 from torch.nn import functional as F
 
-from franka_wm.models.rssm import RSSM, BlockLinear, divergence, layer, network
+from franka_wm.models.rssm import RSSM, BlockLinear, RMSNorm, divergence, layer, network
 
 
 @pytest.fixture(autouse=True)
@@ -110,3 +110,12 @@ def test_first_weights_keep_the_size_of_what_passes_through():
         torch.testing.assert_close(weight.std().item(), std, rtol=0.05, atol=0)
         assert 1.8 * std < weight.amax() < 2.0 / 0.8796 * std and weight.amin() > -2.0 / 0.8796 * std
     assert not network(8, (4,), 4, scale=0.0)[-1].weight.any()
+
+
+def test_normalisation_of_low_precision_is_in_that_of_its_weights():
+    """Torch has one kernel for inputs and weights of one type; for others it warns, and rounds on the way."""
+    x = torch.randn(5, 8, dtype=torch.bfloat16)
+    norm = RMSNorm(8)
+    assert norm(x).dtype == torch.float32
+    assert torch.equal(norm(x), norm(x.float()))
+    assert isinstance(layer(3, 4)[1], RMSNorm) and isinstance(small().mix_norm, RMSNorm)
