@@ -96,6 +96,8 @@ class WorldModel(nn.Module):
     """Discount per step, of a family with reward or value."""
     terminates: bool = False
     """Whether `terminated` predicts ends of episodes."""
+    weight_decay: float = 0.0
+    """Of the optimiser, for matrices, see `parameter_groups`."""
 
     def __init_subclass__(cls, **kwargs: Any) -> None:
         super().__init_subclass__(**kwargs)
@@ -219,8 +221,8 @@ class WorldModel(nn.Module):
         """
 
     def parameter_groups(self, lr: float) -> list[ParameterGroup]:
-        """Groups of parameters for AdamW: all that are trained, without weight decay by default."""
-        return decay_groups(self.parameters(), lr, weight_decay=0.0)
+        """Groups for AdamW, of all that are trained: matrices with `weight_decay`, the rest without."""
+        return decay_groups(self.parameters(), lr, weight_decay=self.weight_decay)
 
     def after_update(self) -> None:
         """Move slow copies of weights, after each optimiser step; there are none by default."""

@@ -13,7 +13,6 @@ from torch.nn import functional as F
 
 from franka_wm.models.backbone import Backbone
 from franka_wm.models.base import summed
-from franka_wm.models.groups import ParameterGroup, decay_groups
 from franka_wm.models.history import FrameHistory, HistoryWorldModel
 from franka_wm.models.images import ImageSize, check_image_sizes, shared_image_size, stack_cameras
 from franka_wm.models.normalizer import ObservationNormalizer
@@ -195,10 +194,6 @@ class DINOWM(HistoryWorldModel):
                 "relative_error": prediction.detach() / unchanged.clamp_min(1e-12),
             }
         return TensorDict({"loss": summed(prediction, state), **metrics}, batch_size=[])
-
-    def parameter_groups(self, lr: float) -> list[ParameterGroup]:
-        """Groups for AdamW: the predictor and its embeddings; the encoder is in none."""
-        return decay_groups(self.parameters(), lr, weight_decay=self.weight_decay)
 
     # ------------------------------------------------------------------ pieces
 

@@ -13,7 +13,6 @@ from torch.nn import functional as F
 from franka_wm import processes
 from franka_wm.models.base import WorldModel, summed
 from franka_wm.models.ema import ema_update, frozen_copy
-from franka_wm.models.groups import ParameterGroup, decay_groups
 from franka_wm.models.images import (
     ImageSize,
     check_image_sizes,
@@ -282,10 +281,6 @@ class JEPA(WorldModel):
         if self.target_projector is not None and self.projector is not None:
             ema_update(self.target_projector, self.projector, self.ema())
         self.updates.add_(1.0)
-
-    def parameter_groups(self, lr: float) -> list[ParameterGroup]:
-        """Parameter groups for AdamW; the teacher is in none."""
-        return decay_groups(self.parameters(), lr, weight_decay=self.weight_decay)
 
     # ------------------------------------------------------------------ pieces
 

@@ -11,7 +11,6 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from franka_wm.errors import UserError
-from franka_wm.models.groups import ParameterGroup, decay_groups
 from franka_wm.models.history import FrameHistory, HistoryWorldModel
 from franka_wm.models.images import (
     ImageSize,
@@ -318,10 +317,6 @@ class LeWorldModel(HistoryWorldModel):
                 **{name: value.detach() for name, value in extra.items()},
             }
         return TensorDict({"loss": total, **metrics}, batch_size=[])
-
-    def parameter_groups(self, lr: float) -> list[ParameterGroup]:
-        """Groups for AdamW: matrices with weight decay, the rest without."""
-        return decay_groups(self.parameters(), lr, weight_decay=self.weight_decay)
 
     # ------------------------------------------------------------------ pieces
 

@@ -11,7 +11,6 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from franka_wm.errors import UserError
-from franka_wm.models.groups import ParameterGroup, decay_groups
 from franka_wm.models.images import ImageSize, check_images
 from franka_wm.models.layers import Linear, NormedLinear, SimNorm, TwoHotSymlog, initialize, mlp
 from franka_wm.models.returns import discount_per_step, n_step_returns, value_range
@@ -308,10 +307,6 @@ class MuZero(SimplicialWorldModel):
         return n_step_returns(
             reward, terminated, bootstrap, discount=self.discount, steps=self.n_step, ends=ends
         )
-
-    def parameter_groups(self, lr: float) -> list[ParameterGroup]:
-        """Groups for AdamW: matrices with weight decay, the rest without; one gradient norm."""
-        return decay_groups(self.parameters(), lr, weight_decay=self.weight_decay)
 
     # ------------------------------------------------------------------ pieces
 

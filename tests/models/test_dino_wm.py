@@ -50,6 +50,7 @@ def test_the_encoder_stays_as_it_is_and_needs_no_file_to_be_rebuilt(dots):
     trained = {id(p) for group in model.parameter_groups(1.0) for p in group["params"]}
     own = {id(p) for p in model.encoder.parameters()}
     assert not trained & own and trained | own == {id(p) for p in model.parameters()}
+    assert {g["weight_decay"] for g in small(weight_decay=0.3).parameter_groups(1.0)} == {0.3, 0.0}
     assert all(p.grad is not None for p in model.parameters() if p.requires_grad)
     again = small(**{**model.rebuild_overrides(), "grid": 2})
     again.load_state_dict(model.state_dict())

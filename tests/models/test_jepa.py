@@ -144,6 +144,7 @@ def test_the_teacher_follows_its_schedule(dots):
 def test_the_teacher_is_in_no_parameter_group_and_gets_no_gradient(dots):
     model = small(recipe="lejepa", collapse="ema")
     held = {id(p) for group in model.parameter_groups(1e-3) for p in group["params"]}
+    assert {g["weight_decay"] for g in small(weight_decay=0.3).parameter_groups(1.0)} == {0.3, 0.0}
     own = {id(p) for name, p in model.named_parameters() if not name.startswith("target_")}
     assert held == own
     before = copy.deepcopy(model.target_encoder.state_dict())
