@@ -12,7 +12,7 @@ from importlib import import_module
 from inspect import Parameter, signature
 from typing import TYPE_CHECKING, Any
 
-from franka_wm.errors import UserError
+from franka_wm.errors import UserError, trying
 from franka_wm.options import did_you_mean, refuse_ours
 
 if TYPE_CHECKING:
@@ -129,7 +129,10 @@ def make(name: str, **overrides: Any) -> WorldModel:
             f"{cls.__name__} takes no {', '.join(unknown)}; a run gives observation_sizes, image_sizes where there are "
             "images, action_dim or num_actions, episode_length, and what its conf/model file has"
         )
-    made = cls(**overrides)
+    with trying(
+        f"{cls.__name__}.__init__", TypeError, ValueError, ModuleNotFoundError
+    ):  # of these the run says more
+        made = cls(**overrides)
     check_model(made, action_dim=overrides.get("action_dim"))
     return made
 

@@ -3,11 +3,12 @@
 from functools import partial
 
 import torch
-from tensordict import TensorDict
-from torch import Tensor
+from tensordict import TensorDict, TensorDictBase
+from torch import Tensor, nn
 
 from franka_wm.errors import UserError, trying
 from franka_wm.models.base import WorldModel
+from franka_wm.models.groups import ParameterGroup
 
 
 @torch.no_grad()
@@ -25,6 +26,8 @@ def check_model(model: WorldModel, *, action_dim: int | None = None) -> None:
         UserError: one line: a method fails, or answers in another shape.
     """
     name, count = type(model).__name__, 3
+    if "_modules" not in vars(model):
+        raise UserError(f"{name}.__init__ must begin with super().__init__(), which is missing")
     modes = {part: part.training for part in model.modules()}
     vectors = {key: torch.zeros(count, size) for key, size in model.observation_sizes.items()}
     images = {key: torch.zeros(count, *size, dtype=torch.uint8) for key, size in model.image_sizes.items()}
@@ -37,6 +40,46 @@ def check_model(model: WorldModel, *, action_dim: int | None = None) -> None:
     finally:
         for part, training in modes.items():
             part.training = training  # what its constructor froze stays so
+
+
+def check_groups(model: WorldModel, groups: object) -> list[ParameterGroup]:
+    """What `parameter_groups` returned, if an optimiser can be built of it.
+
+    Raises:
+        UserError: one line: it is no list of dicts with `params`, or there is nothing to train.
+    """
+    name = f"{type(model).__name__}.parameter_groups"
+    if not isinstance(groups, list | tuple):
+        raise UserError(f"{name} must return a list of dicts with params, not {_shown(groups)}")
+    for group in groups:
+        params = group.get("params") if isinstance(group, dict) else None
+        # Not a generator: they are read more than once.
+        if not isinstance(params, list | tuple | nn.ParameterList) or not all(map(torch.is_tensor, params)):
+            raise UserError(f"{name}: each group must be a dict whose params is a list of parameters")
+    if not any(len(group["params"]) for group in groups):
+        raise UserError(f"{name}: there is no parameter to train")
+    return list(groups)
+
+
+def check_losses(model: WorldModel, losses: object) -> None:
+    """Whether what `loss` returned can be differentiated and logged; reads no value, so nothing waits.
+
+    Raises:
+        UserError: one line: it is no TensorDict with `loss`, an entry is no number, or `loss` has no gradient.
+    """
+    name = f"{type(model).__name__}.loss"
+    loss = losses.get("loss", None) if isinstance(losses, TensorDictBase) else None
+    if not isinstance(losses, TensorDictBase) or loss is None:
+        raise UserError(f"{name} must return a TensorDict: loss, and numbers to log (docs/models.md)")
+    for key, value in losses.items():
+        if not isinstance(value, Tensor) or value.numel() != 1:
+            raise UserError(
+                f"{name}: {key} must be one number (), not {_shown(value)}; take its mean, or leave it out"
+            )
+    if not loss.requires_grad:
+        raise UserError(
+            f"{name}: loss has no gradient; compute it without detach(), .item() and torch.no_grad()"
+        )
 
 
 def _ask(model: WorldModel, name: str, observation: TensorDict, action_dim: int | None) -> None:

@@ -13,6 +13,7 @@ from torch import nn
 from franka_wm import processes
 from franka_wm.console import announced
 from franka_wm.errors import UserError
+from franka_wm.models.check import check_groups, check_losses
 from franka_wm.models.precision import lowered
 from franka_wm.options import PRECISIONS
 from franka_wm.training.settings.groups import SCHEDULES
@@ -69,6 +70,7 @@ class Learner:
             raise UserError("schedule=cosine needs total_updates, at whose end the learning rate is zero")
         if not lr > 0 or not grad_clip > 0:
             raise UserError(f"lr={lr}, grad_clip={grad_clip}: both must be above 0")
+        groups = check_groups(model, model.parameter_groups(lr))
         self.model = model
         self.device = next(model.parameters()).device
         on_cuda = self.device.type == "cuda"
@@ -82,7 +84,6 @@ class Learner:
             for x in model.state_dict().values():
                 if isinstance(x, torch.Tensor):
                     processes.broadcast(x)
-        groups = model.parameter_groups(lr)
         self._clip_groups: dict[str, list[nn.Parameter]] = {}
         for group in groups:
             self._clip_groups.setdefault(group.get("clip", "model"), []).extend(group["params"])
@@ -190,10 +191,7 @@ class Learner:
         casts = torch.autocast(self.device.type, torch.bfloat16, enabled=low, cache_enabled=False)
         with casts, lowered(self.model, torch.bfloat16) if low else nullcontext():
             losses = self._loss(batch)
-        if not isinstance(losses, TensorDictBase) or losses.get("loss", None) is None:
-            raise UserError(
-                f"{type(self.model).__name__}.loss must return a TensorDict: loss, and numbers to log (docs/models.md)"
-            )
+        check_losses(self.model, losses)
         losses.get("loss").backward()
         processes.average_gradients(p for group in self._clip_groups.values() for p in group)
         values = {name: value for name, value in losses.items()}

@@ -115,6 +115,27 @@ def test_a_model_of_ones_own_is_tried_when_it_is_made(registered):
         models.make("own", **sizes, depth=3, size=2)
 
 
+def test_a_constructor_that_forgets_its_base_is_told_in_one_line(registered):
+    class Sizes(Own):
+        def __init__(self, *, observation_sizes, action_dim):
+            self.observation_sizes, self.action_dim = observation_sizes, action_dim
+
+    class Layers(Sizes):
+        def __init__(self, *, observation_sizes, action_dim):
+            self.encoder = nn.Linear(3, 4)
+
+    for cls, says in (
+        (Sizes, r"Sizes.__init__ must begin with super\(\).__init__\(\)"),
+        (
+            Layers,
+            r"Layers.__init__ fails: AttributeError: .* before Module.__init__\(\) call \(.*py, line \d+\)",
+        ),
+    ):
+        models.register("own", cls)
+        with pytest.raises(UserError, match=says):
+            models.make("own", observation_sizes={"state": 3}, action_dim=2)
+
+
 def test_what_is_no_whole_model_is_not_registered(registered):
     class Half(WorldModel):
         def loss(self, batch):

@@ -368,3 +368,52 @@ def test_a_loss_of_another_form_is_told_in_one_line():
             UserError, match=rf"{name}\.loss must return a TensorDict: loss, and numbers to log"
         ):
             Learner(cast(Any, model), lr=0.1).update(batch(1.0))
+
+
+@pytest.mark.parametrize(
+    ("entries", "says"),
+    [
+        (lambda loss: {"loss": loss.detach()}, "loss has no gradient; compute it without detach"),
+        (lambda loss: {"loss": loss.expand(4)}, r"loss must be one number \(\), not \(4,\); take its mean"),
+        (
+            lambda loss: {"loss": loss, "more": torch.ones(2, 3)},
+            r"more must be one number \(\), not \(2, 3\)",
+        ),
+    ],
+)
+def test_a_loss_that_cannot_be_learned_from_is_told_in_one_line(entries, says):
+    class Own(Line):
+        def loss(self, batch):
+            return TensorDict(entries(super().loss(batch)["loss"]), [])
+
+    with pytest.raises(UserError, match=rf"Own\.loss: {says}"):
+        Learner(Own(), lr=0.1).update(batch(1.0))
+
+
+@pytest.mark.parametrize(
+    ("groups", "says"),
+    [
+        (lambda w: None, " must return a list of dicts with params, not NoneType"),
+        (lambda w: {"params": [w]}, " must return a list of dicts with params, not dict"),
+        (lambda w: [w], ": each group must be a dict whose params is a list of parameters"),
+        (lambda w: [{"lr": 0.1}], ": each group must be a dict whose params"),
+        (
+            lambda w: [{"params": iter([w])}],
+            ": each group must be a dict whose params",
+        ),  # it can be read once
+        (lambda w: [{"params": ["w"]}], ": each group must be a dict whose params"),
+        (lambda w: [{"params": []}], ": there is no parameter to train"),
+    ],
+)
+def test_groups_of_no_parameters_are_told_in_one_line(groups, says):
+    class Own(Line):
+        def parameter_groups(self, lr):
+            return groups(self.w)
+
+    with pytest.raises(UserError, match=rf"Own\.parameter_groups{says}"):
+        Learner(Own())
+
+
+def test_a_model_without_parameters_is_told_in_one_line():
+    with pytest.raises(UserError, match=r"WorldModel\.parameter_groups: there is no parameter to train"):
+        Learner(models.WorldModel())
