@@ -1,14 +1,33 @@
 """Whether a model answers in the shapes that `WorldModel` promises, tried once on invented observations."""
 
 from functools import partial
+from inspect import Parameter, signature
 
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor, nn
 
 from franka_wm.errors import UserError, trying
-from franka_wm.models.base import WorldModel
+from franka_wm.models.base import ABILITIES, WorldModel
 from franka_wm.models.groups import ParameterGroup
+
+METHODS = (
+    *(
+        "encode",
+        "loss",
+        *(method for methods in ABILITIES.values() for method in methods),
+        "terminated",
+        "embed",
+    ),
+    *(
+        "set_observation_statistics",
+        "set_image_statistics",
+        "parameter_groups",
+        "after_update",
+        "rebuild_overrides",
+    ),
+)
+"""What others call of a model."""
 
 
 @torch.no_grad()
@@ -28,6 +47,8 @@ def check_model(model: WorldModel, *, action_dim: int | None = None) -> None:
     name, count = type(model).__name__, 3
     if "_modules" not in vars(model):
         raise UserError(f"{name}.__init__ must begin with super().__init__(), which is missing")
+    for method in METHODS:
+        _check_arguments(model, name, method)
     modes = {part: part.training for part in model.modules()}
     vectors = {key: torch.zeros(count, size) for key, size in model.observation_sizes.items()}
     images = {key: torch.zeros(count, *size, dtype=torch.uint8) for key, size in model.image_sizes.items()}
@@ -80,6 +101,22 @@ def check_losses(model: WorldModel, losses: object) -> None:
         raise UserError(
             f"{name}: loss has no gradient; compute it without detach(), .item() and torch.no_grad()"
         )
+
+
+def _check_arguments(model: WorldModel, name: str, method: str) -> None:
+    """Refuses a method that cannot be called as `WorldModel`'s: what has a default there is given by its name."""
+    wanted = [*signature(getattr(WorldModel, method)).parameters.values()][1:]
+    takes = signature(getattr(model, method))
+    named = {one.name: None for one in wanted if one.default is not Parameter.empty}
+    try:
+        takes.bind(*wanted[: len(wanted) - len(named)], **named)
+    except TypeError:
+        arguments, given = (
+            ", ".join(one.name for one in some) for some in (wanted, takes.parameters.values())
+        )
+        raise UserError(
+            f"{name}.{method} must take ({arguments}), not ({given}); see docs/models.md"
+        ) from None
 
 
 def _ask(model: WorldModel, name: str, observation: TensorDict, action_dim: int | None) -> None:

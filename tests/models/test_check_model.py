@@ -78,6 +78,34 @@ def test_what_a_model_answers_otherwise_is_told_in_one_line(wrong, says):
         check_model(own(wrong=wrong), action_dim=2)
 
 
+@pytest.mark.parametrize(
+    ("method", "wrong", "says"),
+    [
+        ("reward", lambda self, state: state, r"must take \(z, action\), not \(state\)"),
+        ("policy", lambda self, z: z, r"must take \(z, deterministic\), not \(z\)"),
+        ("loss", lambda self: None, r"must take \(batch\), not \(\)"),
+        ("parameter_groups", lambda self: [], r"must take \(lr\), not \(\)"),
+        ("after_update", lambda self, step: None, r"must take \(\), not \(step\)"),
+        ("set_observation_statistics", lambda self, mean: None, r"must take \(mean, std\), not \(mean\)"),
+    ],
+)
+def test_a_method_that_takes_other_arguments_is_told_in_one_line(method, wrong, says):
+    cls = type("Odd", (Own,), {method: wrong})
+    with pytest.raises(UserError, match=rf"Odd.{method} {says}; see docs/models.md"):
+        check_model(cls(observation_sizes={"state": 3}, action_dim=2), action_dim=2)
+
+
+def test_names_of_arguments_are_free_and_more_may_have_defaults():
+    class Free(Own):
+        def reward(self, *given, scale=1.0):
+            return scale * given[0][:, :1]
+
+        def value(self, latents):
+            return latents[:, :1]
+
+    check_model(Free(observation_sizes={"state": 3}, action_dim=2), action_dim=2)
+
+
 def test_what_its_constructor_froze_stays_frozen():
     for wrong in ("", "value"):
         model = own(wrong=wrong)
