@@ -23,7 +23,7 @@ def check_planner(planner: Any, *, action_dim: int, name: str = "") -> None:
     Raises:
         UserError: one line: it fails, gives the objective other shapes than (E, S, H+1, D) and (E, S, H, A), or returns
             other than a TensorDict with `action` (E, A) and `plan` (E, H, A), or several
-            such plans (E, …, H, A).
+            such plans (E, …, H, A), all of them finite.
     """
     name, envs, size = name or type(planner).__name__, 2, action_dim + 1
 
@@ -62,6 +62,9 @@ def check_planner(planner: Any, *, action_dim: int, name: str = "") -> None:
             plan if plan.ndim < 4 else plan.reshape(envs, -1, *plan.shape[-2:])[:, 0]
         )  # iCEM carries several
         _require(name, "plan", alone, (envs, horizon, action_dim), "(E, H, A)")
+        for what, x in (("action", found["action"]), ("plan", plan)):
+            if not bool(x.isfinite().all()):
+                raise UserError(f"planner {name}: {what} is not finite (NaN or inf); it must be in [−1, 1]")
         previous = plan
 
 

@@ -100,6 +100,20 @@ def test_what_a_planner_does_otherwise_is_told_in_one_line(planner, says):
         check_planner(planner, action_dim=3)
 
 
+@pytest.mark.parametrize("entry", ["action", "plan"])
+def test_what_is_not_finite_is_no_plan(entry):
+    class Odd(Middle):
+        def plan(self, z, next, objective, *, previous=None, **others):
+            found = super().plan(z, next, objective).clone()  # the action lies in the plan's memory
+            found[entry][-1, ..., 0] = float("nan" if previous is None else "inf")
+            return found
+
+    with pytest.raises(
+        UserError, match=rf"planner Odd: {entry} is not finite \(NaN or inf\); it must be in \[−1, 1\]"
+    ):
+        check_planner(Odd(action_dim=3), action_dim=3)
+
+
 @pytest.fixture
 def registered(monkeypatch):
     monkeypatch.setattr(registry, "_REGISTERED", {})
