@@ -2,13 +2,32 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 from tensordict import TensorDictBase
+from torch import Tensor
 
+from franka_wm.errors import UserError
 from franka_wm.models import WorldModel
 from franka_wm.training.learner import Learner
 from franka_wm.training.settings import RunSettings
+
+
+def finite(
+    moments: Mapping[str, tuple[Tensor, Tensor]], settings: RunSettings
+) -> Mapping[str, tuple[Tensor, Tensor]]:
+    """Mean and deviation of each observation that was gathered, as they are given. It waits.
+
+    Raises:
+        UserError: An observation was not finite, in any step.
+    """
+    odd = [key for key, of in moments.items() if not all(bool(x.isfinite().all()) for x in of)]
+    if odd:
+        raise UserError(
+            f"observation {' and '.join(odd)}: not finite (NaN or inf) in the first steps of {settings.env.label}; "
+            "mend what it observes, or the goal"
+        )
+    return moments
 
 
 def odd_rewards(model: WorldModel, steps: TensorDictBase | None) -> str:

@@ -26,7 +26,7 @@ from franka_wm.interrupt import interruptible
 from franka_wm.models import WorldModel
 from franka_wm.policies.exploration import ActingPolicy
 from franka_wm.seeding import derive_seed, seeded
-from franka_wm.training.broken import odd_rewards, why
+from franka_wm.training.broken import finite, odd_rewards, why
 from franka_wm.training.build import arm_of, explore
 from franka_wm.training.history import columns_of
 from franka_wm.training.learner import Learner
@@ -213,7 +213,7 @@ class Trainer:
         seen = {key: torch.cat([one.get(key).flatten(0, 1) for one in data]) for key in self._vectors}
         seen |= {key: data[0].get(key).flatten(0, 1) for key in self._standardized}
         own = {key: (*moments(x), len(x)) for key, x in seen.items()}
-        self.standardize({key: processes.pooled(*mine) for key, mine in own.items()})
+        self.standardize(finite({key: processes.pooled(*mine) for key, mine in own.items()}, self.settings))
 
     def standardize(self, statistics: Mapping[str, Sequence[torch.Tensor]]) -> None:
         """Lets the model see mean and deviation of its vector observations, and of images if it standardises them."""

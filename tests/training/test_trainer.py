@@ -147,6 +147,24 @@ def test_observations_are_standardized_by_the_seed_data(make: Make) -> None:
     torch.testing.assert_close(given[0][1], seen.std(0).clamp_min(1e-3))
 
 
+@pytest.mark.parametrize("standardize", [True, False])
+def test_an_observation_that_is_not_finite_is_named(make: Make, standardize: bool) -> None:
+    """Rather than the model's statistics, or a loss that no learning rate mends."""
+    trainer = make(standardize=standardize)
+    key = trainer._vectors[-1]
+    gather = trainer.gather
+
+    def one_odd() -> None:
+        gather()
+        trainer.replay.storage._storage.get(key)[0, 0, -1] = torch.nan
+
+    trainer.gather = one_odd  # type: ignore[method-assign]
+    with pytest.raises(
+        UserError, match=rf"observation {key}: not finite \(NaN or inf\) in the first steps of reach;"
+    ):
+        trainer.fit()
+
+
 def test_images_are_standardized_by_the_seed_data(make: Make, settled) -> None:
     cfg = settled(
         *("scale=smoke", "device=cpu", "env=reach_pixels", "env.frame_stack=2", "model=tdmpc2_pixels"),
