@@ -1,9 +1,10 @@
-"""Why training broke, in words: rewards first, since what they spoil looks as if the learning rate were too high."""
+"""Why training broke, and what to warn of: rewards first, since what they spoil looks like too high a learning rate."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 
+import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
@@ -36,6 +37,32 @@ def odd_rewards(model: WorldModel, steps: TensorDictBase | None) -> str:
     reward = steps.get(("next", "reward"), None) if learned and steps is not None else None
     odd = 0 if reward is None else int((~reward.isfinite()).sum())
     return "" if reward is None or not odd else f"{odd} of {reward.numel()} rewards"
+
+
+def beyond_bounds(model: WorldModel, steps: TensorDictBase | None, bounds: tuple[float, float] | None) -> str:
+    """Rewards of steps beyond ``reward_bounds``, to warn of; empty if there are none, or no bounds. It waits."""
+    reward = steps.get(("next", "reward"), None) if steps is not None else None
+    if reward is None or bounds is None or not (model.has_reward or model.has_value):
+        return ""
+    (least, largest), (low, high) = torch.stack(reward.aminmax()).tolist(), bounds
+    rounding = 1e-4 * (high - low)
+    if least >= low - rounding and largest <= high + rounding:
+        return ""
+    return (
+        f"rewards from {least:.4g} to {largest:.4g} go beyond reward_bounds=({low:g}, {high:g}), to which models fit "
+        "the range of their values; widen what the task declares"
+    )
+
+
+def clipped(metrics: Mapping[str, float]) -> str:
+    """How much a model clips of what it learns from, to warn of; empty if nothing."""
+    share = metrics.get("target_outside", 0.0)
+    if not share > 0.0:
+        return ""
+    return (
+        f"{100 * share:.2g} % of rewards and targets of values lie outside the model's range and are clipped to it; "
+        "widen model.value_low and model.value_high, or leave them at null"
+    )
 
 
 def why(rewards: str, broken: Sequence[str], learner: Learner, settings: RunSettings) -> str:

@@ -26,7 +26,7 @@ from franka_wm.interrupt import interruptible
 from franka_wm.models import WorldModel
 from franka_wm.policies.exploration import ActingPolicy
 from franka_wm.seeding import derive_seed, seeded
-from franka_wm.training.broken import finite, odd_rewards, why
+from franka_wm.training.broken import beyond_bounds, clipped, finite, odd_rewards, why
 from franka_wm.training.build import arm_of, explore
 from franka_wm.training.history import columns_of
 from franka_wm.training.learner import Learner
@@ -95,7 +95,7 @@ class Trainer:
         self.validation = validation
         self.diagnose = diagnose
         self._batch: TensorDictBase | None = None
-        self._said = self._said_too_long = False
+        self._said = self._said_too_long = self._said_bounds = False
         self._evaluated = 0.0  # s
         self._asks_at_once = learner.device.type == "cpu"  # elsewhere asking would wait for the device
         self._draw, self._static = replay.sample, lambda batch: False
@@ -312,13 +312,11 @@ class Trainer:
         if self.learner.device.type == "cuda":  # torch's, without the simulator's
             row["device_memory_mb"] = torch.cuda.memory_reserved(self.learner.device) / 1e6
         row |= progress.line(self.learner.updates, self.env_steps, text)
-        if warning:
-            say(f"  warning: {warning}")
-        if metrics.get("target_outside", 0.0) > 0.0:
-            say(
-                f"  warning: {100 * metrics['target_outside']:.2g} % of rewards and targets of values lie outside the "
-                "model's range and are clipped to it; widen model.value_low and model.value_high, or leave them at null"
-            )
+        bounds = None if self._said_bounds else self.spaces.reward_bounds
+        beyond = beyond_bounds(self.model, self._batch, bounds)
+        self._said_bounds |= bool(beyond)
+        for line in filter(None, (warning, clipped(metrics), beyond)):
+            say(f"  warning: {line}")
         self.record(row)
 
     @torch.no_grad()

@@ -6,6 +6,7 @@ import os
 import signal
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -14,6 +15,7 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 
 from franka_wm import processes
+from franka_wm.console import Progress
 from franka_wm.envs import FrankaEnv
 from franka_wm.errors import UserError
 from franka_wm.training import build, storage_budget
@@ -118,6 +120,20 @@ def test_targets_outside_of_the_range_are_said(make: Make, capsys, low) -> None:
     said = [line for line in capsys.readouterr().out.splitlines() if "outside" in line]
     assert bool(said) == (low is not None)
     assert all("model.value_low" in line for line in said)
+
+
+@pytest.mark.parametrize(
+    ("bounds", "beyond"), [((-0.5, 0.0), True), ((-2.0, -1.5), True), ((-1.5, 0.0), False)]
+)
+def test_rewards_beyond_what_the_task_declares_are_said_once(make: Make, capsys, bounds, beyond) -> None:
+    trainer = make()
+    trainer.spaces = replace(trainer.spaces, reward_bounds=bounds)
+    trainer.fit()
+    trainer.log(Progress(20, every=1.0))
+    said = [line for line in capsys.readouterr().out.splitlines() if "reward_bounds" in line]
+    assert len(said) == beyond
+    low, high = bounds
+    assert all(f"beyond reward_bounds=({low:g}, {high:g})" in line for line in said)
 
 
 def test_weights_fit_when_a_run_goes_on_in_another_environment(make: Make, tmp_path: Path) -> None:
