@@ -357,23 +357,28 @@ def with_scale(arguments: list[str], stream: TextIO | None = None, *, quiet: boo
                 stream,
             )
         return arguments
-    device = next((a.split("=", 1)[1] for a in arguments if a.startswith("device=")), None)
-    if device is None:
+    devices = {one for a in arguments if a.startswith("device=") for one in a.split("=", 1)[1].split(",")}
+    if not devices:
         named = [a for a in arguments if a != chosen] if any(map(_may_choose, arguments)) else []
-        device = str(compose(next(swept(named))).device) if named else "auto"
+        devices = {str(compose(one).device) for one in swept(named)} if named else {"auto"}
     launcher = given(arguments, "hydra/launcher")
     here = (
         launcher == "ray" and given(arguments, "hydra.launcher.ray.init.address") is None
     )  # its own cluster
-    if launcher in ELSEWHERE and device == "auto" and not here:
+    if launcher in ELSEWHERE and "auto" in devices and not here:
         fail(
             f"hydra/launcher={launcher}: the device of this machine does not say how large runs on others are; add "
             "scale=gpu, scale=laptop or scale=smoke"
         )
     import torch
 
-    on_gpu = device.startswith(("cuda", "spread")) or (device == "auto" and torch.cuda.is_available())
-    scale = "gpu" if on_gpu else "laptop"
+    gpu = ("cuda", "spread", *(["auto"] if torch.cuda.is_available() else []))
+    scales = {"gpu" if one.strip().startswith(gpu) else "laptop" for one in devices}
+    if len(scales) > 1:
+        fail(
+            "some devices of this sweep want scale=gpu, others scale=laptop; add scale=, or make several sweeps"
+        )
+    [scale] = scales
     if not quiet:
         say(f"scale={scale}, by the device; choose with scale=laptop, gpu or smoke", stream)
     return [a for a in arguments if a != chosen] + [f"scale={scale}"]

@@ -63,6 +63,23 @@ def test_a_device_of_an_experiment_is_that_of_the_scale(monkeypatch, tmp_path: P
     assert with_scale([found, "experiment=mine", "device=cuda"])[-1] == "scale=gpu"
 
 
+def test_devices_of_a_sweep_that_want_two_scales_are_refused(capsys, tmp_path: Path) -> None:
+    """The first alone would decide how large the others are."""
+    for device in ("cpu", "cuda"):
+        found = experiment(tmp_path, f"on_{device}", None)
+        with (tmp_path / "experiment" / f"on_{device}.yaml").open("a") as file:
+            file.write(f"device: {device}\n")
+    for words in (["experiment=on_cpu,on_cuda"], ["device=cpu,cuda"]):
+        with pytest.raises(SystemExit):
+            with_scale([found, *words])
+        assert (
+            "some devices of this sweep want scale=gpu, others scale=laptop; add scale="
+            in capsys.readouterr().err
+        )
+    assert with_scale([found, "experiment=on_cuda,on_cpu", "scale=smoke"])[-1] == "scale=smoke"
+    assert with_scale(["device=cuda:0,cuda:1"])[-1] == "scale=gpu"
+
+
 def test_a_scale_as_a_value_beside_numbers_of_another_is_refused(tmp_path: Path) -> None:
     found = experiment(tmp_path, "wrong", None)
     with (tmp_path / "experiment" / "wrong.yaml").open("a") as file:
