@@ -34,6 +34,11 @@ RENAMED = {"model.fresh_values": "model.reanalyze", "collector.acts": "collector
 """Former names of options -> their present names."""
 
 
+def presets(group: str) -> list[str]:
+    """What ``GROUP=`` may be, of this package's own."""
+    return sorted(file.stem for file in (FOLDER / group).glob("*.yaml"))
+
+
 def use_present_names(config: DictConfig) -> None:
     """Rename the options of a checkpoint that had other names when it was written, in place."""
     whole: DictConfig | None = config.get("whole_run")

@@ -20,14 +20,13 @@ from franka_wm.envs.task_options import typed
 from franka_wm.errors import UserError
 from franka_wm.models import WorldModel
 from franka_wm.models.vision import ViT
-from franka_wm.options import OF_ONES_OWN
 from franka_wm.planning import registry
 from franka_wm.planning.objectives import goal_images
 from franka_wm.training import build
 from franka_wm.training.demos import check_demonstrations
 from franka_wm.training.loggers import check_loggers
 from franka_wm.training.settings import RunSettings
-from franka_wm.training.settings.groups import ObjectiveSettings
+from franka_wm.training.settings.groups import ObjectiveSettings, no_such
 from franka_wm.training.spaces import Spaces
 from franka_wm.training.storage_budget import check_memory
 from franka_wm.training.unread import say_unread
@@ -254,9 +253,7 @@ def _check_evaluation(run: RunSettings) -> None:
 def _check_planner(run: RunSettings) -> None:
     """Its options, also where the sizes of actions are not known yet."""
     if run.planner.name not in registry.available():
-        raise UserError(
-            f"planner.name={run.planner.name!r}: must be one of {', '.join(registry.available())}{OF_ONES_OWN}"
-        )
+        raise UserError(no_such("planner", run.planner.name, registry.available()))
     if run.model.family.has_next:
         run.check_planner_fits()
     registry.validate(run.planner.name, run.planner.options)

@@ -407,7 +407,7 @@ TYPOS = [
     ("trainer.updates=-1", "trainer.updates=-1: must be a whole number of at least 0"),
     ("+trianer.updates=3", "trianer: there is no such option; did you mean trainer?"),
     ("scale=auto trainer.lr=abc", "trainer.lr='abc': must be a finite number above 0"),
-    ("env=gym model.name=nope", "model.name='nope': must be one of tdmpc2"),
+    ("env=gym model.name=nope", "model=nope: must be one of action_world_model"),
     ("env=gym env.frame_skip=0", "env.frame_skip=0: must be a whole number"),
     ("env.substeps=0", "substeps=0: must be a whole number"),
     ("trainer=offline", "trainer=offline: trains on recorded data; name them, dataset=lerobot"),

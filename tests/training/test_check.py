@@ -130,3 +130,20 @@ def test_a_goal_that_no_image_shows_is_refused_offline_too(settled) -> None:
         _check_parts(settled("env=push_pixels", *words))
     _check_parts(settled("env=push_goal_image", *words))
     _check_parts(settled("env=none", *words))
+
+
+def test_a_model_or_planner_that_is_not_there_is_answered_as_one_chooses_it(settled) -> None:
+    """Among all presets, those too that are another one with other settings."""
+    planners = "must be one of cem, gradient, gumbel, icem, mcts, mppi; one of your own: plugins="
+    wrong = settled("planner.name=crystal_ball")
+    for asked in (lambda: build.make_planner(wrong, 7), lambda: check(wrong)):
+        with pytest.raises(UserError, match=f"^planner=crystal_ball: {planners}"):
+            asked()
+    with pytest.raises(
+        UserError, match=r"^model=oracle_bone: must be one of .*, tdmpc2, tdmpc2_pixels, vjepa; one"
+    ):
+        settled("model.name=oracle_bone")
+    for preset in ("planner.name=gumbel", "model.name=vjepa"):
+        group, name = preset.split(".name=")
+        with pytest.raises(UserError, match=rf"^{preset}: write {group}={name}, which sets more than a name"):
+            check(settled(preset))

@@ -6,11 +6,11 @@ simulator, so that what is wrong is answered before they load.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, fields
 from typing import Any
 
-from franka_wm import models
+from franka_wm import conf, models
 from franka_wm.envs.config import FrankaConfig
 from franka_wm.envs.external_config import ExternalConfig, external_config
 from franka_wm.envs.multitask_config import MultiTaskConfig, multi_task_config
@@ -171,6 +171,18 @@ class DatasetSettings:
         return {f.name: getattr(self, f.name) for f in fields(self) if f.name != "kind"}
 
 
+def no_such(group: str, name: str, known: Iterable[str]) -> str:
+    """One line about a model or planner that is not there: as one chooses it, ``GROUP=NAME``, whatever named it.
+
+    Args:
+        known: Those that there are; a preset may be one of them with other settings.
+    """
+    there = sorted({*conf.presets(group), *known})
+    if name in there:
+        return f"{group}.name={name}: write {group}={name}, which sets more than a name"
+    return f"{group}={name}: must be one of {', '.join(there)}{OF_ONES_OWN}"
+
+
 @dataclass(frozen=True)
 class _Learning:
     """The part of a model's entries that is about its training."""
@@ -203,9 +215,7 @@ class ModelSettings:
         training = {f.name for f in fields(_Learning)}
         read_first = read(_Learning, {k: v for k, v in values.items() if k in training}, prefix)
         if read_first.name not in models.available():
-            raise UserError(
-                f"{prefix}.name={read_first.name!r}: must be one of {', '.join(models.available())}{OF_ONES_OWN}"
-            )
+            raise UserError(no_such(prefix, read_first.name, models.available()))
         options = {key: value for key, value in values.items() if key not in training}
         return cls(**vars(read_first), options=options)
 

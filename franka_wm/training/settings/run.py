@@ -29,6 +29,7 @@ from franka_wm.training.settings.groups import (
     PretrainSettings,
     ReplaySettings,
     TrainerSettings,
+    no_such,
 )
 
 
@@ -372,12 +373,13 @@ class RunSettings:
         """Whether the planner is one for the actions of the model.
 
         Raises:
-            UserError: It is for the other kind.
-            ValueError: No planner has this name.
+            UserError: It is for the other kind, or no planner has this name.
         """
         from franka_wm.planning import registry  # here: it imports torch
 
         name, discrete = self.planner.name, self.is_discrete
+        if name not in registry.available():
+            raise UserError(no_such("planner", name, registry.available()))
         if registry.is_search(name) == discrete:
             return
         fitting = [one for one in registry.available() if registry.is_search(one) == discrete]
