@@ -23,7 +23,7 @@ from omegaconf.errors import OmegaConfBaseException
 
 from franka_wm import conf
 from franka_wm.commands import launching, several
-from franka_wm.commands.overrides import compose, explain, given
+from franka_wm.commands.overrides import compose, explain, given, unknown_flags
 from franka_wm.commands.sweep import Sweep, jobs, names, spread
 from franka_wm.console import program, quoted, resuming, say, terminal_log
 from franka_wm.errors import REFUSALS, FrankaError, machine_refused
@@ -168,8 +168,12 @@ def hydra_flags(arguments: list[str]) -> Any:
     from hydra._internal.utils import get_args_parser
 
     parser = get_args_parser()
+    parser.allow_abbrev = False  # --experiment=NAME would be --experimental-rerun
     parser.error = lambda message: fail(f"{message}; python train.py --hydra-help lists the flags")  # type: ignore
-    return parser.parse_intermixed_args(arguments)
+    asked, unknown = parser.parse_known_intermixed_args(arguments)
+    if unknown:
+        parser.error(unknown_flags(arguments, unknown))
+    return asked
 
 
 def with_folder(asked: Any) -> list[str]:
@@ -349,7 +353,7 @@ def with_scale(arguments: list[str], stream: TextIO | None = None, *, quiet: boo
     if chosen is None and (own := _scales_of_files(arguments)) != {None}:
         if None in own:
             fail(
-                "some experiments of this sweep choose a scale, others do not; add scale=, or make several sweeps"
+                "some experiments of this sweep choose a scale, others do not; add scale=, or make two sweeps"
             )
         if not quiet:
             say(
@@ -362,10 +366,8 @@ def with_scale(arguments: list[str], stream: TextIO | None = None, *, quiet: boo
         named = [a for a in arguments if a != chosen] if any(map(_may_choose, arguments)) else []
         devices = {str(compose(one).device) for one in swept(named)} if named else {"auto"}
     launcher = given(arguments, "hydra/launcher")
-    here = (
-        launcher == "ray" and given(arguments, "hydra.launcher.ray.init.address") is None
-    )  # its own cluster
-    if launcher in ELSEWHERE and "auto" in devices and not here:
+    own_cluster = launcher == "ray" and given(arguments, "hydra.launcher.ray.init.address") is None
+    if launcher in ELSEWHERE and "auto" in devices and not own_cluster:
         fail(
             f"hydra/launcher={launcher}: the device of this machine does not say how large runs on others are; add "
             "scale=gpu, scale=laptop or scale=smoke"
@@ -375,9 +377,7 @@ def with_scale(arguments: list[str], stream: TextIO | None = None, *, quiet: boo
     gpu = ("cuda", "spread", *(["auto"] if torch.cuda.is_available() else []))
     scales = {"gpu" if one.strip().startswith(gpu) else "laptop" for one in devices}
     if len(scales) > 1:
-        fail(
-            "some devices of this sweep want scale=gpu, others scale=laptop; add scale=, or make several sweeps"
-        )
+        fail("some devices of this sweep want scale=gpu, others scale=laptop; add scale=, or make two sweeps")
     [scale] = scales
     if not quiet:
         say(f"scale={scale}, by the device; choose with scale=laptop, gpu or smoke", stream)

@@ -45,6 +45,22 @@ def given(overrides: Sequence[str], key: str) -> str | None:
     return value.text if isinstance(value, QuotedString) else str(value)
 
 
+def unknown_flags(arguments: Sequence[str], unknown: Sequence[str]) -> str:
+    """What is wrong with flags that Hydra does not have; of options typed as elsewhere, how they are typed here."""
+    flags = [one for one in unknown if one.startswith("-") and not one[1:2].isdigit()]  # -1 is a value
+    typed, written = [], []
+    for flag in flags:
+        name, equals, value = flag.lstrip("-").partition("=")
+        following = arguments[arguments.index(flag) + 1 :][:1]
+        if not equals and following and not following[0].startswith("--") and "=" not in following[0]:
+            flag, equals, value = f"{flag} {following[0]}", "=", following[0]
+        typed += [flag]
+        written += [f"{name}={value}"] if equals else []
+    if not written:
+        return f"unrecognized arguments: {' '.join(flags)}"
+    return f"{' '.join(typed)}: no such flag; options have no dashes, write {' '.join(written)}"
+
+
 def changes(verb: str, overrides: Sequence[str]) -> dict[str, Any]:
     """``GROUP.KEY=VALUE`` … of a verb as nested dictionaries, values as in YAML.
 
