@@ -147,3 +147,26 @@ def test_a_model_or_planner_that_is_not_there_is_answered_as_one_chooses_it(sett
         group, name = preset.split(".name=")
         with pytest.raises(UserError, match=rf"^{preset}: write {group}={name}, which sets more than a name"):
             check(settled(preset))
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (
+            (*MODELS[-1], "collector.policy=planner"),
+            "collector.policy=planner: model=jepa cannot plan; must be one of auto, noop, random, ik, expert",
+        ),
+        (
+            (*MODELS[-1], "collector.policy=policy"),
+            "collector.policy=policy: model=jepa has no policy; must be one of auto, noop, random, ik, expert",
+        ),
+        (
+            (*MODELS[2], "collector.policy=random"),
+            "collector.policy=random: model=muzero learns from its own search; must be one of auto, planner",
+        ),
+    ],
+)
+def test_a_policy_that_the_model_does_not_have_cannot_gather(words, said: str, settled) -> None:
+    with pytest.raises(UserError) as refused:
+        check(settled("device=cpu", "scale=smoke", *words))
+    assert str(refused.value) == said

@@ -52,7 +52,7 @@ def test_a_policy_towards_goals_gathers_where_it_is_asked_to(settled) -> None:
     check(run)
     assert run.actor == "policy"
     without = settled(*words, "collector.policy=policy")
-    with pytest.raises(UserError, match=r"use collector\.policy=planner, or model\.goal_policy_coef above 0"):
+    with pytest.raises(UserError, match=r"of auto, planner, .*expert, or model\.goal_policy_coef above 0"):
         check(without)
     with pytest.raises(UserError, match="needs goal_pixels"):
         check(settled(*SMALL, "env=reach_pixels", "model.goal_policy_coef=1", "collector.policy=policy"))

@@ -15,7 +15,7 @@ from franka_wm.console import say
 from franka_wm.envs.multitask_config import MultiTaskConfig
 from franka_wm.errors import UserError
 from franka_wm.options import is_whole, read, unknown
-from franka_wm.policies.names import refuse_old_name
+from franka_wm.policies.names import POLICIES, refuse_old_name
 from franka_wm.training.settings.groups import (
     CollectorSettings,
     DatasetSettings,
@@ -361,11 +361,13 @@ class RunSettings:
             # that is given goals by their images can learn from any motion.
             return "planner" if self.objective_name == "reward_value" else "random"
         if not there.get(policy, True) or (searched and policy != "planner"):
-            fitting = "planner" if there["planner"] else "random"
-            if policy == "policy" and family.has_goal_policy:
-                fitting += ", or model.goal_policy_coef above 0"
+            fitting = ["planner"] if searched else [one for one in POLICIES if there.get(one, True)]
+            why = "cannot plan" if policy == "planner" else "has no policy"
+            why = "learns from its own search" if searched else why
+            more = ", or model.goal_policy_coef above 0" * (policy == "policy" and family.has_goal_policy)
             raise UserError(
-                f"collector.policy={policy}: model={self.model.name} cannot; use collector.policy={fitting}"
+                f"collector.policy={policy}: model={self.model.name} {why}; "
+                f"must be one of {', '.join(['auto', *fitting])}{more}"
             )
         return policy
 
