@@ -46,7 +46,9 @@ def beyond_bounds(model: WorldModel, steps: TensorDictBase | None, bounds: tuple
         return ""
     (least, largest), (low, high) = torch.stack(reward.aminmax()).tolist(), bounds
     rounding = 1e-4 * (high - low)
-    if least >= low - rounding and largest <= high + rounding:
+    if not (
+        least < low - rounding or largest > high + rounding
+    ):  # of what is not finite more is said elsewhere
         return ""
     return (
         f"rewards from {least:.4g} to {largest:.4g} go beyond reward_bounds=({low:g}, {high:g}), to which models fit "

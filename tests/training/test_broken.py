@@ -11,6 +11,7 @@ import torch
 from tensordict import TensorDict
 
 from franka_wm.errors import UserError
+from franka_wm.training.broken import beyond_bounds
 from franka_wm.training.trainer import Trainer
 
 
@@ -62,3 +63,15 @@ def test_a_first_stage_that_breaks_names_its_own_option(settled, tmp_path: Path)
                 "model": jepa,
             }
             Trainer.require_finite(SimpleNamespace(**given))  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(("reward", "warns"), [(-3.0, True), (0.5, False), (torch.nan, False), (3.0, True)])
+def test_rewards_beyond_their_bounds_are_warned_of_unless_the_run_breaks_by_them(
+    reward: float, warns: bool
+) -> None:
+    model: Any = SimpleNamespace(has_reward=True, has_value=True)
+    seen = steps(0.0, reward)
+    assert bool(beyond_bounds(model, seen, (-1.0, 1.0))) == warns
+    assert not beyond_bounds(model, seen, None) and not beyond_bounds(model, None, (-1.0, 1.0))
+    model.has_reward = model.has_value = False
+    assert not beyond_bounds(model, seen, (-1.0, 1.0))
