@@ -394,7 +394,7 @@ def test_a_run_that_breaks_stops_and_keeps_the_last_whole_checkpoint(
     make: Make, at_once: bool, monkeypatch
 ) -> None:
     """Within a few updates on the CPU; elsewhere (no wait for the device in between) before it logs or saves."""
-    trainer = make(updates=60, checkpoint_every=1e-9)
+    trainer = make(updates=60, checkpoint_every=1e-9, log_every=1e6)  # to log is to ask, too
     update, broken = trainer.learner.update, trainer.learner.broken
     asked = []
 
