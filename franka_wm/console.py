@@ -10,7 +10,7 @@ import shutil
 import sys
 import threading
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TextIO
@@ -157,23 +157,30 @@ def count(number: float) -> str:
 
 
 @contextmanager
-def announced(what: str, *, every: float = 10.0) -> Iterator[None]:
+def announced(what: str, *, every: float = 10.0) -> Iterator[Callable[[str], None]]:
     """Says what starts, that it is still going on every so many seconds, and how long it took.
 
-    A thread does the talking, since compiling a kernel does not return to Python.
+    Gives a function that is told which part of it runs from now on. A thread does the talking, since compiling a
+    kernel does not return to Python.
     """
+    part = ""
+
+    def runs(name: str) -> None:
+        nonlocal part
+        part = f": {name}"
+
     say(f"{what} …")
     started = time.perf_counter()
     finished = threading.Event()
 
     def talk() -> None:
         while not finished.wait(every):
-            say(f"  still running, {duration(time.perf_counter() - started)}")
+            say(f"  still running, {duration(time.perf_counter() - started)}{part}")
 
     thread = threading.Thread(target=talk, daemon=True)
     thread.start()
     try:
-        yield
+        yield runs
     finally:
         finished.set()
         thread.join()

@@ -5,12 +5,13 @@ from __future__ import annotations
 import io
 import os
 import sys
+import time
 from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
 
-from franka_wm.console import Progress, log_to, program, terminal_log
+from franka_wm.console import Progress, announced, log_to, program, terminal_log
 
 
 def test_what_is_printed_before_and_after_there_is_a_file(tmp_path: Path, capsys) -> None:
@@ -73,3 +74,13 @@ def test_rates_and_time_left_count_from_the_last_beginning(monkeypatch: pytest.M
     assert progress.due()
     assert progress.line(21, 240) == {"updates_per_s": 2.0, "env_steps_per_s": 20.0}
     assert "left 0:40" in capsys.readouterr().out  # 80 more, at 2 a second
+
+
+def test_a_long_wait_says_what_part_of_it_runs(capsys) -> None:
+    with announced("five policies", every=0.05) as runs:
+        time.sleep(0.08)
+        runs("4 episodes of noop")
+        time.sleep(0.08)
+    first, *_, last, _ = capsys.readouterr().out.splitlines()
+    assert first == "five policies …"
+    assert last == "  still running, 0:00: 4 episodes of noop"

@@ -32,7 +32,12 @@ from franka_wm.interrupt import INTERRUPTED
     required=True,
 )
 @word("out", "where results go (RUN/evaluation; for hf: outputs/evaluation/user--name)", metavar="FOLDER")
-@word("episodes", "per policy, on fixed held-out seeds", whole(2, 10**6), 100)
+@word(
+    "episodes",
+    "per policy, on fixed held-out seeds; the run's evaluation.episodes",
+    whole(2, 10**6),
+    metavar="N",
+)
 @word("device", "auto, cpu, cuda, cuda:K", default="auto")
 @word(
     "open_loop",
@@ -142,10 +147,15 @@ def check_other(folder: Path, own: Path, planned_with: str) -> None:
         )
 
 
-def check_larger(folder: Path, episodes: int, checkpoint: str) -> None:
+def check_larger(folder: Path, episodes: int | None, checkpoint: str) -> None:
     """Whether a result of more episodes would be lost there; asked before anything is played.
 
     A result of earlier weights may go: it would not be shown any more.
+
+    Args:
+        folder: Where results go.
+        episodes: How many will be played; ``None``: as many as the run's own.
+        checkpoint: As it was given.
 
     Raises:
         UserError: It would be lost, or there is no checkpoint to compare it with.
@@ -158,13 +168,14 @@ def check_larger(folder: Path, episodes: int, checkpoint: str) -> None:
         there = read_result(folder / "evaluation.json")
     except UserError:  # nobody can read it
         return
+    from franka_wm.training.load import find_checkpoint, own_episodes
+
+    episodes = own_episodes(checkpoint) if episodes is None else episodes
     if there.episodes <= episodes:
         return
-    if there.updates is not None:
-        from franka_wm.training.load import find_checkpoint
-
-        if there.updates < find_checkpoint(checkpoint).counters.get("updates", 0):  # of earlier weights
-            return
+    now = 0 if there.updates is None else find_checkpoint(checkpoint).counters.get("updates", 0)
+    if there.updates is not None and there.updates < now:  # of earlier weights
+        return
     raise UserError(
         f"evaluate: {folder} holds a result of {there.episodes} episodes, which one of {episodes} would replace; "
         "give out=FOLDER, or more episodes="

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import shlex
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -27,7 +27,7 @@ from franka_wm.report.diagnostics import (
 )
 from franka_wm.report.run import read_chosen
 from franka_wm.report.table import evaluation_tables, markdown
-from franka_wm.training.load import load_agent
+from franka_wm.training.load import load_agent, own_episodes
 
 if TYPE_CHECKING:
     from franka_wm.training.load import Agent
@@ -44,7 +44,7 @@ class Options:
 
     checkpoint: str
     out: Path
-    episodes: int
+    episodes: int | None
     device: str
     open_loop: bool
     probes: bool
@@ -74,10 +74,11 @@ def run(options: Options) -> dict[str, Any]:
     from rich.console import Console
 
     console = Console(width=120)
-    with announced(f"loading {options.checkpoint} and building {min(options.episodes, WORLDS)} worlds"):
+    episodes = own_episodes(options.checkpoint) if options.episodes is None else options.episodes
+    with announced(f"loading {options.checkpoint} and building {min(episodes, WORLDS)} worlds"):
         agent = load_agent(
             options.checkpoint,
-            num_envs=min(options.episodes, WORLDS),
+            num_envs=min(episodes, WORLDS),
             device=options.device,
             **_planning(options),
         )
@@ -86,9 +87,9 @@ def run(options: Options) -> dict[str, Any]:
     own = agent.folder.parents[1] if agent.folder.parent.name == "checkpoints" else agent.folder
     within = options.out.resolve() == own / "evaluation"
     of_run = None if within or options.out.resolve() == own else _of_run(agent, options)
-    with announced(f"{options.episodes} held-out episodes for each of {', '.join(agent.policies)}"):
-        report = _progress(len(agent.policies))
-        evaluation = evaluate_agent(agent, episodes=options.episodes, report=report)
+    with announced(f"{episodes} held-out episodes for each of {', '.join(agent.policies)}") as runs:
+        report = _progress([f"{episodes} episodes of {name}" for name in agent.policies], runs)
+        evaluation = evaluate_agent(agent, episodes=episodes, report=report)
     described = protocol(agent.settings, agent.env, evaluation, by=COMMAND, counters=agent.counters)
     planned = {OTHERWISE: options.planned_with} if options.planned_with else {}
     results = {
@@ -114,7 +115,7 @@ def run(options: Options) -> dict[str, Any]:
         if options.probes:
             _look_inside(agent, held, results, say)
     if options.robustness:
-        _shift(agent, options, results, say)
+        _shift(agent, min(episodes, WORLDS), results, say)
     for title, table in diagnostic_tables(results, agent.env.config).items():
         console.print(terminal(table, title))
     results["protocol"].pop("diagnostics", None)
@@ -127,10 +128,16 @@ def run(options: Options) -> dict[str, Any]:
     return results
 
 
-def _progress(policies: int) -> Callable[[str, Mapping[str, Any]], None]:
-    """What says of each policy how it did, how long that took, and about how long the others will take."""
+def _progress(parts: Sequence[str], runs: Say) -> Callable[[str, Mapping[str, Any]], None]:
+    """What says of each policy how it did, how long that took, and about how long the others will take.
+
+    Args:
+        parts: What is done for each, in words.
+        runs: Told which of them begins.
+    """
     started = before = time.perf_counter()
-    done = 0
+    done, policies = 0, len(parts)
+    runs(parts[0])
 
     def report(name: str, summary: Mapping[str, Any]) -> None:
         nonlocal before, done
@@ -139,6 +146,8 @@ def _progress(policies: int) -> Callable[[str, Mapping[str, Any]], None]:
         left = (before - started) / done * (policies - done)
         more = f"; {done} of {policies}, left {duration(left)}" if done < policies else ""
         say(f"{describe(name, summary)}   ({took:.1f} s{more})")
+        if done < policies:
+            runs(parts[done])
 
     return report
 
@@ -189,14 +198,13 @@ def _look_inside(agent: Agent, held: diagnose.Held, results: dict[str, Any], say
         say(f"warning: {warning}")
 
 
-def _shift(agent: Agent, options: Options, results: dict[str, Any], say: Say) -> None:
+def _shift(agent: Agent, episodes: int, results: dict[str, Any], say: Say) -> None:
     say("robustness: the same episodes in shifted worlds …")
 
     def told(case: str, found: Mapping[str, Any]) -> None:
         parts = (f"{describe(p, r).strip()} {r['verdict']}" for p, r in found.items())
         say(f"  {case}: {'   '.join(parts)}")
 
-    episodes = min(options.episodes, WORLDS)
     results["robustness"] = robustness(agent, episodes=episodes, report=told)
     results["protocol"]["robustness episodes"] = episodes
     if note(episodes):

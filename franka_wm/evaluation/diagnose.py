@@ -230,7 +230,7 @@ def imagine(
     agent: Agent,
     held: Held,
     *,
-    announce: Callable[[str], AbstractContextManager[None]] = nullcontext,
+    announce: Callable[[str], AbstractContextManager[object]] = nullcontext,
 ) -> tuple[Imagined, Decoder, dict[str, float]] | None:
     """Trains a decoder on the images and draws what the model imagines in an episode that it has not seen.
 

@@ -20,6 +20,7 @@ from franka_wm.evaluation.results import to_json
 from franka_wm.models import WorldModel
 from franka_wm.planning import registry
 from franka_wm.report import diagnostics
+from franka_wm.training.checkpoint import latest_checkpoint, load_checkpoint
 from franka_wm.training.load import _planning_otherwise
 
 POLICIES = {"planner", "policy", "noop", "random", "ik"}
@@ -126,12 +127,36 @@ def test_what_is_stopped_says_what_was_written(tmp_path: Path, capsys, monkeypat
 def test_each_policy_says_how_long_it_took_and_what_is_left(capsys, monkeypatch) -> None:
     now = iter((0.0, 4.0, 4.0, 10.0, 10.0))
     monkeypatch.setattr(evaluate_checkpoint.time, "perf_counter", lambda: next(now))
-    report = evaluate_checkpoint._progress(2)
+    began: list[str] = []
+    report = evaluate_checkpoint._progress(["4 episodes of planner", "4 episodes of noop"], began.append)
     for name in ("planner", "noop"):
         report(name, {"return": {"mean": -1.0}})
     first, last = capsys.readouterr().out.splitlines()
     assert first == "  planner: return -1.00   (4.0 s; 1 of 2, left 0:04)"
     assert last == "  noop: return -1.00   (6.0 s)"
+    assert began == ["4 episodes of planner", "4 episodes of noop"]
+
+
+def test_as_many_episodes_as_the_run_has_itself(
+    run_folder: Path, tmp_path: Path, capsys, monkeypatch
+) -> None:
+    """Not a number of its own: of a run of scale=smoke it took as long as of a large one."""
+    own = load_checkpoint(latest_checkpoint(run_folder)).config["evaluation"]["episodes"]
+    built: list[int] = []
+
+    def load(*_: object, num_envs: int, **__: object) -> None:
+        built.append(num_envs)
+        raise UserError("loaded")
+
+    monkeypatch.setattr(evaluate_checkpoint, "load_agent", load)
+    words = ["evaluate", str(run_folder), f"out={tmp_path}", "device=cpu"]
+    assert cli.main(words) == cli.main([*words, "episodes=9"]) == 1
+    assert built == [own, 9] and own != 100
+    told = {"protocol": {}, "policies": {"planner": {"episodes": own + 1}}}
+    (tmp_path / "evaluation.json").write_text(json.dumps(told))
+    capsys.readouterr()
+    assert cli.main(words) == 1
+    assert f"a result of {own + 1} episodes, which one of {own} would replace" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(
@@ -257,7 +282,7 @@ def test_results_of_something_else_are_not_replaced(tmp_path: Path, capsys, monk
     monkeypatch.setattr(evaluate_checkpoint, "run", lambda _: None)
 
     def told(out: str, *words: str) -> str:
-        code = cli.main(["evaluate", str(tmp_path / "run"), f"out={tmp_path / out}", *words])
+        code = cli.main(["evaluate", str(tmp_path / "run"), f"out={tmp_path / out}", "episodes=9", *words])
         said = capsys.readouterr().err
         assert bool(code) is bool(said)
         return said
@@ -310,7 +335,7 @@ def test_shifting_what_is_no_arm_is_refused_before_playing(tmp_path: Path, monke
     monkeypatch.setattr(evaluate_checkpoint, "load_agent", lambda *a, **k: SimpleNamespace(env=object()))
     monkeypatch.setattr(evaluate_checkpoint, "evaluate_agent", lambda *a, **k: pytest.fail("played"))
     (tmp_path / "checkpoints").mkdir()
-    arguments = [f"checkpoint={tmp_path}", f"out={tmp_path}/out", "robustness=true"]
+    arguments = [f"checkpoint={tmp_path}", f"out={tmp_path}/out", "episodes=9", "robustness=true"]
     monkeypatch.setattr(evaluate_checkpoint, "protocol", lambda *a: pytest.fail("went on"))
     assert cli.main(["evaluate", *arguments]) == 1
     captured = capsys.readouterr()
