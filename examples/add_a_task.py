@@ -1,7 +1,9 @@
 """A task of your own: raise the tool. Goal, reward and success are Warp kernels, part of the captured step.
 
 python train.py plugins=[examples.add_a_task] env.task=raise_tool
-python train.py plugins=[examples.add_a_task] --config-dir=examples/conf env=raise_tool env.task_options.height=0.8
+python train.py plugins=[examples.add_a_task] hydra.searchpath=[file://examples/conf] env=raise_tool
+
+The second may also change the preset's options: env.task_options.height=0.8.
 """
 
 import warp as wp

@@ -66,7 +66,8 @@ def compose(*overrides: str) -> DictConfig:
     """The configuration that ``python train.py OVERRIDE …`` runs with.
 
     Raises:
-        UserError: An option by a former name, a group that does not exist, or a scale that a file sets as a value.
+        UserError: An option by a former name, a group that does not exist, folders that Hydra would not look in, or a
+            scale that a file sets as a value.
         HydraException, OmegaConfBaseException: An override that cannot be.
     """
     import hydra
@@ -75,6 +76,8 @@ def compose(*overrides: str) -> DictConfig:
         name = override.split("=", 1)[0].lstrip("+~")
         if name in RENAMED:
             raise UserError(f"{override}: this option is now called {RENAMED[name]}")
+        if name == "hydra.searchpath" and override[0] in "+~":  # Hydra would not look there, nor say so
+            raise UserError(f"{override}: write hydra.searchpath=[file://FOLDER], without {override[0]}")
     with _hydra():
         cfg = hydra.compose("config", overrides=list(overrides), return_hydra_config=True)
     chosen = cfg.hydra.runtime.choices.get("scale")

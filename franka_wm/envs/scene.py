@@ -98,7 +98,7 @@ class Scene:
         if isinstance(values, str):  # env.scene=kitchen.yaml
             raise UserError(
                 f"scene={short(values)}: must be a mapping, not the name of a file; write 'env.scene={{objects: "
-                "[{name: cube}]}', or make the file one of --config-dir: docs/tasks.md, A scene in a run"
+                "[{name: cube}]}', or a preset in a folder of hydra.searchpath=: docs/tasks.md, A scene in a run"
             )
         return values if isinstance(values, cls) else cls(**known_fields(cls, values))
 

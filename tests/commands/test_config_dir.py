@@ -71,6 +71,12 @@ def test_what_cannot_be_is_one_line(words: list[str], said: str, mine: list[str]
         there = f"(looked for from {Path.cwd()})"
         said = f"error: hydra.searchpath: {folder}: no such folder {there}, and no such package\n"
         assert capsys.readouterr().err == said
+    for sign in ("+", "++", "~"):  # Hydra would not look there
+        path = f"{sign}hydra.searchpath=[file://my presets]"
+        with pytest.raises(SystemExit):
+            entry._run(lambda: pytest.fail("begun"), ["device=cpu", "env=reach", path])
+        said = capsys.readouterr().err
+        assert said == f"error: {path}: write hydra.searchpath=[file://FOLDER], without {sign[0]}\n"
     with pytest.raises(SystemExit):
         entry._run(lambda: pytest.fail("begun"), ["--config-dir=nowhere"])
     assert capsys.readouterr().err == "error: --config-dir=nowhere: no such folder\n"

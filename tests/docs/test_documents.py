@@ -162,7 +162,8 @@ PLUGINS = {
 TRAIN = [
     (name, arguments)
     for name, arguments in [*commands("python train.py"), *commands("franka-wm train")]
-    if not any(a.startswith(("--config-dir", "--cfg")) for a in arguments)  # presets elsewhere; no training
+    # A folder that a reader makes; no training.
+    if not any(a.startswith(("hydra.searchpath=[file://mine]", "--cfg")) for a in arguments)
 ]
 VERBS = list(commands("franka-wm"))
 
