@@ -30,6 +30,9 @@ def compose(overrides: Sequence[str], options: Sequence[str] = ()) -> Any:
         said = str(error)
         if _UNKNOWN.search(said):  # of a mapping, the cause names the key inside it
             said = f"{said}\n{error.__cause__}"
+        unknown = _unknown_key(said) or ""
+        if unknown.startswith(OF_TASK) and (told := _of_task(unknown, overrides)) is not None:
+            raise UserError(told) from error
         raise UserError(explain(said, allowed=_allowed(said, overrides, options))) from error
 
 
@@ -86,6 +89,8 @@ EXTRAS = {
     "optuna": "optuna",
 }
 """Launchers and sweepers of ``--multirun``, and the extra of this package that has each."""
+OF_TASK = "env.task_options."
+"""What options that a task brings itself begin with."""
 _MISSING = re.compile(r"Could not find '([^']+)/([^'/]+)'")
 _UNKNOWN = re.compile(r"Could not override '([^']+)'")
 
@@ -118,6 +123,29 @@ def _unknown_key(message: str) -> str | None:
     if unknown is None:
         return None
     return full[1] if full is not None and full[1].startswith(f"{unknown[1]}.") else unknown[1]
+
+
+def _of_task(unknown: str, overrides: Sequence[str]) -> str | None:
+    """What is wrong with an option of the task that the configuration does not name: only its class knows all.
+
+    ``None`` where there is no such task.
+    """
+    from franka_wm.envs.task_options import has
+    from franka_wm.envs.tasks import TASKS, task_class
+    from franka_wm.training.run import import_plugins
+
+    keys = [(o.partition("=")[0], o) for o in overrides]
+    cfg = conf.compose(*(o for key, o in keys if key == "hydra.searchpath" or "." not in key))
+    import_plugins(cfg.plugins)
+    task = given(overrides, "env.task") or cfg.env.get("task")
+    if cfg.env.kind != "franka" or task not in TASKS:
+        return None
+    defaults, name = task_class(task).option_defaults, unknown.removeprefix(OF_TASK)
+    there = has(task, defaults)
+    if name in defaults:
+        value = next((o.partition("=")[2] for key, o in keys if key == unknown), "…")
+        return f"{unknown}: the preset does not name it; write +{unknown}={value}; {there}"
+    return f"{unknown}: no such option; {there}"
 
 
 def _allowed(message: str, overrides: Sequence[str], options: Sequence[str]) -> list[str]:

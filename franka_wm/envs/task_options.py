@@ -34,6 +34,12 @@ def check_defaults(owner: str, defaults: Any) -> None:
             raise UserError(f"{owner}.option_defaults: {name} is {value!r}; must be one of: {wanted}")
 
 
+def has(task: str, defaults: Mapping[str, Any]) -> str:
+    """Which options a task brings, in words."""
+    listed = ", ".join(f"{name}={typed(value)}" for name, value in defaults.items())
+    return f"task={task} has {listed or 'none; leave them out'}"
+
+
 def task_options(config: FrankaConfig) -> dict[str, Any]:
     """The config's ``task_options``, each of the type of its default.
 
@@ -41,16 +47,15 @@ def task_options(config: FrankaConfig) -> dict[str, Any]:
         UserError: An option that the task does not have, or a value of another type than its default.
     """
     defaults, given = config.task_class.option_defaults, config.task_options
-    has = ", ".join(f"{name}={typed(value)}" for name, value in defaults.items())
-    has = f"task={config.task} has {has or 'none; leave them out'}"
+    there = has(config.task, defaults)
     given = {} if given is None else given  # null in a file
     if not isinstance(given, Mapping):
-        raise UserError(f"task_options={given!r}: must be a mapping; {has}")
+        raise UserError(f"task_options={given!r}: must be a mapping; {there}")
     for name, value in given.items():
         if name not in defaults:
-            raise UserError(f"task_options.{name}={typed(value)}: no such option; {has}")
+            raise UserError(f"task_options.{name}={typed(value)}: no such option; {there}")
         if not (rule := KINDS[type(defaults[name])]).fits(value):
-            raise UserError(f"task_options.{name}={value!r}: must be {rule.wanted}; {has}")
+            raise UserError(f"task_options.{name}={value!r}: must be {rule.wanted}; {there}")
     return {name: type(defaults[name])(value) for name, value in given.items()}
 
 
