@@ -404,7 +404,10 @@ class Trainer:
         if not (rewards or broken):
             return
         if self.env is not None and not rewards:  # of a batch before, perhaps
-            rewards = odd_rewards(self.model, self.replay.storage._storage)
+            kept = self.replay.storage
+            rewards = odd_rewards(
+                self.model, kept._storage[: kept._len_along_dim0]
+            )  # the rest holds anything
         latest, before = self.folder / "checkpoints" / "latest", self.settings.resume
         saved = "no checkpoint was written" + (f"; what it went on from is whole: {before}" if before else "")
         if latest.exists():

@@ -19,9 +19,18 @@ def steps(*rewards: float) -> TensorDict:
     return TensorDict({"next": {"reward": torch.tensor(rewards)[:, None]}}, batch_size=[len(rewards)])
 
 
-def broken(folder: Path, settings: Any, *, learned: bool, drawn: TensorDict, kept: TensorDict) -> str:
+def broken(
+    folder: Path,
+    settings: Any,
+    *,
+    learned: bool,
+    drawn: TensorDict,
+    kept: TensorDict,
+    filled: int | None = None,
+) -> str:
     learner = SimpleNamespace(broken=lambda: ["loss"], updates=3, lr=1e-3, grad_clip=20.0)
-    replay = SimpleNamespace(storage=SimpleNamespace(_storage=kept))
+    filled = len(kept) if filled is None else filled
+    replay = SimpleNamespace(storage=SimpleNamespace(_storage=kept, _len_along_dim0=filled))
     given = {
         "learner": learner, "folder": folder, "settings": settings, "env": object(), "replay": replay, "_batch": drawn,
         "model": SimpleNamespace(has_reward=learned, has_value=False),
@@ -36,6 +45,8 @@ def test_a_reward_of_a_batch_before_is_found_in_the_replay(settled, tmp_path: Pa
     line = broken(tmp_path, settings, learned=True, drawn=fine, kept=odd)
     assert "1 of 3 rewards not finite at update 3; mend the reward of reach" in line
     assert "lower trainer.lr" in broken(tmp_path, settings, learned=True, drawn=fine, kept=fine)
+    # What was never written holds whatever the memory held.
+    assert "lower trainer.lr" in broken(tmp_path, settings, learned=True, drawn=fine, kept=odd, filled=1)
     assert "lower trainer.lr" in broken(
         tmp_path, settings, learned=False, drawn=odd, kept=odd
     )  # it reads none
