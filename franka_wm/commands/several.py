@@ -49,18 +49,12 @@ def wanted(overrides: list[str]) -> tuple[int, str]:
 def run_folder(overrides: list[str]) -> Path:
     """Where a run of this command line will write; with the present time in it, another one each time."""
     import hydra
-    from hydra.core.global_hydra import GlobalHydra
     from hydra.core.hydra_config import HydraConfig
 
-    before = HydraConfig.instance().cfg
-    try:
-        with hydra.initialize_config_dir(str(conf.FOLDER), version_base="1.3"):
-            cfg = hydra.compose("config", overrides=overrides, return_hydra_config=True)
-            HydraConfig.instance().set_config(cfg)
-            return Path(str(cfg.hydra.run.dir)).absolute()
-    finally:
-        HydraConfig.instance().cfg = before
-        GlobalHydra.instance().clear()
+    with conf.hydra_session():
+        cfg = hydra.compose("config", overrides=overrides, return_hydra_config=True)
+        HydraConfig.instance().set_config(cfg)
+        return Path(str(cfg.hydra.run.dir)).absolute()
 
 
 def enter(overrides: list[str]) -> list[str]:

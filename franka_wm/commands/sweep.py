@@ -44,24 +44,18 @@ def jobs(overrides: list[str]) -> list[Job]:
     """
     import hydra
     from hydra._internal.core_plugins.basic_sweeper import BasicSweeper
-    from hydra.core.global_hydra import GlobalHydra
     from hydra.core.override_parser.overrides_parser import OverridesParser
 
     if any(one.startswith("hydra/sweeper=") for one in overrides):
         return []
     found: list[Job] = []
-    before = HydraConfig.instance().cfg
-    try:
-        with hydra.initialize_config_dir(str(conf.FOLDER), version_base="1.3"):
-            parser = OverridesParser.create(config_loader=GlobalHydra.instance().config_loader())
-            for own in BasicSweeper.split_arguments(parser.parse_overrides(overrides), None)[0]:
-                number = [f"hydra.job.num={len(found)}", f"hydra.job.id={len(found)}"]
-                cfg = hydra.compose("config", overrides=[*own, *number], return_hydra_config=True)
-                HydraConfig.instance().set_config(cfg)
-                found.append(Job(own, Path(str(cfg.hydra.sweep.dir), str(cfg.hydra.sweep.subdir))))
-    finally:
-        HydraConfig.instance().cfg = before
-        GlobalHydra.instance().clear()
+    with conf.hydra_session() as loader:
+        parser = OverridesParser.create(config_loader=loader)
+        for own in BasicSweeper.split_arguments(parser.parse_overrides(overrides), None)[0]:
+            number = [f"hydra.job.num={len(found)}", f"hydra.job.id={len(found)}"]
+            cfg = hydra.compose("config", overrides=[*own, *number], return_hydra_config=True)
+            HydraConfig.instance().set_config(cfg)
+            found.append(Job(own, Path(str(cfg.hydra.sweep.dir), str(cfg.hydra.sweep.subdir))))
     folders = [job.folder for job in found]
     for k, folder in enumerate(folders):
         if folder in folders[:k]:

@@ -11,12 +11,15 @@ import warnings
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from omegaconf import DictConfig, OmegaConf, open_dict
 
 from franka_wm.errors import UserError
 from franka_wm.options import unknown
+
+if TYPE_CHECKING:
+    from hydra.core.config_loader import ConfigLoader
 
 FOLDER = Path(__file__).resolve().parent
 
@@ -78,7 +81,7 @@ def compose(*overrides: str) -> DictConfig:
             raise UserError(f"{override}: this option is now called {RENAMED[name]}")
         if name == "hydra.searchpath" and override[0] in "+~":  # Hydra would not look there, nor say so
             raise UserError(f"{override}: write hydra.searchpath=[file://FOLDER], without {override[0]}")
-    with _hydra():
+    with hydra_session():
         cfg = hydra.compose("config", overrides=list(overrides), return_hydra_config=True)
     chosen = cfg.hydra.runtime.choices.get("scale")
     with open_dict(cfg):
@@ -98,19 +101,18 @@ def scale_of_files(*overrides: str) -> str | None:
     Raises:
         HydraException: An override that cannot be.
     """
-    from hydra.core.global_hydra import GlobalHydra
     from hydra.types import RunMode
 
     others = [one for one in overrides if not one.startswith("scale=")]  # Hydra lets the command line win
-    with _hydra():
-        found = GlobalHydra.instance().config_loader().compute_defaults_list("config", others, RunMode.RUN)
+    with hydra_session() as loader:
+        found = loader.compute_defaults_list("config", others, RunMode.RUN)
     chosen = found.overrides.override_choices.get("scale")
     return None if chosen is None else str(chosen)
 
 
 @contextmanager
-def _hydra() -> Iterator[None]:
-    """Hydra at these files.
+def hydra_session() -> Iterator[ConfigLoader]:
+    """Hydra at these files, with what loads them; what it knows of a running job is as before afterwards.
 
     Raises:
         UserError: A file is not YAML, or a folder of ``hydra.searchpath`` is not there, which Hydra only warns of.
@@ -118,13 +120,15 @@ def _hydra() -> Iterator[None]:
     import hydra
     import yaml
     from hydra.core.global_hydra import GlobalHydra
+    from hydra.core.hydra_config import HydraConfig
 
     GlobalHydra.instance().clear()
+    before = HydraConfig.instance().cfg
     try:
         with warnings.catch_warnings():
             warnings.filterwarnings("error", r"provider=hydra\.searchpath .* is not available", UserWarning)
             with hydra.initialize_config_dir(str(FOLDER), version_base="1.3"):
-                yield
+                yield GlobalHydra.instance().config_loader()
     except UserWarning as error:
         folder = str(error).partition(" path=")[2].removesuffix(" is not available.")
         raise UserError(
@@ -135,6 +139,7 @@ def _hydra() -> Iterator[None]:
         where = f"{mark.name}, line {mark.line + 1}" if mark else "a configuration file"
         raise UserError(f"{where}: not YAML ({error.problem})") from error
     finally:
+        HydraConfig.instance().cfg = before
         GlobalHydra.instance().clear()
 
 
