@@ -11,6 +11,7 @@ import benchmarks.results
 from benchmarks.results import confirm, headlines, plots, records, render, running
 from benchmarks.results.rows import Row, choose, load_rows
 from benchmarks.results.state import state, unmeasured
+from franka_wm.console import terminal_log
 from franka_wm.errors import FrankaError
 from franka_wm.files import atomic_write
 from franka_wm.source import ROOT
@@ -181,4 +182,5 @@ def main(arguments: list[str] | None = None) -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    with terminal_log():  # a closed pipe, `… | head`, ends quietly
+        sys.exit(main())

@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+import os
+import subprocess
+import sys
 from dataclasses import replace
+from pathlib import Path
 
 import pytest
 
@@ -123,3 +127,13 @@ def test_a_rows_model_reads_images_that_its_arm_has(name) -> None:
     images = [key for key in cfg.model.observations if key.startswith("pixels")]
     there = ["pixels", *(f"pixels_{camera}" for camera in cfg.env.cameras[1:])]
     assert images and set(images) <= set(there), (images, there)
+
+
+def test_a_list_that_nobody_reads_to_its_end_ends_quietly(root: Path, tmp_path: Path) -> None:
+    """`python -m benchmarks.results | head`."""
+    reads, writes = os.pipe()
+    os.close(reads)
+    with os.fdopen(writes, "w") as stream:
+        command = [sys.executable, "-m", "benchmarks.results", "list", f"--results={tmp_path}"]
+        done = subprocess.run(command, cwd=root, stdout=stream, stderr=subprocess.PIPE, text=True)
+    assert done.returncode == 1 and done.stderr == ""
