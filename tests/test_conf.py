@@ -9,11 +9,12 @@ from pathlib import Path
 import hydra
 import pytest
 import yaml
+from hydra.core.global_hydra import GlobalHydra
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from franka_wm.conf import FOLDER, SCALES, compose, use_present_names
+from franka_wm.conf import FOLDER, SCALES, compose, hydra_session, use_present_names
 from franka_wm.errors import UserError
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -171,3 +172,12 @@ def test_a_run_s_folder_is_called_by_what_it_simulates(
     HydraConfig.instance().set_config(cfg)
     assert Path(cfg.hydra.run.dir).name[9:] == f"{name}-4"  # behind the time
     assert cfg.hydra.sweep.subdir == f"2-{name}"
+
+
+def test_a_session_leaves_hydra_as_it_was(monkeypatch) -> None:
+    """A run in progress has told it of its job."""
+    monkeypatch.setattr(HydraConfig.instance(), "cfg", "the job's")
+    with hydra_session() as loader:
+        HydraConfig.instance().cfg = "another's"
+        assert "mppi" in loader.get_group_options("planner")
+    assert HydraConfig.instance().cfg == "the job's" and not GlobalHydra.instance().is_initialized()

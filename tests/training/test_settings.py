@@ -75,7 +75,6 @@ OUT_OF_RANGE = {
     "dataset.image_size": [0, [1, 2, 3]],
     "pretrain.kind": ["model"],
     "pretrain.updates": [-1],
-    "model.name": ["oracle_bone"],
     "model.window": [0],
     "model.lr": [0.0],
     "model.schedule": ["linear"],
