@@ -23,7 +23,7 @@ from omegaconf.errors import OmegaConfBaseException
 
 from franka_wm import conf
 from franka_wm.commands import launching, several
-from franka_wm.commands.overrides import compose, explain, given, unknown_flags
+from franka_wm.commands.overrides import compose, explain, given, unknown_flags, values
 from franka_wm.commands.sweep import Sweep, jobs, names, spread
 from franka_wm.console import program, quoted, resuming, say, terminal_log
 from franka_wm.errors import REFUSALS, FrankaError, machine_refused
@@ -361,7 +361,7 @@ def with_scale(arguments: list[str], stream: TextIO | None = None, *, quiet: boo
                 stream,
             )
         return arguments
-    devices = {one for a in arguments if a.startswith("device=") for one in a.split("=", 1)[1].split(",")}
+    devices = {*values(arguments, "device")}
     if not devices:
         named = [a for a in arguments if a != chosen] if any(map(_may_choose, arguments)) else []
         devices = {str(compose(one).device) for one in swept(named)} if named else {"auto"}

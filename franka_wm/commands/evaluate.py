@@ -168,13 +168,14 @@ def check_larger(folder: Path, episodes: int | None, checkpoint: str) -> None:
         there = read_result(folder / "evaluation.json")
     except UserError:  # nobody can read it
         return
+    if episodes is not None and there.episodes <= episodes:
+        return
     from franka_wm.training.load import find_checkpoint, own_episodes
 
-    episodes = own_episodes(checkpoint) if episodes is None else episodes
-    if there.episodes <= episodes:
-        return
-    now = 0 if there.updates is None else find_checkpoint(checkpoint).counters.get("updates", 0)
-    if there.updates is not None and there.updates < now:  # of earlier weights
+    found = find_checkpoint(checkpoint)
+    episodes = own_episodes(found) if episodes is None else episodes
+    earlier = there.updates is not None and there.updates < found.counters.get("updates", 0)  # weights
+    if there.episodes <= episodes or earlier:
         return
     raise UserError(
         f"evaluate: {folder} holds a result of {there.episodes} episodes, which one of {episodes} would replace; "

@@ -27,7 +27,7 @@ from franka_wm.report.diagnostics import (
 )
 from franka_wm.report.run import read_chosen
 from franka_wm.report.table import evaluation_tables, markdown
-from franka_wm.training.load import load_agent, own_episodes
+from franka_wm.training.load import find_checkpoint, load_agent, own_episodes
 
 if TYPE_CHECKING:
     from franka_wm.training.load import Agent
@@ -74,10 +74,11 @@ def run(options: Options) -> dict[str, Any]:
     from rich.console import Console
 
     console = Console(width=120)
-    episodes = own_episodes(options.checkpoint) if options.episodes is None else options.episodes
-    with announced(f"loading {options.checkpoint} and building {min(episodes, WORLDS)} worlds"):
+    with announced(f"loading {options.checkpoint} and building worlds"):
+        found = find_checkpoint(options.checkpoint)
+        episodes = own_episodes(found) if options.episodes is None else options.episodes
         agent = load_agent(
-            options.checkpoint,
+            found.folder,
             num_envs=min(episodes, WORLDS),
             device=options.device,
             **_planning(options),

@@ -48,6 +48,17 @@ def given(overrides: Sequence[str], key: str) -> str | None:
     return value.text if isinstance(value, QuotedString) else str(value)
 
 
+def values(overrides: Sequence[str], key: str) -> list[str]:
+    """The same of a list that a sweep goes through: each of its values."""
+    from hydra.core.override_parser.overrides_parser import OverridesParser
+
+    line = next((one for one in reversed(overrides) if one.lstrip("+").startswith(f"{key}=")), None)
+    override = None if line is None else OverridesParser.create().parse_override(line)
+    if override is None or not override.is_sweep_override():
+        return [] if line is None else [str(given([line], key))]
+    return [str(given([f"{key}={one}"], key)) for one in override.sweep_string_iterator()]
+
+
 def unknown_flags(arguments: Sequence[str], unknown: Sequence[str]) -> str:
     """What is wrong with flags that Hydra does not have; of options typed as elsewhere, how they are typed here."""
     flags = [one for one in unknown if one.startswith("-") and not one[1:2].isdigit()]  # -1 is a value
@@ -55,12 +66,12 @@ def unknown_flags(arguments: Sequence[str], unknown: Sequence[str]) -> str:
     for flag in flags:
         name, equals, value = flag.lstrip("-").partition("=")
         following = arguments[arguments.index(flag) + 1 :][:1]
-        if not equals and following and not following[0].startswith("--") and "=" not in following[0]:
+        if not equals and following and _VALUE.fullmatch(following[0]):
             flag, equals, value = f"{flag} {following[0]}", "=", following[0]
         typed += [flag]
         written += [f"{name}={value}"] if equals else []
     if not written:
-        return f"unrecognized arguments: {' '.join(flags)}"
+        return f"unrecognized arguments: {' '.join(flags or unknown)}"
     return f"{' '.join(typed)}: no such flag; options have no dashes, write {' '.join(written)}"
 
 
@@ -91,6 +102,8 @@ EXTRAS = {
 """Launchers and sweepers of ``--multirun``, and the extra of this package that has each."""
 OF_TASK = "env.task_options."
 """What options that a task brings itself begin with."""
+_VALUE = re.compile(r"-?[\d.][^=]*|[^-][^=]*")
+"""What may follow a flag as its value: no flag, and no override."""
 _MISSING = re.compile(r"Could not find '([^']+)/([^'/]+)'")
 _UNKNOWN = re.compile(r"Could not override '([^']+)'")
 
@@ -125,6 +138,17 @@ def _unknown_key(message: str) -> str | None:
     return full[1] if full is not None and full[1].startswith(f"{unknown[1]}.") else unknown[1]
 
 
+def _composed(*overrides: str) -> Any:
+    """The configuration of some overrides; ``None`` where one of these is wrong, too."""
+    from hydra.errors import HydraException
+    from omegaconf.errors import OmegaConfBaseException
+
+    try:
+        return conf.compose(*overrides)
+    except (HydraException, OmegaConfBaseException, UserError):
+        return None
+
+
 def _of_task(unknown: str, overrides: Sequence[str]) -> str | None:
     """What is wrong with an option of the task that the configuration does not name: only its class knows all.
 
@@ -135,7 +159,9 @@ def _of_task(unknown: str, overrides: Sequence[str]) -> str | None:
     from franka_wm.training.run import import_plugins
 
     keys = [(o.partition("=")[0], o) for o in overrides]
-    cfg = conf.compose(*(o for key, o in keys if key == "hydra.searchpath" or "." not in key))
+    cfg = _composed(*(o for key, o in keys if key == "hydra.searchpath" or "." not in key))
+    if cfg is None:
+        return None
     import_plugins(cfg.plugins)
     task = given(overrides, "env.task") or cfg.env.get("task")
     if cfg.env.kind != "franka" or task not in TASKS:
@@ -158,7 +184,9 @@ def _allowed(message: str, overrides: Sequence[str], options: Sequence[str]) -> 
     # With the same choices of groups, and where they are looked for: other environments have other options.
     keys = [(o.partition("=")[0], o) for o in overrides]
     chosen = [o for key, o in keys if key == "hydra.searchpath" or ("." not in key and key != unknown)]
-    node: Any = conf.compose(*chosen)
+    node = _composed(*chosen)
+    if node is None:
+        return []
     place = unknown.rpartition(".")[0] if "/" not in unknown and "@" not in unknown else ""
     found = OmegaConf.select(node, place) if place else node
     if isinstance(found, DictConfig):

@@ -112,7 +112,7 @@ def scale_of_files(*overrides: str) -> str | None:
 
 @contextmanager
 def hydra_session() -> Iterator[ConfigLoader]:
-    """Hydra at these files, with what loads them; what it knows of a running job is as before afterwards.
+    """Hydra at these files, with what loads them; ``HydraConfig`` is as before afterwards, ``GlobalHydra`` is cleared.
 
     Raises:
         UserError: A file is not YAML, or a folder of ``hydra.searchpath`` is not there, which Hydra only warns of.

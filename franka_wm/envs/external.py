@@ -102,11 +102,9 @@ class ExternalEnv(TransformedEnv):
             base = TransformedEnv(base, flat)
         else:
             base = SerialEnv(num_envs, make, device="cpu")
-        # All entries of all worlds are copied at once: many small copies take longer than the worlds.
+        # Each entry is copied for all worlds at once: copies world by world take longer than the worlds.
         if device is not None and torch.device(device).type != "cpu" and not ray:
-            cast = DeviceCastTransform(device, orig_device="cpu")
-            cast.enable_inv_on_reset = True  # masks of a reset, too
-            transforms.append(cast)
+            transforms.append(_ToDevice(device, orig_device="cpu"))
         super().__init__(base, Compose(*transforms))
         self.config, self.num_envs = config, num_envs
         self._totals = torch.zeros(3, device=device)
@@ -178,6 +176,18 @@ class ExternalEnv(TransformedEnv):
             self._totals.zero_()
         count_or_one = max(count, 1.0)
         return {"return": total / count_or_one, "length": length / count_or_one, "episodes": count}
+
+
+class _ToDevice(DeviceCastTransform):
+    """Worlds on the CPU, entries on another device; what worlds and counters do not read stays there."""
+
+    READ = (
+        "action", "step_count", "episode_reward", "is_init", "done", "terminated", "truncated", "_reset", "_step",
+    )  # fmt: skip
+    enable_inv_on_reset = True  # masks of a reset, too
+
+    def _inv_call(self, tensordict: TensorDictBase) -> TensorDictBase:
+        return tensordict.select(*self.READ, strict=False).to("cpu", non_blocking=False)
 
 
 def check_external(config: ExternalConfig) -> tuple[dict[str, int], int, int]:

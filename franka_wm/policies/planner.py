@@ -401,20 +401,22 @@ class ModelPolicy(TensorDictModuleBase):
     @torch.no_grad()
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write `action`."""
-        read = (*self.in_keys, *(CONTEXT if self.observe is not None else ()))
+        # What `encode` may read, as a planner gives it.
+        read = (*self.in_keys, "is_init", *(CONTEXT if self.observe is not None else ()))
         inputs = TensorDict(
             {key: value for key in read if (value := tensordict.get(key, None)) is not None},
             batch_size=tensordict.batch_size,
         )
         explore = explores(self.explore)
-        if not captures(self.capture, inputs.get(self.in_keys[0])):
+        if not captures(self.capture, inputs[self.in_keys[0]]):
             return tensordict.update(self._decide(inputs, explore))
         training = None if self.model is None else self.model.training
+        held = (self.encode, self.policy, self.observe, self.goals)
         decision = self._graphs(
             lambda entries: self._decide(entries, explore),
             inputs,
-            key=(explore, training, share_of_worlds()),
-            held=(self.encode, self.policy, self.observe, self.goals),
+            key=(explore, training, share_of_worlds(), *map(graph_key, held)),
+            held=held,
         )
         return tensordict.update(decision)
 

@@ -25,8 +25,8 @@ def finite(
     odd = [key for key, of in moments.items() if not all(bool(x.isfinite().all()) for x in of)]
     if odd:
         raise UserError(
-            f"observation {' and '.join(odd)}: not finite (NaN or inf) in the first steps of {settings.env.label}; "
-            "mend what it observes, or the goal"
+            f"observation {' and '.join(odd)}: not finite (NaN or inf) in the first steps of {settings.env.label}, "
+            "demonstrations included; mend what the task observes, its goal, or the dataset"
         )
     return moments
 
@@ -51,8 +51,8 @@ def beyond_bounds(model: WorldModel, steps: TensorDictBase | None, bounds: tuple
     ):  # of what is not finite more is said elsewhere
         return ""
     return (
-        f"rewards from {least:.4g} to {largest:.4g} go beyond reward_bounds=({low:g}, {high:g}), to which models fit "
-        "the range of their values; widen what the task declares"
+        f"rewards from {least:.4g} to {largest:.4g} go beyond reward_bounds=({low:g}, {high:g}), for which the model "
+        "was built; widen what the task declares"
     )
 
 

@@ -163,9 +163,9 @@ def find_checkpoint(folder: str | Path) -> Checkpoint:
     return load_checkpoint(latest_checkpoint(folder))
 
 
-def own_episodes(folder: str | Path) -> int:
-    """By how many a run is judged at its end; ``folder``: see :func:`load_agent`."""
-    return RunSettings.of(find_checkpoint(folder).config, saved=True).evaluation.episodes
+def own_episodes(checkpoint: Checkpoint) -> int:
+    """By how many its run is judged at the end."""
+    return RunSettings.of(checkpoint.config, saved=True).evaluation.episodes
 
 
 def require_same_actions(checkpoint: Checkpoint, config: FrankaConfig) -> None:

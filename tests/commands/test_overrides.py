@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from franka_wm.commands import entry
-from franka_wm.commands.overrides import compose
+from franka_wm.commands.overrides import compose, values
 from franka_wm.errors import UserError
 from franka_wm.training.run import import_plugins
 from franka_wm.training.settings import RunSettings
@@ -28,6 +28,8 @@ FLAGS = "; python train.py --hydra-help lists the flags\n"
             "--experiment images: no such flag; options have no dashes, write experiment=images",
         ),
         (["--fast", "env=reach", "--faster"], "unrecognized arguments: --fast --faster"),
+        (["--fast", "-m", "seed=1,2"], "unrecognized arguments: --fast"),
+        (["-1x"], "unrecognized arguments: -1x"),
     ],
 )
 def test_options_with_dashes_are_told_how_to_be_written(words: list[str], said: str, capsys) -> None:
@@ -68,3 +70,23 @@ def test_an_option_of_a_task_that_the_preset_does_not_name_can_be_added(registri
     words = ["plugins=[examples.add_a_task]", "env.task=raise_tool", "+env.task_options.height=0.8"]
     import_plugins(["examples.add_a_task"])
     assert RunSettings.of(compose([*words, "scale=smoke"])).env.arm.task_options == {"height": 0.8}
+
+
+@pytest.mark.parametrize("first", ["env.bogus=1", "env.task_options.height=1"])
+def test_of_two_wrong_overrides_the_first_is_told(first: str) -> None:
+    """To name what there is the others are composed, of which one is wrong, too."""
+    with pytest.raises(UserError, match=f"^{first.partition('=')[0]}: no such option$"):
+        compose([first, "nope=3"])
+
+
+@pytest.mark.parametrize(
+    ("override", "found"),
+    [
+        ("device=cpu,cuda:1", ["cpu", "cuda:1"]),
+        ("device=choice(cuda:0,cuda:1)", ["cuda:0", "cuda:1"]),
+        ("++device='cuda:0'", ["cuda:0"]),
+        ("seed=3", []),
+    ],
+)
+def test_all_values_of_a_list(override: str, found: list[str]) -> None:
+    assert values(["env=lift", override], "device") == found

@@ -10,8 +10,9 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from tensordict import TensorDict
 
-from franka_wm.envs.external import ExternalEnv, check_external
+from franka_wm.envs.external import ExternalEnv, _ToDevice, check_external
 from franka_wm.envs.external_config import ExternalConfig, external_config
 from franka_wm.errors import UserError
 from franka_wm.training.spaces import Spaces
@@ -124,11 +125,23 @@ def test_actions_that_no_model_chooses_are_one_line(actions: Any, monkeypatch: p
             make(config)
 
 
-def test_worlds_stay_on_the_cpu_and_their_entries_are_copied_at_once() -> None:
+def test_worlds_stay_on_the_cpu() -> None:
     """With a device that every machine has in place of a GPU."""
     device = torch.device("meta")
     env = ExternalEnv(ExternalConfig(kind="gym", name="CartPole-v1"), num_envs=3, device=device)
     assert (env.base_env.device, env.device) == (torch.device("cpu"), device)
+
+
+def test_worlds_are_given_what_they_read_alone() -> None:
+    """A policy's memory would be copied from the device at every step."""
+    given = {
+        key: torch.zeros(3, 1)
+        for key in ("action", "step_count", "episode_reward", "state", "context", "plan")
+    }
+    read = _ToDevice("meta", orig_device="cpu").inv(
+        TensorDict({**given, "done": torch.zeros(3, 1, dtype=torch.bool)}, [3])
+    )
+    assert {*read.keys()} == {"action", "step_count", "episode_reward", "done"}
 
 
 @pytest.mark.gpu

@@ -205,7 +205,7 @@ def test_a_policy_captures_anew_when_its_objective_changes(recorded, monkeypatch
     assert torch.equal(decide(), first) and len(recorded) == 3  # kept
 
 
-def test_an_actor_is_captured_anew_for_another_mode_or_share_of_the_worlds(recorded, monkeypatch):
+def test_an_actor_is_captured_anew_for_another_mode_number_or_share_of_the_worlds(recorded, monkeypatch):
     monkeypatch.setattr("franka_wm.policies.planner.captures", lambda *_: True)
     model = small_model()
     actor, found = ModelPolicy.for_model(model, explore=False), []
@@ -225,6 +225,8 @@ def test_an_actor_is_captured_anew_for_another_mode_or_share_of_the_worlds(recor
     assert decide() == 3
     with drawing_for(0, 4, 8):
         assert decide() == 4
+    model.discount = 0.5  # a number that its methods may read
+    assert decide() == 5
 
 
 class Held:

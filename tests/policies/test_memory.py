@@ -12,6 +12,28 @@ from franka_wm.planning import MPPI
 from franka_wm.policies import ExploringPolicy, ModelPolicy, PlannerPolicy
 from points import Points
 
+
+class Begun(WorldModel):
+    """Its latents say whether an episode begins."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.observation_sizes, self.discount = {"state": 2}, 0.9
+
+    def encode(self, observation):
+        return observation.get("is_init").float()
+
+    def policy(self, z, deterministic=False):
+        return z.expand(-1, 2)
+
+
+def test_a_model_without_memory_may_read_where_episodes_begin():
+    """`check_model` gives it that."""
+    begins = torch.tensor([[True], [False]])
+    seen = TensorDict({"state": torch.zeros(2, 2), "is_init": begins}, [2])
+    assert torch.equal(ModelPolicy.for_model(Begun())(seen)["action"], begins.float().expand(-1, 2))
+
+
 NEVER = torch.zeros(4, 1, dtype=torch.bool)
 
 
