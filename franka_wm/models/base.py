@@ -97,7 +97,7 @@ class WorldModel(nn.Module):
     terminates: bool = False
     """Whether `terminated` predicts ends of episodes."""
     weight_decay: float = 0.0
-    """Of the optimiser, for matrices, see `parameter_groups`."""
+    """Weight decay of matrices, see `parameter_groups`."""
 
     def __init_subclass__(cls, **kwargs: Any) -> None:
         super().__init_subclass__(**kwargs)

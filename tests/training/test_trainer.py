@@ -24,7 +24,7 @@ from franka_wm.training.learner import Learner
 from franka_wm.training.resume import restore
 from franka_wm.training.run import Run
 from franka_wm.training.settings import RunSettings
-from franka_wm.training.trainer import Trainer, _of_all
+from franka_wm.training.trainer import Trainer
 
 N, CAPACITY = 4, 50
 
@@ -122,9 +122,7 @@ def test_targets_outside_of_the_range_are_said(make: Make, capsys, low) -> None:
     assert all("model.value_low" in line for line in said)
 
 
-@pytest.mark.parametrize(
-    ("bounds", "beyond"), [((-0.5, 0.0), True), ((-2.0, -1.5), True), ((-1.5, 0.0), False)]
-)
+@pytest.mark.parametrize(("bounds", "beyond"), [((-0.5, 0.0), True), ((-1.5, 0.0), False)])
 def test_rewards_beyond_what_the_task_declares_are_said_once(make: Make, capsys, bounds, beyond) -> None:
     trainer = make()
     trainer.spaces = replace(trainer.spaces, reward_bounds=bounds)
@@ -454,15 +452,3 @@ def test_policies_take_turns(make: Make) -> None:
     trainer.fit()
     acted = used[-15:]
     assert acted == ["random"] * 10 + ["policy"] * 5
-
-
-def test_statistics_of_several_processes_are_means_over_their_episodes() -> None:
-    """Success of a task by that task's episodes: here 1 of 1 and 0 of 3."""
-    found = _of_all(
-        [
-            {"episodes": 9, "success": 1.0, "success/lift": 1.0, "episodes/lift": 1, "overflow": 2},
-            {"episodes": 3, "success": 0.0, "success/lift": 0.0, "episodes/lift": 3, "overflow": 1},
-            {"episodes": 0, "overflow": 0},
-        ]
-    )
-    assert found == {"episodes": 12, "success": 0.75, "success/lift": 0.25, "episodes/lift": 4, "overflow": 3}
