@@ -299,7 +299,8 @@ def test_results_of_something_else_are_not_replaced(tmp_path: Path, capsys, monk
     assert "holds a result planned with planner=cem" in told("new")
 
 
-def test_a_result_of_more_episodes_is_not_replaced(tmp_path: Path, capsys) -> None:
+def test_a_result_of_more_episodes_is_not_replaced(tmp_path: Path, monkeypatch, capsys) -> None:
+    monkeypatch.setattr("franka_wm.training.load.find_checkpoint", lambda _: SimpleNamespace(counters={}))
     (tmp_path / "checkpoints").mkdir()
     place = tmp_path / "evaluation"
     place.mkdir()
@@ -332,12 +333,13 @@ def test_results_that_cannot_be_written_are_refused_before_playing(out: str, tmp
 
 
 def test_shifting_what_is_no_arm_is_refused_before_playing(tmp_path: Path, monkeypatch, capsys) -> None:
-    monkeypatch.setattr(evaluate_checkpoint, "load_agent", lambda *a, **k: SimpleNamespace(env=object()))
+    found = SimpleNamespace(folder=tmp_path, env=object())
+    for name in ("find_checkpoint", "load_agent"):
+        monkeypatch.setattr(evaluate_checkpoint, name, lambda *a, **k: found)
     monkeypatch.setattr(evaluate_checkpoint, "evaluate_agent", lambda *a, **k: pytest.fail("played"))
     (tmp_path / "checkpoints").mkdir()
-    arguments = [f"checkpoint={tmp_path}", f"out={tmp_path}/out", "episodes=9", "robustness=true"]
     monkeypatch.setattr(evaluate_checkpoint, "protocol", lambda *a: pytest.fail("went on"))
-    assert cli.main(["evaluate", *arguments]) == 1
+    assert cli.main(["evaluate", str(tmp_path), f"out={tmp_path}/out", "episodes=9", "robustness=true"]) == 1
     captured = capsys.readouterr()
     assert captured.err.count("\n") == 1 and "only the arm can be shifted" in captured.err
 
