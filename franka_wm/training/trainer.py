@@ -404,10 +404,8 @@ class Trainer:
         if not (rewards or broken):
             return
         if self.env is not None and not rewards:  # of a batch before, perhaps
-            kept = self.replay.storage
-            rewards = odd_rewards(
-                self.model, kept._storage[: kept._len_along_dim0]
-            )  # the rest holds anything
+            kept = self.replay.storage  # what was not written yet holds anything
+            rewards = odd_rewards(self.model, kept._storage[: kept._len_along_dim0])
         latest, before = self.folder / "checkpoints" / "latest", self.settings.resume
         saved = "no checkpoint was written" + (f"; what it went on from is whole: {before}" if before else "")
         if latest.exists():
