@@ -42,6 +42,7 @@ def evaluate(monkeypatch, tmp_path: Path) -> Any:
         )
         found = Evaluation({"planner": {**policy(0.1), "episodes": episodes}}, {}, [1], {"planner": 0.1}, 1)
         told = {"by": COMMAND, "task": "reach", "updates": 300}
+        monkeypatch.setattr(evaluate_checkpoint, "find_checkpoint", lambda folder: agent)
         monkeypatch.setattr(evaluate_checkpoint, "load_agent", lambda *a, **k: agent)
         monkeypatch.setattr(evaluate_checkpoint, "evaluate_agent", lambda *a, **k: found)
         monkeypatch.setattr(evaluate_checkpoint, "protocol", lambda *a, **k: told)
