@@ -329,11 +329,11 @@ class Dreamer(ActorCritic):
     # ------------------------------------------------------------------ pieces
 
     def _embed(self, observation: TensorDictBase) -> Tensor:
-        """Features (..., embed_dim) of observations (...)."""
+        """What the posterior reads (..., hidden_dim) of observations (...)."""
         parts = [one(check_images(observation.get(key))) for key, one in self.image_encoders.items()]
         if self.vector_encoder is not None:
             parts.append(self.vector_encoder(symlog(self.vectors(observation))))
-        return torch.cat(parts, dim=-1)
+        return self.rssm.of_observation(torch.cat(parts, dim=-1))
 
     def _see(self, h: Tensor, embedded: Tensor, *, sample: bool) -> tuple[Tensor, Tensor]:
         """States (..., Z) and posteriors (..., codes, classes) of h and features (..., E)."""

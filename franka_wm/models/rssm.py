@@ -27,7 +27,7 @@ class RSSM(nn.Module):
     no class is ever impossible and divergences stay finite.
 
     Args:
-        embed_dim: size of what the posterior reads of an observation.
+        embed_dim: size of an observation's features.
         action_dim: size of an action.
         deter_dim: size of h; a multiple of `blocks`.
         hidden_dim: width of hidden layers.
@@ -57,11 +57,24 @@ class RSSM(nn.Module):
         self.of_deter = layer(deter_dim, hidden_dim)
         self.of_codes = layer(codes * classes, hidden_dim)
         self.of_action = layer(action_dim, hidden_dim)
-        self.mix = BlockLinear(deter_dim + 3 * hidden_dim * blocks, deter_dim, blocks)
+        # A layer of several inputs is a sum of one for each: blocks share theirs, an observation's needs no h.
+        self.mix = BlockLinear(deter_dim, deter_dim, blocks)
+        self.mix_inputs = Linear(3 * hidden_dim, deter_dim, bias=False)
         self.mix_norm = RMSNorm(deter_dim, eps=EPS)
         self.gates = BlockLinear(deter_dim, 3 * deter_dim, blocks)
         self.prior_head = network(deter_dim, (hidden_dim, hidden_dim), codes * classes)
-        self.posterior_head = network(deter_dim + embed_dim, (hidden_dim,), codes * classes)
+        self.posterior_mix = Linear(deter_dim, hidden_dim)
+        self.of_observation = Linear(embed_dim, hidden_dim, bias=False)
+        self.posterior_head = nn.Sequential(
+            RMSNorm(hidden_dim, eps=EPS), nn.SiLU(), *network(hidden_dim, (), codes * classes)
+        )
+        for one, other, inputs in (
+            (self.mix, self.mix_inputs, deter_dim // blocks + 3 * hidden_dim),
+            (self.posterior_mix, self.of_observation, deter_dim + embed_dim),
+        ):
+            spread(one.weight, inputs)
+            spread(other.weight, inputs)
+        nn.init.zeros_(self.posterior_mix.bias)
 
     def begin(self, like: Tensor) -> Tensor:
         """h (..., deter_dim) of an episode's first observation, for inputs `like` (..., anything)."""
@@ -72,9 +85,7 @@ class RSSM(nn.Module):
         """The next h (..., deter_dim) after actions (..., A) in [-1, 1] in z (..., size)."""
         h, s = z.split(self.sizes, dim=-1)
         inputs = torch.cat((self.of_deter(h), self.of_codes(s), self.of_action(action)), dim=-1)
-        grouped = h.unflatten(-1, (self.blocks, -1))
-        shared = inputs.unsqueeze(-2).expand(*grouped.shape[:-1], -1)
-        x = F.silu(self.mix_norm(self.mix(torch.cat((grouped, shared), dim=-1).flatten(-2))))
+        x = F.silu(self.mix_norm(self.mix(h) + self.mix_inputs(inputs)))
         reset, candidate, update = (
             gate.flatten(-2) for gate in self.gates(x).unflatten(-1, (self.blocks, -1)).chunk(3, dim=-1)
         )
@@ -85,9 +96,9 @@ class RSSM(nn.Module):
         """Log-probabilities (..., codes, classes) of s from h (..., deter_dim)."""
         return self._log_probabilities(self.prior_head(h))
 
-    def posterior(self, h: Tensor, embedded: Tensor) -> Tensor:
-        """Log-probabilities (..., codes, classes) of s from h and an observation's features (..., embed_dim)."""
-        return self._log_probabilities(self.posterior_head(torch.cat((h, embedded), dim=-1)))
+    def posterior(self, h: Tensor, observed: Tensor) -> Tensor:
+        """Log-probabilities (..., codes, classes) of s from h and `of_observation` (..., hidden_dim) of features."""
+        return self._log_probabilities(self.posterior_head(self.posterior_mix(h) + observed))
 
     def state(self, h: Tensor, log_probabilities: Tensor, *, sample: bool) -> Tensor:
         """z (..., size) of h and codes: drawn, or the likeliest. Gradients pass straight through to probabilities."""

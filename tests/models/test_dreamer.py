@@ -138,7 +138,7 @@ def test_vectors_are_read_by_their_symlog():
     model = small()
     observation = TensorDict({"state": 1e3 * torch.randn(4, 3), "joint_target": torch.randn(4, 2)}, [4])
     vectors = torch.cat((observation["state"], observation["joint_target"]), -1)
-    read = model.vector_encoder(symlog(vectors))
+    read = model.rssm.of_observation(model.vector_encoder(symlog(vectors)))
     torch.testing.assert_close(model._embed(observation), read)
 
 
@@ -180,9 +180,12 @@ def test_each_loss_reaches_what_it_should_and_nothing_else():
     batch = windows(batch=5, horizon=4)
     model = {
         "vector_encoder",
-        *(f"rssm.{n}" for n in ("of_deter", "of_codes", "of_action", "mix", "mix_norm", "gates")),
+        *(
+            f"rssm.{n}"
+            for n in ("of_deter", "of_codes", "of_action", "mix", "mix_inputs", "mix_norm", "gates")
+        ),
+        *(f"rssm.{n}" for n in ("of_observation", "posterior_mix", "posterior_head")),
     }
-    model |= {"rssm.posterior_head"}
     always = {"actor", "critic"}  # their losses have no weight
 
     def reached(**coefficients) -> set[str]:

@@ -32,7 +32,8 @@ def test_the_recurrent_step_is_a_gated_unit_whose_blocks_see_their_own_memory_an
     z, action = torch.randn(5, rssm.size), torch.rand(5, 2) * 2 - 1
     h, s = z[:, :16], z[:, 16:]
     shared = torch.cat((rssm.of_deter(h), rssm.of_codes(s), rssm.of_action(action)), -1)
-    parts = [torch.cat((h[:, 8 * k : 8 * k + 8], shared), -1) @ rssm.mix.weight[k] for k in range(2)]
+    inputs = rssm.mix_inputs.weight.mT.unflatten(-1, (2, 8))
+    parts = [h[:, 8 * k : 8 * k + 8] @ rssm.mix.weight[k] + shared @ inputs[:, k] for k in range(2)]
     x = F.silu(rssm.mix_norm(torch.cat(parts, -1) + rssm.mix.bias.flatten()))
     after = []
     for k in range(2):
@@ -42,6 +43,17 @@ def test_the_recurrent_step_is_a_gated_unit_whose_blocks_see_their_own_memory_an
         own = h[:, 8 * k : 8 * k + 8]
         after.append(update * torch.tanh(torch.sigmoid(reset) * candidate) + (1 - update) * own)
     torch.testing.assert_close(rssm.recur(z, action), torch.cat(after, -1))
+
+
+def test_the_posterior_reads_memory_and_observation_as_one_layer_would():
+    rssm = small()
+    h, embedded = torch.randn(5, 16), torch.randn(5, 16)
+    weight = torch.cat((rssm.posterior_mix.weight, rssm.of_observation.weight), -1)
+    torch.nn.init.normal_(rssm.posterior_mix.bias)
+    x = rssm.posterior_head(F.linear(torch.cat((h, embedded), -1), weight, rssm.posterior_mix.bias))
+    torch.testing.assert_close(
+        rssm.posterior(h, rssm.of_observation(embedded)), rssm._log_probabilities(x), atol=1e-5, rtol=1e-5
+    )
 
 
 def test_divergence_is_that_of_categorical_distributions_with_a_uniform_share():
@@ -100,7 +112,14 @@ def test_an_episode_begins_with_a_step_from_nothing():
 
 
 def test_first_weights_keep_the_size_of_what_passes_through():
+    rssm = RSSM(
+        embed_dim=256, action_dim=2, deter_dim=512, hidden_dim=64, codes=4, classes=8, blocks=4, unimix=0.01
+    )
     for weight, inputs, scale in (
+        (rssm.mix.weight, 128 + 3 * 64, 1.0),  # each block its own part of h, and all inputs
+        (rssm.mix_inputs.weight, 128 + 3 * 64, 1.0),
+        (rssm.posterior_mix.weight, 512 + 256, 1.0),
+        (rssm.of_observation.weight, 512 + 256, 1.0),
         (BlockLinear(512, 256, 4).weight, 128, 1.0),
         (layer(256, 256)[0].weight, 256, 1.0),
         (network(256, (128, 64, 32), 512)[-1].weight, 32, 1.0),
