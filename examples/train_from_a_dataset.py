@@ -1,4 +1,4 @@
-"""A world model from a recorded dataset, in code of your own.
+"""A TD-MPC2 from the vectors of a recorded dataset that has rewards, in code of your own.
 
     python examples/train_from_a_dataset.py user/name        a LeRobot dataset on the Hugging Face Hub
     python examples/train_from_a_dataset.py datasets/reach   one on disk, from `franka-wm collect` say
@@ -21,7 +21,7 @@ device = "cuda" if torch.cuda.is_available() else "cpu"
 
 # Decoded once into arrays beside the cache of other packages; the second time it opens at once.
 source = {"root": where} if Path(where).is_dir() else {"repo_id": where}
-windows = open_dataset(**source, window=3, batch_size=64, device=device)
+windows = open_dataset(**source, window=3, batch_size=64, device=device, rewards_for="this example")
 validation = windows.validation()
 print(
     f"vectors {dict(windows.observation_sizes)}, images {dict(windows.image_sizes)}, actions {windows.action_dim}"

@@ -29,7 +29,7 @@ from franka_wm.training.settings import RunSettings
 from franka_wm.training.settings.groups import ObjectiveSettings, no_such
 from franka_wm.training.spaces import Spaces
 from franka_wm.training.storage_budget import check_memory
-from franka_wm.training.unread import say_unread
+from franka_wm.training.unread import say_unread, say_unseen_goal
 
 if TYPE_CHECKING:
     from franka_wm.data.lerobot.mapping import FeatureMap
@@ -278,6 +278,7 @@ def _check_parts(run: RunSettings) -> None:
     spaces = known_spaces(run)
     if spaces is None:
         return
+    say_unseen_goal(run)
     if run.is_offline:  # the data has the sizes; what acts in the environment needs its goals
         known = run.model.observations
         return None if known is None else _check_goal_images(run, [k for k in known if "pixels" in k], spaces)

@@ -1,8 +1,9 @@
-"""Images that are rendered and read by nothing, or seen by one stage of a run alone: each said in one line."""
+"""Images that nothing reads, or one stage of a run alone, and goals that the model cannot see: each said in one line."""
 
 from __future__ import annotations
 
 from franka_wm.console import say
+from franka_wm.envs.tasks import make_task
 from franka_wm.planning.objectives import goal_images
 from franka_wm.training.settings import RunSettings
 from franka_wm.training.spaces import Spaces
@@ -20,6 +21,20 @@ def say_unread(run: RunSettings, spaces: Spaces) -> None:
         say(f"not read by the model: {', '.join(unread)} (model.observations)")
     if run.pretrain.kind != "none":
         _say_unseen(run, spaces)
+
+
+def say_unseen_goal(run: RunSettings) -> None:
+    """Says so where each episode has another goal, rewards are for reaching it, and the model reads nothing of it."""
+    if not run.is_arm or run.objective_name == "goal_image" or not run.model.family.has_value:
+        return
+    config, keys = run.env.arm, run.model.observations
+    read = config.observations if keys is None else keys
+    seen = config.show_goal or any(key in ("state", "goal") or "goal_pixels" in key for key in read)
+    if not (seen or config.fixed_goal) and make_task(config).relabels():
+        say(
+            "warning: each episode has another goal, and the model reads nothing that shows it: add state or goal to "
+            "model.observations, or set env.show_goal=true"
+        )
 
 
 def _say_unseen(run: RunSettings, spaces: Spaces) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from franka_wm.errors import UserError
-from franka_wm.training.check import check
+from franka_wm.training.check import _check_parts, check
 
 MUZERO = ("env=reach_fixed", "model=muzero", "planner=mcts")
 LEWM = ("env=reach_goal_image", "model=lewm")
@@ -71,3 +71,33 @@ def test_images_that_only_the_second_stage_reads_are_said(settled, capsys) -> No
     assert f"{said}'pretrain.model.observations=[pixels,pixels_side]'" in capsys.readouterr().out.splitlines()
     check(settled(*words, "pretrain.model.observations=[pixels,pixels_side]"))
     assert "first stage" not in capsys.readouterr().out
+
+
+PIXELS = ("env=reach_pixels", "model=tdmpc2_pixels")
+
+
+@pytest.mark.parametrize(
+    ("words", "unseen"),
+    [
+        (PIXELS, True),
+        ((*PIXELS, "dataset=lerobot", "dataset.root=there", "trainer=offline"), True),
+        ((*PIXELS, "env.goal_sampling=fixed"), False),
+        ((*PIXELS, "env.show_goal=true"), False),
+        ((*PIXELS, "model.observations=[pixels,state]"), False),
+        ((*PIXELS, "model.observations=[pixels,goal]"), False),
+        (("env=reach", "model=tdmpc2", "env.observations=[joint_target]"), True),
+        (("env=reach", "model=tdmpc2"), False),
+        (("env=push_pixels", "model=tdmpc2_pixels"), False),  # the disc is drawn
+        (("env=push_pixels", "model=tdmpc2_pixels", "env.show_goal=false"), True),
+        (
+            ("env=drawer", "model=tdmpc2", "model.observations=[joint_target]"),
+            False,
+        ),  # no goal but the drawer
+        (LEWM, False),
+    ],
+)
+def test_a_goal_that_changes_and_is_not_seen_is_said(
+    words: tuple[str, ...], unseen: bool, settled, capsys
+) -> None:
+    _check_parts(settled("device=cpu", "scale=smoke", *words))
+    assert ("the model reads nothing that shows it" in capsys.readouterr().out) is unseen
