@@ -35,14 +35,14 @@ from tensordict import TensorDictBase
 from torchrl.collectors import Collector
 
 from franka_wm.commands.collect import open_source
-from franka_wm.data.lerobot.collect import Source, gather
+from franka_wm.data.lerobot.collect import Gatherer, gather
 from franka_wm.data.lerobot.episodes import Episode, EpisodeCutter
 from franka_wm.data.lerobot.provenance import describe
 from franka_wm.data.lerobot.schema import FORMATS, Schema, schema_for
 from franka_wm.data.lerobot.writer import DatasetWriter
 
 
-def rendered(source: Source, schema: Schema, count: int) -> list[Episode]:
+def rendered(source: Gatherer, schema: Schema, count: int) -> list[Episode]:
     """So many episodes of the environment, in memory."""
     cutter, episodes = EpisodeCutter(schema, seed=0), []
     options: dict[str, Any] = {"total_frames": -1, "track_traj_ids": False, "trust_policy": True}

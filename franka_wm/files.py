@@ -40,6 +40,15 @@ def sync(path: Path) -> None:
         os.close(descriptor)
 
 
+def run_of(checkpoint: Path) -> Path:
+    """The folder of the run that a checkpoint lies in; the checkpoint itself where it lies alone."""
+    place = checkpoint if checkpoint.name == "checkpoints" else checkpoint.parent
+    run = place.parent
+    # Anybody may call a folder so: a run's, or its first stage's, has more.
+    own = place.name == "checkpoints" and ((run / "config.yaml").is_file() or run.name == "pretrained")
+    return run if own else checkpoint
+
+
 @contextmanager
 def atomic_write(path: str | Path) -> Iterator[Path]:
     """Yield a temporary path beside `path`; on success it becomes `path`, on failure it is removed.

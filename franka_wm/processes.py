@@ -29,7 +29,7 @@ TIMEOUT = timedelta(minutes=30)
 LAST_WORDS = 1.0
 """So long does the first process outlive what it refuses [s]: others that refuse the same ask its store who says so."""
 
-LOST = 75
+LOST_STATUS = 75
 """Exit status of a process that has lost another one, whose launcher says so: none of those of errors."""
 
 PIECE = 2**20
@@ -166,7 +166,7 @@ def leave(status: int = 0) -> None:
     if _joined():
         sys.stdout.flush()
         sys.stderr.flush()
-        if status in (1, LOST) and is_first():
+        if status in (1, LOST_STATUS) and is_first():
             time.sleep(LAST_WORDS)
         util._run_finalizers(0)  # semaphores of the replay, of which Python would tell as leaked  # pyright: ignore
         os._exit(status)

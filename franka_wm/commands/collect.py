@@ -18,7 +18,7 @@ from franka_wm.options import did_you_mean
 from franka_wm.policies.names import refuse_old_name
 
 if TYPE_CHECKING:
-    from franka_wm.data.lerobot.collect import Source
+    from franka_wm.data.lerobot.collect import Gatherer
 
 _SIMPLE = ("random", "noop", "ik", "expert")
 _PARTS = ("planner", "policy")
@@ -179,7 +179,7 @@ def open_source(
     num_envs: int | None = None,
     format: str = "exact",
     noise: float | None = None,
-) -> Source:
+) -> Gatherer:
     """Build the worlds and the policy.
 
     Args:
@@ -262,7 +262,7 @@ def check_policy(
 
 def _simple(
     name: str, overrides: Sequence[str], episodes: int, num_envs: int | None, format: str, noise: float
-) -> Source:
+) -> Gatherer:
     from omegaconf import OmegaConf
 
     from franka_wm.commands.entry import with_scale
@@ -304,7 +304,7 @@ def _simple(
     cfg.env.observations = values["observations"]
     import torch
 
-    from franka_wm.data.lerobot.collect import Source
+    from franka_wm.data.lerobot.collect import Gatherer
     from franka_wm.policies.expert import ExpertPolicy
     from franka_wm.seeding import derive_seed
 
@@ -323,10 +323,10 @@ def _simple(
     }
     resolved: Any = OmegaConf.to_container(cfg, resolve=True)
     kept = {key: resolved[key] for key in ("env", "collector", "seed", "device")}
-    return Source(env, makers[name](), kept, name, seed)
+    return Gatherer(env, makers[name](), kept, name, seed)
 
 
-def _agent(part: str, checkpoint: str, overrides: Sequence[str], worlds: int) -> Source:
+def _agent(part: str, checkpoint: str, overrides: Sequence[str], worlds: int) -> Gatherer:
     from omegaconf import OmegaConf
     from omegaconf.errors import OmegaConfBaseException
     from yaml import YAMLError
@@ -356,7 +356,7 @@ def _agent(part: str, checkpoint: str, overrides: Sequence[str], worlds: int) ->
             *changes["observations"],
             *(key for key in ("state", "joint_target") if key not in changes["observations"]),
         ]
-    from franka_wm.data.lerobot.collect import Source
+    from franka_wm.data.lerobot.collect import Gatherer
     from franka_wm.training.load import load_agent
     from franka_wm.training.storage_budget import check_worlds
 
@@ -374,4 +374,4 @@ def _agent(part: str, checkpoint: str, overrides: Sequence[str], worlds: int) ->
         raise UserError(f"collect: policy={part}: {checkpoint} has only {', '.join(agent.policies)}")
     settings = agent.settings
     played = {**settings.values, "env": dict(settings.env.changed(**changes).values)}
-    return Source(agent.env, agent.policies[part], played, f"{part} of {checkpoint}", settings.seed)
+    return Gatherer(agent.env, agent.policies[part], played, f"{part} of {checkpoint}", settings.seed)

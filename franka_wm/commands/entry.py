@@ -56,7 +56,7 @@ def run_command(main: Callable[[], object], arguments: list[str] | None = None) 
             except KeyboardInterrupt:  # before a run begins
                 sys.exit(INTERRUPTED)
     except BaseException as error:
-        several.part(error)
+        several.end_process(error)
         raise
     finally:
         gc.enable()
@@ -72,7 +72,7 @@ def ends_together() -> Iterator[None]:
             except FrankaError as error:
                 fail_by(error)
     except BaseException as error:
-        several.part(error)
+        several.end_process(error)
         raise
 
 
@@ -328,7 +328,7 @@ def fail_by(error: FrankaError) -> NoReturn:
 
     if isinstance(error, processes.LostAnother) and several.TOLD in os.environ:
         Path(os.environ[several.TOLD]).write_text(str(error), encoding="utf-8")
-        processes.leave(processes.LOST)
+        processes.leave(processes.LOST_STATUS)
     lost = isinstance(error, processes.LostAnother)
     fail(f"{error}{': go on with resume=FOLDER, and collect with resume=true' if lost else ''}")
 

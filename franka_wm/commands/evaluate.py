@@ -11,7 +11,7 @@ import click
 from franka_wm.commands.arguments import FLAG, TYPED, check_run, plugins, verb, whole, word
 from franka_wm.console import say
 from franka_wm.errors import UserError
-from franka_wm.files import unwritable
+from franka_wm.files import run_of, unwritable
 from franka_wm.interrupt import INTERRUPTED
 
 
@@ -106,9 +106,7 @@ def default_folder(checkpoint: str) -> Path:
     """Where results go if not said: beside the run's own, or under ``outputs`` for one from the Hub."""
     if checkpoint.startswith("hf:"):
         return Path("outputs") / "evaluation" / checkpoint.removeprefix("hf:").replace("/", "--")
-    folder = Path(checkpoint)
-    run = next((f for f in (folder, *folder.parents) if (f / "checkpoints").is_dir()), folder)
-    return run / "evaluation"
+    return run_of(Path(checkpoint)) / "evaluation"
 
 
 def check_folder(folder: Path) -> None:

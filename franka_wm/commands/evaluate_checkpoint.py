@@ -18,7 +18,7 @@ from franka_wm.evaluation.open_loop import NothingToPredictError
 from franka_wm.evaluation.protocol import Evaluation, describe, evaluate_agent, protocol
 from franka_wm.evaluation.results import COMMAND, FILE, OF_RUN, OTHERWISE, read_result, to_json
 from franka_wm.evaluation.robustness import check_shiftable, note, robustness
-from franka_wm.files import atomic_write
+from franka_wm.files import atomic_write, run_of
 from franka_wm.report.diagnostics import (
     diagnostic_tables,
     evaluation_markdown,
@@ -78,14 +78,14 @@ def run(options: Options) -> dict[str, Any]:
         found = find_checkpoint(options.checkpoint)
         episodes = own_episodes(found) if options.episodes is None else options.episodes
         agent = load_agent(
-            found.folder,
+            found,
             num_envs=min(episodes, WORLDS),
             device=options.device,
             **_planning(options),
         )
     if options.robustness:
         check_shiftable(agent)
-    own = agent.folder.parents[1] if agent.folder.parent.name == "checkpoints" else agent.folder
+    own = run_of(agent.folder)
     within = options.out.resolve() == own / "evaluation"
     of_run = None if within or options.out.resolve() == own else _of_run(agent, options)
     with announced(f"{episodes} held-out episodes for each of {', '.join(agent.policies)}") as runs:
@@ -156,8 +156,8 @@ def _progress(parts: Sequence[str], runs: Say) -> Callable[[str, Mapping[str, An
 def _of_run(agent: Agent, options: Options) -> dict[str, Any]:
     """What results that lie elsewhere say of their run; where they lie beside them, the run's own files do."""
     told: dict[str, Any] = {"config": {}, "overrides": [], "preset": ""}
-    if agent.folder.parent.name == "checkpoints":
-        told = read_chosen(agent.folder.parents[1])
+    if (run := run_of(agent.folder)) != agent.folder:
+        told = read_chosen(run)
     values = agent.settings.values
     changed = {
         group for group in ("planner", "objective") if any(w.startswith(group) for w in options.overrides)
@@ -238,7 +238,7 @@ def _write(
     text: str,
     evaluation: Evaluation,
     imagined: Imagined | None,
-    of_run: Mapping[str, Any] | None = None,
+    of_run: Mapping[str, Any] | None,
 ) -> None:
     """Every file whole; the one that others read, last. Nothing stays of an earlier evaluation."""
     if imagined is None:

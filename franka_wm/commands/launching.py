@@ -112,7 +112,7 @@ def launch_verb(command: list[str], gpus: int, device: str, advice: Callable[[],
 
 def _end(failures: Mapping[int, Any], told: Path, advice: Callable[[], str]) -> NoReturn:
     """Ends by processes that failed by themselves: that were killed, have said why, or have lost one another."""
-    from franka_wm.processes import LOST
+    from franka_wm.processes import LOST_STATUS
 
     by_time = sorted(failures.items(), key=lambda one: one[1].timestamp)
     for rank, one in by_time:
@@ -121,7 +121,7 @@ def _end(failures: Mapping[int, Any], told: Path, advice: Callable[[], str]) -> 
                 f"process {rank} of the run (pid {one.pid}) was ended by {one.signal_name()}, the others with it; "
                 f"{advice()}"
             ) from None
-    said = [one.exitcode for _, one in by_time if one.exitcode != LOST]
+    said = [one.exitcode for _, one in by_time if one.exitcode != LOST_STATUS]
     if said:
         sys.exit(said[0])
     why = told.read_text(encoding="utf-8") if told.is_file() else "the processes have lost one another"

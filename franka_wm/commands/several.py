@@ -186,7 +186,7 @@ def _left(cfg: DictConfig, folder: Path) -> tuple[str, bool]:
     return "", (UntrustedFolder(folder).yaml("config.yaml") or {}).get("resume") == cfg.resume
 
 
-def part(error: BaseException) -> None:
+def end_process(error: BaseException) -> None:
     """Ends this process, where it is one of several, by what ended its run; alone it does nothing.
 
     To leave as Python does would wait for threads that wait for the other processes.

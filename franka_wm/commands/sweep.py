@@ -24,7 +24,7 @@ from franka_wm.errors import REFUSALS, FrankaError, UserError, machine_refused
 from franka_wm.interrupt import INTERRUPTED, interruptible
 from franka_wm.versions import FINISHED
 
-JOB, STOPPED, FOLDER = "job-", "stopped", "folder"
+JOB_FILE, STOPPED_FILE, FOLDER_FILE = "job-", "stopped", "folder"
 """Names of files in `Sweep.place`."""
 
 
@@ -115,7 +115,7 @@ class Sweep:
         self.ran += 1
         # Of joblib's: an exception there kills the jobs beside it, before they have saved.
         beside_others = bool(self.place) and self.process != os.getpid()
-        mark = Path(self.place, STOPPED)
+        mark = Path(self.place, STOPPED_FILE)
         if beside_others and mark.exists():
             return None
         self.inside = self.process == os.getpid()
@@ -152,7 +152,7 @@ class Sweep:
             if beside_others:
                 # Until the next one: this process would die, and joblib kill the jobs beside it.
                 signal.signal(signal.SIGTERM, signal.SIG_IGN)
-                Path(self.place, f"{JOB}{os.getpid()}").unlink(missing_ok=True)
+                Path(self.place, f"{JOB_FILE}{os.getpid()}").unlink(missing_ok=True)
             log_anew()
             gc.collect()  # the next one needs the memory
 
@@ -163,8 +163,8 @@ class Sweep:
             raise KeyboardInterrupt
 
         signal.signal(signal.SIGTERM, stop)
-        Path(self.place, f"{JOB}{os.getpid()}").write_text(self.folder)
-        Path(self.place, FOLDER).write_text(self.folder)
+        Path(self.place, f"{JOB_FILE}{os.getpid()}").write_text(self.folder)
+        Path(self.place, FOLDER_FILE).write_text(self.folder)
 
     @contextmanager
     def waiting(self) -> Iterator[None]:
@@ -182,9 +182,9 @@ class Sweep:
             self.stopped = True
             if self.inside:  # joblib runs a single job at a time in this process
                 raise KeyboardInterrupt
-            for job in Path(self.place).glob(f"{JOB}*") if signum == signal.SIGTERM else ():
+            for job in Path(self.place).glob(f"{JOB_FILE}*") if signum == signal.SIGTERM else ():
                 with suppress(ProcessLookupError):
-                    os.kill(int(job.name.removeprefix(JOB)), signal.SIGTERM)
+                    os.kill(int(job.name.removeprefix(JOB_FILE)), signal.SIGTERM)
 
         killed = False
         with tempfile.TemporaryDirectory(prefix="franka_wm-") as self.place:
@@ -196,8 +196,8 @@ class Sweep:
                         raise
                 except BrokenProcessPool:
                     killed = True
-            stopped = self.stopped or Path(self.place, STOPPED).exists()  # or a job was, alone
-            if (told := Path(self.place, FOLDER)).exists():
+            stopped = self.stopped or Path(self.place, STOPPED_FILE).exists()  # or a job was, alone
+            if (told := Path(self.place, FOLDER_FILE)).exists():
                 self.folder = told.read_text()
         if not self.folder and self.folders:
             self.folder = str(self.folders[0].parent)

@@ -18,4 +18,20 @@ def free_memory(device: torch.device | str) -> int | None:
     except OSError:  # not Linux
         return None
     kilobytes = next((line.split()[1] for line in lines if line.startswith("MemAvailable:")), None)
-    return None if kilobytes is None else 1024 * int(kilobytes)
+    if kilobytes is None:
+        return None
+    left = left_of_container(Path("/sys/fs/cgroup"))
+    return 1024 * int(kilobytes) if left is None else min(left, 1024 * int(kilobytes))
+
+
+def left_of_container(place: Path) -> int | None:
+    """Bytes below the limit of the container (Linux control groups, version 2); ``None`` without a limit."""
+    try:
+        most, used = ((place / name).read_text().strip() for name in ("memory.max", "memory.current"))
+        if most == "max":
+            return None
+        lines = (place / "memory.stat").read_text().splitlines()
+        cached = next((int(line.split()[1]) for line in lines if line.startswith("inactive_file ")), 0)
+        return max(0, int(most) - int(used) + cached)
+    except (OSError, ValueError):  # not Linux, or the older version
+        return None

@@ -13,6 +13,13 @@ from franka_wm.envs.franka import FrankaEnv
 from franka_wm.errors import UserError
 
 
+def arm_of(env: EnvBase | None) -> FrankaEnv | None:
+    """The arm inside an environment, under whatever transforms; ``None`` for one of another library."""
+    while isinstance(env, TransformedEnv):
+        env = env.base_env
+    return env if isinstance(env, FrankaEnv) else None
+
+
 class TransformedFrankaEnv(TransformedEnv):
     """A ``TransformedEnv`` that does not ask the device in each step whether an episode has ended.
 

@@ -13,9 +13,9 @@ from torch import Tensor, nn
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from franka_wm.envs import Environment, FrankaEnv, MultiTaskEnv
+from franka_wm.envs.transformed import arm_of
 from franka_wm.errors import UserError
 from franka_wm.evaluation.intervals import bootstrap_mean, wilson
-from franka_wm.training.build import arm_of
 
 THRESHOLDS = (0.05, 0.025, 0.01)
 """Distances to the goal that count as success [m]."""

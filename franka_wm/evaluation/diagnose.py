@@ -11,6 +11,7 @@ import torch
 from tensordict import TensorDict
 from torch import Tensor
 
+from franka_wm.envs.transformed import arm_of
 from franka_wm.evaluation.closed_loop import begin
 from franka_wm.evaluation.decoder import (
     SIZES,
@@ -43,7 +44,6 @@ from franka_wm.evaluation.rollouts import (
 from franka_wm.evaluation.spectrum import spectrum
 from franka_wm.policies import PlannerPolicy
 from franka_wm.seeding import derive_seed, seeded
-from franka_wm.training.build import arm_of
 
 if TYPE_CHECKING:
     from franka_wm.envs import Environment

@@ -9,12 +9,12 @@ from typing import TYPE_CHECKING, Any
 from tensordict import TensorDictBase
 from torch import Tensor
 
+from franka_wm.envs.transformed import arm_of
 from franka_wm.errors import UserError
 from franka_wm.evaluation.closed_loop import play_episodes, success_distance
 from franka_wm.evaluation.intervals import bootstrap_mean, wilson
 from franka_wm.evaluation.protocol import held_out_seeds
 from franka_wm.seeding import seeded
-from franka_wm.training.build import arm_of
 
 if TYPE_CHECKING:
     from franka_wm.training.load import Agent

@@ -12,9 +12,9 @@ from torch import Tensor, nn
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from franka_wm.envs import Environment, MultiTaskEnv
+from franka_wm.envs.transformed import arm_of
 from franka_wm.evaluation.closed_loop import begin, evaluating
 from franka_wm.seeding import derive_seed, seeded
-from franka_wm.training.build import arm_of
 
 if TYPE_CHECKING:
     from franka_wm.models.base import WorldModel

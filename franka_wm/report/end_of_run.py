@@ -14,6 +14,7 @@ from franka_wm.console import say
 from franka_wm.envs import FrankaConfig, FrankaEnv, MultiTaskEnv
 from franka_wm.envs.camera import project, whole_arm
 from franka_wm.envs.multitask_config import MultiTaskConfig
+from franka_wm.envs.transformed import arm_of
 from franka_wm.evaluation.closed_loop import play_episodes, success_distance
 from franka_wm.evaluation.protocol import Evaluation
 from franka_wm.evaluation.results import FILE, Result, last_row
@@ -23,7 +24,7 @@ from franka_wm.report.diagnostics import evaluation_markdown, terminal
 from franka_wm.report.style import acting, policy_name
 from franka_wm.report.table import evaluation_tables
 from franka_wm.seeding import drawing_for, seeded
-from franka_wm.training.build import arm_of, make_evaluation_env
+from franka_wm.training.build import make_evaluation_env
 from franka_wm.training.settings import RunSettings
 from franka_wm.video import draw_labels, draw_marker, tile_frames, write_png, write_video
 

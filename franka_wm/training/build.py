@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, Any, cast
 
 import torch
 from tensordict.nn import TensorDictModuleBase
-from torchrl.envs import EnvBase, TransformedEnv
 
 from franka_wm import models, planning, processes
 from franka_wm.console import say
@@ -25,6 +24,7 @@ from franka_wm.envs.external import ExternalEnv
 from franka_wm.envs.external_config import ExternalConfig
 from franka_wm.envs.multitask_config import MultiTaskConfig
 from franka_wm.envs.tasks import make_task
+from franka_wm.envs.transformed import arm_of
 from franka_wm.errors import UserError, place
 from franka_wm.planning import registry
 from franka_wm.planning.base import Planner
@@ -394,13 +394,6 @@ def no_hindsight(run: RunSettings) -> str | None:
     if config.show_goal or any("goal_pixels" in key for key in keys or ()):
         return "images show the recorded goal"
     return None
-
-
-def arm_of(env: EnvBase | None) -> FrankaEnv | None:
-    """The arm inside an environment, under whatever transforms; ``None`` for one of another library."""
-    while isinstance(env, TransformedEnv):
-        env = env.base_env
-    return env if isinstance(env, FrankaEnv) else None
 
 
 def make_replay_buffer(

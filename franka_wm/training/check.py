@@ -405,11 +405,11 @@ def _check_same_observations(run: RunSettings, recorded: FeatureMap) -> None:
 
 def _check_same_actions(run: RunSettings, sources: Named) -> None:
     """Actions must mean the same, of the same robot; rewards of another task and other physics are said."""
-    from franka_wm.data.lerobot.provenance import ACTIONS, other_option, read_provenance, told
+    from franka_wm.data.lerobot.provenance import ACTIONS, other_option, recorded_sessions, told
 
     env = {**vars(run.env.arm), "urdf_path": run.env.urdf_path}
     for option, source in sources:
-        sessions = (read_provenance(source.root) or {}).get("sessions", ())
+        sessions = recorded_sessions(source.root)
         if (changed := other_option(sessions, env, ACTIONS)) is not None:
             name, there = changed
             raise UserError(
@@ -422,7 +422,7 @@ def _check_same_actions(run: RunSettings, sources: Named) -> None:
 
 def _check_same_views(run: RunSettings, sources: Named) -> None:
     """What a model that acts has learned to see, its world must show; sizes are compared elsewhere."""
-    from franka_wm.data.lerobot.provenance import VIEWS, other_option, other_scene, read_provenance, told
+    from franka_wm.data.lerobot.provenance import VIEWS, other_option, other_scene, recorded_sessions, told
 
     arm, family = run.env.arm, run.model.family
     env = {**vars(arm), "urdf_path": run.env.urdf_path}
@@ -432,7 +432,7 @@ def _check_same_views(run: RunSettings, sources: Named) -> None:
     chosen = ("image_size", *(("cameras",) if run.dataset.features else ()))  # for the dataset
     views = [name for name in VIEWS if looks and name not in chosen]
     for option, source in sources:
-        sessions = (read_provenance(source.root) or {}).get("sessions", ())
+        sessions = recorded_sessions(source.root)
         if changed := other_option(sessions, env, views):
             name, there = changed
             raise UserError(

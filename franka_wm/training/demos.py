@@ -20,8 +20,8 @@ from franka_wm.envs.config import FrankaConfig
 from franka_wm.envs.multitask_config import MultiTaskConfig
 from franka_wm.envs.simulation.demonstrated import READS
 from franka_wm.envs.task_options import typed
+from franka_wm.envs.transformed import arm_of
 from franka_wm.errors import UserError
-from franka_wm.training import build
 from franka_wm.training.settings import RunSettings
 from franka_wm.training.spaces import Spaces
 
@@ -132,15 +132,15 @@ def _by_task(run: RunSettings, config: MultiTaskConfig) -> dict[str, list[str]]:
     Raises:
         UserError: One was recorded in none of them.
     """
-    from franka_wm.data.lerobot.provenance import MEANING, other_option, read_provenance
+    from franka_wm.data.lerobot.provenance import MEANING, other_option, recorded_sessions, recorded_tasks
     from franka_wm.data.lerobot.source import read_source
 
     demos, found = run.replay.demos, {}
     for root in (demos,) if isinstance(demos, str) else demos or ():
         with _as_demos():
             source = read_source(Path(root))
-        sessions = (read_provenance(source.root) or {}).get("sessions", ())
-        tasks = {session.get("config", {}).get("env", {}).get("task") for session in sessions} - {None}
+        sessions = recorded_sessions(source.root)
+        tasks = recorded_tasks(sessions)
         fitting = [name for name, one in config.tasks.items() if tasks == {one.task}]
         if not fitting:
             what = f"env.task={tasks.pop()}" if len(tasks) == 1 else "no single task of this package"
@@ -158,7 +158,7 @@ def _by_task(run: RunSettings, config: MultiTaskConfig) -> dict[str, list[str]]:
 
 def start_along(env: Environment, shown: Demonstrations, share: float) -> None:
     """Lets a share of the episodes that the arm's worlds begin from now on start in a demonstrated state."""
-    arm = build.arm_of(env)
+    arm = arm_of(env)
     assert arm is not None and shown.states is not None
     begins = shown.transitions.get(BOUNDARY).flatten()
     arm.simulation.start_along(shown.states, begins, share)
@@ -172,8 +172,6 @@ def check_demonstrations(run: RunSettings) -> None:
         UserError: One line.
     """
     share = run.replay.demo_resets
-    if run.replay.demos is None:
-        return
     if share and run.env.kind == "multitask":
         raise UserError(
             f"replay.demo_resets={share}: episodes of env=multitask do not begin along demonstrations; leave it at 0"
@@ -197,7 +195,7 @@ def check_demonstrations(run: RunSettings) -> None:
 def _check_recorded(run: RunSettings, roots: Any, arm: FrankaConfig | None, whose: str) -> None:
     """The same of datasets of one task, that of `arm`; `whose` it is, for what is refused."""
     from franka_wm.data.lerobot.opening import read_datasets
-    from franka_wm.data.lerobot.provenance import MEANING, VIEWS, other_option, other_scene, read_provenance
+    from franka_wm.data.lerobot.provenance import MEANING, VIEWS, other_option, other_scene, recorded_sessions
 
     share = run.replay.demo_resets
     if arm is not None and share:
@@ -226,7 +224,7 @@ def _check_recorded(run: RunSettings, roots: Any, arm: FrankaConfig | None, whos
                 f"replay.demos={source.root}: has no {' nor '.join(lacking)}, which model={run.model.name} reads; "
                 f"record it with all that {whose} observes"
             )
-        sessions = (read_provenance(source.root) or {}).get("sessions", ())
+        sessions = recorded_sessions(source.root)
         for session in sessions if share else ():
             recorded = session.get("config", {}).get("env", {})
             _check_seen(share, "dataset", recorded.get("randomization", {}))

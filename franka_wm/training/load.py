@@ -19,8 +19,6 @@ from franka_wm.device import resolve_device
 from franka_wm.envs import Environment, FrankaConfig
 from franka_wm.errors import UserError
 from franka_wm.options import did_you_mean, preset_of_ones_own
-from franka_wm.planning.base import Planner
-from franka_wm.planning.mcts import MCTS
 from franka_wm.training import build
 from franka_wm.training.check import sketch
 from franka_wm.training.checkpoint import Checkpoint, latest_checkpoint, load_checkpoint
@@ -43,7 +41,6 @@ class Agent:
         settings: Those it was trained with; ``device`` is the one in use now.
         env: Evaluation worlds.
         model: In evaluation mode.
-        planner: Planner of the family; ``None`` where the model has no dynamics.
         policies: By name, as :func:`franka_wm.training.build.make_policies` makes them.
         counters: ``updates``, ``env_steps``, ``seconds``.
     """
@@ -52,13 +49,12 @@ class Agent:
     settings: RunSettings
     env: Environment
     model: WorldModel
-    planner: Planner | MCTS | None
     policies: dict[str, TensorDictModuleBase]
     counters: dict[str, float]
 
 
 def load_agent(
-    folder: str | Path,
+    folder: str | Path | Checkpoint,
     *,
     num_envs: int | None = None,
     device: torch.device | str = "auto",
@@ -71,7 +67,7 @@ def load_agent(
     """Rebuilds environment, model, planner and policies from a checkpoint.
 
     Args:
-        folder: A run's folder, a checkpoint in it, or ``hf:user/name``.
+        folder: A run's folder, a checkpoint in it, ``hf:user/name``, or what ``find_checkpoint`` found.
         num_envs: Evaluation worlds; the configuration's ``evaluation.episodes`` if not given.
         device: ``auto``, ``cpu``, ``cuda``, ``cuda:K``.
         env_changes: Fields of the environment's configuration to change.
@@ -83,7 +79,7 @@ def load_agent(
     Raises:
         UserError: One line: no checkpoint, a damaged one, or one whose environment cannot be built here.
     """
-    checkpoint = find_checkpoint(folder)
+    checkpoint = folder if isinstance(folder, Checkpoint) else find_checkpoint(folder)
     settings = RunSettings.of(checkpoint.config, saved=True).changed(device=str(device))
     if seed is not None:
         settings = settings.changed(seed=seed)
@@ -95,7 +91,7 @@ def load_agent(
         settings = _planning_otherwise(settings, planning)
     if settings.env.kind == "none":
         raise UserError(
-            f"{folder}: was trained on recorded data without an environment; there is nothing to act in"
+            f"{checkpoint.folder}: was trained on recorded data without an environment; there is nothing to act in"
         )
     if settings.is_arm and settings.is_discrete:
         require_same_actions(checkpoint, settings.env.arm)
@@ -106,8 +102,7 @@ def load_agent(
     env = build.make_evaluation_env(settings, num_envs=num_envs, **changes)
     spaces = Spaces.of_env(env)
     policies = build.make_agent_policies(settings, model, env, spaces)
-    planner = getattr(policies.get("planner"), "planner", None)
-    return Agent(checkpoint.folder, settings, env, model, planner, policies, dict(checkpoint.counters))
+    return Agent(checkpoint.folder, settings, env, model, policies, dict(checkpoint.counters))
 
 
 def preset_of(planner: str, settings: RunSettings, *searchpath: str) -> dict[str, Any]:
@@ -165,7 +160,8 @@ def find_checkpoint(folder: str | Path) -> Checkpoint:
 
 def own_episodes(checkpoint: Checkpoint) -> int:
     """By how many its run is judged at the end."""
-    return RunSettings.of(checkpoint.config, saved=True).evaluation.episodes
+    with damaged(checkpoint.folder, "config.yaml"):
+        return int(checkpoint.config["evaluation"]["episodes"])
 
 
 def require_same_actions(checkpoint: Checkpoint, config: FrankaConfig) -> None:

@@ -10,7 +10,8 @@ from __future__ import annotations
 import importlib.util
 import os
 import tempfile
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from importlib import import_module
 from pathlib import Path
 from typing import Any
@@ -90,17 +91,25 @@ def make_loggers(names: Sequence[str], folder: str | Path, **options: Mapping[st
 def log_numbers(loggers: Iterable[Logger], numbers: Mapping[str, float], *, step: int) -> None:
     """Log a row of numbers: one entry of a service's history, not one for each number.
 
-    Where a file cannot be written (a full disk), it says so and goes on: the weights are saved after the last row.
+    What cannot be logged (a full disk, a service that is away) is said, here as below, and training goes on.
 
     Args:
         numbers: by name; a service shows ``a/b`` as b in the group a.
         step: updates made.
     """
     for logger in loggers:
-        try:
+        with _going_on(logger, f"cannot log the numbers of update {step}"):
             _log_row(logger, dict(numbers), step)
-        except OSError as error:
-            say(f"  warning: {kind(logger)} cannot log the numbers of update {step}: {error}")
+
+
+@contextmanager
+def _going_on(logger: Logger, fails: str) -> Iterator[None]:
+    try:
+        yield
+    except UserError:
+        raise
+    except Exception as error:  # services fail in ways of their own
+        say(f"  warning: {kind(logger)} {fails}: {error}")
 
 
 def _log_row(logger: Any, numbers: dict[str, float], step: int) -> None:
@@ -146,33 +155,36 @@ def log_video(loggers: Iterable[Logger], name: str, frames: Tensor, *, fps: int,
     with tempfile.TemporaryDirectory() as place:
         film = Path(place) / f"{name.replace('/', '_')}_{step}.mp4"
         for logger in loggers:
-            which = kind(logger)
-            if which == "csv":
-                write_video(frames, Path(logger.experiment.log_dir) / "videos" / f"{name}_{step}.mp4", fps)
-                continue
-            if which == "tensorboard":
-                moving = write_gif(frames, film.with_suffix(".gif"), fps)
-                _tensorboard_image(logger, name, moving.read_bytes(), frames, step)
-                continue
-            if not film.exists():
-                write_video(frames, film, fps)
-            if which == "wandb":
-                shown = import_module("wandb").Video(str(film), format="mp4")
-                logger.experiment.log({name: shown}, step=step)
-            elif which == "mlflow":
-                import_module("mlflow").log_artifact(str(film), "videos")
-            elif which == "trackio":
-                shown = import_module("trackio").Video(str(film), fps=fps, format="mp4")
-                logger.experiment.log({name: shown}, step=step)
+            with _going_on(logger, f"cannot log the video {name} of update {step}"):
+                which = kind(logger)
+                if which == "csv":
+                    folder = Path(logger.experiment.log_dir) / "videos"
+                    write_video(frames, folder / f"{name}_{step}.mp4", fps)
+                    continue
+                if which == "tensorboard":
+                    moving = write_gif(frames, film.with_suffix(".gif"), fps)
+                    _tensorboard_image(logger, name, moving.read_bytes(), frames, step)
+                    continue
+                if not film.exists():
+                    write_video(frames, film, fps)
+                if which == "wandb":
+                    shown = import_module("wandb").Video(str(film), format="mp4")
+                    logger.experiment.log({name: shown}, step=step)
+                elif which == "mlflow":
+                    import_module("mlflow").log_artifact(str(film), "videos")
+                elif which == "trackio":
+                    shown = import_module("trackio").Video(str(film), fps=fps, format="mp4")
+                    logger.experiment.log({name: shown}, step=step)
 
 
 def close_loggers(loggers: Iterable[Logger]) -> None:
     """Write what is still held back, and end runs, so that services do not show them as running or crashed."""
     for logger in loggers:
-        if kind(logger) == "mlflow":
-            import_module("mlflow").end_run()
-        else:
-            logger.shutdown()
+        with _going_on(logger, "cannot end its run"):
+            if kind(logger) == "mlflow":
+                import_module("mlflow").end_run()
+            else:
+                logger.shutdown()
 
 
 def kind(logger: Logger) -> str:

@@ -12,8 +12,8 @@ from torchrl.collectors import Collector
 
 from franka_wm.envs import Environment, FrankaEnv, MultiTaskEnv
 from franka_wm.envs.specs import MARKS
+from franka_wm.envs.transformed import arm_of
 from franka_wm.seeding import derive_seed
-from franka_wm.training.build import arm_of
 from franka_wm.training.tree import nested
 
 

@@ -68,7 +68,7 @@ def _optimizer_difference(saved: Mapping[str, Any], optimizer: Optimizer) -> str
                     return f"{name} of parameter {index} holds no finite numbers"
                 if name == "step" and value.ndim:
                     return f"step of parameter {index} has shape {tuple(value.shape)}"
-                if isinstance(value, Tensor) and value.ndim > 0 and value.shape != parameter.shape:
+                if value.ndim and value.shape != parameter.shape:
                     return (
                         f"{name} of parameter {index} has shape {tuple(value.shape)}, "
                         f"the parameter {tuple(parameter.shape)}"

@@ -15,8 +15,10 @@ from franka_wm.data.lerobot.hub import check_license, check_repo_id
 from franka_wm.data.lerobot.paths import shortened, without_paths
 from franka_wm.data.lerobot.publish import README, publish_staged
 from franka_wm.errors import UserError
+from franka_wm.files import run_of
 from franka_wm.training.checkpoint import latest_checkpoint, load_checkpoint
 from franka_wm.training.manifest import read_manifest, saved_at, write_manifest
+from franka_wm.training.tree import damaged, write_tree
 from franka_wm.untrusted import UntrustedFolder, values_of
 
 
@@ -49,7 +51,7 @@ def publish_model(
 
 
 def stage_model(checkpoint: Path, place: Path, *, repo_id: str, license: str) -> Path:
-    """A checkpoint without what only training needs: no optimiser, no replay, no random states, no absolute paths.
+    """A checkpoint without what only training needs: no optimiser, replay, worlds, random states or absolute paths.
 
     Args:
         checkpoint: A run's folder, or a checkpoint in it.
@@ -60,21 +62,21 @@ def stage_model(checkpoint: Path, place: Path, *, repo_id: str, license: str) ->
         ``place``, which is a checkpoint now.
     """
     folder = latest_checkpoint(checkpoint)
-    run = folder.parent.parent if folder.parent.name == "checkpoints" else folder
+    run = run_of(folder)
     files = UntrustedFolder(run)
     files.below(folder.relative_to(run)).check_links()
     opened = load_checkpoint(folder)
     manifest = read_manifest(opened.folder)
-    kept = ("model.safetensors", "counters.json", "extra.json", "extra.safetensors")
-    for name in kept:
+    for name in ("model.safetensors", "counters.json"):
         if name in manifest.files:
             shutil.copyfile(opened.folder / name, place / name)
     config = without_paths(opened.config, clear=True)
     if "resume" in config:
         config["resume"] = None
     OmegaConf.save(OmegaConf.create(config), place / "config.yaml")
-    if (place / "extra.json").is_file():
-        _copy_json(place / "extra.json", place / "extra.json")
+    with damaged(opened.folder, "extra.json"):
+        sizes = {key: value for key, value in (opened.extra() or {}).items() if key == "spaces"}
+    write_tree(place, "extra", sizes)  # curves, worlds and their images stay here
     write_manifest(place, manifest.model, written_by=manifest.written_by, saved_at_ns=saved_at(opened.folder))
     # Where the verb evaluate puts them, unless it played fewer episodes; a published model has them at its top.
     updates = opened.counters.get("updates")

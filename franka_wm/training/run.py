@@ -30,7 +30,7 @@ from franka_wm.data.replay import WindowReplay
 from franka_wm.device import prefer_speed, resolve_device
 from franka_wm.envs import Environment
 from franka_wm.envs.multitask_config import MultiTaskConfig
-from franka_wm.errors import FrankaError, UserError, trying
+from franka_wm.errors import UserError, trying
 from franka_wm.interrupt import INTERRUPTED
 from franka_wm.seeding import derive_seed, seeded
 from franka_wm.training import build
@@ -365,12 +365,12 @@ def resumed(cfg: DictConfig, overrides: list[str]) -> tuple[Checkpoint, DictConf
         if name in ("resume", "plugins") or name.startswith(("hydra.", "hydra/")):
             continue
         if name.startswith("~"):
-            raise FrankaError(
+            raise UserError(
                 f"{override}: a run that resumes keeps all its options; change their values (GROUP.key=…)"
             )
         same = name in ("scale", "size", "seed") and str(cfg[name]) == str(saved.get(name))
         if "." not in name and not same and name not in ("device", "gpus"):
-            raise FrankaError(
+            raise UserError(
                 f"{override}: a run that resumes keeps its {name}; leave it out, or change single values ({name}.key=…)"
             )
         # Of device=spread the GPU that was chosen, which the configuration has.

@@ -21,13 +21,14 @@ from franka_wm.data.lerobot.windows import RecordedWindows
 from franka_wm.data.moments import moments
 from franka_wm.data.replay import OVERFLOW, WindowReplay
 from franka_wm.envs import Environment
+from franka_wm.envs.transformed import arm_of
 from franka_wm.errors import UserError
 from franka_wm.interrupt import interruptible
 from franka_wm.models import WorldModel
 from franka_wm.policies.exploration import ActingPolicy
 from franka_wm.seeding import derive_seed, seeded
 from franka_wm.training.broken import beyond_bounds, clipped, finite, odd_rewards, why
-from franka_wm.training.build import arm_of, explore
+from franka_wm.training.build import explore
 from franka_wm.training.history import columns_of
 from franka_wm.training.learner import Learner
 from franka_wm.training.loggers import log_numbers
@@ -58,7 +59,7 @@ class Trainer:
         loggers: TorchRL loggers.
         evaluate: Called now and then with nothing, returns numbers to log. What it and ``diagnose`` draw at random
             comes from generators of their own: they do not change what is learned.
-        spaces: What the model was built for; the environment's if not given.
+        spaces: What the model was built for.
         validation: Recorded windows that training never sees; their losses are logged.
         diagnose: From model and batch to numbers to log and, if something is going wrong, a warning.
     """
@@ -72,10 +73,10 @@ class Trainer:
         policies: Mapping[str, TensorDictModuleBase],
         actor: str,
         settings: RunSettings,
+        spaces: Spaces,
         folder: Path,
         loggers: list[Logger],
         evaluate: Callable[[], dict[str, float]],
-        spaces: Spaces | None = None,
         validation: RecordedWindows | None = None,
         diagnose: Callable[[WorldModel, TensorDictBase], tuple[dict[str, float], str | None]] | None = None,
     ):
@@ -102,9 +103,6 @@ class Trainer:
         if learner.capture and env is not None:
             self._draw = sampling = CapturedSampling(self.replay)
             self._static = sampling.is_static
-        if spaces is None:
-            assert env is not None, "without worlds the spaces must be said"
-            spaces = Spaces.of_env(env)
         self.spaces = spaces
         self._vectors = list(self.model.observation_sizes)
         self._standardized = self.model.standardized_images if settings.trainer.standardize else ()
@@ -181,6 +179,8 @@ class Trainer:
                 )
                 if due:
                     self.log(progress)
+                if reached and stopping:
+                    say(f"  evaluation.at_steps: left out at {self.env_steps} steps, the run stops")
                 if evaluates and not stopping:
                     self.require_finite()
                     with self.aside("evaluation"):
@@ -194,7 +194,7 @@ class Trainer:
                 if saves:
                     self.save(last=False)
                     saved = time.perf_counter()
-            if ahead:
+            if ahead and not stopping:
                 say(f"  evaluation.at_steps={ahead}: not evaluated, the run ends at {self.env_steps} steps")
             self.save()
             [self.interrupted] = processes.agree([stopping or stop()], [])
@@ -320,13 +320,13 @@ class Trainer:
         self.record(row)
 
     @torch.no_grad()
-    def validate(self, batches: int = 4) -> dict[str, float]:
+    def validate(self) -> dict[str, float]:
         """Mean losses over some recorded windows that training never sees; one host sync."""
         if self.validation is None:
             return {}
         training = self.model.training
         self.model.eval()
-        losses = [self.model.loss(self.validation.sample()) for _ in range(batches)]
+        losses = [self.model.loss(self.validation.sample()) for _ in range(4)]
         self.model.train(training)
         means = {name: torch.stack([one.get(name) for one in losses]).mean() for name in losses[0].keys()}  # noqa: SIM118
         return {f"validation/{name}": float(processes.mean(value)) for name, value in means.items()}

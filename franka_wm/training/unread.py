@@ -1,4 +1,4 @@
-"""Images that nothing reads, or one stage of a run alone, and goals that the model cannot see: each said in one line."""
+"""Images that nothing reads, or one stage alone, and goals that the model cannot see: each said in one line."""
 
 from __future__ import annotations
 

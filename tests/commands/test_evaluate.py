@@ -316,7 +316,7 @@ def test_images_of_an_earlier_evaluation_do_not_stay_beside_new_numbers(tmp_path
     for name in ("imagined.png", "imagined.mp4", "mine.png"):
         (tmp_path / name).write_text("earlier")
     nothing: Any = SimpleNamespace(seconds={}, worlds=2)
-    evaluate_checkpoint._write(tmp_path, {}, "", nothing, None)
+    evaluate_checkpoint._write(tmp_path, {}, "", nothing, None, None)
     names = {"mine.png", "timing.json", "evaluation.md", "evaluation.json"}
     assert {one.name for one in tmp_path.iterdir()} == names
 
@@ -390,11 +390,8 @@ def test_options() -> None:
 
 
 def test_the_bare_folder_may_follow_an_option_and_its_value() -> None:
-    for words in (
-        ["--episodes", "7", "a"],
-        ["a", "--episodes", "7"],
-        ["--robustness", "a", "--episodes", "7"],
-    ):
+    episodes = ["--episodes", "7"]
+    for words in ([*episodes, "a"], ["a", *episodes], ["--robustness", "a", *episodes]):
         found = verb.make_context("evaluate", words).params
         assert (found["checkpoint"], found["episodes"]) == ("a", 7), words
     assert verb.make_context("evaluate", ["--out", "b=1", "a"]).params["out"] == "b=1"
@@ -403,11 +400,14 @@ def test_the_bare_folder_may_follow_an_option_and_its_value() -> None:
 def test_default_folder(tmp_path: Path) -> None:
     checkpoint = tmp_path / "run" / "checkpoints" / "latest"
     checkpoint.mkdir(parents=True)
-    assert (
-        default_folder(str(checkpoint))
-        == default_folder(str(tmp_path / "run"))
-        == tmp_path / "run" / "evaluation"
+    assert default_folder(str(checkpoint)) == checkpoint / "evaluation", (
+        "anybody may call a folder checkpoints"
     )
+    (tmp_path / "run" / "config.yaml").touch()
+    first = tmp_path / "run" / "pretrained"
+    assert default_folder(str(first / "checkpoints" / "7")) == first / "evaluation"
+    for one in (checkpoint, checkpoint.parent, tmp_path / "run"):
+        assert default_folder(str(one)) == tmp_path / "run" / "evaluation"
     assert default_folder("hf:me/arm") == Path("outputs/evaluation/me--arm")
 
 
@@ -433,7 +433,7 @@ def representation_alone(agent):
     from dataclasses import replace
 
     policies = {name: agent.policies[name] for name in ("noop", "random")}
-    return replace(agent, model=Blind(), planner=None, policies=policies)
+    return replace(agent, model=Blind(), policies=policies)
 
 
 def test_a_representation_alone(representation_alone) -> None:

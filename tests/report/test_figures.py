@@ -19,6 +19,7 @@ from franka_wm.report import style
 from franka_wm.report.bars import bars_figure
 from franka_wm.report.calibration import calibration_figure
 from franka_wm.report.curves import panel_figure, quantity, seed_bands, seeds_figure
+from franka_wm.report.document import sparkline
 from franka_wm.report.figure import inline_svg, save_figure
 from franka_wm.report.frames import hide_patches, mask_figure, strip_figure
 from franka_wm.report.horizon import horizon_figure
@@ -172,6 +173,13 @@ def test_seeds_are_drawn_as_mean_and_band() -> None:
     heights = band.get_paths()[0].vertices[:, 1]
     np.testing.assert_allclose([heights.min(), heights.max()], [10, 40])
     assert "[cm]" in figure.axes[0].get_title() and figure.axes[0].get_xlabel() == "environment steps"
+
+
+def test_small_curves_have_two_points_to_a_pixel_however_long_the_run() -> None:
+    rows = [math.sin(k / 5000) for k in range(100_000)]
+    assert 2_000 < len(sparkline(rows, "loss")) < 10_000
+    few = sparkline([0.0, 1.0, math.nan, 2.0], "loss")
+    assert len(few) < 500
 
 
 def test_panels_are_drawn_only_where_there_is_something() -> None:

@@ -273,6 +273,30 @@ def test_a_service_that_fails_closes_what_was_open(tmp_path: Path, wandb: Fake, 
     assert len(wandb.of("finish")) == 1
 
 
+def test_a_service_that_is_away_later_is_said_and_training_goes_on(
+    tmp_path: Path, mlflow: Fake, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """MLflow's own error is no OSError."""
+    loggers = make_loggers(["mlflow", "csv"], tmp_path)
+
+    def away(*_: Any, **__: Any) -> None:
+        raise RuntimeError("no server")
+
+    for name in ("log_artifact", "end_run"):
+        setattr(mlflow, name, away)
+    loggers[0].log_metrics = away  # type: ignore[method-assign]
+    log_numbers(loggers, {"loss": 1.0}, step=3)
+    log_video(loggers, "film", frames(), fps=5, step=3)
+    close_loggers(loggers)
+    said = capsys.readouterr().out.splitlines()
+    assert said == [
+        "  warning: mlflow cannot log the numbers of update 3: no server",
+        "  warning: mlflow cannot log the video film of update 3: no server",
+        "  warning: mlflow cannot end its run: no server",
+    ]
+    assert list(tmp_path.rglob("film_3.mp4")) and list(tmp_path.rglob("loss.csv")), "the others have it"
+
+
 def test_every_logger_has_a_preset(root: Path, composed) -> None:
     """`logger=NAME` composes, and its options are known."""
     from omegaconf import OmegaConf

@@ -56,6 +56,7 @@ def make(cfg: RunSettings, env: FrankaEnv, tmp_path_factory) -> Make:
             policies=build.make_policies(model, build.make_planner(mine, env.action_dim), env),
             actor="policy",
             settings=mine,
+            spaces=build.Spaces.of_env(env),
             folder=folder / name,
             loggers=[],
             evaluate=dict,
@@ -169,6 +170,7 @@ def test_two_stages_of_several_processes_draw_unlike_numbers(
 ) -> None:
     other, seeds = make(), []
     parts: Any = {"env": env, "learner": other.learner, "replay": other.replay, "policies": {}, "loggers": []}
+    parts["spaces"] = other.spaces
     first = replace(cfg, values={**cfg.values, "whole_run": cfg.values})
     for rank in range(2):
         monkeypatch.setattr(processes, "count", lambda: 2)

@@ -10,7 +10,9 @@ from tensordict import TensorDict
 
 from franka_wm import processes
 from franka_wm.commands.entry import check_command
+from franka_wm.data import memory
 from franka_wm.data.image_storage import OVERFLOW
+from franka_wm.data.memory import left_of_container
 from franka_wm.data.replay import make_replay
 from franka_wm.envs import FrankaConfig
 from franka_wm.errors import UserError
@@ -151,6 +153,19 @@ def test_what_cannot_be_allocated_is_one_line_as_well(monkeypatch, settled) -> N
 def test_free_memory_is_that_of_the_machine() -> None:
     free = storage_budget.free_memory(torch.device("cpu"))
     assert free is None or 1e7 < free < 1e14
+
+
+def test_free_memory_is_no_more_than_the_container_may_use(tmp_path, monkeypatch) -> None:
+    assert left_of_container(tmp_path) is None
+    (tmp_path / "memory.max").write_text("max\n")
+    (tmp_path / "memory.current").write_text("3000000\n")
+    (tmp_path / "memory.stat").write_text("anon 5\ninactive_file 1000000\nactive_file 7\n")
+    assert left_of_container(tmp_path) is None
+    (tmp_path / "memory.max").write_text("10000000\n")
+    assert left_of_container(tmp_path) == 8_000_000  # what is only cached may go
+    monkeypatch.setattr(memory, "left_of_container", lambda _: 8_000_000)
+    if memory.free_memory("cpu") is not None:
+        assert memory.free_memory("cpu") == 8_000_000
 
 
 @pytest.mark.parametrize(

@@ -58,14 +58,14 @@ def make(cfg: RunSettings, env: FrankaEnv, tmp_path: Path) -> Make:
         torch.manual_seed(0)
         env.set_seed(0)
         built = build.make_model(mine, env)
-        planner = build.make_planner(mine, env.action_dim)
         return Trainer(
             env=env,
             learner=Learner(built),
             replay=build.make_replay_buffer(mine, env.device),
-            policies=build.make_policies(built, planner, env),
+            policies=build.make_policies(built, build.make_planner(mine, env.action_dim), env),
             actor="policy",
             settings=mine,
+            spaces=build.Spaces.of_env(env),
             folder=tmp_path / folder,
             loggers=[],
             evaluate=evaluate,
@@ -358,15 +358,17 @@ def test_evaluation_at_environment_steps(make: Make, capsys) -> None:
     assert [row["env_steps"] for row in rows] == [35 * N]
 
 
-def test_who_is_asked_to_stop_saves_before_anything_else(make: Make) -> None:
+def test_who_is_asked_to_stop_saves_before_anything_else(make: Make, capsys) -> None:
     """Whoever asked may kill it soon: the evaluation that was due is left to the run that goes on."""
     trainer = make(updates=40, evaluate=lambda: pytest.fail("evaluated"))
-    trainer.settings = trainer.settings.changed(evaluation={"every": 10})
+    trainer.settings = trainer.settings.changed(evaluation={"every": 10, "at_steps": [1, 999]})
     draw = trainer._draw
     trainer._draw = lambda: (os.kill(os.getpid(), signal.SIGTERM), draw())[1]  # type: ignore[method-assign]
     trainer.fit()
-    assert trainer.interrupted and trainer.learner.updates == 10
-    assert latest_checkpoint(trainer.folder).is_dir()
+    assert (
+        trainer.interrupted and trainer.learner.updates == 10 and latest_checkpoint(trainer.folder).is_dir()
+    )
+    assert capsys.readouterr().out.count("at_steps") == 1  # one is left out; the other is still ahead
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])

@@ -26,7 +26,7 @@ HOPELESS = 200
 
 
 @dataclass
-class Source:
+class Gatherer:
     """Who acts where.
 
     Attributes:
@@ -45,7 +45,7 @@ class Source:
 
 
 def gather(
-    source: Source,
+    source: Gatherer,
     *,
     out: str | Path,
     episodes: int,

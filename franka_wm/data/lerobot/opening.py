@@ -14,13 +14,12 @@ from torch import Tensor
 from franka_wm import processes
 from franka_wm.data.lerobot.cache import Cache, Say, open_cache
 from franka_wm.data.lerobot.mapping import FeatureMap, map_features
-from franka_wm.data.lerobot.provenance import read_provenance
+from franka_wm.data.lerobot.provenance import recorded_sessions, recorded_tasks
 from franka_wm.data.lerobot.source import Source, find_dataset, read_source
 from franka_wm.data.lerobot.windows import RecordedWindows, Recording
 from franka_wm.data.memory import free_memory
 from franka_wm.device import resolve_device
 from franka_wm.errors import UserError
-from franka_wm.untrusted import values_of
 
 MEMORY_SHARE = 0.5
 """How much of the free memory a dataset may take before it is read from the disk instead."""
@@ -219,10 +218,8 @@ def read_datasets(
 
 def _recorded_task(source: Source) -> str:
     """``env.task=NAME``, if it says so: what else is other may be since this is. It is said before that."""
-    with values_of(str(source.root), "copy or download the dataset again"):
-        sessions = (read_provenance(source.root) or {}).get("sessions") or ()
-        tasks = {session.get("config", {}).get("env", {}).get("task") for session in sessions} - {None}
-        return f"env.task={tasks.pop()}" if len(tasks) == 1 else ""
+    tasks = recorded_tasks(recorded_sessions(source.root))
+    return f"env.task={tasks.pop()}" if len(tasks) == 1 else ""
 
 
 def _scales(mappings: Sequence[FeatureMap], normalize_actions: bool | None) -> bool:

@@ -14,7 +14,7 @@ from typing import Any
 
 from franka_wm.data.lerobot.schema import PROVENANCE
 from franka_wm.errors import UserError
-from franka_wm.untrusted import linked_json
+from franka_wm.untrusted import linked_json, values_of
 
 _PACKAGES = ("franka-wm", "torch", "torchrl", "newton", "warp-lang", "lerobot", "numpy")
 
@@ -258,3 +258,21 @@ def read_provenance(root: str | Path) -> dict[str, Any] | None:
     if not path.is_file():
         return None
     return linked_json(path)
+
+
+def recorded_sessions(root: str | Path) -> list[dict[str, Any]]:
+    """What :func:`describe` said of each session of gathering; none for others' datasets.
+
+    Raises:
+        UserError: The file cannot be read, or is of a form that nothing here writes.
+    """
+    with values_of(str(root), "copy or download the dataset again"):
+        sessions: list[dict[str, Any]] = list((read_provenance(root) or {}).get("sessions") or ())
+        for session in sessions:
+            session.get("config", {}).get("env", {}).items()
+        return sessions
+
+
+def recorded_tasks(sessions: Iterable[Mapping[str, Any]]) -> set[str]:
+    """Names of the tasks of :func:`recorded_sessions`."""
+    return {session.get("config", {}).get("env", {}).get("task") for session in sessions} - {None}

@@ -43,7 +43,7 @@ from franka_wm.data.lerobot.shard_workers import (
 )
 from franka_wm.data.lerobot.source import MOST_ROWS, check_finite
 from franka_wm.errors import UserError
-from franka_wm.files import unwritable
+from franka_wm.files import sync, unwritable
 from franka_wm.options import is_whole, whole_rule
 from franka_wm.untrusted import UntrustedFolder, linked_json, values_of
 
@@ -353,10 +353,13 @@ class DatasetWriter:
         with self._rescuing():
             self._idle_worker().send(("merge", merged, roots, provenance))
         self.flush()
+        for path in (*merged.rglob("*"), merged):  # on the disk before the shards go
+            sync(path)
         self._save_state(replacing=True)
         if self.out.exists():
             os.rename(self.out, self.working / PREVIOUS)
         os.rename(merged, self.out)
+        sync(self.out.parent)
         self._remove_working()
 
     def _sessions_with_episodes(self, shards: list[Path]) -> list[dict[str, Any]]:

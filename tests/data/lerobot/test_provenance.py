@@ -1,6 +1,9 @@
 """Whether a recording was made in the same environment, from what it says of that."""
 
 from dataclasses import fields
+from pathlib import Path
+
+import pytest
 
 from franka_wm.data.lerobot.provenance import (
     DYNAMICS,
@@ -9,10 +12,14 @@ from franka_wm.data.lerobot.provenance import (
     VIEWS,
     other_option,
     other_scene,
+    recorded_sessions,
+    recorded_tasks,
     told,
 )
+from franka_wm.data.lerobot.schema import PROVENANCE
 from franka_wm.envs import FrankaConfig
 from franka_wm.envs.ranges import Randomization
+from franka_wm.errors import UserError
 
 NOT_COMPARED = {
     *("pose_noise", "goal", "home", "goal_sampling", "goal_noise"),  # where episodes start and lead to
@@ -70,3 +77,18 @@ def test_the_scene_of_a_task_that_is_not_known_here_is_not_compared() -> None:
     for task, other in (("hover", False), ("stack", True), ("push", False)):
         there = [{"config": {"env": {"task": task, "scene": None}}}]
         assert other_scene(there, env, images=False) is other
+
+
+@pytest.mark.parametrize(
+    "strange", ['{"sessions": [1]}', '{"sessions": [{"config": []}]}', '{"sessions": 1}']
+)
+def test_sessions_of_another_form_end_in_one_line(tmp_path: Path, strange: str) -> None:
+    assert recorded_sessions(tmp_path) == []
+    (tmp_path / PROVENANCE).parent.mkdir(parents=True)
+    (tmp_path / PROVENANCE).write_text('{"sessions": null}')
+    assert recorded_sessions(tmp_path) == []
+    (tmp_path / PROVENANCE).write_text(strange)
+    with pytest.raises(UserError, match="copy or download the dataset again"):
+        recorded_sessions(tmp_path)
+    (tmp_path / PROVENANCE).write_text('{"sessions": [{"config": {"env": {"task": "push"}}}, {}]}')
+    assert recorded_tasks(recorded_sessions(tmp_path)) == {"push"}

@@ -29,8 +29,9 @@ def run_folder(tmp_path):
         optimizer=torch.optim.AdamW(model.parameters()),
         config=config,
         counters={"updates": 7, "env_steps": 70},
-        extra={"spaces": {"action_dim": 2}},
+        extra={"spaces": {"action_dim": 2}, "rows": [1.0], "moment": {"worlds": torch.full((4,), 7.0)}},
     )
+    (tmp_path / "run" / "config.yaml").touch()
     (tmp_path / "run" / "evaluation.md").write_text("| policy | distance |\n|---|---|\n| planner | 1 cm |\n")
     (tmp_path / "run" / "video.mp4").write_bytes(b"a film")
     return tmp_path / "run", model
@@ -84,6 +85,7 @@ def test_a_models_card_has_the_newest_evaluation_and_the_right_world(tmp_path) -
         save_checkpoint(
             run / "checkpoints" / "latest", model=torch.nn.Linear(3, 2), config=config, counters={}
         )
+        (run / "config.yaml").touch()
         (run / "evaluation").mkdir()
         (run / "evaluation.md").write_text("the older numbers")
         (run / "evaluation" / "evaluation.md").write_text("the verb's numbers of /home/someone/run")

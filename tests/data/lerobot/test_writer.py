@@ -14,6 +14,7 @@ import pytest
 
 from dataset_episodes import as_picture, check_terminals, compare
 from franka_wm.data.lerobot import merge as merging
+from franka_wm.data.lerobot import writer as writing
 from franka_wm.data.lerobot.merge import merge, merge_terminals
 from franka_wm.data.lerobot.schema import ACTION, DONE, STATE
 from franka_wm.data.lerobot.shard import ENCODERS, arrow_schema, write_shard
@@ -297,6 +298,24 @@ def test_what_cannot_be_written_is_refused(
             writer.add([bad])
         assert "\n" not in str(error.value)
         compare(load(writer.finish()), schema, [good])
+
+
+def test_what_is_written_reaches_the_disk_before_its_shards_go(
+    tmp_path, monkeypatch, make_schema, make_episode, write
+) -> None:
+    """A machine that loses power then has either."""
+    synced = []
+    monkeypatch.setattr(
+        writing, "sync", lambda path: synced.append((path, len(list(tmp_path.glob("*/shards/*")))))
+    )
+    schema = make_schema()
+    root = write(tmp_path / "set", schema, [make_episode(schema, 0, 3)])
+    inside = [(path, shards) for path, shards in synced if path != root.parent]
+    names = {
+        path.relative_to(next(p for p in (path, *path.parents) if p.name == "merged")) for path, _ in inside
+    }
+    assert names == {path.relative_to(root) for path in (root, *root.rglob("*"))}
+    assert all(shards for _, shards in inside) and synced[-1][0] == root.parent
 
 
 def test_a_dataset_of_nothing_is_refused(tmp_path, make_schema) -> None:
