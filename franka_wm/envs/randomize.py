@@ -1,7 +1,7 @@
 # pyright: reportOptionalMemberAccess=false, reportOptionalSubscript=false, reportAttributeAccessIssue=false
 # pyright: reportArgumentType=false
 # (Warp's annotations do not say what a built model always has.)
-"""What each episode of each world draws anew: looks, servo, joints, links, delay."""
+"""What each episode of each world draws anew: looks, servo, joints, links, objects, contacts, delay."""
 
 from __future__ import annotations
 
@@ -21,8 +21,9 @@ if TYPE_CHECKING:
 class Randomizer:
     """Draws for the masked worlds at every reset, inside the captured graph.
 
-    The drawn values live in the Newton model's own arrays, which hold one row for each world; MuJoCo's copy of
-    the physical ones is refreshed: on the CPU in steps in which some world is reset, on CUDA in every step.
+    Most drawn values live in the Newton model's own arrays, which hold one row for each world; MuJoCo's copy of
+    the physical ones is refreshed: on the CPU in steps in which some world is reset, on CUDA in every step. Contacts'
+    friction, and the sizes and heights that contacts meet, are in MuJoCo's arrays alone.
 
     Args:
         sim: The simulation; its config says what is drawn.
@@ -183,7 +184,10 @@ class Randomizer:
             inputs = [sim.warp.sizes, self._parts, *self._plain_sizes, self._first_object, *self._sized]
             wp.launch(kernels.resize, (sim.num_envs, len(self._parts)), inputs, device=sim.device)
         if self.ranges.dynamics:
-            flags = ModelFlags.JOINT_DOF_PROPERTIES
+            # Of armatures and masses MuJoCo computes its constants anew.
+            flags = ModelFlags.JOINT_DOF_FORCE_PROPERTIES
+            if self.ranges.armature:
+                flags |= ModelFlags.JOINT_DOF_INERTIAL_PROPERTIES
             if self.ranges.inertial:
                 flags |= ModelFlags.BODY_INERTIAL_PROPERTIES
             sim.solver.notify_model_changed(flags)

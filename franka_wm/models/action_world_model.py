@@ -89,11 +89,9 @@ class ActionWorldModel(HistoryWorldModel):
     has_goal_policy = True  # by options, see `learn_goals`
     has_goal_steps = True
     ranges: ClassVar[Mapping[str, Bounds]] = {
-        **dict.fromkeys(
-            ("action_dim", "encoder_width", "encoder_depth", "encoder_heads", "patch_size"), POSITIVE
-        ),
+        **dict.fromkeys(("action_dim", "encoder_width", "encoder_heads", "patch_size"), POSITIVE),
         **dict.fromkeys(("channels", "state_embed_dim", "state_hidden_dim", "grid", "history"), POSITIVE),
-        **dict.fromkeys(("predictor_width", "predictor_depth", "predictor_heads"), POSITIVE),
+        **dict.fromkeys(("predictor_width", "predictor_heads"), POSITIVE),
         **dict.fromkeys(("predictor_hidden_dim", "rollout", "guard_directions"), POSITIVE),
         **dict.fromkeys(("guard_coef", "weight_decay", "encoder_lr_scale"), COEFFICIENT),
         **dict.fromkeys(("goal_policy_coef", "goal_steps_coef"), COEFFICIENT),
@@ -212,7 +210,7 @@ class ActionWorldModel(HistoryWorldModel):
         self.adapter = ProjectionMLP(self.token_dim, self.token_dim) if self.guard.acts else None
         self.target_encoder = frozen_copy(self.encoder) if self.guard.kind == "ema" else None
         goals: Any = {"policy": goal_policy_coef, "steps": goal_steps_coef}
-        self.learn_goals(self.feature_dim, **goals, episode_length=episode_length)
+        self.learn_goals(**goals, episode_length=episode_length)
 
     def train(self, mode: bool = True) -> ActionWorldModel:
         """Set the mode; a frozen encoder stays in evaluation mode."""
@@ -236,10 +234,6 @@ class ActionWorldModel(HistoryWorldModel):
             return self.history.push(z, action, frame)
         frame = self._normalise(self.dynamics(*self.unpack(z, action))[:, -1])
         return self.history.push(z, action, frame.view(*z.shape[:-1], -1))
-
-    def embed(self, z: Tensor) -> Tensor:
-        """Tokens that goals are compared on: the newest frame's tokens, flattened (..., feature_dim)."""
-        return self.history.last(z)[..., : self.feature_dim]
 
     def encode_goal(self, observation: TensorDictBase) -> Tensor:
         """The tokens (..., feature_dim) of a goal: of its images, or of its state vectors for

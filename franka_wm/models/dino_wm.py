@@ -99,7 +99,7 @@ class DINOWM(HistoryWorldModel):
         self.image_sizes = check_image_sizes(image_sizes)
         self.vectors = ObservationNormalizer(observation_sizes)
         self.observation_sizes, self.action_dim = self.vectors.sizes, action_dim
-        self.dropout, self.weight_decay = dropout, weight_decay
+        self.weight_decay = weight_decay
         self.encoder = Backbone(
             shared_image_size(self.image_sizes),
             grid=grid,
@@ -153,10 +153,6 @@ class DINOWM(HistoryWorldModel):
         """Next z (..., latent_dim) after actions (..., action_dim) in z (..., latent_dim)."""
         frame = self._predict(*self.unpack(z, action))[:, -1]
         return self.history.push(z, action, frame.view(*z.shape[:-1], -1))
-
-    def embed(self, z: Tensor) -> Tensor:
-        """The newest frame's patches, flattened (..., feature_dim): what goals are compared on."""
-        return self.history.last(z)[..., : self.feature_dim]
 
     def encode_goal(self, observation: TensorDictBase) -> Tensor:
         """Patches (..., feature_dim) of a goal's images."""

@@ -213,9 +213,9 @@ class Dreamer(ActorCritic):
         self, observation: TensorDictBase, previous_z: Tensor, action: Tensor, is_init: Tensor
     ) -> Tensor:
         """Latents z (E, latent_dim) after `action` led to `observation`, see `WorldModel.observe`."""
-        embedded = self._embed(observation)
-        h = torch.where(is_init, self.rssm.begin(embedded), self.rssm.recur(previous_z, action))
-        return self._see(h, embedded, sample=False)[0]
+        # From nothing where an episode begins, as `RSSM.begin`.
+        h = self.rssm.recur(previous_z.masked_fill(is_init, 0.0), action.masked_fill(is_init, 0.0))
+        return self._see(h, self._embed(observation), sample=False)[0]
 
     def next(self, z: Tensor, action: Tensor) -> Tensor:
         """Next latents (..., latent_dim), with the likeliest codes, after actions (..., action_dim)."""
@@ -287,12 +287,12 @@ class Dreamer(ActorCritic):
         window = window_of(batch, self.observation_keys).transpose(0, 1)
         observed = [window.get(key) for key in self.observation_keys]
         # On CUDA, parts that do not wait for each other's results run side by side.
-        with side_stream(*observed) as seen:
+        # Weights that `lowered` casts for this update alone are read there, too.
+        with side_stream(*observed, *self.rssm.of_observation.parameters()) as seen:
             embedded = self._embed(window)
         h = self._remember(earlier, batch[:, 0], embedded[0])
         seen.join(embedded)
         z, posterior = self._filter(h, embedded, action)  # (H+1, B, ...)
-        # Its weights too: in low precision they were cast for this update alone, see `lowered`.
         read = (z, posterior, *observed, reward, terminated, *self.rssm.prior_head.parameters())
         with side_stream(*read) as model:
             model_loss, model_metrics = self._model_loss(z, posterior, window, reward, terminated)

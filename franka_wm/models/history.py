@@ -22,10 +22,12 @@ from franka_wm.models.normalizer import ObservationNormalizer
 class HistoryWorldModel(WorldModel):
     """World model whose latent is a history of frames: what LeWorldModel and the action world model share.
 
-    A family sets `history` and `vectors`, and defines `encode_frame` and `next`.
+    A family sets `history`, `vectors` and `feature_dim` (entries of a frame, the first, that goals are compared on),
+    and defines `encode_frame` and `next`.
     """
 
     history: FrameHistory
+    feature_dim: int
     vectors: ObservationNormalizer
     goal_heads: GoalHeads | None
     has_goal_policy = False  # of families that call `learn_goals`
@@ -62,9 +64,12 @@ class HistoryWorldModel(WorldModel):
         pushed = self.history.push(previous_z, action, frame)
         return torch.where(is_init, self.history.start(frame), pushed)
 
+    def embed(self, z: Tensor) -> Tensor:
+        """What goals are compared on (..., feature_dim), of the newest frame."""
+        return self.history.last(z)[..., : self.feature_dim]
+
     def learn_goals(
         self,
-        embed_dim: int,
         *,
         policy: float,
         steps: float,
@@ -78,7 +83,7 @@ class HistoryWorldModel(WorldModel):
         if policy or steps:
             size = self.history.action_dim
             self.goal_heads = GoalHeads(
-                embed_dim,
+                self.feature_dim,
                 size,
                 policy=policy > 0,
                 distance=steps > 0,

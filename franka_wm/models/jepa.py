@@ -103,10 +103,8 @@ class JEPA(WorldModel):
     """
 
     ranges: ClassVar[Mapping[str, Bounds]] = {
-        **dict.fromkeys(
-            ("encoder_width", "encoder_depth", "encoder_heads", "patch_size", "tubelet"), POSITIVE
-        ),
-        **dict.fromkeys(("predictor_width", "predictor_depth", "predictor_heads", "projection"), POSITIVE),
+        **dict.fromkeys(("encoder_width", "encoder_heads", "patch_size", "tubelet"), POSITIVE),
+        **dict.fromkeys(("predictor_width", "predictor_heads", "projection"), POSITIVE),
         **dict.fromkeys(("ema_steps", "guard_directions", "global_views"), POSITIVE),
         **dict.fromkeys(("guard_coef", "weight_decay"), COEFFICIENT),
         **dict.fromkeys(("ema_start", "ema_end"), FRACTION),

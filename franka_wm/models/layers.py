@@ -90,6 +90,13 @@ class Linear(nn.Linear):
         return F.linear(F.pad(input, (0, more)), weight, bias)[..., : self.out_features]
 
 
+class RMSNorm(nn.RMSNorm):
+    """In the precision of its weights under autocast, too: torch's one kernel takes no other."""
+
+    def forward(self, x: Tensor) -> Tensor:
+        return super().forward(x.to(self.weight.dtype))
+
+
 class SimNorm(nn.Module):
     """Simplicial normalisation: softmax within consecutive groups of `group_size` features.
 

@@ -102,10 +102,8 @@ class LeWorldModel(HistoryWorldModel):
         **dict.fromkeys(
             ("action_dim", "embed_dim", "state_embed_dim", "state_hidden_dim", "history"), POSITIVE
         ),
-        **dict.fromkeys(("encoder_width", "encoder_depth", "encoder_heads", "patch_size"), POSITIVE),
-        **dict.fromkeys(
-            ("projector_hidden", "predictor_width", "predictor_depth", "predictor_heads"), POSITIVE
-        ),
+        **dict.fromkeys(("encoder_width", "encoder_heads", "patch_size"), POSITIVE),
+        **dict.fromkeys(("projector_hidden", "predictor_width", "predictor_heads"), POSITIVE),
         **dict.fromkeys(("predictor_head_dim", "predictor_mlp", "sigreg_directions", "rollout"), POSITIVE),
         **dict.fromkeys(_COEFS, COEFFICIENT),
         "discount": FRACTION,
@@ -163,6 +161,7 @@ class LeWorldModel(HistoryWorldModel):
         self.weight_decay, self.discount = weight_decay, discount
         self.encoder = self.projector = self.state_encoder = None
         self.image_part = self.state_part = 0
+        self.feature_dim = embed_dim  # of images, or of vectors alone
         if self.image_sizes:
             shape = vit_size(encoder_size, width=encoder_width, depth=encoder_depth, heads=encoder_heads)
             self.encoder = ViT(
@@ -202,14 +201,13 @@ class LeWorldModel(HistoryWorldModel):
         self.sigreg = SIGReg(directions=sigreg_directions)
         self.inverse_head = None
         if inverse_coef:
-            seen = (history + 1) * (self.image_part or frame)
-            self.inverse_head = mlp(seen, (512, 512), history * action_dim)
+            self.inverse_head = mlp((history + 1) * self.feature_dim, (512, 512), history * action_dim)
         self.reward_probe, self.has_reward = None, reward_head
         if reward_head:
             self.two_hot = TwoHotSymlog()
             self.reward_probe = zero_head(self.latent_dim + action_dim, (256, 256), self.two_hot.bins)
         goals: Any = {"policy": goal_policy_coef, "steps": goal_steps_coef, "gradient": goal_policy_gradient}
-        self.learn_goals(self.image_part or frame, **goals, episode_length=episode_length)
+        self.learn_goals(**goals, episode_length=episode_length)
 
     @classmethod
     def validate(cls, options: Mapping[str, Any], *, window: int | None = None) -> None:
@@ -239,16 +237,12 @@ class LeWorldModel(HistoryWorldModel):
         predicted = self._predict(frames, actions, hide_invalid(mask, valid), training=False)[:, -1]
         return self.history.push(z, action, predicted.view(*z.shape[:-1], -1))
 
-    def embed(self, z: Tensor) -> Tensor:
-        """Embedding that goals are compared on: the newest frame's embedding (..., embed_dim)."""
-        return self._comparable(self.history.last(z))
-
     def encode_goal(self, observation: TensorDictBase) -> Tensor:
         """The embedding (..., embed_dim) of a goal: of its images where the model reads any (state vectors
         are not needed then), else of its state vectors."""
         if self.image_sizes:
             return self._image(observation, batch_statistics=False)
-        return self._comparable(self.encode_frame(observation))
+        return self.encode_frame(observation)
 
     def reward(self, z: Tensor, action: Tensor) -> Tensor:
         """Expected reward (..., 1) of an action in z, of a model with `reward_head`."""
@@ -336,9 +330,6 @@ class LeWorldModel(HistoryWorldModel):
             parts.append(self.state_encoder(self.vectors(observation)))
         return parts[0] if len(parts) == 1 else torch.cat(parts, dim=-1)
 
-    def _comparable(self, frame: Tensor) -> Tensor:
-        return frame[..., : self.image_part] if self.image_part else frame
-
     def _predict(self, frames: Tensor, actions: Tensor, mask: Tensor, *, training: bool) -> Tensor:
         """Frames (N, K, F), the action taken at each (N, K, A) -> the frame after each (N, K, F)."""
         positions = torch.arange(frames.shape[1], device=frames.device)
@@ -360,7 +351,7 @@ class LeWorldModel(HistoryWorldModel):
                 f"inverse_coef needs windows of at least history={self.history.length} transitions, got "
                 f"{actions.shape[1]}"
             )
-        frames = self._comparable(torch.cat((before, after[:, -1:]), dim=1))
+        frames = torch.cat((before, after[:, -1:]), dim=1)[..., : self.feature_dim]
         read = self.inverse_head(frames.flatten(1)).float().view(actions.shape)
         return F.mse_loss(read, actions.float())
 

@@ -78,9 +78,7 @@ class MuZero(SimplicialWorldModel):
     )
     replay_keys = ("search_policy", "search_value")
     ranges: ClassVar[Mapping[str, Bounds]] = {
-        **dict.fromkeys(
-            ("num_actions", "latent_dim", "simnorm_dim", "encoder_dim", "encoder_layers"), POSITIVE
-        ),
+        **dict.fromkeys(("num_actions", "latent_dim", "simnorm_dim", "encoder_dim"), POSITIVE),
         **dict.fromkeys(("hidden_dim", "channels", "unroll", "n_step"), POSITIVE),
         **dict.fromkeys(("reward_coef", "value_coef", "policy_coef", "consistency_coef"), COEFFICIENT),
         **dict.fromkeys(("projector_dim", "bins"), Bounds(least=2)),

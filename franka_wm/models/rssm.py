@@ -13,7 +13,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from franka_wm.models.layers import Linear
+from franka_wm.models.layers import Linear, RMSNorm
 
 
 class RSSM(nn.Module):
@@ -133,13 +133,6 @@ def divergence(p: Tensor, q: Tensor) -> Tensor:
 
 EPS = 1e-4
 """Epsilon of the normalisations, as published."""
-
-
-class RMSNorm(nn.RMSNorm):
-    """In the precision of its weights under autocast, too: torch's one kernel takes no other."""
-
-    def forward(self, x: Tensor) -> Tensor:
-        return super().forward(x.to(self.weight.dtype))
 
 
 class BlockLinear(nn.Module):

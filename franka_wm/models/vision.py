@@ -14,7 +14,7 @@ from torch.nn import functional as F
 
 from franka_wm.models.attention import attention
 from franka_wm.models.images import check_images
-from franka_wm.models.layers import initialize
+from franka_wm.models.layers import RMSNorm, initialize
 from franka_wm.options import is_whole
 
 SIZES = {"tiny": (192, 12, 3), "small": (384, 12, 6)}
@@ -111,7 +111,7 @@ class ConvDecoder(nn.Module):
         self.image_size, self.grid = image_size, (-(-height // 16), -(-width // 16))
         widths = [2 * channels, 2 * channels, 3 * channels // 2, channels]
         self.start = nn.Linear(in_features, widths[0] * self.grid[0] * self.grid[1])
-        self.norms = nn.ModuleList(nn.RMSNorm(each, eps=1e-4) for each in widths)
+        self.norms = nn.ModuleList(RMSNorm(each, eps=1e-4) for each in widths)
         self.convolutions = nn.ModuleList(
             nn.Conv2d(a, 4 * b, 3, padding=1) for a, b in zip(widths, [*widths[1:], outputs], strict=True)
         )
@@ -241,7 +241,7 @@ class ViT(nn.Module):
         if width % heads or width % 4:
             raise ValueError(f"width must be a multiple of 4 and of heads, got {width} and {heads}")
         self.image_size, self.patch_size, self.tubelet = (rows, columns, channels), patch_size, tubelet
-        self.width, self.depth, self.heads, self.cls = width, depth, heads, cls
+        self.width, self.cls = width, cls
         self.grid = (rows // patch_size, columns // patch_size)
         self.num_patches = self.grid[0] * self.grid[1]
         self.patch_embedding = nn.Linear(tubelet * patch_size * patch_size * channels, width)
@@ -298,10 +298,6 @@ class ViT(nn.Module):
             mlp_ratio=built.mlp_ratio,
             cls=bool(built.cls),
         )
-
-    def tokens(self, frames: int = 1) -> int:
-        """Number of patch tokens of a clip of `frames` frames."""
-        return max(1, frames // self.tubelet) * self.num_patches
 
     def forward(self, clips: Tensor, keep: Tensor | None = None) -> Tensor:
         """Encode.

@@ -176,7 +176,8 @@ class ContinuousPlanner:
         for _ in range(self.horizon):
             # A weight of zero does not remove a nan from a weighted mean, so it must not get in.
             actions.append(torch.nan_to_num(query.prior(latent), nan=0.0).clamp(self.low, self.high))
-            latent = query.next(latent, actions[-1])
+            if len(actions) < self.horizon:
+                latent = query.next(latent, actions[-1])
         return [torch.stack(actions, dim=2)]
 
     def result(self, query: Query, action: Tensor, noise: Tensor | float, **entries: Tensor) -> TensorDict:

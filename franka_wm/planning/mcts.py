@@ -18,7 +18,7 @@ from franka_wm.seeding import of_worlds
 class MCTS:
     """Tree search over a model of E environments, as MuZero or as Gumbel MuZero acts.
 
-    Every simulation walks from the root to a action not tried yet, asks the model for what it leads to, and adds
+    Every simulation walks from the root to an action not tried yet, asks the model for what it leads to, and adds
     the return found to every action on the way. The two variants differ in how they walk, act and teach:
 
     `puct` (MuZero, Schrittwieser et al., arXiv:1911.08265). At each node the action of the largest

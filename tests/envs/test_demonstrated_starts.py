@@ -127,3 +127,6 @@ def test_an_image_of_the_goal_is_that_of_the_demonstrated_one(shown) -> None:
     observed = env.reset(seed=5)
     assert torch.equal(observed["goal"], rows["goal"][nearest(observed, rows)])
     assert (observed["goal_pixels"] != plain).flatten(1).any(1).all()
+    # Upright at the goal, however the hand held it.
+    turned = env.simulation.tensors.goal_rest.view(8, -1)[:, 5:9]
+    assert (turned[:, :2] == 0).all() and torch.allclose(turned.norm(dim=-1), torch.ones(8))

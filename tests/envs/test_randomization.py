@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import torch
 import warp as wp
+from newton import ModelFlags
 from tensordict import TensorDictBase
 
 from franka_wm.envs import FrankaConfig, FrankaEnv
@@ -153,6 +154,25 @@ def test_mujoco_has_what_was_drawn(physical: FrankaEnv, random_actions) -> None:
                 new_episode = (t + 1) % LENGTH == 0
                 assert (now[name] != before[name]).any(axis=1).all() == new_episode, (name, t)
         before = now
+
+
+@pytest.mark.parametrize("name", DYNAMICS)
+def test_each_range_alone_reaches_mujoco_and_constants_change_where_they_depend_on_it(
+    name: str, small_env, monkeypatch
+) -> None:
+    """MuJoCo computes its constants anew of armatures and masses, which takes longest."""
+    env = small_env(2, randomization={name: DYNAMICS[name]})
+    env.reset(seed=1)
+    now, expected, nominal = drawn(env), newton_s(env), newton_s(small_env(2))
+    for one in now:
+        np.testing.assert_allclose(now[one], expected[one], rtol=1e-6, err_msg=one)
+    assert any((now[one] != nominal[one]).any() for one in now)
+    told = []
+    monkeypatch.setattr(env.simulation.solver, "notify_model_changed", told.append)
+    env.simulation.randomizer.apply()
+    slow = ModelFlags.JOINT_DOF_INERTIAL_PROPERTIES | ModelFlags.BODY_INERTIAL_PROPERTIES
+    slow |= ModelFlags.JOINT_DOF_PROPERTIES
+    assert bool(told[0] & slow) is (name in ("armature", "mass"))
 
 
 def test_draws_are_within_their_ranges(physical: FrankaEnv, small_env) -> None:

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import re
+from pathlib import Path
+
 import pytest
 import torch
 from tensordict import TensorDict
@@ -140,3 +143,12 @@ def starts_of_episode(env: FrankaEnv, seed: int, number: int) -> torch.Tensor:
     for _ in range(number):
         observation = env.reset()
     return observation["state"]
+
+
+def test_each_purpose_draws_from_a_stream_of_its_own(root: Path) -> None:
+    """But for a task's goal that is chosen anew as its uniform numbers were."""
+    rng = re.compile(r"episode_rng\(seed\[0\], seed\[1\] \+ world, [^,]+, (\d+)\)")
+    used = [
+        int(n) for file in (root / "franka_wm" / "envs").rglob("*.py") for n in rng.findall(file.read_text())
+    ]
+    assert sorted(used) == sorted([*range(16), 7])

@@ -9,6 +9,7 @@ from tensordict import TensorDict
 from franka_wm.errors import UserError
 from franka_wm.evaluation.health import training_diagnostics
 from franka_wm.evaluation.spectrum import latent_statistics
+from franka_wm.models import dreamer
 from franka_wm.models.dreamer import Dreamer
 from small_tdmpc2 import windows
 
@@ -111,3 +112,27 @@ def test_a_log_tells_of_latents_with_their_memory() -> None:
     assert found["value/td_bias"] == pytest.approx(float((value - target).mean()), abs=1e-5)
     expected = {f"latent/{name}": number for name, number in latent_statistics(z[EARLIER]).items()}
     assert {name: found[name] for name in expected} == pytest.approx(expected)
+
+
+def test_a_decision_goes_through_the_recurrent_network_once(monkeypatch):
+    model, calls = small(), []
+    recur = model.rssm.recur
+    monkeypatch.setattr(model.rssm, "recur", lambda *given: (calls.append(1), recur(*given))[1])
+    observation = TensorDict({"state": torch.randn(4, 3), "joint_target": torch.randn(4, 2)}, [4])
+    model.observe(observation, torch.randn(4, model.latent_dim), torch.rand(4, 2), torch.eye(4)[:, :1].bool())
+    assert len(calls) == 1
+
+
+def test_weights_that_are_cast_for_an_update_are_told_to_the_streams_that_read_them(monkeypatch):
+    """Their memory would be given away as soon as the main stream is done with it."""
+    model, told = small(), []
+
+    class Noted(dreamer.side_stream):
+        def __init__(self, *inputs: torch.Tensor, lane: int = 0) -> None:
+            told.append({id(one) for one in inputs})
+            super().__init__(*inputs, lane=lane)
+
+    monkeypatch.setattr(dreamer, "side_stream", Noted)
+    model.loss(batch())
+    for layer, inputs in zip((model.rssm.of_observation, model.rssm.prior_head), told, strict=True):
+        assert {id(one) for one in layer.parameters()} <= inputs

@@ -129,7 +129,7 @@ def test_tokens_know_their_places():
 def test_clips_have_tubelets_and_a_single_picture_fills_one():
     vit = small(tubelet=2)
     clip = pictures(2, 6)
-    assert vit(clip).shape == (2, 3 * 16, 32) and vit.tokens(6) == 48
+    assert vit(clip).shape == (2, 3 * 16, 32)
     image = pictures(2)
     torch.testing.assert_close(vit(image), vit(image.unsqueeze(1).expand(-1, 2, -1, -1, -1)))
     still = image.unsqueeze(1).expand(-1, 4, -1, -1, -1)

@@ -1,6 +1,7 @@
 """What holds for every planner of continuous actions."""
 
 # pyright: reportArgumentType=false, reportCallIssue=false, reportOptionalMemberAccess=false
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -385,3 +386,17 @@ def test_worlds_plan_alike_however_they_are_divided(name):
         apart = decided(start[3:])
     torch.testing.assert_close(apart, together[3:], rtol=0, atol=1e-6)
     assert not torch.allclose(decided(start[3:]), apart, rtol=0, atol=1e-6)  # other draws are seen
+
+
+@pytest.mark.parametrize("name", SAMPLING)
+def test_the_policys_candidates_ask_the_model_for_no_more_than_they_read(name: str) -> None:
+    """The latent after the last action is the search's to ask for."""
+    planner, asked = make(name, num_policy_samples=2), []
+
+    def after(z: torch.Tensor, action: torch.Tensor) -> torch.Tensor:
+        asked.append(action)
+        return z
+
+    query = SimpleNamespace(z=torch.zeros(1, 2), prior=lambda z: z, next=after)
+    (found,) = planner.guided(query)
+    assert found.shape[2] == planner.horizon == len(asked) + 1

@@ -1,8 +1,8 @@
 """The Warp kernels of a control step, by concern. One thread per world unless a kernel says otherwise.
 
-``servo`` turns actions into joint targets, ``observation`` reads the arm, ``bodies`` is about
-fingers and objects, ``episodes`` ends and begins episodes,
-``randomization`` draws what each episode has anew, ``goals`` is about images of the goal, ``rendering`` aims cameras and
+``servo`` turns actions into joint targets, ``observation`` reads the arm, ``bodies`` is about fingers and objects,
+``articulated`` about drawers and doors, ``episodes`` ends and begins episodes, ``demonstrated`` begins them in recorded
+states, ``randomization`` draws what each episode has anew, ``goals`` is about images of the goal, ``rendering`` aims cameras and
 places images.
 The kernels of a task are in the task's file.
 

@@ -12,7 +12,12 @@ STATE = wp.constant(20)
 
 @wp.func
 def episode_rng(seed: int, world: int, episode: int, stream: int) -> wp.uint32:
-    """A generator that depends on nothing but these four: not on N, not on the order of resets."""
+    """A generator that depends on nothing but these four: not on N, not on the order of resets.
+
+    Streams: 0 start, 1 goal, 2 action noise, 3 noise on states, 4 looks, 5 joints and masses, 6 phase of a moving goal,
+    7 :func:`draw_uniform` (a task's numbers), 8 places of bodies, 9 of drawers and doors, 10 grip, 11 delay, 12 sizes,
+    13 friction of contacts, 14 states of demonstrations, 15 noise on objects; 16 and up are for tasks of one's own.
+    """
     return wp.rand_init(int(wp.rand_init(int(wp.rand_init(seed, world)), episode)), stream)
 
 

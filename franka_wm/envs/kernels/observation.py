@@ -72,7 +72,7 @@ def blur_objects(
 ):
     """``objects`` as seen: noise on the positions of the first so many ``bodies``."""
     world = wp.tid()
-    rng = wp.rand_init(int(episode_rng(seed[0], seed[1] + world, episode[world], 12)), step_count[world, 0])
+    rng = wp.rand_init(int(episode_rng(seed[0], seed[1] + world, episode[world], 15)), step_count[world, 0])
     for i in range(objects.shape[1]):
         value = objects[world, i]
         if i < EACH * bodies and i % EACH < 3:

@@ -2,7 +2,8 @@
 
 ``build`` makes model, solver and the arrays of the robot, ``scene`` adds what it can touch; ``arrays`` holds
 what a step reads and writes; ``graph`` records and replays; ``bodies`` adds fingers and objects to a step;
-``rendering`` renders; ``state`` saves and restores; ``simulator`` says in which order.
+``rendering`` renders; ``state`` saves and restores; ``compiling`` compiles kernels ahead; ``demonstrated`` holds
+recorded states, ``pipeline`` the contacts that Newton finds; ``simulator`` says in which order.
 """
 
 from franka_wm.envs.simulation.arrays import STATISTICS, Arrays

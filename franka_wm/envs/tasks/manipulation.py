@@ -150,6 +150,8 @@ def bring_to_goal(
         turned, nearest_turn(yaw, QUARTER) + turn, 0.0
     )  # grasped as it stood, then turned
     yaw += turn
+    rest[world, FIRST + 3] = 0.0
+    rest[world, FIRST + 4] = 0.0
     rest[world, FIRST + 5] = wp.sin(0.5 * yaw)
     rest[world, FIRST + 6] = wp.cos(0.5 * yaw)
     across = wp.abs(wp.sin(hand[world, 3] - yaw)) > 0.5  # the fingers stand along the object's x

@@ -13,7 +13,6 @@ from franka_wm.envs.kernels import episode_rng
 from franka_wm.envs.tasks.reach import Reach
 
 if TYPE_CHECKING:
-    from franka_wm.envs.config import FrankaConfig
     from franka_wm.envs.simulation import Simulation
 
 
@@ -58,10 +57,6 @@ class Track(Reach):
     lowest_goal = 0.05
     own_options = (*Reach.own_options, "track_radius", "track_period")
     words = "Follow the moving goal with the tool."
-
-    def __init__(self, config: "FrankaConfig"):
-        super().__init__(config)
-        self._center: wp.array | None = None
 
     def reset(self, sim: "Simulation", mask: wp.array) -> None:
         self.choose(sim, mask, sim.warp.goal_center)
