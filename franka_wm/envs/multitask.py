@@ -149,6 +149,9 @@ class MultiTaskEnv(EnvBase):
         count, out = len(parts), {"task": self.one_hot.clone()}
         for key in dict.fromkeys(key for part in parts for key in part.keys()):  # noqa: SIM118
             having = [part[key] for part in parts if key in part.keys()]  # noqa: SIM118
+            if len({own.shape for own in having}) == 1 and len(having) == count:  # in turns, in one launch
+                out[key] = torch.stack(having, 1).flatten(0, 1)
+                continue
             out[key] = having[0].new_zeros(self.num_envs, max(own.shape[-1] for own in having))
             for k, part in enumerate(parts):
                 own = part.get(key, None)

@@ -55,14 +55,19 @@ def play(env, given: torch.Tensor) -> tuple[TensorDict, TensorDict]:
     return torch.stack(roots), torch.stack(after)  # type: ignore[return-value]
 
 
-def test_every_world_is_as_it_would_be_alone(env, config) -> None:
+@pytest.mark.parametrize("worlds", [4, 5])
+def test_every_world_is_as_it_would_be_alone(env, config, worlds: int) -> None:
+    """As many of each task, or more of the first."""
+    env = env if worlds == 5 else MultiTaskEnv(config, num_envs=worlds, device="cpu")
     env.set_seed(3)
-    roots, after = play(env, actions())
+    given = actions()[:, :worlds]
+    roots, after = play(env, given)
     assert env.sizes == {"state": 28, "joint_target": 8, "objects": 13, "goal": 3} and env.action_dim == 8
-    assert torch.equal(roots["task"][0], torch.eye(2)[[0, 1, 0, 1, 0]])
+    assert torch.equal(roots["task"][0], torch.eye(2)[[0, 1, 0, 1, 0][:worlds]])
     for k, (name, one) in enumerate(config.tasks.items()):
-        alone = FrankaEnv(one, num_envs=len(range(k, 5, 2)), device="cpu", seed=derive_seed("task", 3, name))
-        own_roots, own_after = play(alone, actions()[:, k::2, : alone.action_dim])
+        count, seed = len(range(k, worlds, 2)), derive_seed("task", 3, name)
+        alone = FrankaEnv(one, num_envs=count, device="cpu", seed=seed)
+        own_roots, own_after = play(alone, given[:, k::2, : alone.action_dim])
         for together, apart in ((roots[:, k::2], own_roots), (after[:, k::2], own_after)):
             for key in apart.keys():  # noqa: SIM118
                 found, size = together[key], apart[key].shape[-1]
