@@ -17,6 +17,7 @@ from threading import Lock
 
 from benchmarks.results.records import BESIDE, PLACE, record_benchmark, record_run, write
 from benchmarks.results.rows import Row
+from franka_wm.data.lerobot.provenance import recorded_sessions
 from franka_wm.errors import UserError
 from franka_wm.source import ROOT
 
@@ -114,8 +115,15 @@ def run(
         raise UserError("these rows do not run on the same kind of device or cores; run them apart")
     stamp = datetime.now().strftime("%Y-%m-%d_%H-%M-%S")
     line: list[tuple[Row, int]] = []
+
+    def late() -> str | None:
+        over = minutes is not None and time.monotonic() - begun > 60 * minutes
+        return f"not begun, {minutes:g} minutes were over" if over else None
+
     for row, seeds in work:
-        if made := prepare(row, ROOT, ROOT):
+        if row.script is not None and (why := late()):
+            failed.append(f"{row.name}: {why}")
+        elif made := prepare(row, ROOT, ROOT):
             failed.append(made)
         elif row.script is None:
             line += [(row, seed) for seed in seeds]
@@ -130,8 +138,8 @@ def run(
     def one(run: tuple[Row, int]) -> str | None:
         (row, seed), slot = run, slots.get()
         try:
-            if minutes is not None and time.monotonic() - begun > 60 * minutes:
-                return f"{row.name}, seed {seed}: not begun, {minutes:g} minutes were over"
+            if why := late():
+                return f"{row.name}, seed {seed}: {why}"
             before, after, environment = slot
             folder = out / row.name / stamp
             folder.mkdir(parents=True, exist_ok=True)  # another command may have begun in the same second
@@ -166,15 +174,23 @@ def _benchmark(row: Row, slot: Slot, folder: Path, place: Path, jobs: int) -> li
     command = [*before, sys.executable, *row.command[1:], "--out", str(folder / "run.json")]
     failure = _call(command, environment, folder / "run.log")
     if failure is None:
-        print(write(record_benchmark(row, folder / "run.json", jobs=jobs), place), flush=True)
+        try:
+            print(write(record_benchmark(row, folder / "run.json", jobs=jobs), place), flush=True)
+        except UserError as error:  # the rows after it run all the same
+            failure = str(error)
     return [failure] if failure else []
 
 
 def prepare(row: Row, top: Path, place: Path, **environment: str) -> str | None:
-    """Makes what the row's runs read, at ``place`` by the code at ``top``, unless it is there; what failed."""
+    """Makes what the row's runs read, at ``place`` by the code at ``top``, unless it is there; what failed.
+
+    A dataset that is there must have been gathered by the row's own command.
+    """
     environment = {"PYTHONPATH": os.pathsep.join([str(top), os.environ.get("PYTHONPATH", "")])} | environment
     for words, made in row.prepares:
         if (place / made).exists():
+            if other := _gathered_otherwise(place / made, shlex.join(["franka-wm", *words])):
+                return f"{made} was gathered otherwise ({other}); move it away"
             continue
         command = [sys.executable, "-m", "franka_wm", *words]
         done = subprocess.run(
@@ -184,6 +200,17 @@ def prepare(row: Row, top: Path, place: Path, **environment: str) -> str | None:
             last = ((done.stderr or done.stdout).strip().splitlines() or ["nothing printed"])[-1]
             return f"{shlex.join(command)}: {last}"
     return None
+
+
+def _gathered_otherwise(dataset: Path, command: str) -> str | None:
+    """By what the dataset was gathered, if not by this command alone."""
+    try:
+        typed = [str(session.get("command")) for session in recorded_sessions(dataset)]
+    except UserError as error:
+        return str(error)
+    if not typed:
+        return "it does not say how"
+    return next((one for one in typed if one != command), None)
 
 
 def _call(command: Sequence[str], environment: dict[str, str], log: Path) -> str | None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import subprocess
 import threading
@@ -15,6 +16,7 @@ from benchmarks.results import records, running
 from benchmarks.results.__main__ import main
 from benchmarks.results.rows import Row, Section, load_rows
 from benchmarks.results.state import state
+from franka_wm.data.lerobot.schema import PROVENANCE
 from franka_wm.errors import UserError
 
 ROW = Row(
@@ -86,6 +88,11 @@ def test_what_a_row_needs_first_is_a_folder_of_each_command(before) -> None:
         _ = replace(ROW, before=before).prepares
 
 
+def gathered(dataset: Path, *commands: str) -> None:
+    (dataset / PROVENANCE).parent.mkdir(parents=True, exist_ok=True)
+    (dataset / PROVENANCE).write_text(json.dumps({"sessions": [{"command": one} for one in commands]}))
+
+
 def test_what_a_row_needs_first_is_made_once(tmp_path, monkeypatch) -> None:
     called = []
 
@@ -99,12 +106,26 @@ def test_what_a_row_needs_first_is_made_once(tmp_path, monkeypatch) -> None:
     (failed,) = running.run([(row, [100])], running.Machine(threads=1), out=tmp_path / "out")
     assert "the disk is full" in failed and not (tmp_path / "out").exists()
     assert called == [["-m", "franka_wm", "collect", "out=push", "episodes=2"]] * 2
-    (tmp_path / "push").mkdir()
+    gathered(tmp_path / "push", "franka-wm collect out=push episodes=2")
     assert running.prepare(row, tmp_path, tmp_path) is None and len(called) == 2
     assert running.prepare(ROW, tmp_path, tmp_path) is None
     two = replace(row, before=row.before + "\nfranka-wm collect out=lift\n")
     assert "the disk is full" in (running.prepare(two, tmp_path, tmp_path) or "")
     assert called[2:] == [["-m", "franka_wm", "collect", "out=lift"]]
+
+
+def test_a_dataset_of_another_command_is_not_taken(tmp_path) -> None:
+    own, other = (f"franka-wm collect out=push episodes={number}" for number in (2, 3))
+    row = replace(ROW, before=own)
+    (tmp_path / "push").mkdir()
+    said = "push was gathered otherwise (it does not say how); move it away"
+    assert running.prepare(row, tmp_path, tmp_path) == said
+    for commands in ([other], [own, other]):
+        gathered(tmp_path / "push", *commands)
+        said = f"push was gathered otherwise ({other}); move it away"
+        assert running.prepare(row, tmp_path, tmp_path) == said
+    (tmp_path / "push" / PROVENANCE).write_text("{")
+    assert "push was gathered otherwise" in (running.prepare(row, tmp_path, tmp_path) or "")
 
 
 def test_what_runs_beside_is_recorded_with_the_times(tmp_path, monkeypatch) -> None:
@@ -158,6 +179,26 @@ def test_no_run_begins_when_the_time_is_over(tmp_path, monkeypatch) -> None:
     monkeypatch.setattr(running, "record_run", lambda row, folder, **_: {"row": "x", "seed": 1, "code": {}})
     failed = running.run([(GPU, [1, 2])], running.Machine(), out=tmp_path, place=tmp_path / "p", minutes=1)
     assert failed == ["reach, seed 2: not begun, 1 minutes were over"]
+
+
+def test_benchmarks_keep_to_the_time_and_one_that_fails_leaves_the_others(tmp_path, monkeypatch) -> None:
+    now = iter([0.0, 30.0, 59.0, 61.0])
+    monkeypatch.setattr(running.time, "monotonic", lambda: next(now))
+    monkeypatch.setattr(running, "_call", lambda *_: None)
+    written = []
+
+    def recorded(row: Row, file: Path, **_: object) -> dict[str, object]:
+        if row.name == "first":
+            raise UserError("first: no lines")
+        return {"row": row.name}
+
+    monkeypatch.setattr(running, "record_benchmark", recorded)
+    monkeypatch.setattr(running, "write", lambda record, place: written.append(record["row"]))
+    work = [
+        (replace(GPU, name=name, script="benchmarks/env.py"), []) for name in ("first", "second", "third")
+    ]
+    failed = running.run(work, running.Machine(), out=tmp_path, place=tmp_path / "p", minutes=1)
+    assert failed == ["first: no lines", "third: not begun, 1 minutes were over"] and written == ["second"]
 
 
 def test_only_what_is_missing_is_run(tmp_path, monkeypatch) -> None:
