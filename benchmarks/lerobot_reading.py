@@ -20,7 +20,6 @@ from typing import Any
 os.environ["HF_HUB_OFFLINE"] = "1"
 sys.path.append(sys.path.pop(0))  # this folder last: `lerobot` is the package, not the script beside this one
 
-import torch
 from common import publish, rate
 
 from franka_wm.data.replay import make_replay
@@ -141,7 +140,6 @@ def main() -> None:
     parser.add_argument("--batch-size", type=int, default=64)
     parser.add_argument("--out")
     options = parser.parse_args()
-    torch.set_num_threads(len(os.sched_getaffinity(0)) if "OMP_NUM_THREADS" not in os.environ else 1)
     rows = reading(episodes=options.episodes, window=options.window, batch_size=options.batch_size)
     publish("reading a LeRobot dataset", rows, options.out, device="cpu")
 

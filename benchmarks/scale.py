@@ -90,13 +90,14 @@ def worker(device: str, worlds: int, seconds: float) -> None:
 
     env = FrankaEnv(FrankaConfig(observations=("pixels", "state")), num_envs=worlds, device=device)
     tensordict = env.reset()
-    action = torch.rand(worlds, env.action_dim, device=env.device) * 2 - 1
 
     def steps(seconds: float) -> float:
         nonlocal tensordict
         started, done = time.perf_counter(), 0
         while time.perf_counter() - started < seconds:
             for _ in range(20):
+                # The same one for ever would drive every joint to its limit, where worlds do little.
+                action = torch.rand(worlds, env.action_dim, device=env.device) * 2 - 1
                 _, tensordict = env.step_and_maybe_reset(tensordict.set("action", action))
                 tensordict.pop("next", None)
             if env.device.type == "cuda":

@@ -5,6 +5,8 @@ from __future__ import annotations
 import math
 import sys
 from importlib import import_module
+from io import StringIO
+from itertools import count, pairwise
 from pathlib import Path
 from threading import Barrier, current_thread, main_thread
 from types import ModuleType, SimpleNamespace
@@ -12,6 +14,7 @@ from typing import Any
 
 import pytest
 import torch
+from tensordict import TensorDict
 
 from benchmarks.cost_model import HOST, NETWORKS, Link, all_reduce, speed_up
 
@@ -46,6 +49,49 @@ def test_beyond_what_there_is_speaks_the_cost_model(benchmark) -> None:
         assert row["messages [ms]"] == pytest.approx(1e3 * (large + 7 * small))  # eight messages
         assert row["predicted"] == pytest.approx(speed_up(row["GPUs"], 0.01, large + 7 * small))
         assert tuple(row) == scale.COLUMNS
+
+
+def test_worlds_that_are_timed_move_at_random(benchmark, monkeypatch) -> None:
+    """One action for ever would drive every joint to its limit, where worlds do little."""
+    scale, _ = benchmark("scale")
+    seen: list[torch.Tensor] = []
+
+    class Still:
+        device, action_dim = torch.device("cpu"), 7
+
+        def __init__(self, *_: Any, **__: Any):
+            pass
+
+        def reset(self) -> TensorDict:
+            return TensorDict({}, batch_size=[4])
+
+        def step_and_maybe_reset(self, step: TensorDict) -> tuple[TensorDict, TensorDict]:
+            seen.append(step["action"].clone())
+            return step, TensorDict({"next": step}, batch_size=[4])
+
+    clock = count()
+    monkeypatch.setattr("franka_wm.envs.FrankaEnv", Still)
+    monkeypatch.setattr(scale, "time", SimpleNamespace(perf_counter=lambda: next(clock)))
+    monkeypatch.setattr(sys, "stdin", StringIO("go\n"))
+    scale.worker("cpu", 4, 3)
+    assert len(seen) == 60
+    assert not any(torch.equal(one, following) for one, following in pairwise(seen))
+    actions = torch.stack(seen)
+    assert actions.shape == (60, 4, 7) and actions.abs().max() <= 1
+    assert actions.min() < -0.9 and actions.max() > 0.9
+
+
+def test_reading_leaves_the_threads_to_torch(benchmark, monkeypatch) -> None:
+    monkeypatch.setenv("HF_HUB_OFFLINE", "1")
+    reading, _ = benchmark("lerobot_reading")
+    told: list[int] = []
+    monkeypatch.setattr(torch, "set_num_threads", told.append)
+    monkeypatch.setattr(reading, "reading", lambda **_: [])
+    monkeypatch.setattr(sys, "argv", ["lerobot_reading.py"])
+    for variable in ("4", None):
+        monkeypatch.setenv("OMP_NUM_THREADS", variable) if variable else monkeypatch.delenv("OMP_NUM_THREADS")
+        reading.main()
+    assert not told
 
 
 def test_the_first_evaluation_that_is_good_enough_counts(benchmark) -> None:
