@@ -129,6 +129,7 @@ class FrankaEnv(EnvBase):
         else:
             raise UserError(f"task={task!r}: must be an instance of Task; by name: FrankaConfig(task=NAME)")
         self.config = config
+        self.urdf_path = None if urdf_path is None else str(urdf_path)
         self.num_envs = num_envs = int(num_envs)
         started = time.perf_counter()
         log.info("building %d worlds on %s with seed %d", num_envs, device, seed)

@@ -13,9 +13,13 @@ from tensordict import TensorDictBase
 from franka_wm.console import say
 from franka_wm.envs import FrankaEnv
 from franka_wm.envs.camera import project, whole_arm
+from franka_wm.envs.transformed import arm_of
 from franka_wm.errors import UserError
 from franka_wm.keys import LOST
 from franka_wm.video import draw_marker, write_video
+
+MEMORY = 10**9
+"""What the steps of a dataset may take in memory [bytes]; writing it takes as much again."""
 
 
 class Recorder:
@@ -99,7 +103,7 @@ class DatasetRecorder(Recorder):
         seed: Seed of the session.
         policy: Who acts at the start, for the dataset's provenance.
         format: How images are stored; see :data:`~franka_wm.data.lerobot.schema.FORMATS`.
-        most: Steps after which it is full.
+        most: Steps after which it is full; fewer where so many take more than :data:`MEMORY`.
 
     Raises:
         UserError: The environment observes something that has no place in a dataset.
@@ -111,7 +115,9 @@ class DatasetRecorder(Recorder):
         from franka_wm.data.lerobot.schema import schema_for
 
         self.env, self.seed, self.policy, self.most = env, seed, policy, most
-        self.arm: FrankaEnv = env if isinstance(env, FrankaEnv) else env.base_env
+        arm = arm_of(env)
+        assert arm is not None
+        self.arm = arm
         self.schema = schema_for(self.arm.config, format=format)
         self.steps: list[TensorDictBase] = []
 
@@ -124,6 +130,8 @@ class DatasetRecorder(Recorder):
         flags = ("reward", "done", "terminated", "truncated", "success", LOST)
         after = step.get("next").select(*keys, *(flag for flag in flags if flag in step["next"]))
         self.steps.append(step.select(*keys, "action", "is_init").set("next", after).cpu().clone())
+        if len(self.steps) == 1:  # all others are as large
+            self.most = min(self.most, max(1, MEMORY // self.steps[0].bytes()))
 
     def write(self, path: str | Path) -> Path:
         """Writes the dataset's folder, which appears whole.
@@ -131,9 +139,8 @@ class DatasetRecorder(Recorder):
         Raises:
             UserError: No step was taken, or the folder cannot be written.
         """
-        from franka_wm.data.lerobot.episodes import UNKNOWN_EPISODE, EpisodeCutter, complete, tell_lost
+        from franka_wm.data.lerobot.episodes import EpisodeCutter, tell_lost
         from franka_wm.data.lerobot.provenance import describe
-        from franka_wm.data.lerobot.schema import EPISODE_KEY, SEED
         from franka_wm.data.lerobot.writer import DatasetWriter
 
         if not self.steps:
@@ -148,19 +155,15 @@ class DatasetRecorder(Recorder):
         batch["next", "truncated"] |= cut & ~ended
         ended |= cut
         table = None if self.env.action_spec.dtype.is_floating_point else self.env.transform.table
-        cutter = EpisodeCutter(self.schema, seed=self.seed, discrete=table)
+        # It was played by hand and cannot be repeated, so episodes have no numbers.
+        cutter = EpisodeCutter(self.schema, seed=self.seed, numbered=False, discrete=table)
         provenance = describe(
             policy=f"live session, began with {self.policy}",
             seed=self.seed,
-            config={"env": _plain(asdict(self.arm.config))},
+            config={"env": {"urdf_path": self.arm.urdf_path, **_plain(asdict(self.arm.config))}},
         )
         with DatasetWriter(path, self.schema, provenance=provenance, workers=0) as writer:
-            for episode in cutter.push(batch):
-                world = int(episode.rows.pop(SEED)[0, 1])
-                del episode.rows[EPISODE_KEY]
-                # Which of its world's episodes it was is not said: it was played by hand and cannot be repeated.
-                seed = (self.seed, world, UNKNOWN_EPISODE)
-                writer.add([complete(episode.rows, episode.terminal, seed=seed)])
+            writer.add(cutter.push(batch))
             tell_lost("recording", cutter.lost)
             return writer.finish()
 

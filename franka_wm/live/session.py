@@ -16,7 +16,7 @@ import torch
 from tensordict import TensorDictBase
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
-from franka_wm.envs import FrankaEnv
+from franka_wm.envs.transformed import arm_of
 from franka_wm.errors import UserError
 from franka_wm.live.commanded import planned_path
 from franka_wm.live.frame import Frame
@@ -63,8 +63,9 @@ class Session:
         policy: str | None = None,
         seed: int = 0,
     ):
-        self.env = env
-        self.arm: FrankaEnv = env if isinstance(env, FrankaEnv) else env.base_env
+        arm = arm_of(env)
+        assert arm is not None
+        self.env, self.arm = env, arm
         if self.arm.num_envs != 1:
             raise UserError(f"a live session simulates one world, the environment has {self.arm.num_envs}")
         self.policies = dict(policies)

@@ -82,8 +82,10 @@ def gather(
     from torchrl.collectors import Collector
 
     from franka_wm import processes
+    from franka_wm.envs.transformed import arm_of
 
-    base = getattr(source.env, "base_env", source.env)
+    base = arm_of(source.env)
+    assert base is not None
     numbers = processes.objects(base.num_envs)
     first, whole_job = sum(numbers[: processes.rank()]), sum(numbers)
     schema = schema_for(base.config, format=format)

@@ -27,7 +27,7 @@ if TYPE_CHECKING:  # writing processes unpickle episodes, and need no torch
     from tensordict import TensorDictBase
 
 UNKNOWN_EPISODE = -1
-"""Number of an episode whose place in its world's history is not known (from a replay)."""
+"""Number of an episode whose place in its world's history is not known: from a replay, or played by hand."""
 
 
 @dataclass(frozen=True)
@@ -64,7 +64,8 @@ class EpisodeCutter:
         schema: What is kept.
         seed: Seed of the run: the first number of the feature ``seed``.
         first_world: Number of the first world of the batches.
-        first_episode: (worlds,) numbers of the episodes that the first batch starts with; 0 if not given.
+        numbered: Whether the first batch begins with each world's first episode, so that the feature ``seed`` says
+            which one each is; else it says :data:`UNKNOWN_EPISODE`.
         discrete: Table (number of actions, A) that an integer action is a row of; for continuous actions ``None``.
 
     Attributes:
@@ -77,23 +78,17 @@ class EpisodeCutter:
         *,
         seed: int,
         first_world: int = 0,
-        first_episode: np.ndarray | None = None,
+        numbered: bool = True,
         discrete: torch.Tensor | None = None,
     ):
         self.schema = schema
         self.seed = seed
         self.first_world = first_world
         self._table = None if discrete is None else discrete.cpu().numpy()
-        self._numbers = first_episode
+        self._numbered = numbered
+        self._numbers: np.ndarray | None = None
         self._open: dict[str, np.ndarray] | None = None
         self.lost = 0
-
-    @property
-    def waiting(self) -> int:
-        """Steps of episodes that have not ended."""
-        if self._open is None:
-            return 0
-        return int(np.cumsum(self._open["is_init"][..., 0], 1).astype(bool).sum())
 
     def push(self, batch: TensorDictBase) -> list[Episode]:
         """The episodes that end in this batch, in order of their end, then world.
@@ -174,6 +169,7 @@ class EpisodeCutter:
         for name in (ACTION, REWARD, DONE, TERMINATED, TRUNCATED, SUCCESS):
             if name in arrays:
                 rows[name] = arrays[name][world, begin:end].copy()
+        number = number if self._numbered else UNKNOWN_EPISODE
         return complete(rows, terminal, seed=(self.seed, self.first_world + world, number))
 
 
@@ -238,24 +234,12 @@ def cut_replay(
     after["terminated"] = (whole & terminated).unsqueeze(-1)
     after["truncated"] = (whole & ~terminated).unsqueeze(-1)
     data["next"] = after
-    worlds = first.shape[0]
-    cutter = EpisodeCutter(
-        schema,
-        seed=seed,
-        first_world=first_world,
-        first_episode=np.full(worlds, UNKNOWN_EPISODE, np.int64),
-        discrete=discrete,
-    )
+    cutter = EpisodeCutter(schema, seed=seed, first_world=first_world, numbered=False, discrete=discrete)
     # Every step of an episode that is not whole belongs to a start without an end, or to none.
     pieces = first.clone()
     pieces[:, :1] = True
     partial = int(pieces.sum()) - int(whole.sum())
-    episodes = []
-    for episode in cutter.push(data):
-        world = int(episode.rows[SEED][0, 1])
-        del episode.rows[SEED], episode.rows[EPISODE_KEY]
-        episodes.append(complete(episode.rows, episode.terminal, seed=(seed, world, UNKNOWN_EPISODE)))
-    return episodes, partial, cutter.lost
+    return cutter.push(data), partial, cutter.lost
 
 
 def tell_lost(verb: str, episodes: int) -> None:

@@ -7,10 +7,11 @@ import pytest
 import torch
 from tensordict import TensorDict
 
-from franka_wm.data.lerobot.episodes import EpisodeCutter, cut_replay
+from franka_wm.data.lerobot.episodes import UNKNOWN_EPISODE, EpisodeCutter, cut_replay
 from franka_wm.data.lerobot.schema import (
     ACTION,
     DONE,
+    EPISODE_KEY,
     JOINTS,
     REWARD,
     SEED,
@@ -94,8 +95,6 @@ def test_cutting_does_not_depend_on_the_batches(sizes, make_schema) -> None:
         assert np.array_equal(episode.rows[JOINTS], episode.rows[STATE][:, :7])
         assert np.array_equal(episode.terminal[TOOL], episode.terminal[STATE][14:17])
         assert episode.key == episode_key(episode.rows)
-    open_steps = sum(STEPS - 1 - max(np.flatnonzero(row), default=-1) for row in done)
-    assert cutter.waiting == open_steps
 
 
 def test_an_episode_whose_start_was_not_seen_is_left_out(make_schema) -> None:
@@ -104,9 +103,20 @@ def test_an_episode_whose_start_was_not_seen_is_left_out(make_schema) -> None:
     data = stream(ends)
     data["is_init"][0, 0] = False
     cutter = EpisodeCutter(make_schema(), seed=0)
-    assert cutter.waiting == 0
     lengths = [len(episode.rows[STATE]) for episode in cutter.push(data)]
-    assert lengths == [4, 6, 6] and cutter.waiting == 4 and cutter.lost == 0
+    assert lengths == [4, 6, 6] and cutter.lost == 0
+
+
+def test_episodes_without_numbers_are_the_same_but_for_that(make_schema) -> None:
+    data = stream(rng_bool((2, STEPS), 3, 0.2))
+    numbered = EpisodeCutter(make_schema(), seed=4).push(data)
+    unknown = EpisodeCutter(make_schema(), seed=4, numbered=False).push(data)
+    assert len(unknown) == len(numbered) > 10
+    for one, other in zip(unknown, numbered, strict=True):
+        assert [*one.rows] == [*other.rows] and one.key == episode_key(one.rows) != other.key
+        assert (one.rows[SEED] == [4, other.rows[SEED][0, 1], UNKNOWN_EPISODE]).all()
+        for feature in {*one.rows} - {SEED, EPISODE_KEY}:
+            assert np.array_equal(one.rows[feature], other.rows[feature])
 
 
 def test_what_is_lost_counts_for_its_own_episode_alone(make_schema) -> None:
