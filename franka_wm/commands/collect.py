@@ -36,8 +36,8 @@ _PARTS = ("planner", "policy")
 @word("episodes", "how many, with those of a resumed one", whole(1, 10**9), 100)
 @word(
     "policy",
-    "random (smooth motion), noop, ik (inverse kinematics), expert (of tasks with a gripper), or an agent: a run's "
-    "folder, a checkpoint, hf:user/name",
+    "random (smooth motion), noop, ik (inverse kinematics), expert (of tasks with a gripper), or an agent, which "
+    "explores as in training: a run's folder, a checkpoint, hf:user/name",
     default="random",
 )
 @word("checkpoint", "an agent of which only a part acts: policy=planner or policy=policy", metavar="RUN")
