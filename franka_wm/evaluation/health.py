@@ -36,16 +36,17 @@ def training_diagnostics(model: WorldModel, batch: TensorDictBase) -> dict[str, 
 
     Returns:
         ``latent/…``: everything of :func:`~franka_wm.evaluation.spectrum.latent_statistics`, of the first observation
-        of up to :data:`SAMPLES` windows, on ``embed`` where the family has it;
+        of up to :data:`SAMPLES` windows, spread over the batch, on ``embed`` where the family has it;
         :func:`~franka_wm.evaluation.spectrum.collapse_warning` reads it. Of families with ``value`` and ``discount``
         on data with rewards ``value/…``: ``mean``; ``td_bias``, mean of V(z_0) − (Σ γ^t r_t + γ^H V(z_H)) over the
         windows that no time limit cuts in two; and ``td_correlation`` between the two. This is calibration against
         the model's own later value and the behaviour in the replay; against true returns see
-        ``franka-wm evaluate``. Empty where an encoding is not finite.
+        ``franka-wm evaluate``. Empty where an encoding is not finite, and of one window alone.
     """
     device = batch.device if batch.device is not None else batch.get("action").device
     keys = model.observation_keys
-    batch, skipped = cast(TensorDictBase, batch[:SAMPLES]), model.burn_in
+    apart = max(1, -(-len(batch) // SAMPLES))  # not the first ones: these may be demonstrations
+    batch, skipped = cast(TensorDictBase, batch[::apart]), model.burn_in
     devices = [device] if device.type == "cuda" else []
     with evaluating(model), torch.random.fork_rng(devices=devices):
         first = _walked(model, model.encode(batch.select(*keys)[:, 0]), batch, 1, skipped + 1)
@@ -175,5 +176,7 @@ def diagnose_training(model: WorldModel, batch: TensorDictBase) -> tuple[dict[st
     """Whether latents collapse and values drift: numbers to log, and a warning."""
     numbers = training_diagnostics(model, batch)
     if not numbers:
+        if len(batch) < 2:
+            return {}, None
         return {}, "the model's latents are no longer finite; lower the learning rate"
     return numbers, collapse_warning(numbers)

@@ -6,7 +6,8 @@ import pytest
 import torch
 from tensordict import TensorDict
 
-from franka_wm.evaluation.health import paired_gain, planner_health, training_diagnostics
+from franka_wm.evaluation import health
+from franka_wm.evaluation.health import diagnose_training, paired_gain, planner_health, training_diagnostics
 from franka_wm.evaluation.spectrum import collapse_warning, latent_statistics
 from franka_wm.models.tdmpc2 import TDMPC2
 from franka_wm.planning import CEM, ICEM, MPPI, GradientPlanner
@@ -97,6 +98,21 @@ def test_without_rewards_or_finite_latents(model: TDMPC2, batch: TensorDict) -> 
     assert found and not any(name.startswith("value/") for name in found)
     batch["state"].fill_(torch.nan)
     assert training_diagnostics(model, batch) == {}
+
+
+def test_the_windows_are_spread_over_the_batch(model: TDMPC2, batch: TensorDict, monkeypatch) -> None:
+    """Demonstrations stand in the first ones."""
+    del batch["next", "reward"]
+    for most, seen in ((32, batch[::2]), (30, batch[::3]), (64, batch)):
+        monkeypatch.setattr(health, "SAMPLES", most)
+        expected = latent_statistics(model.encode(seen[:, 0]))
+        assert training_diagnostics(model, batch) == {f"latent/{name}": x for name, x in expected.items()}
+
+
+def test_one_window_says_nothing_of_latents(model: TDMPC2, batch: TensorDict) -> None:
+    assert diagnose_training(model, batch[:1]) == ({}, None)
+    batch["state"].fill_(torch.nan)
+    assert "no longer finite" in str(diagnose_training(model, batch)[1])
 
 
 # -- planners ----------------------------------------------------------------------------------------------
