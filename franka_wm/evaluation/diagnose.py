@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, Any
 
 import torch
 from tensordict import TensorDict
@@ -92,8 +92,8 @@ def hold_out(agent: Agent, *, images: bool) -> Held:
         keys=keys,
         image_size=image_size(model),
         images=shown,
+        keep=EPISODES,
     )
-    episodes = cast(TensorDict, episodes[:EPISODES])
     with torch.no_grad():
         latents = encode_episodes(model, episodes)
     return Held(episodes, latents, encoded_validly(episodes), seen, _reaches(env))
@@ -271,6 +271,7 @@ def _starts(agent: Agent, *, decoder_size: int) -> tuple[Tensor, Tensor]:
     """Latents (n, D) and images of the first steps of many more episodes: more poses than a few long ones show."""
     keys = agent.model.observation_keys
     latents, images = [], []
+    count = min(64, agent.env.num_envs)
     for k in range(6):
         episodes, seen = gather_episodes(
             agent.env,
@@ -279,10 +280,10 @@ def _starts(agent: Agent, *, decoder_size: int) -> tuple[Tensor, Tensor]:
             steps=8,
             keys=keys,
             image_size=decoder_size,
-            images=min(64, agent.env.num_envs),
+            images=count,
+            keep=count,
         )
         assert seen is not None
-        episodes = cast(TensorDict, episodes[: len(seen)])
         with torch.no_grad():
             embedded = agent.model.embed(encode_episodes(agent.model, episodes)[:, :-1]).float()
         use = episodes.get("valid")

@@ -76,6 +76,7 @@ def gather_episodes(
     keys: Sequence[str] = (),
     image_size: int | None = None,
     images: int = 0,
+    keep: int | None = None,
 ) -> tuple[TensorDict, Tensor | None]:
     """Plays the first episode of every world and keeps what the diagnostics need.
 
@@ -87,12 +88,13 @@ def gather_episodes(
         keys: Observations to keep.
         image_size: Side of the images to render [px].
         images: Number of worlds whose images are kept, the first ones; the arm only.
+        keep: Number of worlds whose steps are kept, the first ones; all E if not given.
 
     Returns:
-        Batch size (E, T). Root: ``keys``, ``action``, ``is_init``, ``valid`` (E, T) bool (step of the first
-        episode), for the arm ``physical`` (E, T, 20): the true state without noise, as under the key ``state``;
-        under ``next``: ``keys``, ``reward``, ``terminated``, ``done``, ``physical``. And images of the roots,
-        (images, T, S, S, 3) uint8 on the CPU, or ``None``.
+        Batch size (E, T), of E worlds that are kept. Root: ``keys``, ``action``, ``is_init``, ``valid`` (E, T) bool
+        (step of the first episode), for the arm ``physical`` (E, T, 20): the true state without noise, as under the
+        key ``state``; under ``next``: ``keys``, ``reward``, ``terminated``, ``done``, ``physical``. And images of the
+        roots, (images, T, S, S, 3) uint8 on the CPU, or ``None``.
     """
     arm = arm_of(env)
     longest = int(env.config.episode_length)
@@ -116,7 +118,9 @@ def gather_episodes(
             if arm is not None:
                 row["next", "physical"] = arm.simulation.tensors.next_true_state.clone()
             running &= ~tensordict.get(("next", "done")).squeeze(-1)
-            rows.append(TensorDict(row, batch_size=[env.num_envs], device=env.device))
+            whole = TensorDict(row, batch_size=[env.num_envs], device=env.device)
+            # A slice alone would hold on to what it is cut from.
+            rows.append(whole if keep is None else whole[:keep].clone())
             tensordict = following
     return cast(TensorDict, torch.stack(rows, 1)), (torch.stack(seen, 1) if seen else None)
 

@@ -10,6 +10,7 @@ import pytest
 import torch
 
 from franka_wm.errors import UserError
+from franka_wm.evaluation import diagnose
 from franka_wm.evaluation.closed_loop import summarize
 from franka_wm.evaluation.protocol import evaluate_agent, held_out_seeds, numbers_to_log
 from franka_wm.evaluation.robustness import SHIFTS, UNSHIFTED, Shift, note, robustness, verdict
@@ -138,6 +139,32 @@ def test_half_at_random_half_by_the_model(agent) -> None:
     assert (episodes["action"][::2] - wanted[::2]).abs().mean() > 0.1
     assert episodes["valid"].all()
     torch.testing.assert_close(episodes["physical"][:, 1:], episodes["next", "physical"][:, :-1])
+
+
+def test_worlds_that_nobody_looks_at_are_not_kept(agent) -> None:
+    keys = list(agent.model.observation_sizes)
+    whole, _ = gather_episodes(agent.env, agent.policies["random"], keys=keys)
+    part, _ = gather_episodes(agent.env, agent.policies["random"], keys=keys, keep=2)
+    assert part.batch_size == (2, 12) and whole.batch_size == (6, 12)
+    for key, values in part.items(True, True):
+        assert torch.equal(values, whole[key][:2]), key
+    more, _ = gather_episodes(agent.env, agent.policies["random"], keys=keys, keep=60, steps=1)
+    assert more.batch_size == (6, 1)
+
+
+def test_the_diagnostics_keep_what_they_look_at(agent, monkeypatch) -> None:
+    kept = []
+
+    def gathered(env, policy, *, keep=None, images=0, **options):
+        kept.append(keep)
+        return gather_episodes(env, policy, keep=keep, images=images, **options)
+
+    monkeypatch.setattr(diagnose, "gather_episodes", gathered)
+    monkeypatch.setattr(diagnose, "EPISODES", 4)
+    held = diagnose.hold_out(agent, images=False)
+    assert held.episodes.batch_size == (4, 12) and held.latents.shape[:2] == held.valid.shape == (4, 13)
+    latents, images = diagnose._starts(agent, decoder_size=16)
+    assert len(latents) == len(images) == 6 * 6 * 8 and kept == [4] + [6] * 6
 
 
 def test_latents_of_whole_episodes(agent) -> None:
