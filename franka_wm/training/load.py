@@ -152,9 +152,9 @@ def load_model(folder: str | Path, *, device: torch.device | str = "cpu") -> Wor
 def find_checkpoint(folder: str | Path) -> Checkpoint:
     """The newest checkpoint of a folder, or of a repository on the Hub."""
     if str(folder).startswith(HUB):
-        from franka_wm.data.lerobot.hub import download
+        from franka_wm.data.lerobot.hub import download_model
 
-        folder = download(str(folder).removeprefix(HUB))
+        folder = download_model(str(folder).removeprefix(HUB))
     return load_checkpoint(latest_checkpoint(folder))
 
 

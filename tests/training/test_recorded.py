@@ -17,6 +17,7 @@ from lerobot.utils import constants as lerobot_constants
 
 from fake_hub import TOKEN, Hub
 from franka_wm.commands import main as cli
+from franka_wm.data.lerobot import publish, source
 from franka_wm.data.lerobot.schema import PROVENANCE
 from franka_wm.data.lerobot.source import find_dataset
 from franka_wm.errors import UserError
@@ -91,6 +92,13 @@ def test_what_fails_while_a_dataset_comes_is_one_line(error, says: str, hub: Hub
     with pytest.raises(UserError, match=rf"^dataset\.repo_id=user/reach: {says}") as refused:
         find_dataset("user/reach")
     assert "\n" not in str(refused.value)
+
+
+def test_the_tag_that_publishing_sets_is_asked_for(hub: Hub, monkeypatch) -> None:
+    assert publish.VERSION_TAG is source.VERSION_TAG
+    monkeypatch.setattr(source, "VERSION_TAG", "v9.9")
+    find_dataset("user/reach", meta=True)
+    assert any("/revision/v9.9" in path for _, path in hub.requests)
 
 
 def test_its_rows_follow_when_they_are_read(recorded: Path, hub: Hub) -> None:

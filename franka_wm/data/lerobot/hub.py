@@ -46,7 +46,7 @@ def check_license(license: str) -> None:
         )
 
 
-def download(repo_id: str) -> Path:
+def download_model(repo_id: str) -> Path:
     """A published model, in the Hub's own cache: only safetensors, JSON and YAML, whatever else is there.
 
     Args:

@@ -15,12 +15,9 @@ from franka_wm.data.lerobot.hub import check_license, check_repo_id, explained
 from franka_wm.data.lerobot.paths import without_paths
 from franka_wm.data.lerobot.provenance import read_provenance
 from franka_wm.data.lerobot.schema import PROVENANCE
-from franka_wm.data.lerobot.source import check_finite
+from franka_wm.data.lerobot.source import VERSION_TAG, check_finite
 from franka_wm.errors import UserError
 from franka_wm.untrusted import linked_json
-
-VERSION_TAG = "v3.0"
-"""LeRobot loads the revision of this name from the Hub."""
 
 README = "README.md"
 

@@ -20,6 +20,8 @@ from franka_wm.errors import UserError
 from franka_wm.options import is_real, is_whole
 from franka_wm.untrusted import UntrustedFolder, linked_bytes, linked_json
 
+VERSION_TAG = "v3.0"
+"""LeRobot loads the revision of this name from the Hub."""
 LONGEST_PATH = 255
 """Longest template of a path [characters]."""
 MOST_EPISODES, MOST_ROWS, MOST_NUMBERS = 10**8, 10**10, 10**8
@@ -275,13 +277,12 @@ def find_dataset(repo_id: str, *, meta: bool = False) -> Path:
     from huggingface_hub import snapshot_download
     from huggingface_hub.errors import HFValidationError, LocalEntryNotFoundError, RevisionNotFoundError
 
-    version = "v3.0"  # the tag that LeRobot loads
     with explained(f"dataset.repo_id={repo_id}"):
         try:
             folder = snapshot_download(
                 repo_id,
                 repo_type="dataset",
-                revision=version,
+                revision=VERSION_TAG,
                 cache_dir=HF_LEROBOT_HUB_CACHE,
                 allow_patterns=["meta/*"] if meta else None,
             )
@@ -294,7 +295,7 @@ def find_dataset(repo_id: str, *, meta: bool = False) -> Path:
             ) from error
         except RevisionNotFoundError as error:
             raise UserError(
-                f"dataset.repo_id={repo_id}: has no tag {version} on the Hub; it is in an older format, or was "
+                f"dataset.repo_id={repo_id}: has no tag {VERSION_TAG} on the Hub; it is in an older format, or was "
                 "published without its tag"
             ) from error
     return Path(folder)

@@ -215,7 +215,12 @@ def test_a_staged_model_is_damaged_if_changed(run_folder, tmp_path) -> None:
 def test_downloads_take_tensors_and_plain_values_only(monkeypatch, tmp_path) -> None:
     import huggingface_hub
 
-    from franka_wm.data.lerobot.hub import download
+    from franka_wm.data import lerobot
+    from franka_wm.data.lerobot.hub import download_model
+
+    assert lerobot.__all__ == [
+        "open_dataset"
+    ]  # beside it a name like `download` would be read as a dataset's
 
     asked = {}
 
@@ -225,9 +230,9 @@ def test_downloads_take_tensors_and_plain_values_only(monkeypatch, tmp_path) -> 
 
     monkeypatch.setattr(huggingface_hub, "snapshot_download", snapshot)
     with pytest.raises(UserError, match="holds no model"):
-        download("user/model")
+        download_model("user/model")
     (tmp_path / "manifest.json").write_text("{}")
-    assert download("user/model@v1") == tmp_path
+    assert download_model("user/model@v1") == tmp_path
     assert asked["repo_id"] == "user/model"
     assert asked["revision"] == "v1"
     assert sorted(asked["allow_patterns"]) == ["*.json", "*.safetensors", "*.yaml"]
