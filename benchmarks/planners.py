@@ -1,4 +1,4 @@
-"""Planning time: encode, plan, act, with rewards and a terminal value, by every planner of continuous actions.
+"""Planning time: encode, plan, act, by every planner of continuous actions.
 
     python benchmarks/planners.py                          each with its numbers at scale=gpu
     python benchmarks/planners.py --planners mppi cem --sizes laptop --envs 1 16
@@ -141,7 +141,7 @@ def main() -> None:
                     )
                     print(rows[-1], flush=True)
     details = ", compiled" if arguments.compile else ""
-    title = f"planners, with rewards and a terminal value, {arguments.precision}{details}"
+    title = f"planners, {arguments.precision}{details}"
     publish(title, rows, arguments.out, device=device)
 
 

@@ -55,7 +55,7 @@ def mean(values: Sequence[float]) -> float:
 
 
 def goals_met(row: Row, lines: Sequence[Mapping[str, Any]]) -> list[tuple[str, str, bool]]:
-    """The same of a benchmark's lines: of those that a goal names, the worst.
+    """For each goal of a benchmark: what, the worst of the lines that it names, and whether that is enough.
 
     Raises:
         UserError: A goal names no line, or a column that has no numbers.

@@ -1,1 +1,1 @@
-"""Policies that gather data, and the replay buffer that keeps it."""
+"""Replay on the training device; LeRobot datasets written and read."""

@@ -87,8 +87,8 @@ def robustness(
         agent: Agent of :func:`franka_wm.training.load.load_agent`; of the arm.
         episodes: Worlds, at least 2.
         shifts: By name; those that change images alone are left out for models that read none.
-        policies: Names; the planner (or the policy where there is none) and ``ik``, which shows what the shift
-            leaves possible, if not given.
+        policies: Names; if not given, the planner (or the policy where there is none), and ``ik`` and ``expert``,
+            which show what the shift leaves possible.
         report: Called with each shift's name and results as they come.
 
     Returns:

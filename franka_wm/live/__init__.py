@@ -1,5 +1,5 @@
 """Watching one arm: a page in the browser that plans while you drag its goal, and recordings for Rerun.
 
-`view` is the verb; `session` simulates and knows nothing of browsers; `scene` and `page` show a session with
-viser; `rerun_recording` writes an episode for the Rerun viewer.
+`stage` builds the world for `franka-wm view`; `session` simulates and knows nothing of browsers; `viser_scene` and
+`page` show a session with viser; `rerun_recording` writes an episode for the Rerun viewer.
 """

@@ -48,7 +48,7 @@ class Session:
     Args:
         env: One world: :class:`~franka_wm.envs.FrankaEnv`, or transforms around one.
         policies: By name; TensorDict modules that write ``action``.
-        policy: Who acts first; ``planner``, ``ik`` or ``noop``, whichever there is, if not given.
+        policy: Who acts first; if not given, the first of :data:`PREFERRED` that there is, else the first of all.
         seed: Seed of poses and goals.
 
     Raises:

@@ -29,7 +29,8 @@ ARM: dict[str, Any] = {
     "gravity_compensation": True,
     "substeps": 4,
 }
-"""Without a checkpoint: what ``env=reach`` sets. Repeated here, since an installed package has no ``conf``."""
+"""Without a checkpoint: what ``env=reach`` sets. Repeated here: this room does not read the configuration; a test
+holds both to the same."""
 
 GRACE = 1.0
 """After Ctrl-C the process ends within this time [s]."""

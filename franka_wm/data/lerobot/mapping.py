@@ -87,7 +87,7 @@ def map_features(
     ``observation.state``               ``state``
     ``observation.environment_state``   ``goal`` in a dataset of ours, else ``environment_state``
     ``observation.<name>``              ``<name>``, dots replaced by underscores
-    ``joint_target``                    ``joint_target``, in a dataset of ours
+    ``joint_target``, ``objects``       the same, in a dataset of ours
     ``action``                          ``action``
     ``next.reward``, ``next.done``, …   the same under ``next``, without the prefix
     ==================================  ==============================================================
