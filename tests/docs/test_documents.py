@@ -15,6 +15,7 @@ import torch
 from hydra.core.override_parser.overrides_parser import OverridesParser
 
 from forks import script, spare
+from franka_wm.commands.demo import AGENT
 
 ROOT = Path(__file__).resolve().parents[2]
 GROUPS = ("*.md", "docs/*.md", "docs/models/*.md", "docs/reference/*.md", ".github/*.md")
@@ -95,12 +96,21 @@ def test_environment_page_steps() -> None:
 
 def test_environment_page_samples_windows() -> None:
     """Two worlds in place of 64."""
-    _, code, _ = blocks("docs/environment-names.md", "python")
+    code = blocks("docs/environment-names.md", "python")[1]
     scope: dict[str, Any] = {}
     exec(compile(code.replace("64", "2"), "docs/environment-names.md", "exec"), scope)
     batch = scope["batch"]
     assert batch.batch_size == (256, 5) and batch["next", "pixels"].shape == (256, 5, 64, 64, 3)
     assert (batch["pixels"][:, 1:] == batch["next", "pixels"][:, :-1]).all()
+
+
+def test_environment_page_lets_a_trained_agent_act() -> None:
+    (code,) = (one for one in blocks("docs/environment-names.md", "python") if "load_agent" in one)
+    scope: dict[str, Any] = {}
+    code = code.replace("outputs/DATE/TIME-reach-0", str(AGENT)).replace("num_envs=16", "num_envs=2")
+    exec(compile(code, "docs/environment-names.md", "exec"), scope)
+    assert scope["episode"].batch_size == (2, 50) and scope["episode"]["next", "truncated"][:, -1].all()
+    assert {"planner", "policy", "noop", "random", "ik"} <= {*scope["agent"].policies}
 
 
 def test_models_page_makes_a_model() -> None:

@@ -33,6 +33,8 @@ from franka_wm.training import run
 from franka_wm.versions import versions
 from small_checkpoint import save
 
+LOST = processes.LOST_STATUS
+
 
 @pytest.fixture
 def port() -> int:
@@ -287,15 +289,11 @@ def test_the_next_job_of_a_sweep_finds_the_environment_as_it_was(mine, monkeypat
 @pytest.mark.parametrize(
     ("ended", "stopped", "says"),
     [
-        ({0: processes.LOST_STATUS, 1: -9}, [], "process 1 of the run .* was ended by SIGKILL.*; go on"),
+        ({0: LOST, 1: -9}, [], "process 1 of the run .* was ended by SIGKILL.*; go on"),
         ({0: -15, 1: -9}, [0], "process 1 of the run .* was ended by SIGKILL.*; go on"),
-        (
-            {0: processes.LOST_STATUS, 1: processes.LOST_STATUS},
-            [],
-            "^process 1 has lost another one: a timeout; go on",
-        ),
-        ({0: processes.LOST_STATUS, 1: -15}, [1], "^process 1 has lost another one: a timeout; go on"),
-        ({0: processes.LOST_STATUS, 1: 1}, [], 1),  # it has said why
+        ({0: LOST, 1: LOST}, [], "^process 1 has lost another one: a timeout; go on"),
+        ({0: LOST, 1: -15}, [1], "^process 1 has lost another one: a timeout; go on"),
+        ({0: LOST, 1: 1}, [], 1),  # it has said why
         ({0: -15, 1: 1}, [0], 1),  # the launcher has stopped the other one
         ({0: -15, 1: 130}, [0], 130),  # it has saved
     ],
@@ -309,7 +307,7 @@ def test_the_launcher_tells_of_what_nobody_could_say(ended, stopped, says, monke
 
     def elastic_launch(config, program):
         def fails(*_: str) -> None:
-            if processes.LOST_STATUS in ended.values():
+            if LOST in ended.values():
                 Path(os.environ[several.TOLD]).write_text("process 1 has lost another one: a timeout")
             raise errors.ChildFailedError("train", {rank: failure(rank, s) for rank, s in ended.items()})
 
@@ -338,7 +336,7 @@ def test_a_process_that_has_lost_another_leaves_the_word_to_its_launcher(
     monkeypatch.setenv(several.TOLD, str(tmp_path / "lost"))
     with pytest.raises(SystemExit) as ends:
         entry.fail_by(lost)
-    assert ends.value.code == processes.LOST_STATUS and not capsys.readouterr().err
+    assert ends.value.code == LOST and not capsys.readouterr().err
     assert (tmp_path / "lost").read_text() == str(lost)
 
 
