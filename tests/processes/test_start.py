@@ -29,11 +29,10 @@ from franka_wm.commands.overrides import compose, given
 from franka_wm.console import quoted
 from franka_wm.data.moments import moments
 from franka_wm.errors import UserError
+from franka_wm.processes import LOST_STATUS as LOST
 from franka_wm.training import run
 from franka_wm.versions import versions
 from small_checkpoint import save
-
-LOST = processes.LOST_STATUS
 
 
 @pytest.fixture
