@@ -437,8 +437,7 @@ def test_processes_end_with_who_has_started_them(tmp_path: Path) -> None:
         note.write_text(str(os.getpid()))
         time.sleep(60)
 
-    launcher = Fork(launch, cwd=tmp_path, log=tmp_path / "log")
-    ends = time.monotonic() + 30
+    launcher, ends = Fork(launch, cwd=tmp_path, log=tmp_path / "log"), time.monotonic() + 30
     while not (note.is_file() and note.read_text()) and time.monotonic() < ends:
         time.sleep(0.02)
     started = int(note.read_text())
