@@ -69,8 +69,18 @@ class Query(NamedTuple):
     generator: torch.Generator | None
 
     def score(self, actions: Tensor) -> Tensor:
-        """Scores (E, S) of candidates (E, S, H, A), rolled out with the model."""
-        return self.objective(rollout(self.z, actions, self.next), actions)
+        """Scores (E, S) of candidates (E, S, H, A), rolled out with the model.
+
+        Raises:
+            ValueError: the objective returns something else.
+        """
+        scores = self.objective(rollout(self.z, actions, self.next), actions)
+        if scores.shape != actions.shape[:2] or not scores.is_floating_point():
+            found = f"{tuple(scores.shape)} of {scores.dtype}"
+            raise ValueError(
+                f"an objective returns scores (E, S) = {tuple(actions.shape[:2])}, floats; got {found}"
+            )
+        return scores
 
 
 @dataclass(kw_only=True, eq=False)

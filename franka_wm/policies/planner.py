@@ -211,10 +211,8 @@ class PlannerPolicy(TensorDictModuleBase):
             next = compiled(next)
             if prior is not None and not isinstance(prior, GoalGuide):
                 prior = compiled(prior)
-            objective = as_objective(objective).compiled()
-        self.precision = precision
-        self.objective = as_objective(objective)
-        self.in_keys = [*observation_keys, *self.objective.in_keys, "is_init"]
+        self.precision, self._compiles, self._observed = precision, compile, list(observation_keys)
+        self.objective = objective
         self.out_keys = ["action", "plan", *(CONTEXT if observe is not None else ())]
         self.planner, self.explore, self.model = planner, explore, model
         self.encode, self.next, self.prior = encode, next, prior
@@ -265,12 +263,24 @@ class PlannerPolicy(TensorDictModuleBase):
             compile=compile,
         )
 
+    @property
+    def objective(self) -> Objective:
+        """What it plans for. Another one may be set, a plain function too."""
+        return self._objective
+
+    @objective.setter
+    def objective(self, objective: Objective | Score) -> None:
+        objective = as_objective(objective)
+        self._objective = objective.compiled() if self._compiles else objective
+        self.in_keys = [*self._observed, *objective.in_keys, "is_init"]
+
     @torch.no_grad()
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write `action` and `plan`.
 
         Raises:
-            ValueError: the batch size is not [E], or a plan is carried without `is_init` to clear it.
+            ValueError: the batch size is not [E], something that is read is missing, or a plan is carried without
+                `is_init` to clear it.
         """
         if len(tensordict.batch_size) != 1:
             raise ValueError(f"expected batch size [E], got {list(tensordict.batch_size)}")
@@ -280,6 +290,12 @@ class PlannerPolicy(TensorDictModuleBase):
             {key: value for key in read if (value := tensordict.get(key, None)) is not None},
             batch_size=tensordict.batch_size,
         )
+        if missing := [key for key in self.in_keys if key not in inputs and key != "is_init"]:
+            there = ", ".join(str(key) for key, _ in tensordict.items())
+            raise ValueError(
+                f"the plan reads {', '.join(missing)}, which is not there, but {there}; is it another environment "
+                "than the model's?"
+            )
         if "plan" in inputs and "is_init" not in inputs:
             raise ValueError(
                 "a plan is carried but is_init is missing: append torchrl.envs.InitTracker to the env"

@@ -71,10 +71,12 @@ def load_agent(
         num_envs: Evaluation worlds; the configuration's ``evaluation.episodes`` if not given.
         device: ``auto``, ``cpu``, ``cuda``, ``cuda:K``.
         env_changes: Fields of the environment's configuration to change.
-        seed: Seed of the environment and the policies; the run's if not given.
+        seed: Of the environment and of random policies; the run's if not given. Planners, and the model's policy where
+            it explores, draw from torch's generator: ``torch.manual_seed``.
         planned_by: Another planner, by its name in ``conf/planner``, as the run's scale has it; the run's if not given.
         searchpath: ``hydra.searchpath=[file://FOLDER]`` with ``planner/NAME.yaml``, for a planner of one's own.
-        planning: Options of ``planner`` and ``objective`` that are other than the run's.
+        planning: Options of ``planner`` and ``objective`` that are other than the run's, such as
+            ``{"planner": {"num_samples": 64}}``.
 
     Raises:
         UserError: One line: no checkpoint, a damaged one, or one whose environment cannot be built here.
@@ -130,6 +132,11 @@ def _planning_otherwise(settings: RunSettings, planning: Mapping[str, Mapping[st
             f"objective.{next(iter(planning['objective']))}: a tree search has no objective; leave it out"
         )
     for group, changes in planning.items():
+        if group not in ("planner", "objective") or not isinstance(changes, Mapping):
+            raise UserError(
+                f"planning: {group}={changes!r}: must be options of planner or objective, such as "
+                '{"planner": {"num_samples": 64}}'
+            )
         there = [key for key in settings.values.get(group, {}) if key != "name"]
         for key in changes:
             if key not in there:

@@ -400,3 +400,14 @@ def test_the_policys_candidates_ask_the_model_for_no_more_than_they_read(name: s
     query = SimpleNamespace(z=torch.zeros(1, 2), prior=lambda z: z, next=after)
     (found,) = planner.guided(query)
     assert found.shape[2] == planner.horizon == len(asked) + 1
+
+
+@every_planner
+@pytest.mark.parametrize("wrong", ["(2, 64, 5)", "(2,)", "long"])
+def test_scores_of_another_shape_are_named(name: str, wrong: str) -> None:
+    def objective(trajectory: torch.Tensor, actions: torch.Tensor) -> torch.Tensor:
+        scores = actions.sum(-1)
+        return {"(2,)": scores.sum((1, 2)), "long": scores.sum(-1).long()}.get(wrong, scores)
+
+    with pytest.raises(ValueError, match=r"an objective returns scores \(E, S\) = \(2, \d+\), floats; got "):
+        make(name).plan(torch.zeros(2, ACTIONS), push, objective)

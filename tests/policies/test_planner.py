@@ -12,6 +12,7 @@ from torchrl.envs.utils import ExplorationType, check_env_specs, set_exploration
 
 from franka_wm.models import WorldModel, make
 from franka_wm.planning import CEM, ICEM, MPPI, GoalDistance, GoalImage, GradientPlanner
+from franka_wm.planning.objectives import Objective
 from franka_wm.policies import ModelPolicy, PlannerPolicy
 from franka_wm.policies.planner import Guide
 from points import GOAL, Points
@@ -164,6 +165,27 @@ def test_mistakes_are_named():
         acting(observation()[0])
     with pytest.raises(ValueError, match="objective"):
         PlannerPolicy.for_model(Exact(), mppi())
+    with pytest.raises(ValueError, match="the plan reads state, which is not there, but .*goal.*; is it"):
+        acting(observation().rename_key_("state", "goal"))
+
+
+@pytest.mark.parametrize("compile", [False, True])
+def test_a_policy_may_be_given_another_objective(compile: bool):
+    """A plain function, or one that reads the present observation, which the policy then asks for."""
+    acting = policy(mppi(), compile=compile, explore=False)
+    acting.objective = lambda trajectory, actions: -(actions - 0.5).square().sum((-2, -1))
+    torch.testing.assert_close(acting(observation())["action"], torch.full((3, 2), 0.5), atol=0.2, rtol=0)
+
+    class Own(Objective):
+        in_keys = ("wanted",)
+
+        def bind(self, tensordict):
+            return lambda z, actions: -(actions - tensordict["wanted"][:, None, None]).square().sum((-2, -1))
+
+    acting.objective = Own()
+    assert acting.in_keys == ["state", "wanted", "is_init"]
+    asked = observation().set("wanted", torch.full((3, 2), -0.5))
+    torch.testing.assert_close(acting(asked)["action"], asked["wanted"], atol=0.2, rtol=0)
 
 
 def test_a_copy_of_the_policy_uses_its_own_model():
@@ -327,7 +349,9 @@ def test_an_image_of_a_goal_is_encoded_for_the_policy_only_where_it_proposes(sam
         CEM(action_dim=2, horizon=2, num_samples=16, num_elites=4, num_policy_samples=samples),
         objective=GoalImage(model.encode_goal),
     )
-    seen = observation().set("goal_pixels", torch.zeros(3, 4, 4, 3, dtype=torch.uint8))
+    seen = observation().update(
+        {key: torch.zeros(3, 4, 4, 3, dtype=torch.uint8) for key in ("pixels", "goal_pixels")}
+    )
     acting(seen.clone())
     assert model.encoded == encodings
     assert acting.bound_prior(seen) is not None  # what is asked of it otherwise

@@ -20,7 +20,7 @@ from franka_wm.errors import UserError
 from franka_wm.training import build
 from franka_wm.training.check import check
 from franka_wm.training.learner import Learner
-from franka_wm.training.load import load_agent, preset_of
+from franka_wm.training.load import _planning_otherwise, load_agent, preset_of
 from franka_wm.training.place import _LOCKS, lock_run_dir
 from franka_wm.training.run import Run
 from franka_wm.training.settings import RunSettings
@@ -249,3 +249,9 @@ def test_what_does_not_go_together(overrides: list[str], named: str, settled) ->
 def test_another_planner_is_what_the_runs_scale_has(scale: str, horizon: int, settled) -> None:
     preset = preset_of("cem", settled(f"scale={scale}", "env=reach", "device=cpu"))
     assert (preset["name"], preset["horizon"]) == ("cem", horizon)
+
+
+@pytest.mark.parametrize("planning", [{"planner.num_samples": 64}, {"num_samples": 64}, {"planner": 64}])
+def test_options_of_a_planner_that_are_given_otherwise_end_in_one_line(planning: Any, settled) -> None:
+    with pytest.raises(UserError, match=r'must be options of planner or objective, such as \{"planner"'):
+        _planning_otherwise(settled("scale=smoke", "device=cpu"), planning)

@@ -133,6 +133,11 @@ def read_source(root: str | Path) -> Source:
     root = Path(root).expanduser()
     info_path = root / "meta" / "info.json"
     if not root.is_dir():
+        if (unfinished := Path(f"{root}.writing")).is_dir():
+            raise UserError(
+                f"dataset.root={root}: {unfinished} holds one that is not finished; franka-wm collect out={root} … "
+                "resume=true finishes it"
+            )
         raise UserError(f"dataset.root={root}: no such folder; franka-wm collect out=FOLDER makes one")
     if not info_path.is_file():
         raise UserError(

@@ -43,6 +43,9 @@ def test_metadata_that_cannot_be(
 
 
 def test_no_dataset(opened: Callable, tmp_path: Path) -> None:
+    (tmp_path / "begun.writing").mkdir()
+    with pytest.raises(UserError, match=r"begun\.writing holds one that is not finished; .* resume=true"):
+        opened(tmp_path / "begun")
     with pytest.raises(UserError, match="no such folder"):
         opened(tmp_path / "nothing")
     (tmp_path / "empty").mkdir()
