@@ -290,7 +290,7 @@ class PlannerPolicy(TensorDictModuleBase):
             {key: value for key in read if (value := tensordict.get(key, None)) is not None},
             batch_size=tensordict.batch_size,
         )
-        if missing := [key for key in self.in_keys if key not in inputs and key != "is_init"]:
+        if missing := [str(key) for key in self.in_keys if key not in inputs and key != "is_init"]:
             there = ", ".join(str(key) for key, _ in tensordict.items())
             raise ValueError(
                 f"the plan reads {', '.join(missing)}, which is not there, but {there}; is it another environment "

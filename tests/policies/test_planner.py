@@ -165,7 +165,7 @@ def test_mistakes_are_named():
         acting(observation()[0])
     with pytest.raises(ValueError, match="objective"):
         PlannerPolicy.for_model(Exact(), mppi())
-    with pytest.raises(ValueError, match="the plan reads state, which is not there, but .*goal.*; is it"):
+    with pytest.raises(ValueError, match=r"the plan reads state, which is not there, but .*goal.*; is it"):
         acting(observation().rename_key_("state", "goal"))
 
 
