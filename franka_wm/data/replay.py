@@ -11,6 +11,7 @@ from torchrl.data import ReplayBuffer
 from torchrl.data.replay_buffers import RoundRobinWriter, Sampler
 
 from franka_wm.data.demonstrations import Demonstrations
+from franka_wm.data.following import Following
 from franka_wm.data.future import FutureFrames
 from franka_wm.data.hindsight import Hindsight
 from franka_wm.data.image_storage import BOUNDARY, OVERFLOW, ImageStorage
@@ -216,12 +217,13 @@ class WindowReplay(ReplayBuffer):
         super().__init__(**options)
         self.num_envs = num_envs
         self.hindsight, self.future, self.demonstrations = hindsight, future, demonstrations
+        self.following = Following()
 
     def extend(self, data: Any, *, update_priority: bool | None = None) -> torch.Tensor:
         """Keeps a batch (worlds, time) of the collector, behind the one before.
 
         Raises:
-            UserError: It has another shape.
+            UserError: It has another shape, or, on the CPU, does not go on where the last one ended.
         """
         shape = tuple(data.shape)
         if len(shape) != 2 or shape[0] != self.num_envs:
@@ -229,7 +231,12 @@ class WindowReplay(ReplayBuffer):
                 f"the replay buffer: extend with the collector's batch (worlds, time), ({self.num_envs}, …) here, not "
                 f"{shape}"
             )
-        return super().extend(data, update_priority=update_priority)
+        if len(self) == 0:
+            self.following.forget()
+        self.following.check(data)
+        index = super().extend(data, update_priority=update_priority)
+        self.following.keep(data)
+        return index
 
     def sample(self, batch_size: int | None = None, return_info: bool = False) -> Any:
         batch, info = super().sample(batch_size, return_info=True)

@@ -9,9 +9,9 @@ from typing import Any
 
 import torch
 from tensordict import TensorDictBase
-from torchrl.data import ReplayBuffer
 
 from franka_wm.data.memory import free_memory
+from franka_wm.data.replay import WindowReplay
 from franka_wm.device import resolve_device
 from franka_wm.errors import UserError
 from franka_wm.models import WorldModel
@@ -104,7 +104,7 @@ def _bytes(of: Spaces | WorldModel, stack: int = 1) -> int:
 
 
 def fill(
-    replay: ReplayBuffer, batch: TensorDictBase, run: RunSettings, *, updates: int = 0, restored: bool = False
+    replay: WindowReplay, batch: TensorDictBase, run: RunSettings, *, updates: int = 0, restored: bool = False
 ) -> None:
     """Extends an empty replay by its first ``batch``, if it has room for that and for what a run will add.
 
@@ -133,6 +133,8 @@ def fill(
         )
     try:
         replay.extend(batch)
+        if restored:  # worlds are put back, and may look a little different on another device
+            replay.following.forget()
     except RuntimeError as error:  # some systems refuse what is larger than all memory, used or not
         if not isinstance(error, torch.OutOfMemoryError) and "can't allocate memory" not in str(error):
             raise
@@ -151,7 +153,7 @@ def _not_allocated(run: RunSettings, per_step: float, device: torch.device) -> s
     )
 
 
-def filled_bytes(replay: ReplayBuffer) -> int:
+def filled_bytes(replay: WindowReplay) -> int:
     """Bytes of the filled part of a replay as a checkpoint holds it: with both images of each step."""
     storage: Any = replay.storage
     filled, data = storage._len_along_dim0, storage._storage

@@ -205,3 +205,16 @@ def test_a_replay_of_worlds_with_a_scene_keeps_which_steps_lost_contacts(
     replay = make_replay_buffer(settings, torch.device("cpu"))
     trainer = SimpleNamespace(settings=settings, _keys=["state"], _extra=[])
     assert replay.sampler.marks is (OVERFLOW in Trainer.kept.fget(trainer)) is marks
+
+
+def test_a_run_that_resumes_may_go_on_from_other_worlds(settled) -> None:
+    """Those that are put back may look a little different; a batch that is gathered must follow on the one before."""
+    step = {"state": torch.zeros(4, 1, 3), "is_init": torch.zeros(4, 1, 1, dtype=torch.bool)}
+    batch = TensorDict({**step, "next": TensorDict({"state": torch.ones(4, 1, 3)}, [4, 1])}, [4, 1])
+    for restored in (True, False):
+        replay = make_replay(capacity=40, num_envs=4, window=2, batch_size=2, device="cpu")
+        storage_budget.fill(replay, batch, settled("scale=smoke"), restored=restored)
+        if restored:
+            replay.extend(batch)
+        with pytest.raises(UserError, match="must go on where the last one ended"):
+            replay.extend(batch)
