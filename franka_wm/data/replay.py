@@ -16,6 +16,7 @@ from franka_wm.data.future import FutureFrames
 from franka_wm.data.hindsight import Hindsight
 from franka_wm.data.image_storage import BOUNDARY, OVERFLOW, ImageStorage
 from franka_wm.errors import UserError
+from franka_wm.options import check_whole
 
 
 class WindowSampler(Sampler):
@@ -223,7 +224,7 @@ class WindowReplay(ReplayBuffer):
         """Keeps a batch (worlds, time) of the collector, behind the one before.
 
         Raises:
-            UserError: It has another shape, or, on the CPU, does not go on where the last one ended.
+            UserError: It has another shape, lacks an entry, or, on the CPU, does not go on where the last one ended.
         """
         shape = tuple(data.shape)
         if len(shape) != 2 or shape[0] != self.num_envs:
@@ -231,12 +232,27 @@ class WindowReplay(ReplayBuffer):
                 f"the replay buffer: extend with the collector's batch (worlds, time), ({self.num_envs}, …) here, not "
                 f"{shape}"
             )
+        if data.get(BOUNDARY, None) is None:
+            raise UserError(
+                f"the replay buffer: the batch has no {BOUNDARY}, which marks first steps of episodes; franka_wm.envs "
+                "gives it, elsewhere TorchRL's InitTracker"
+            )
         if len(self) == 0:
             self.following.forget()
+        elif (key := self._lacking(data)) is not None:
+            name = key if isinstance(key, str) else ".".join(key)
+            raise UserError(f"the replay buffer: the batch has no {name}, which those before have")
         self.following.check(data)
         index = super().extend(data, update_priority=update_priority)
         self.following.keep(data)
         return index
+
+    def _lacking(self, data: Any) -> Any:
+        """A key of what is kept that a batch does not have."""
+        storage: Any = self.storage
+        kept = [*storage._storage.keys(True, True), *(("next", key) for key in storage.images)]
+        there = set(data.keys(True, True))
+        return next((key for key in kept if key not in there), None)
 
     def sample(self, batch_size: int | None = None, return_info: bool = False) -> Any:
         batch, info = super().sample(batch_size, return_info=True)
@@ -318,6 +334,8 @@ def make_replay(
     Returns:
         A ``ReplayBuffer`` whose samples have batch size (batch_size, burn_in + window).
     """
+    check_whole("num_envs", num_envs)
+    check_whole("batch_size", batch_size)
     steps, before = capacity // num_envs, frame_stack - 1 if stacked else 0
     if steps <= window + before:
         raise UserError(

@@ -252,6 +252,29 @@ def test_what_is_no_batch_of_worlds_and_times_is_refused() -> None:
         assert len(replay) == 0
 
 
+def test_a_batch_that_lacks_an_entry_is_refused() -> None:
+    """The flag of first steps always; anything else that those before have."""
+    replay, data = buffer(40, 3), experience(14)
+    pixels = torch.zeros(WORLDS, 14, 4, 4, 3)
+    data.update({"pixels": pixels, "action": torch.zeros(WORLDS, 14, 2), "next": {"pixels": pixels}})
+    with pytest.raises(UserError, match="the batch has no is_init, which marks first steps of episodes"):
+        replay.extend(data[:, :7].exclude("is_init"))
+    replay.extend(data[:, :7])
+    for key in ("pixels", ("next", "pixels"), "action", ("next", "done")):
+        name = key if isinstance(key, str) else ".".join(key)
+        with pytest.raises(UserError, match=f"the batch has no {name}, which those before have"):
+            replay.extend(data[:, 7:].exclude(key))
+    assert len(replay) == 7 * WORLDS
+    replay.extend(data[:, 7:])
+
+
+@pytest.mark.parametrize("option", ["num_envs", "batch_size"])
+def test_sizes_are_whole_numbers(option: str) -> None:
+    sizes = {"capacity": 40, "num_envs": 3, "window": 3, "batch_size": 4, option: 0}
+    with pytest.raises(UserError, match=f"{option}=0: must be"):
+        make_replay(**sizes, device="cpu")
+
+
 @pytest.mark.parametrize(("capacity", "num_envs"), [(3, 3), (11, 3), (0, 3), (2, 3)])
 def test_capacity_too_small(capacity: int, num_envs: int) -> None:
     with pytest.raises(UserError, match="at least 12"):

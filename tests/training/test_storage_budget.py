@@ -24,7 +24,9 @@ from franka_wm.training.trainer import Trainer
 
 def test_size_of_what_is_filled() -> None:
     replay = make_replay(capacity=10 * 4, num_envs=4, window=2, batch_size=2, device="cpu")
-    replay.extend(TensorDict({"x": torch.zeros(4, 5, 3)}, [4, 5]))
+    replay.extend(
+        TensorDict({"x": torch.zeros(4, 5, 3), "is_init": torch.zeros(4, 5, 1, dtype=torch.bool)}, [4, 5])
+    )
     assert storage_budget.filled_bytes(replay) == replay[:].bytes()
 
 
@@ -146,8 +148,9 @@ def test_what_cannot_be_allocated_is_one_line_as_well(monkeypatch, settled) -> N
         trainer={"updates": 0, "updates_per_batch": 1},
     )
     replay = make_replay(capacity=10**14, num_envs=4, window=2, batch_size=2, device="cpu")
+    batch = TensorDict({"x": torch.zeros(4, 5, 3), "is_init": torch.zeros(4, 5, 1, dtype=torch.bool)}, [4, 5])
     with pytest.raises(UserError, match=r"replay\.capacity=100000000000000: .* cannot be allocated on cpu"):
-        storage_budget.fill(replay, TensorDict({"x": torch.zeros(4, 5, 3)}, [4, 5]), cfg)
+        storage_budget.fill(replay, batch, cfg)
 
 
 def test_free_memory_is_that_of_the_machine() -> None:
