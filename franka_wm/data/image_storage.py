@@ -8,6 +8,7 @@ episode; samples are put together from them.
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Sequence
 from typing import Any, cast
 
@@ -93,6 +94,14 @@ class ImageStorage(LazyTensorStorage):
             self._ends = _Ends(times, self.episode_length, led_to)
         self._ends.add(data.get(BOUNDARY).squeeze(-1).to(self.device), led_to, skipped=steps - len(data))
 
+    def _init(self, data: Any) -> None:
+        log = logging.getLogger("torchrl")
+        log.addFilter(_is_worth_telling)
+        try:
+            super()._init(data)
+        finally:
+            log.removeFilter(_is_worth_telling)
+
     def get(self, index: Any) -> Any:  # pyright: ignore[reportIncompatibleMethodOverride]  # two overloads
         match index:
             case torch.Tensor() as time, torch.Tensor() as world:
@@ -177,6 +186,11 @@ class ImageStorage(LazyTensorStorage):
     def _empty(self) -> None:
         super()._empty()
         self._ends = None
+
+
+def _is_worth_telling(record: logging.LogRecord) -> bool:
+    """TorchRL's line about the shape of a new storage is not."""
+    return not record.getMessage().startswith("Initialized ")
 
 
 class _Ends:

@@ -219,6 +219,7 @@ class WindowReplay(ReplayBuffer):
         self.num_envs = num_envs
         self.hindsight, self.future, self.demonstrations = hindsight, future, demonstrations
         self.following = Following()
+        self._warned_batch_size_conflict = True  # sample(8) is honoured: TorchRL need not warn of it
 
     def extend(self, data: Any, *, update_priority: bool | None = None) -> torch.Tensor:
         """Keeps a batch (worlds, time) of the collector, behind the one before.

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import logging
+import warnings
 from collections import Counter
 from types import SimpleNamespace
 from unittest import mock
@@ -10,7 +12,7 @@ import pytest
 import torch
 from scipy.stats import chisquare
 from tensordict import TensorDict
-from torchrl.data import ReplayBuffer
+from torchrl.data import LazyTensorStorage, ReplayBuffer
 
 from franka_wm.data.replay import OVERFLOW, WindowSampler, make_replay, newest_step
 from franka_wm.errors import UserError
@@ -217,7 +219,22 @@ def test_cost_does_not_depend_on_capacity() -> None:
 def test_a_batch_size_of_ones_own() -> None:
     replay = buffer(40, 3)
     replay.extend(experience(30))
-    assert replay.sample(7).batch_size == (7, 3)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert replay.sample(7).batch_size == (7, 3)
+
+
+def test_the_first_batch_is_kept_without_a_line_of_torchrl(caplog: pytest.LogCaptureFixture) -> None:
+    log = logging.getLogger("torchrl")
+    with caplog.at_level(logging.INFO, logger="torchrl"):
+        log.addHandler(caplog.handler)  # it tells its own handlers alone
+        try:
+            buffer(40, 3).extend(experience(30))
+            assert not caplog.messages and not log.filters
+            ReplayBuffer(storage=LazyTensorStorage(4)).extend(torch.zeros(2))  # another's is as it was
+        finally:
+            log.removeHandler(caplog.handler)
+    assert [line.split(" with")[0] for line in caplog.messages] == ["Initialized LazyTensorStorage"]
 
 
 def test_too_few_windows() -> None:
