@@ -53,7 +53,7 @@ class DiscreteActions(Transform):
     (N,), without a trailing 1: that is what TorchRL's own modules emit for a categorical action (the argmax of
     ``QValueActor``, a sample of ``torch.distributions.Categorical``). The environment sees the row, (N, A).
 
-    One gather on the device: no host sync. An index out of range is an error (on CUDA a device-side assert).
+    One gather on the device: no host sync. A number outside the table is an error (on CUDA a device-side assert).
 
     Args:
         action_dim: Number of axes, A.
@@ -87,6 +87,10 @@ class DiscreteActions(Transform):
         return self.table.shape[0]
 
     def _inv_apply_transform(self, action: torch.Tensor) -> torch.Tensor:
+        if action.device.type == "cpu":  # elsewhere asking waits for the device
+            outside = action[(action < 0) | (action >= self.num_actions)]
+            if len(outside):
+                raise UserError(f"action {int(outside[0])}: must be from 0 to {self.num_actions - 1}")
         return torch.nn.functional.embedding(action, self.table)
 
     def transform_input_spec(self, input_spec: Composite) -> Composite:

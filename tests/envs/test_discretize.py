@@ -58,6 +58,14 @@ def test_with_a_gripper_each_move_is_there_with_open_and_with_closed_fingers(dim
         discrete_action_table(1, gripper=True)
 
 
+@pytest.mark.parametrize("number", [-1, 15, 99])
+def test_a_number_that_is_not_in_the_table_is_refused(number: int) -> None:
+    env = make(2)
+    step = env.reset().set("action", torch.tensor([14, number]))
+    with pytest.raises(UserError, match=f"^action {number}: must be from 0 to 14$"):
+        env.step(step)
+
+
 def test_what_is_held_stays_held_as_the_arm_moves(settled: Callable) -> None:
     """Each world makes one move over and over: open fingers let go of the cube, closed ones hold it."""
     run = settled("env=lift", "model=muzero", "planner=gumbel", "device=cpu")
