@@ -237,6 +237,17 @@ def did_you_mean(word: str, known: Sequence[str]) -> str:
     return f"; did you mean {near[0]}?" if near else ""
 
 
+def no_such_option(name: str, known: Sequence[str]) -> str:
+    """One line about an option that does not exist: the nearest one, that of another group, or all."""
+    last = name.rpartition(".")[2]
+    near = (
+        did_you_mean(name, known)
+        or (f"; did you mean {last}?" if last in known else "")
+        or (f"; did you mean {known[0]}?" if len(known) == 1 else "")
+    )
+    return f"{name}: no such option{near or '; there are ' + ', '.join(known) if known else ''}"
+
+
 def check_arguments(
     cls: Callable[..., Any],
     values: Mapping[str, Any],

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import shlex
 from itertools import product
 from pathlib import Path
@@ -135,6 +136,23 @@ def test_an_unknown_size_says_which_there_are() -> None:
 def test_a_pretrained_encoder_has_the_scales_size() -> None:
     cfg = compose("pretrain=vjepa", "model=action_world_model", "scale=smoke")
     assert (cfg.pretrain.updates, cfg.pretrain.model.encoder_width, cfg.pretrain.model.window) == (10, 24, 8)
+
+
+@pytest.mark.parametrize(
+    ("override", "line"),
+    [
+        ("env=psuh", "env=psuh: must be one of .*push.*; did you mean push[?]"),
+        (
+            "env.episode_lenght=10",
+            "env[.]episode_lenght: no such option; did you mean env[.]episode_length[?]",
+        ),
+    ],
+)
+def test_an_override_that_cannot_be_is_one_line(override: str, line: str) -> None:
+    """As on the command line."""
+    with pytest.raises(UserError) as caught:
+        compose("model=tdmpc2", override)
+    assert re.fullmatch(line, str(caught.value)), caught.value
 
 
 def test_an_option_by_its_former_name_names_the_present_one() -> None:

@@ -20,7 +20,7 @@ from typing import Any
 import click
 
 from franka_wm.errors import UserError
-from franka_wm.options import did_you_mean
+from franka_wm.options import no_such_option
 
 FLAG = click.BOOL
 
@@ -260,14 +260,3 @@ def verb(name: str, **settings: Any) -> Callable[[Any], Verb]:
     """Make a function a verb; the first paragraphs of its docstring, up to a form feed, are its help."""
     context = {"max_content_width": 110, "help_option_names": ["--help", "-h"]}
     return click.command(name, cls=Verb, context_settings=context, **settings)
-
-
-def no_such_option(name: str, known: Sequence[str]) -> str:
-    """One line about an option that does not exist: the nearest one, that of another group, or all."""
-    last = name.rpartition(".")[2]
-    near = (
-        did_you_mean(name, known)
-        or (f"; did you mean {last}?" if last in known else "")
-        or (f"; did you mean {known[0]}?" if len(known) == 1 else "")
-    )
-    return f"{name}: no such option{near or '; there are ' + ', '.join(known) if known else ''}"

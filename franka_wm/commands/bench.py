@@ -6,8 +6,9 @@ import subprocess
 import sys
 from pathlib import Path
 
-from franka_wm.commands.arguments import did_you_mean, verb
+from franka_wm.commands.arguments import verb
 from franka_wm.errors import UserError
+from franka_wm.options import did_you_mean
 
 CHECKOUT = Path(__file__).parents[2]
 """Top of the repository, where ``benchmarks`` is, if the package runs from one."""

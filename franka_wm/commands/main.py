@@ -9,9 +9,10 @@ from typing import Any
 
 import click
 
-from franka_wm.commands.arguments import did_you_mean, verb
+from franka_wm.commands.arguments import verb
 from franka_wm.errors import REFUSALS, FrankaError, machine_refused
 from franka_wm.interrupt import INTERRUPTED
+from franka_wm.options import did_you_mean
 from franka_wm.version import __version__
 
 VERBS = {

@@ -6,10 +6,11 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from franka_wm.commands.arguments import check_run, did_you_mean, plugins, real, verb, whole, word
+from franka_wm.commands.arguments import check_run, plugins, real, verb, whole, word
 from franka_wm.errors import UserError
 from franka_wm.files import unwritable
 from franka_wm.live.extras import import_rerun, import_viser
+from franka_wm.options import did_you_mean
 from franka_wm.policies.names import POLICIES, refuse_old_name
 
 if TYPE_CHECKING:

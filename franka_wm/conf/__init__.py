@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 
 from omegaconf import DictConfig, OmegaConf, open_dict
 
+from franka_wm.conf import wrong
 from franka_wm.errors import UserError
 from franka_wm.options import unknown
 
@@ -67,6 +68,20 @@ def refuse_unknown(names: Iterable[Any]) -> None:
 
 def compose(*overrides: str) -> DictConfig:
     """The configuration that ``python train.py OVERRIDE …`` runs with.
+
+    Raises:
+        UserError: An override that cannot be, in one line.
+    """
+    try:
+        return compose_or_raise(*overrides)
+    except UserError:
+        raise
+    except wrong.refusals() as error:
+        raise UserError(wrong.said_of(error, overrides, compose_or_raise)) from error
+
+
+def compose_or_raise(*overrides: str) -> DictConfig:
+    """The same, with errors of Hydra as they are.
 
     Raises:
         UserError: An option by a former name, a group that does not exist, folders that Hydra would not look in, or a

@@ -112,7 +112,9 @@ def preset_of(planner: str, settings: RunSettings, *searchpath: str) -> dict[str
     if not re.fullmatch(r"\w[\w-]*", planner):
         raise UserError(f"planner={planner}: must be the name of a planner, as franka-wm list has them")
     try:
-        composed = conf.compose(f"planner={planner}", f"scale={settings.values['scale']}", *searchpath)
+        composed = conf.compose_or_raise(
+            f"planner={planner}", f"scale={settings.values['scale']}", *searchpath
+        )
     except MissingConfigException as error:
         group, name = (error.missing_cfg_file or f"planner/{planner}").rsplit("/", 1)
         there = sorted(error.options or ())

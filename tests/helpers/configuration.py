@@ -32,7 +32,7 @@ def compose_once() -> None:
     for module, name in SOURCES.items():
         reader = getattr(importlib.import_module(f"hydra._internal.core_plugins.{module}"), name)
         reader.load_config = _read_once(reader.load_config)
-    conf.compose = _composed_once(conf.compose)
+    conf.compose_or_raise = _composed_once(conf.compose_or_raise)
     conf.compose("scale=smoke")
 
 
