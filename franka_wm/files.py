@@ -45,8 +45,8 @@ def run_of(checkpoint: Path) -> Path:
     place = checkpoint if checkpoint.name == "checkpoints" else checkpoint.parent
     run = place.parent
     # Anybody may call a folder so: a run's, or its first stage's, has more.
-    own = place.name == "checkpoints" and ((run / "config.yaml").is_file() or run.name == "pretrained")
-    return run if own else checkpoint
+    own = (run / "config.yaml").is_file() or run.name == "pretrained" or checkpoint.name == "latest"
+    return run if own and place.name == "checkpoints" else checkpoint
 
 
 @contextmanager

@@ -88,16 +88,16 @@ def stale(records: Sequence[Record]) -> list[str]:
 @cache
 def composed(typed: tuple[str, ...]) -> dict[str, Any] | str:
     """The configuration of a command, as it is now, without what repetitions differ in; or why there is none."""
-    from hydra.errors import HydraException
     from omegaconf import OmegaConf
     from omegaconf.errors import OmegaConfBaseException
 
     from franka_wm import conf
+    from franka_wm.errors import UserError
 
     try:
         cfg = conf.compose(*typed)
         found = OmegaConf.to_container(cfg, resolve=True)
-    except (HydraException, OmegaConfBaseException) as error:
+    except (UserError, OmegaConfBaseException) as error:
         return str(error).splitlines()[0]
     assert isinstance(found, dict)
     return {str(name): value for name, value in found.items() if name not in SAME_BUT}

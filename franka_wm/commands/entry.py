@@ -23,8 +23,9 @@ from omegaconf.errors import OmegaConfBaseException
 
 from franka_wm import conf
 from franka_wm.commands import launching, several
-from franka_wm.commands.overrides import compose, explain, given, unknown_flags, values
+from franka_wm.commands.overrides import compose, given, unknown_flags, values
 from franka_wm.commands.sweep import Sweep, jobs, names, spread
+from franka_wm.conf.wrong import explain
 from franka_wm.console import program, quoted, resuming, say, terminal_log
 from franka_wm.errors import REFUSALS, FrankaError, machine_refused
 from franka_wm.interrupt import INTERRUPTED

@@ -8,7 +8,6 @@ from typing import Any
 
 from franka_wm import conf
 from franka_wm.conf import wrong
-from franka_wm.conf.wrong import explain as explain
 from franka_wm.errors import UserError
 
 

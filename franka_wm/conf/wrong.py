@@ -84,7 +84,7 @@ def composed(compose: Compose, *overrides: str) -> Any:
     """The configuration of some overrides; ``None`` where one of these is wrong, too."""
     try:
         return compose(*overrides)
-    except (*refusals()[:2], UserError):
+    except (*refusals(), UserError):
         return None
 
 

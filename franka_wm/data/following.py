@@ -14,16 +14,17 @@ from franka_wm.errors import UserError
 class Following:
     """What the last step of each world led to, and whether the next batch (worlds, time) begins with it.
 
-    Vectors that steps both begin with and lead to are compared, if they go on from step to step within the batches so
-    far. On the CPU alone: elsewhere a comparison waits for the device.
+    Vectors and images that steps both begin with and lead to are compared, once they were seen to go on from step to
+    step: others, as a policy's own, need not. On the CPU alone: elsewhere a comparison waits for the device.
     """
 
     def __init__(self) -> None:
-        self._last: dict[str, torch.Tensor] | None = None
+        self._last: dict[str, torch.Tensor] = {}
+        self._goes_on: dict[str, bool] = {}  # nothing of keys of which nothing was seen
 
     def forget(self) -> None:
         """The next batch may begin with anything."""
-        self._last = None
+        self._last = {}
 
     def check(self, data: Any) -> None:
         """Compares the first step of a batch with what the last one before led to.
@@ -32,37 +33,49 @@ class Following:
             UserError: A world neither goes on nor begins an episode.
         """
         first = data[:, 0]
-        for key, last in (self._last or {}).items():
+        begins = first.get(BOUNDARY).flatten(1).any(1)
+        for key, last in self._last.items():
             now = first.get(key, None)
             if now is None or now.shape != last.shape or now.device.type != "cpu":
                 continue
-            broken = ~(_same(last, now) | first.get(BOUNDARY).reshape(len(now), -1).any(1))
-            if bool(broken.any()):
+            broken = ~(_same(last, now, 1) | begins)
+            if self._goes_on.get(key) and bool(broken.any()):
                 raise UserError(
                     f"a batch must go on where the last one ended (world {int(broken.long().argmax())} does not): give "
                     f"every batch in turn, or begin with {BOUNDARY}"
                 )
+            self._learn(key, broken, begins)
 
     def keep(self, data: Any) -> None:
         """Keeps in mind what the last step of a batch led to."""
-        keys = [key for key in vectors(data) if self._last is None or key in self._last]
         self._last = {}
-        for key in keys:
-            begins = data.get(BOUNDARY).reshape(*data.shape, -1).any(2)
+        begins = data.get(BOUNDARY).flatten(2).any(2)[:, 1:]
+        for key in observed(data):
             led_to = data.get(("next", key))
-            if bool((_same(led_to[:, :-1], data.get(key)[:, 1:]) | begins[:, 1:]).all()):
+            self._learn(key, ~(_same(led_to[:, :-1], data.get(key)[:, 1:], 2) | begins), begins)
+            if self._goes_on.get(key, True):
                 self._last[key] = led_to[:, -1].clone()
 
+    def _learn(self, key: str, broken: torch.Tensor, begins: torch.Tensor) -> None:
+        """That a key goes on, if so far it did wherever no episode begins; once it does not, it never did."""
+        if bool(broken.any()):
+            self._goes_on[key] = False
+        elif not bool(begins.all()):  # of no steps it is True
+            self._goes_on.setdefault(key, True)
 
-def vectors(data: Any) -> Sequence[str]:
-    """Keys of vectors on the CPU that steps (worlds, time) both begin with and lead to."""
+
+def observed(data: Any) -> Sequence[str]:
+    """Keys on the CPU, of vectors and images, that steps (worlds, time) both begin with and lead to."""
     return [
         key for key, x in data.items()
-        if isinstance(x, torch.Tensor) and x.dim() == 3 and x.is_floating_point() and x.device.type == "cpu"
-        and getattr(data.get(("next", key), None), "shape", None) == x.shape
+        if isinstance(x, torch.Tensor) and (x.is_floating_point() if x.dim() == 3 else x.dim() > 4)
+        and x.device.type == "cpu" and getattr(data.get(("next", key), None), "shape", None) == x.shape
     ]  # fmt: skip
 
 
-def _same(before: torch.Tensor, now: torch.Tensor) -> torch.Tensor:
-    """Whether vectors (…, D) are the same, (…,); what is no number is like anything."""
-    return ((before == now) | before.isnan()).all(-1)
+def _same(before: torch.Tensor, now: torch.Tensor, leading: int) -> torch.Tensor:
+    """Whether entries are the same, in their leading dimensions; what is no number is like anything."""
+    same = before == now
+    if before.is_floating_point():
+        same |= before.isnan()
+    return same.flatten(leading).all(-1)

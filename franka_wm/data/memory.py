@@ -31,7 +31,8 @@ def left_of_container(place: Path) -> int | None:
         if most == "max":
             return None
         lines = (place / "memory.stat").read_text().splitlines()
-        cached = next((int(line.split()[1]) for line in lines if line.startswith("inactive_file ")), 0)
+        sizes = {name: int(size) for name, size in map(str.split, lines)}
+        cached = sum(sizes.get(name, 0) for name in ("inactive_file", "active_file", "slab_reclaimable"))
         return max(0, int(most) - int(used) + cached)
     except (OSError, ValueError):  # not Linux, or the older version
         return None

@@ -212,10 +212,11 @@ class PlannerPolicy(TensorDictModuleBase):
             if prior is not None and not isinstance(prior, GoalGuide):
                 prior = compiled(prior)
         self.precision, self._compiles, self._observed = precision, compile, list(observation_keys)
-        self.objective = objective
+        self.prior = prior
+        self.plan_for(objective)
         self.out_keys = ["action", "plan", *(CONTEXT if observe is not None else ())]
         self.planner, self.explore, self.model = planner, explore, model
-        self.encode, self.next, self.prior = encode, next, prior
+        self.encode, self.next = encode, next
         self.observe, self.capture = observe, capture
         self._graphs = GraphCache()
 
@@ -263,16 +264,12 @@ class PlannerPolicy(TensorDictModuleBase):
             compile=compile,
         )
 
-    @property
-    def objective(self) -> Objective:
-        """What it plans for. Another one may be set, a plain function too."""
-        return self._objective
-
-    @objective.setter
-    def objective(self, objective: Objective | Score) -> None:
+    def plan_for(self, objective: Objective | Score) -> None:
+        """Plan for something else from now on: an objective, or a plain function of trajectories and actions."""
         objective = as_objective(objective)
-        self._objective = objective.compiled() if self._compiles else objective
-        self.in_keys = [*self._observed, *objective.in_keys, "is_init"]
+        self.objective = objective.compiled() if self._compiles else objective
+        guide = self.prior.in_keys if isinstance(self.prior, GoalGuide) else ()
+        self.in_keys = list(dict.fromkeys((*self._observed, *objective.in_keys, *guide, "is_init")))
 
     @torch.no_grad()
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:

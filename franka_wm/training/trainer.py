@@ -179,7 +179,7 @@ class Trainer:
                 )
                 if due:
                     self.log(progress)
-                if reached and stopping:
+                if reached and stopping and not last:
                     say(f"  evaluation.at_steps: left out at {self.env_steps} steps, the run stops")
                 if evaluates and not stopping:
                     self.require_finite()

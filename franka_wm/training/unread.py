@@ -29,7 +29,8 @@ def say_unseen_goal(run: RunSettings) -> None:
         return
     config, keys = run.env.arm, run.model.observations
     read = config.observations if keys is None else keys
-    seen = config.show_goal or any(key in ("state", "goal") or "goal_pixels" in key for key in read)
+    drawn = config.show_goal and any("pixels" in key for key in read)
+    seen = drawn or any(key in ("state", "goal") or "goal_pixels" in key for key in read)
     if not (seen or config.fixed_goal) and make_task(config).relabels():
         say(
             "warning: each episode has another goal, and the model reads nothing that shows it: add state or goal to "

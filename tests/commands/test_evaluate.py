@@ -400,9 +400,9 @@ def test_the_bare_folder_may_follow_an_option_and_its_value() -> None:
 def test_default_folder(tmp_path: Path) -> None:
     checkpoint = tmp_path / "run" / "checkpoints" / "latest"
     checkpoint.mkdir(parents=True)
-    assert default_folder(str(checkpoint)) == checkpoint / "evaluation", (
-        "anybody may call a folder checkpoints"
-    )
+    other = checkpoint.with_name("reach")  # anybody may call a folder checkpoints
+    assert default_folder(str(other)) == other / "evaluation"
+    assert default_folder(str(checkpoint)) == tmp_path / "run" / "evaluation"
     (tmp_path / "run" / "config.yaml").touch()
     first = tmp_path / "run" / "pretrained"
     assert default_folder(str(first / "checkpoints" / "7")) == first / "evaluation"

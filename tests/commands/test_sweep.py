@@ -21,8 +21,9 @@ from omegaconf import OmegaConf
 from forks import TRAIN, Fork, script, spare, torchrun_in_fork, train_in_fork
 from franka_wm.commands import entry, launching
 from franka_wm.commands.launching import refused_job
-from franka_wm.commands.overrides import compose, explain
+from franka_wm.commands.overrides import compose
 from franka_wm.commands.sweep import spread
+from franka_wm.conf.wrong import explain
 from franka_wm.errors import UserError
 from franka_wm.evaluation.results import read_result, score
 from franka_wm.training import run

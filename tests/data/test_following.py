@@ -39,15 +39,31 @@ def replay() -> WindowReplay:
 def test_batches_that_do_not_follow_are_refused(size: int) -> None:
     """Also of one step each; what is kept stays as it was, and the right batch is taken afterwards."""
     kept = replay()
-    kept.extend(steps(0, 5))
-    kept.extend(steps(5, 5 + size))
+    for k in range(0, 5 + size, size):
+        kept.extend(steps(k, k + size))
     with pytest.raises(
         UserError, match=r"where the last one ended \(world 3 does not\): give every batch in turn"
     ):
-        kept.extend(steps(9 + size, 14 + size, begins=(0, 1, 2)))
-    assert len(kept) == (5 + size) * WORLDS
-    kept.extend(steps(5 + size, 9 + size))
+        kept.extend(steps(9 + k + size, 14 + k + size, begins=(0, 1, 2)))
+    assert len(kept) == (k + size) * WORLDS
+    kept.extend(steps(k + size, k + 9))
     kept.extend(steps(90, 95, begins=(0, 1, 2, 3)))
+
+
+def test_images_go_on_too() -> None:
+    """Each is kept once, so what a step led to would be another one."""
+
+    def images(first: int, until: int) -> TensorDict:
+        batch = steps(first, until).exclude("state", ("next", "state"))
+        time = torch.arange(first, until + 1, dtype=torch.uint8).expand(WORLDS, -1)[..., None, None, None]
+        seen = time.expand(-1, -1, 2, 2, 3)
+        return batch.set("pixels", seen[:, :-1].clone()).set(("next", "pixels"), seen[:, 1:].clone())
+
+    kept = replay()
+    kept.extend(images(0, 3))
+    kept.extend(images(3, 5))
+    with pytest.raises(UserError, match="world 0 does not"):
+        kept.extend(images(50, 52))
 
 
 def test_an_empty_replay_begins_with_anything() -> None:

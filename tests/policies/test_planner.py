@@ -173,7 +173,7 @@ def test_mistakes_are_named():
 def test_a_policy_may_be_given_another_objective(compile: bool):
     """A plain function, or one that reads the present observation, which the policy then asks for."""
     acting = policy(mppi(), compile=compile, explore=False)
-    acting.objective = lambda trajectory, actions: -(actions - 0.5).square().sum((-2, -1))
+    acting.plan_for(lambda trajectory, actions: -(actions - 0.5).square().sum((-2, -1)))
     torch.testing.assert_close(acting(observation())["action"], torch.full((3, 2), 0.5), atol=0.2, rtol=0)
 
     class Own(Objective):
@@ -182,8 +182,16 @@ def test_a_policy_may_be_given_another_objective(compile: bool):
         def bind(self, tensordict):
             return lambda z, actions: -(actions - tensordict["wanted"][:, None, None]).square().sum((-2, -1))
 
-    acting.objective = Own()
+    acting.plan_for(Own())
     assert acting.in_keys == ["state", "wanted", "is_init"]
+
+    class Learned(nn.Module):
+        def forward(self, trajectory, actions):
+            return -actions.square().sum((-2, -1))
+
+    other = policy(mppi(), explore=False)
+    other.plan_for(Learned())
+    assert other(observation())["action"].abs().max() < 0.2
     asked = observation().set("wanted", torch.full((3, 2), -0.5))
     torch.testing.assert_close(acting(asked)["action"], asked["wanted"], atol=0.2, rtol=0)
 
@@ -355,6 +363,11 @@ def test_an_image_of_a_goal_is_encoded_for_the_policy_only_where_it_proposes(sam
     acting(seen.clone())
     assert model.encoded == encodings
     assert acting.bound_prior(seen) is not None  # what is asked of it otherwise
+    acting.plan_for(lambda trajectory, actions: -actions.square().sum((-2, -1)))
+    assert (
+        acting.in_keys == ["state", "goal_pixels", "is_init"]
+        and acting(seen.clone())["action"].isfinite().all()
+    )
 
 
 def test_capture_is_refused_where_there_is_no_gpu():

@@ -89,6 +89,7 @@ PIXELS = ("env=reach_pixels", "model=tdmpc2_pixels")
         (("env=reach", "model=tdmpc2"), False),
         (("env=push_pixels", "model=tdmpc2_pixels"), False),  # the disc is drawn
         (("env=push_pixels", "model=tdmpc2_pixels", "env.show_goal=false"), True),
+        (("env=push_pixels", "model=tdmpc2", "model.observations=[joint_target]"), True),  # it reads no image
         (
             ("env=drawer", "model=tdmpc2", "model.observations=[joint_target]"),
             False,

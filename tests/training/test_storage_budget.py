@@ -162,7 +162,9 @@ def test_free_memory_is_no_more_than_the_container_may_use(tmp_path, monkeypatch
     assert left_of_container(tmp_path) is None
     (tmp_path / "memory.max").write_text("max\n")
     (tmp_path / "memory.current").write_text("3000000\n")
-    (tmp_path / "memory.stat").write_text("anon 5\ninactive_file 1000000\nactive_file 7\n")
+    (tmp_path / "memory.stat").write_text(
+        "anon 5\ninactive_file 600000\nactive_file 300000\nslab_reclaimable 100000\n"
+    )
     assert left_of_container(tmp_path) is None
     (tmp_path / "memory.max").write_text("10000000\n")
     assert left_of_container(tmp_path) == 8_000_000  # what is only cached may go

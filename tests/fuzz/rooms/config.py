@@ -66,7 +66,7 @@ class Config:
         from omegaconf import OmegaConf
         from omegaconf.errors import OmegaConfBaseException
 
-        from franka_wm.commands.overrides import explain
+        from franka_wm.conf.wrong import explain
         from franka_wm.errors import UserError
         from franka_wm.training.check import check
         from franka_wm.training.settings import RunSettings
