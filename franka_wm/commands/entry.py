@@ -25,7 +25,6 @@ from franka_wm import conf
 from franka_wm.commands import launching, several
 from franka_wm.commands.overrides import compose, given, unknown_flags, values
 from franka_wm.commands.sweep import Sweep, jobs, names, spread
-from franka_wm.conf.wrong import explain
 from franka_wm.console import program, quoted, resuming, say, terminal_log
 from franka_wm.errors import REFUSALS, FrankaError, machine_refused
 from franka_wm.interrupt import INTERRUPTED
@@ -202,7 +201,7 @@ def swept(overrides: list[str]) -> Iterator[list[str]]:
     try:
         parsed = OverridesParser.create().parse_overrides(overrides)
     except OverrideParseException as error:
-        fail(explain(str(error)))
+        fail(conf.wrong.explain(str(error)))
     known = [o for o in parsed if not o.is_sweep_override() or o.is_choice_sweep() or o.is_range_sweep()]
     try:
         values = [
@@ -283,7 +282,7 @@ def check_overrides(arguments: list[str]) -> DictConfig:
     except FrankaError as error:
         fail(str(error))
     except OmegaConfBaseException as error:
-        fail(explain(str(error)))
+        fail(conf.wrong.explain(str(error)))
 
 
 def check_settings(cfg: DictConfig) -> None:

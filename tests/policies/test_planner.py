@@ -365,7 +365,7 @@ def test_an_image_of_a_goal_is_encoded_for_the_policy_only_where_it_proposes(sam
     assert acting.bound_prior(seen) is not None  # what is asked of it otherwise
     acting.plan_for(lambda trajectory, actions: -actions.square().sum((-2, -1)))
     assert (
-        acting.in_keys == ["state", "goal_pixels", "is_init"]
+        acting.in_keys == ["state", "pixels", "goal_pixels", "is_init"]
         and acting(seen.clone())["action"].isfinite().all()
     )
 

@@ -214,8 +214,9 @@ def test_a_replay_of_worlds_with_a_scene_keeps_which_steps_lost_contacts(
 
 def test_a_run_that_resumes_may_go_on_from_other_worlds(settled) -> None:
     """Those that are put back may look a little different; a batch that is gathered must follow on the one before."""
-    step = {"state": torch.zeros(4, 1, 3), "is_init": torch.zeros(4, 1, 1, dtype=torch.bool)}
-    batch = TensorDict({**step, "next": TensorDict({"state": torch.ones(4, 1, 3)}, [4, 1])}, [4, 1])
+    state = torch.arange(3.0).reshape(1, 3, 1).expand(4, 3, 3)
+    steps = {"state": state[:, :2], "is_init": torch.zeros(4, 2, 1, dtype=torch.bool)}
+    batch = TensorDict({**steps, "next": TensorDict({"state": state[:, 1:]}, [4, 2])}, [4, 2])
     for restored in (True, False):
         replay = make_replay(capacity=40, num_envs=4, window=2, batch_size=2, device="cpu")
         storage_budget.fill(replay, batch, settled("scale=smoke"), restored=restored)
