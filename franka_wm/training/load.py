@@ -71,7 +71,7 @@ def load_agent(
         num_envs: Evaluation worlds; the configuration's ``evaluation.episodes`` if not given.
         device: ``auto``, ``cpu``, ``cuda``, ``cuda:K``.
         env_changes: Fields of the environment's configuration to change.
-        seed: Of the environment and of random policies; the run's if not given. Planners, and the model's policy where
+        seed: Seed of the environment and of random policies; the run's if not given. Planners, and a policy where
             it explores, draw from torch's generator: ``torch.manual_seed``.
         planned_by: Another planner, by its name in ``conf/planner``, as the run's scale has it; the run's if not given.
         searchpath: ``hydra.searchpath=[file://FOLDER]`` with ``planner/NAME.yaml``, for a planner of one's own.
