@@ -44,7 +44,7 @@ def run_of(checkpoint: Path) -> Path:
     """The folder of the run that a checkpoint lies in; the checkpoint itself where it lies alone."""
     place = checkpoint if checkpoint.name == "checkpoints" else checkpoint.parent
     run = place.parent
-    # Anybody may call a folder so: a run's, or its first stage's, has more.
+    # Anybody may call a folder so: a run has its configuration beside it; `latest` is replaced at the next save.
     own = (run / "config.yaml").is_file() or run.name == "pretrained" or checkpoint.name == "latest"
     return run if own and place.name == "checkpoints" else checkpoint
 
