@@ -22,6 +22,7 @@ from franka_wm.envs.specs import MARKS, check_state
 from franka_wm.envs.start import check_arguments
 from franka_wm.errors import UserError
 from franka_wm.seeding import derive_seed
+from franka_wm.streams import side_stream
 
 MEANS = ("return", "length", "success", "success_once")
 
@@ -109,10 +110,15 @@ class MultiTaskEnv(EnvBase):
             raise UserError(
                 f"action has shape {tuple(action.shape)}; it must be {tuple(self.action_spec.shape)}"
             )
-        parts = []
+        parts, lanes = [], []
         for k, env in enumerate(self.envs.values()):
             own = action[k :: len(self.envs), : env.action_dim]
-            parts.append(env._step(TensorDict({"action": own}, env.batch_size, device=env.device)))
+            # The worlds of one task are few for a GPU: all tasks step at the same time there.
+            with side_stream(action, lane=k) as lane:
+                parts.append(env._step(TensorDict({"action": own}, env.batch_size, device=env.device)))
+            lanes.append(lane)
+        for lane, part in zip(lanes, parts, strict=True):
+            lane.join(*part.values())
         return TensorDict(self._together(parts), batch_size=self.batch_size, device=self.device)
 
     # It asks for `config.auto_reset`, `restarting` and `_present` alone.

@@ -18,10 +18,10 @@ from franka_wm.models.layers import TwoHotSymlog, symlog
 from franka_wm.models.normalizer import ObservationNormalizer
 from franka_wm.models.returns import RunningScale, discount_per_step, value_range
 from franka_wm.models.rssm import RSSM, divergence, network
-from franka_wm.models.streams import side_stream
 from franka_wm.models.vision import ConvDecoder, ConvEncoder
 from franka_wm.models.windows import check_windows, window_of
 from franka_wm.options import COEFFICIENT, DEPTH, FRACTION, POSITIVE, Bounds, with_defaults
+from franka_wm.streams import side_stream
 
 
 class Dreamer(ActorCritic):

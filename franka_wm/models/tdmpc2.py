@@ -25,9 +25,9 @@ from franka_wm.models.layers import (
 from franka_wm.models.normalizer import concatenate
 from franka_wm.models.returns import RunningScale, discount_per_step, value_range
 from franka_wm.models.simplicial import SimplicialWorldModel
-from franka_wm.models.streams import side_stream
 from franka_wm.models.windows import check_windows, window_of
 from franka_wm.options import COEFFICIENT, DEPTH, FRACTION, POSITIVE, Bounds, with_defaults
+from franka_wm.streams import side_stream
 
 
 class TDMPC2(SimplicialWorldModel):

@@ -11,7 +11,7 @@ from torchrl.envs import RewardSum, TransformedEnv
 from torchrl.envs.utils import check_env_specs
 
 from franka_wm import conf
-from franka_wm.envs import FrankaEnv, MultiTaskEnv
+from franka_wm.envs import FrankaEnv, MultiTaskEnv, multitask
 from franka_wm.envs.multitask_config import MultiTaskConfig, multi_task_config
 from franka_wm.errors import UserError
 from franka_wm.evaluation.closed_loop import play_episodes, summarize
@@ -76,6 +76,61 @@ def test_every_world_is_as_it_would_be_alone(env, config, worlds: int) -> None:
     assert not after["objects"][:, 0::2].any()  # reach has none
     ends = after["done"][..., 0].nonzero().tolist()
     assert [3, 0] in ends and [5, 1] in ends and [3, 1] not in ends  # each task at its own time
+
+
+class Plainly:
+    """In place of `side_stream`: one after the other."""
+
+    opened: list["Plainly"] = []
+
+    def __init__(self, *inputs: torch.Tensor, lane: int = 0) -> None:
+        self.inputs, self.lane, self.outputs = inputs, lane, ()
+        self.opened.append(self)
+
+    def __enter__(self) -> "Plainly":
+        return self
+
+    def __exit__(self, *_: object) -> None: ...
+
+    def join(self, *outputs: torch.Tensor) -> None:
+        self.outputs = outputs
+
+
+def test_each_task_steps_in_a_lane_of_its_own(env, monkeypatch) -> None:
+    monkeypatch.setattr(multitask, "side_stream", Plainly)
+    Plainly.opened.clear()
+    env.step(env.reset().set("action", actions()[0]))
+    assert [one.lane for one in Plainly.opened] == [0, 1]
+    assert all(one.inputs[0].shape == (5, 8) for one in Plainly.opened)
+    observed = [len([*one.observation_spec.keys()]) for one in env.envs.values()]
+    # All that a step made is handed over: observations, the reward, and at least three marks.
+    assert all(len(one.outputs) > count + 3 for one, count in zip(Plainly.opened, observed, strict=True))
+
+
+@pytest.mark.gpu
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
+def test_tasks_step_side_by_side_as_one_after_the_other(monkeypatch) -> None:
+    """All eight, through ends of episodes; contacts are summed in any order on a GPU, so these are compared loosely."""
+    given = RunSettings.of(conf.compose("env=multitask")).env.values["tasks"]
+    tasks = {name: {**values, "episode_length": 12} for name, values in given.items()}
+    config = multi_task_config({"kind": "multitask", "tasks": tasks})
+    generator = torch.Generator().manual_seed(0)
+    moves = (torch.rand(30, 64, 8, generator=generator) * 2 - 1).cuda()
+    found = []
+    for apart in (False, True):
+        if not apart:
+            monkeypatch.setattr(multitask, "side_stream", Plainly)
+        else:
+            monkeypatch.undo()
+        found.append(play(MultiTaskEnv(config, num_envs=64, device="cuda", seed=3), moves)[1])
+    (one, other), count = found, len(tasks)
+    for k, name in enumerate(tasks):
+        state = one["state"][:, k::count], other["state"][:, k::count]
+        if name in ("reach", "track"):
+            torch.testing.assert_close(*state, rtol=1e-4, atol=1e-4)
+        else:
+            assert ((state[0] - state[1]).abs().amax(-1) < 0.02).float().mean() > 0.95, name
+        assert torch.equal(one["done"][:, k::count], other["done"][:, k::count])
 
 
 def test_a_reset_by_mask_touches_the_worlds_that_it_names(env) -> None:
