@@ -5,8 +5,8 @@
     python benchmarks/against_xwm.py --python /tmp/xwm/bin/python --compile      some minutes longer
 
 xwm is compiled throughout. `--compile` compiles what `trainer.compile=true` and `planner.compile=true` compile in a
-run; without it all operations are launched one by one. Updates and MPPI are measured in bfloat16, too
-(`trainer.precision`, `planner.precision`); xwm in float32 alone.
+run; without it all operations are launched one by one. Updates and MPPI are measured with products by oneDNN, too
+(`trainer.onednn`), and in bfloat16 (`trainer.precision`, `planner.precision`); xwm in float32 alone.
 
 Same sizes: state of 27 numbers, 7 actions, latent and hidden 512, batch 64 windows of 3 for TD-MPC2; MPPI 512 × 6 × 3;
 50 simulations of MCTS over 15 moves; a tiny ViT (patches of 8) on clips of 4 frames of 64 × 64 for the action world
@@ -32,6 +32,7 @@ from franka_wm.envs import FrankaConfig, FrankaEnv
 from franka_wm.planning import MPPI, RewardPlusValue
 from franka_wm.planning.mcts import MCTS
 from franka_wm.policies import PlannerPolicy, SearchPolicy
+from franka_wm.products import prefer_onednn
 from franka_wm.training.learner import Learner
 
 TWO = ", 512/512, batch 64, two Q-functions"
@@ -141,6 +142,9 @@ def main() -> None:
     each = args.seconds / 3  # rate() takes the median of three measurements
     mine = learning(each, compile=args.compile, precision="float32")
     mine |= searching_and_stepping(each, compile=args.compile)
+    prefer_onednn()
+    products = learning(each, compile=args.compile, precision="float32")
+    prefer_onednn(False)
     half = learning(each, compile=args.compile, precision="bfloat16")
     print("ours measured; now xwm, which compiles first", flush=True)
     side = Path(__file__).parent / "_xwm_side.py"
@@ -156,6 +160,8 @@ def main() -> None:
             "ours [1/s]": mine[name],
             "xwm [1/s]": theirs[name],
             "ratio": mine[name] / theirs[name],
+            "ours, oneDNN [1/s]": products.get(name, float("nan")),
+            "oneDNN ratio": products.get(name, float("nan")) / theirs[name],
             "ours, bfloat16 [1/s]": half.get(name, float("nan")),
             "bfloat16 ratio": half.get(name, float("nan")) / theirs[name],
             "what differs": next(note for start, note in NOTES.items() if name.startswith(start)),

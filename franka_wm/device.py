@@ -10,6 +10,7 @@ from pathlib import Path
 import torch
 
 from franka_wm.errors import UserError
+from franka_wm.products import prefer_onednn
 
 
 def resolve_device(device: torch.device | str | None) -> torch.device:
@@ -38,11 +39,17 @@ def resolve_device(device: torch.device | str | None) -> torch.device:
     return torch.device("cpu")
 
 
-def prefer_speed(device: torch.device) -> None:
+def prefer_speed(device: torch.device, *, onednn: bool = False) -> None:
     """Let CUDA round float32 products to TF32, and time convolutions of each new size to choose the fastest way.
 
-    For training, whose sizes stay the same. On a CPU nothing changes.
+    For training, whose sizes stay the same. On a CPU oneDNN multiplies where it is asked for (:func:`prefer_onednn`).
+
+    Raises:
+        UserError: If oneDNN is asked for on CUDA, or this PyTorch has none.
     """
+    if onednn and device.type != "cpu":
+        raise UserError("trainer.onednn=true: needs device=cpu; leave trainer.onednn out")
+    prefer_onednn(onednn)
     if device.type == "cuda":
         torch.set_float32_matmul_precision("high")
         torch.backends.cudnn.benchmark = True

@@ -263,7 +263,7 @@ def start(cfg: DictConfig) -> Run:
         raise UserError("trainer.capture=true: needs device=cuda; null captures where it is possible")
     logging.getLogger("torchrl").setLevel(logging.WARNING)
     torch.manual_seed(derive_seed("weights", settings.seed))
-    prefer_speed(device)
+    prefer_speed(device, onednn=settings.trainer.onednn)
     if not processes.is_first():
         return Run(settings, folder, checkpoint)  # the first one writes
     lock_run_dir(folder)

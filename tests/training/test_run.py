@@ -158,16 +158,20 @@ def test_a_value_means_the_same_with_resume(tmp_path: Path) -> None:
 def test_the_first_steps_are_learned_before_more_is_gathered(train, tmp_path: Path, monkeypatch) -> None:
     """Three batches of five steps of three worlds, each before ten updates; the second is not gathered."""
     gathered, fast = [], []
-    monkeypatch.setattr("franka_wm.training.run.prefer_speed", fast.append)
+
+    def asked(device: torch.device, *, onednn: bool) -> None:
+        fast.append((device, onednn))
+
+    monkeypatch.setattr("franka_wm.training.run.prefer_speed", asked)
     for updates in (0, 11):  # the second in whole batches of updates
-        words = (f"collector.seed_updates={updates}", "evaluation.during=[]")
+        words = (f"collector.seed_updates={updates}", "evaluation.during=[]", f"trainer.onednn={updates > 0}")
         saved = train(*words, folder=tmp_path / f"{updates}")
         run = RunSettings.of(saved.config)
         assert saved.counters["updates"] == run.trainer.updates == 30
         assert saved.counters["env_steps"] == run.collector.num_envs * run.planned_steps()
         gathered.append(saved.counters["env_steps"])
     assert gathered[0] - gathered[1] == 3 * 5
-    assert fast == [torch.device("cpu")] * 2
+    assert fast == [(torch.device("cpu"), False), (torch.device("cpu"), True)]
 
 
 @pytest.mark.parametrize(("device", "fast"), [("cuda:0", True), ("cpu", False)])

@@ -91,6 +91,7 @@ class TrainerSettings:
     capture: bool | None = flag(None, null="on CUDA")
     compile: bool = flag(False)
     precision: str = choice("float32", of=PRECISIONS)
+    onednn: bool = flag(False)
     schedule: str | None = choice(None, of=SCHEDULES, null=MODELS_OWN)
     warmup: int | None = whole(None, least=0, unit="updates", null=MODELS_OWN)
     log_every: float = real(10.0, above=0, unit="seconds")

@@ -1,0 +1,140 @@
+"""Products by oneDNN: the same as PyTorch's own, up to rounding, and only while they are asked for."""
+
+from collections.abc import Iterator
+
+import pytest
+import torch
+from torch import Tensor, nn
+
+from franka_wm import products
+from franka_wm.device import prefer_speed
+from franka_wm.errors import UserError
+from franka_wm.products import LEAST, prefer_onednn
+
+pytestmark = pytest.mark.skipif(not torch.backends.mkldnn.is_available(), reason="needs oneDNN")
+
+
+@pytest.fixture
+def calls(monkeypatch: pytest.MonkeyPatch) -> Iterator[list[tuple[int, ...]]]:
+    """(rows, inner, columns) of each product of oneDNN."""
+    found: list[tuple[int, ...]] = []
+    product = products._product
+
+    def counted(a: Tensor, b: Tensor, bias: Tensor | None = None) -> Tensor:
+        found.append((*a.shape, b.shape[1]))
+        return product(a, b, bias)
+
+    monkeypatch.setattr(products, "_product", counted)
+    yield found
+    prefer_onednn(False)
+
+
+def drawn(*shape: int) -> Tensor:
+    return torch.randn(shape, generator=torch.Generator().manual_seed(sum(shape)))
+
+
+M, K, N = 96, 256, 160
+LARGE = {
+    "rows": lambda: torch.mm(drawn(M, K), drawn(K, N)),
+    "columns": lambda: torch.mm(drawn(K, M).t(), drawn(N, K).t()),
+    "part of a matrix": lambda: torch.mm(drawn(M, 2 * K)[:, :K], drawn(K, N)),
+    "a place for it": lambda: torch.mm(drawn(M, K), drawn(K, N), out=torch.empty(M, N)),
+    "columns of a place": lambda: torch.mm(drawn(M, K), drawn(K, N), out=torch.empty(N, M).t()),
+    "bias": lambda: torch.addmm(drawn(N), drawn(M, K), drawn(K, N)),
+    "bias by strides": lambda: torch.addmm(drawn(N).expand(M, N), drawn(M, K), drawn(K, N)),
+    "bias with gaps": lambda: torch.addmm(drawn(2 * N)[::2], drawn(M, K), drawn(K, N)),
+    "matrix added": lambda: torch.addmm(drawn(M, N), drawn(M, K), drawn(K, N)),
+    "members": lambda: torch.bmm(drawn(3, M, K), drawn(3, K, N)),
+    "members, a place": lambda: torch.bmm(drawn(3, M, K), drawn(3, K, N), out=torch.empty(3, M, N)),
+    "members, biases": lambda: torch.baddbmm(drawn(3, 1, N), drawn(3, M, K), drawn(3, K, N)),
+    "layer": lambda: nn.functional.linear(drawn(2, M, K), drawn(N, K), drawn(N)),
+}
+PLAIN = {
+    "small": lambda: torch.mm(drawn(8, 8), drawn(8, 8)),
+    "one row": lambda: torch.mm(drawn(1, 2048), drawn(2048, 1024)),
+    "double": lambda: torch.mm(drawn(M, K).double(), drawn(K, N).double()),
+    "bfloat16": lambda: torch.mm(drawn(M, K).bfloat16(), drawn(K, N).bfloat16()),
+    "repeated": lambda: torch.mm(drawn(1, K).expand(M, K), drawn(K, N)),
+    "every second column": lambda: torch.mm(drawn(M, 2 * K)[:, ::2], drawn(K, N)),
+    "scaled": lambda: torch.addmm(drawn(N), drawn(M, K), drawn(K, N), beta=0.5, alpha=2),
+    "scaled members": lambda: torch.baddbmm(drawn(3, M, N), drawn(3, M, K), drawn(3, K, N), alpha=2),
+    "empty": lambda: torch.mm(drawn(0, K), drawn(K, N)),
+}
+
+
+@pytest.mark.parametrize("name", LARGE)
+def test_large_products_are_those_of_pytorch(name: str, calls: list) -> None:
+    product, wanted = LARGE[name], LARGE[name]()
+    prefer_onednn()
+    torch.testing.assert_close(product(), wanted, rtol=1e-4, atol=1e-4)
+    assert len(calls) == (3 if "members" in name else 1)
+    assert all(m * k * n >= LEAST for m, k, n in calls)
+    prefer_onednn(False)
+    assert torch.equal(product(), wanted) and len(calls) <= 3
+
+
+@pytest.mark.parametrize("name", PLAIN)
+def test_what_is_small_or_of_another_kind_stays_as_it_was(name: str, calls: list) -> None:
+    wanted = PLAIN[name]()
+    prefer_onednn()
+    assert torch.equal(PLAIN[name](), wanted) and not calls
+
+
+def test_gradients_are_those_of_pytorch(calls: list) -> None:
+    layer = nn.Linear(K, N)
+    with torch.no_grad():
+        layer.weight.copy_(drawn(N, K))
+
+    def gradients() -> tuple[Tensor, ...]:
+        x = drawn(M, K).requires_grad_()
+        return torch.autograd.grad(layer(x).square().sum(), (x, layer.weight, layer.bias))
+
+    wanted = gradients()
+    prefer_onednn()
+    torch.testing.assert_close(gradients(), wanted, rtol=1e-3, atol=1e-2)
+    assert len(calls) == 3  # forward, the input's gradient, the weight's
+
+
+def test_sizes_that_do_not_fit_are_told_as_before(calls: list) -> None:
+    prefer_onednn()
+    with pytest.raises(RuntimeError, match="shapes cannot be multiplied"):
+        torch.mm(drawn(M, K), drawn(N, K))
+    with pytest.raises(RuntimeError, match="batch"):
+        torch.bmm(drawn(2, M, K), drawn(3, K, N))
+
+
+def test_asked_for_twice_it_ends_at_once(calls: list) -> None:
+    for _ in range(2):
+        prefer_onednn()
+    for _ in range(2):
+        prefer_onednn(False)
+    LARGE["rows"]()
+    assert not calls
+
+
+def test_only_for_a_cpu_and_where_there_is_onednn(calls: list, monkeypatch) -> None:
+    with pytest.raises(UserError, match=r"trainer\.onednn=true: needs device=cpu"):
+        prefer_speed(torch.device("cuda:0"), onednn=True)
+    monkeypatch.setattr(torch.backends.mkldnn, "is_available", lambda: False)
+    with pytest.raises(UserError, match="this PyTorch has no oneDNN"):
+        prefer_speed(torch.device("cpu"), onednn=True)
+    prefer_speed(torch.device("cpu"))
+
+
+def test_the_next_run_of_a_process_is_without(calls: list) -> None:
+    prefer_speed(torch.device("cpu"), onednn=True)
+    LARGE["rows"]()
+    assert len(calls) == 1
+    prefer_speed(torch.device("cpu"))
+    LARGE["rows"]()
+    assert len(calls) == 1
+
+
+@pytest.mark.slow
+def test_compiled_code_is_included(calls: list) -> None:
+    prefer_onednn()
+    layer = nn.Sequential(nn.Linear(K, N), nn.ReLU(), nn.Linear(N, K))
+    compiled = torch.compile(layer)
+    with torch.no_grad():
+        torch.testing.assert_close(compiled(drawn(M, K)), layer(drawn(M, K)))
+    assert len(calls) == 4
