@@ -45,7 +45,7 @@ def make_trainer(arguments: Sequence[str], folder: Path) -> Trainer:
     check(settings)
     run = Run(settings, folder)
     torch.manual_seed(0)
-    prefer_speed(run.device)
+    prefer_speed(run.device, onednn=settings.trainer.onednn)
     env, _ = run.build_environments()
     replay, spaces = run.build_experience(env)
     model = build.make_model(settings, spaces, run.device)

@@ -10,8 +10,8 @@ from torch import Tensor
 
 from franka_wm.errors import UserError
 
-LEAST = 2**21
-"""Multiplications of a product that oneDNN gets; its call takes about 10 µs more than MKL's."""
+LEAST = 2**20
+"""Multiplications, for each thread, of a product that oneDNN gets; its call takes about 10 µs more than MKL's."""
 
 _registered: list[torch.library.Library] = []
 """What takes the place of PyTorch's own kernels, until it is removed from here."""
@@ -20,8 +20,8 @@ _registered: list[torch.library.Library] = []
 def prefer_onednn(on: bool = True) -> None:
     """Let oneDNN multiply float32 matrices in this process, or, with ``on=False``, PyTorch's own choice again.
 
-    PyTorch gives them to MKL, which leaves much of a processor of AMD unused. Gradients and compiled code are included. Small
-    products and other types stay where they were. Results differ by rounding.
+    PyTorch gives them to MKL, which leaves much of a processor of AMD unused. Gradients and compiled code are included.
+    Small products and other types stay where they were. Results differ by rounding.
 
     Raises:
         UserError: If this PyTorch has no oneDNN.
@@ -57,7 +57,7 @@ def _kernel(ours: Callable[..., Tensor | None], plain: Callable[..., Tensor]) ->
 
 
 def _mm(a: Tensor, b: Tensor) -> Tensor | None:
-    return _product(a, b) if _fit(a, b) else None
+    return _product(a, _dense(b)) if _fit(a, b) else None
 
 
 def _addmm(c: Tensor, a: Tensor, b: Tensor, *, beta: float = 1, alpha: float = 1) -> Tensor | None:
@@ -65,13 +65,14 @@ def _addmm(c: Tensor, a: Tensor, b: Tensor, *, beta: float = 1, alpha: float = 1
         return None
     row = c[0] if c.dim() == 2 and c.stride(0) == 0 else c  # compiled code repeats a bias by its strides
     if row.shape == b.shape[1:] and row.is_contiguous():
-        return _product(a, b, row)
-    return _product(a, b).add_(c)
+        return _product(a, _dense(b), row)
+    return _product(a, _dense(b)).add_(c)
 
 
 def _bmm(a: Tensor, b: Tensor) -> Tensor | None:
     if len(a) == len(b) and _fit(a, b):
-        return torch.stack([_product(*pair) for pair in zip(a.unbind(), b.unbind(), strict=True)])
+        pairs = zip(a.unbind(), b.unbind(), strict=True)
+        return torch.stack([_product(one, _dense(other)) for one, other in pairs])
     return None
 
 
@@ -85,19 +86,19 @@ def _product(a: Tensor, b: Tensor, bias: Tensor | None = None) -> Tensor:
     return torch.ops.mkldnn._linear_pointwise.default(a, b.t(), bias, "none", [], "")
 
 
+def _dense(matrix: Tensor) -> Tensor:
+    """Without gaps between rows or columns: a second factor that has some takes oneDNN a thousand times as long."""
+    return matrix if matrix.is_contiguous() or matrix.t().is_contiguous() else matrix.contiguous()
+
+
 def _fit(a: Tensor, b: Tensor) -> bool:
-    """Whether (…, M, K) and (…, K, N) are large float32 matrices that lie in memory row by row or column by column."""
+    """Whether (…, M, K) and (…, K, N) make a large product of float32 matrices that oneDNN can read as they lie."""
     (m, k), (rows, n) = a.shape[-2:], b.shape[-2:]
+    down, right = a.stride()[-2:]
     return (
         k == rows
-        and m * k * n >= LEAST
+        and m * k * n >= LEAST * torch.get_num_threads()
         and m > 1  # one row alone is read as fast as memory allows
         and a.dtype == b.dtype == torch.float32
-        and _lies_whole(a)
-        and _lies_whole(b)
+        and ((right == 1 and down >= k) or (down == 1 and right >= m))
     )
-
-
-def _lies_whole(matrix: Tensor) -> bool:
-    (m, n), (down, right) = matrix.shape[-2:], matrix.stride()[-2:]
-    return (right == 1 and down >= n) or (down == 1 and right >= m)
