@@ -39,17 +39,19 @@ def resolve_device(device: torch.device | str | None) -> torch.device:
     return torch.device("cpu")
 
 
-def prefer_speed(device: torch.device, *, onednn: bool = False) -> None:
+def prefer_speed(device: torch.device, *, onednn: bool | None = None) -> None:
     """Let CUDA round float32 products to TF32, and time convolutions of each new size to choose the fastest way.
 
-    For training, whose sizes stay the same. On a CPU oneDNN multiplies where it is asked for (:func:`prefer_onednn`).
+    For training, whose sizes stay the same. With ``onednn`` oneDNN multiplies on a CPU, or no longer, see
+    :func:`~franka_wm.products.prefer_onednn`; ``None`` leaves that as it is.
 
     Raises:
         UserError: If oneDNN is asked for on CUDA, or this PyTorch has none.
     """
     if onednn and device.type != "cpu":
-        raise UserError("trainer.onednn=true: needs device=cpu; leave trainer.onednn out")
-    prefer_onednn(onednn)
+        raise UserError("trainer.onednn=true: needs device=cpu; give trainer.onednn=false")
+    if onednn is not None:
+        prefer_onednn(onednn)
     if device.type == "cuda":
         torch.set_float32_matmul_precision("high")
         torch.backends.cudnn.benchmark = True

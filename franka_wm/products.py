@@ -27,7 +27,7 @@ def prefer_onednn(on: bool = True) -> None:
         UserError: If this PyTorch has no oneDNN.
     """
     if on and not torch.backends.mkldnn.is_available():
-        raise UserError("trainer.onednn=true: this PyTorch has no oneDNN; leave trainer.onednn out")
+        raise UserError("trainer.onednn=true: this PyTorch has no oneDNN; give trainer.onednn=false")
     if on == bool(_registered):
         return
     if not on:
@@ -45,10 +45,12 @@ def prefer_onednn(on: bool = True) -> None:
 
 
 def _kernel(ours: Callable[..., Tensor | None], plain: Callable[..., Tensor]) -> Callable[..., Tensor]:
+    """What oneDNN computes, and PyTorch's kernel for all else: also for what is wrong, which it tells."""
+
     def kernel(
         keys: torch.DispatchKeySet, *given: Tensor, out: Tensor | None = None, **factors: float
     ) -> Tensor:
-        found = ours(*given, **factors)
+        found = ours(*given, **factors) if out is None or out.dtype == torch.float32 else None
         if found is None or (out is not None and out.shape != found.shape):
             return plain(keys, *given, **factors, **({} if out is None else {"out": out}))
         return found if out is None else out.copy_(found)
@@ -57,20 +59,21 @@ def _kernel(ours: Callable[..., Tensor | None], plain: Callable[..., Tensor]) ->
 
 
 def _mm(a: Tensor, b: Tensor) -> Tensor | None:
-    return _product(a, _dense(b)) if _fit(a, b) else None
+    return _product(a, _dense(b)) if _fit(a, b, 2) else None
 
 
 def _addmm(c: Tensor, a: Tensor, b: Tensor, *, beta: float = 1, alpha: float = 1) -> Tensor | None:
-    if not (c.dtype == torch.float32 and beta == alpha == 1 and _fit(a, b)):
+    if not (c.dtype == torch.float32 and beta == alpha == 1 and _fit(a, b, 2)):
         return None
-    row = c[0] if c.dim() == 2 and c.stride(0) == 0 else c  # compiled code repeats a bias by its strides
-    if row.shape == b.shape[1:] and row.is_contiguous():
+    shape = torch.Size((len(a), b.shape[1]))
+    row = c[0] if c.shape == shape and c.stride(0) == 0 else c  # compiled code repeats a bias by its strides
+    if row.shape == shape[1:] and row.is_contiguous():
         return _product(a, _dense(b), row)
-    return _product(a, _dense(b)).add_(c)
+    return _product(a, _dense(b)).add_(c) if c.shape in (shape, shape[1:]) else None
 
 
 def _bmm(a: Tensor, b: Tensor) -> Tensor | None:
-    if len(a) == len(b) and _fit(a, b):
+    if _fit(a, b, 3) and len(a) == len(b):
         pairs = zip(a.unbind(), b.unbind(), strict=True)
         return torch.stack([_product(one, _dense(other)) for one, other in pairs])
     return None
@@ -91,14 +94,15 @@ def _dense(matrix: Tensor) -> Tensor:
     return matrix if matrix.is_contiguous() or matrix.t().is_contiguous() else matrix.contiguous()
 
 
-def _fit(a: Tensor, b: Tensor) -> bool:
-    """Whether (…, M, K) and (…, K, N) make a large product of float32 matrices that oneDNN can read as they lie."""
+def _fit(a: Tensor, b: Tensor, dimensions: int) -> bool:
+    """Whether (…, M, K) and (…, K, N) make a large product of float32, the first one row by row or column by column."""
+    if not (a.dim() == b.dim() == dimensions and a.dtype == b.dtype == torch.float32):
+        return False
     (m, k), (rows, n) = a.shape[-2:], b.shape[-2:]
     down, right = a.stride()[-2:]
     return (
         k == rows
         and m * k * n >= LEAST * torch.get_num_threads()
-        and m > 1  # one row alone is read as fast as memory allows
-        and a.dtype == b.dtype == torch.float32
+        and min(m, n) > 1  # a matrix by a vector is read as fast as memory allows
         and ((right == 1 and down >= k) or (down == 1 and right >= m))
     )

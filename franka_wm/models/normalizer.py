@@ -61,7 +61,16 @@ def concatenate(observation: TensorDictBase, keys: Iterable[str]) -> Tensor:
 
 
 def standardize(x: Tensor, mean: Tensor, std: Tensor) -> Tensor:
-    """(x - mean) / std in the precision of `mean`."""
+    """(x - mean) / std in the precision of `mean`.
+
+    Raises:
+        ValueError: the last dimensions of `x` and `mean` differ.
+    """
+    if x.shape[-1] != mean.shape[-1]:
+        raise ValueError(
+            f"the model reads {mean.shape[-1]} numbers of an observation, here are {x.shape[-1]}; is it another "
+            "environment than the model's?"
+        )
     return (x.to(mean.dtype) - mean) / std
 
 

@@ -210,3 +210,13 @@ def test_abilities_of_a_mixin_count():
 def test_what_is_no_class_is_no_family():
     with pytest.raises(UserError, match=r"model 'x': 3 must be a subclass"):
         models.register("x", 3)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(("family", "actions"), [("tdmpc2", 2), ("dreamer", 2), ("muzero", None)])
+@pytest.mark.parametrize(("made", "given"), [(3, 4), (1, 4), (4, 1)])
+def test_vectors_of_another_size_are_told(family: str, actions: int | None, made: int, given: int) -> None:
+    kind = {"num_actions": 3} if actions is None else {"action_dim": actions}
+    model = models.make(family, observation_sizes={"state": made}, episode_length=9, **kind)
+    seen = TensorDict({"state": torch.ones(2, given)}, [2])
+    with pytest.raises(ValueError, match=rf"reads {made} numbers of an observation, here are {given}; is it"):
+        model.encode(seen)
