@@ -31,6 +31,9 @@ class Recorder:
         # A pool belongs to the device that is current when it is made.
         with torch.cuda.device(self._torch) if self.device.is_cuda else nullcontext():
             self._pool = torch.cuda.MemPool() if self.device.is_cuda else None
+            # Torch has 32 streams and gives them in turn. Products keep scratch memory by stream, and the graphs of
+            # several tasks run side by side: with one stream for all graphs of a recorder, fewer recorders share one.
+            self._stream = torch.cuda.Stream() if self.device.is_cuda else None
 
     def record(
         self, launches: Function, keep: Iterable[wp.array], warm_up: Function, restored: Function
@@ -101,7 +104,7 @@ class Recorder:
                 yield
             return
         torch.cuda.synchronize(self._torch)
-        with torch.cuda.stream(torch.cuda.Stream(self._torch)), self.on_stream_of_torch():
+        with torch.cuda.stream(self._stream), self.on_stream_of_torch():
             yield
         wp.synchronize_device(self.device)
 
