@@ -4,9 +4,10 @@ from collections.abc import Iterator
 
 import pytest
 import torch
+from tensordict import TensorDict
 from torch import Tensor, nn
 
-from franka_wm import products
+from franka_wm import models, products
 from franka_wm.device import prefer_speed
 from franka_wm.errors import UserError
 from franka_wm.products import LEAST, prefer_onednn
@@ -134,6 +135,50 @@ def test_what_is_large_depends_on_the_threads(threads: int, asked: int, calls: l
     torch.mm(drawn(side, 64), drawn(64, side))  # as many as LEAST
     torch.mm(drawn(side - 1, 64), drawn(64, side))
     assert len(calls) == asked
+
+
+@pytest.mark.parametrize("family", ["tdmpc2", "dreamer", "action_world_model"])
+def test_a_family_learns_the_same(family: str, calls: list, monkeypatch) -> None:
+    """Losses and all gradients, with every product by oneDNN."""
+    monkeypatch.setattr(products, "LEAST", 1)
+    generator = torch.Generator().manual_seed(0)
+    images = {"pixels": (16, 16, 3)} if family == "action_world_model" else {}
+    batch, steps = 6, 5
+    seen: dict[str, Tensor] = {"state": torch.randn(batch, steps + 1, 4, generator=generator)}
+    if images:
+        seen["pixels"] = torch.randint(
+            0, 255, (batch, steps + 1, 16, 16, 3), generator=generator, dtype=torch.uint8
+        )
+    marks = {key: torch.zeros(batch, steps, 1, dtype=torch.bool) for key in ("terminated", "is_init")}
+    after = {key: value[:, 1:] for key, value in seen.items()} | {"terminated": marks["terminated"]}
+    after["reward"] = -torch.rand(batch, steps, 1, generator=generator)
+    window = TensorDict(
+        {key: value[:, :-1] for key, value in seen.items()}
+        | {"action": torch.rand(batch, steps, 2, generator=generator) * 2 - 1, "is_init": marks["is_init"]}
+        | {"next": TensorDict(after, [batch, steps])},
+        [batch, steps],
+    )
+    sizes = {"observation_sizes": {"state": 4}, **({"image_sizes": images} if images else {})}
+    small = {"burn_in": 1, "deter_dim": 32, "hidden_dim": 32, "codes": 4, "classes": 4, "blocks": 2}
+    options = {"dreamer": small, "tdmpc2": {"latent_dim": 32, "hidden_dim": 32}}.get(family, {})
+    torch.manual_seed(0)
+    model = models.make(family, action_dim=2, episode_length=20, **sizes, **options)
+    before = {key: value.clone() for key, value in model.state_dict().items()}
+
+    def learned() -> tuple[Tensor, dict[str, Tensor]]:
+        model.load_state_dict(before)
+        model.zero_grad()
+        torch.manual_seed(1)
+        loss = model.loss(window)["loss"]
+        loss.backward()
+        return loss.detach(), {
+            name: p.grad.clone() for name, p in model.named_parameters() if p.grad is not None
+        }
+
+    wanted = learned()
+    prefer_onednn()
+    torch.testing.assert_close(learned(), wanted, rtol=1e-3, atol=1e-4)
+    assert len(calls) > 20 and any(value.any() for value in wanted[1].values())
 
 
 def test_asked_for_twice_it_ends_at_once(calls: list) -> None:
