@@ -42,8 +42,10 @@ def resolve_device(device: torch.device | str | None) -> torch.device:
 def prefer_speed(device: torch.device, *, onednn: bool | None = None) -> None:
     """Let CUDA round float32 products to TF32, and time convolutions of each new size to choose the fastest way.
 
-    For training, whose sizes stay the same. With ``onednn`` oneDNN multiplies on a CPU, or no longer, see
-    :func:`~franka_wm.products.prefer_onednn`; ``None`` leaves that as it is.
+    For training, whose sizes stay the same.
+
+    Args:
+        onednn: Whether oneDNN multiplies on a CPU, see :func:`~franka_wm.products.prefer_onednn`; ``None``: as before.
 
     Raises:
         UserError: If oneDNN is asked for on CUDA, or this PyTorch has none.
