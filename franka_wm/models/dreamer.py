@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any, ClassVar, Literal
 
 import torch
@@ -58,6 +58,7 @@ class Dreamer(ActorCritic):
         unimix: share of the uniform distribution in those of codes.
         encoder_layers: layers of the encoder, and hidden ones of the decoder, of vectors.
         channels: of each convolution over images.
+        standardize_images: of the convolutions, by a mean image and one deviation, see `set_image_statistics`.
         bins, value_low, value_high: two-hot code of rewards and values; the range is in symlog space. None:
             derived from `reward_bounds` and the discount, see `value_range`.
         reward_bounds: the least and the largest reward of a step; None: unknown.
@@ -118,6 +119,7 @@ class Dreamer(ActorCritic):
         unimix: float = 0.01,
         encoder_layers: int = 3,
         channels: int = 32,
+        standardize_images: bool = False,
         bins: int = 255,
         value_low: float | None = None,
         value_high: float | None = None,
@@ -159,8 +161,12 @@ class Dreamer(ActorCritic):
         self.actor_critic_lr_scale = actor_critic_lr_scale
 
         deep, size = (hidden_dim,) * encoder_layers, self.vectors.size
-        convolutions = {key: ConvEncoder(shape, channels=channels) for key, shape in self.image_sizes.items()}
+        convolutions = {
+            key: ConvEncoder(shape, channels=channels, standardize=standardize_images)
+            for key, shape in self.image_sizes.items()
+        }
         self.image_encoders = nn.ModuleDict(convolutions)
+        self.standardized_images = list(self.image_sizes) if standardize_images else ()
         self.vector_encoder = network(size, deep[1:], hidden_dim) if size else None
         embed_dim = sum(one.features for one in convolutions.values()) + (hidden_dim if size else 0)
         self.rssm = RSSM(
@@ -321,6 +327,17 @@ class Dreamer(ActorCritic):
     def set_observation_statistics(self, mean: Tensor, std: Tensor) -> None:
         """Standardise vectors from now on, see `ObservationNormalizer`."""
         self.vectors.set_statistics(mean, std)
+
+    def set_image_statistics(self, moments: Mapping[str, Sequence[Tensor]]) -> None:
+        """Standardise images of the convolutions from now on, see `ConvEncoder.set_statistics`.
+
+        Args:
+            moments: mean and deviation (height, width, c) of each image, of images in [0, 1].
+        """
+        for key, encoder in self.image_encoders.items():
+            assert isinstance(encoder, ConvEncoder)
+            mean, std = moments[key]
+            encoder.set_statistics(mean, std)
 
     def rebuild_overrides(self) -> dict[str, Any]:
         """The range of rewards and values, wherever it came from."""

@@ -211,6 +211,19 @@ def test_the_loss_is_the_weighted_sum_of_its_parts():
     torch.testing.assert_close(losses["loss"].detach(), total)
 
 
+def test_images_are_standardised_if_asked_for():
+    seen = dict.fromkeys(("pixels", "pixels_side"), (40, 40, 3))
+    plain, asked = (small(image_sizes=seen, channels=2, standardize_images=one) for one in (False, True))
+    assert list(plain.standardized_images) == [] and list(asked.standardized_images) == list(seen)
+    asked.set_image_statistics(
+        {key: (torch.full(seen[key], 0.1 * len(key)), torch.full(seen[key], 0.25)) for key in seen}
+    )
+    for key, encoder in asked.image_encoders.items():
+        images = torch.randint(0, 256, (4, *seen[key]), dtype=torch.uint8)
+        scaled = (images / 255.0 - 0.1 * len(key)) / 0.25
+        torch.testing.assert_close(encoder(images), encoder.network(scaled.movedim(-1, 1)).flatten(1))
+
+
 def test_what_is_logged_is_what_it_says(monkeypatch):
     model = randomise(small(image_sizes={"pixels": (40, 40, 3)}, channels=2, vector_coef=3.0))
     batch = windows(batch=4, horizon=2)
