@@ -37,7 +37,8 @@ class Dreamer(ActorCritic):
         now (with `burn_in=0` it is empty), not from states kept in the replay. The divergences of its first step are
         left out.
       * `encode`, `observe` and `next` take the likeliest codes: what acts and plans is deterministic. Training draws.
-      * Vectors are standardised before symlog, see `set_observation_statistics`; the default is the identity.
+      * Vectors are standardised before symlog, see `set_observation_statistics`; the default is the identity. So are
+        images with `standardize_images`.
       * AdamW with clipped gradient norms (of model, actor and critic apart) instead of LaProp with adaptive clipping.
       * The encoder of vectors ends with a plain linear layer, one of its `encoder_layers`.
       * Images go through TD-MPC2's convolutions, and come back through sub-pixel convolutions.
@@ -58,7 +59,8 @@ class Dreamer(ActorCritic):
         unimix: share of the uniform distribution in those of codes.
         encoder_layers: layers of the encoder, and hidden ones of the decoder, of vectors.
         channels: of each convolution over images.
-        standardize_images: of the convolutions, by a mean image and one deviation, see `set_image_statistics`.
+        standardize_images: images of the convolutions, by a mean image and one deviation of each camera, see
+            `set_image_statistics`.
         bins, value_low, value_high: two-hot code of rewards and values; the range is in symlog space. None:
             derived from `reward_bounds` and the discount, see `value_range`.
         reward_bounds: the least and the largest reward of a step; None: unknown.
@@ -329,10 +331,12 @@ class Dreamer(ActorCritic):
         self.vectors.set_statistics(mean, std)
 
     def set_image_statistics(self, moments: Mapping[str, Sequence[Tensor]]) -> None:
-        """Standardise images of the convolutions from now on, see `ConvEncoder.set_statistics`.
+        """Standardise images of the convolutions from now on, as `ConvEncoder.set_statistics` does.
+
+        An addition to the paper, of models with `standardize_images`; saved with the weights, never trained.
 
         Args:
-            moments: mean and deviation (height, width, c) of each image, of images in [0, 1].
+            moments: mean and deviation (height, width, c) of each of `standardized_images`, of images in [0, 1].
         """
         for key, encoder in self.image_encoders.items():
             assert isinstance(encoder, ConvEncoder)

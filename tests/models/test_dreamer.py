@@ -216,11 +216,11 @@ def test_images_are_standardised_if_asked_for():
     plain, asked = (small(image_sizes=seen, channels=2, standardize_images=one) for one in (False, True))
     assert list(plain.standardized_images) == [] and list(asked.standardized_images) == list(seen)
     asked.set_image_statistics(
-        {key: (torch.full(seen[key], 0.1 * len(key)), torch.full(seen[key], 0.25)) for key in seen}
+        {key: (torch.full(seen[key], 0.05 * len(key)), torch.full(seen[key], 0.25)) for key in seen}
     )
     for key, encoder in asked.image_encoders.items():
         images = torch.randint(0, 256, (4, *seen[key]), dtype=torch.uint8)
-        scaled = (images / 255.0 - 0.1 * len(key)) / 0.25
+        scaled = (images / 255.0 - 0.05 * len(key)) / 0.25
         torch.testing.assert_close(encoder(images), encoder.network(scaled.movedim(-1, 1)).flatten(1))
 
 
