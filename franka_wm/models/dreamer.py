@@ -152,6 +152,10 @@ class Dreamer(ActorCritic):
         self.observation_sizes, self.image_sizes = self.vectors.sizes, check_image_sizes(image_sizes)
         if not self.observation_keys:
             raise ValueError("give observation_sizes or image_sizes: there is nothing to read")
+        if standardize_images and not self.image_sizes:
+            raise ValueError(
+                "standardize_images=True, and it reads no images: set observations=[pixels], or leave it out"
+            )
         self.discount = discount_per_step(discount, episode_length, default=0.997)
         self.action_dim, self.terminates, self.free_nats = action_dim, terminates, free_nats
         self.dynamics_coef, self.representation_coef = dynamics_coef, representation_coef

@@ -213,6 +213,8 @@ def test_the_loss_is_the_weighted_sum_of_its_parts():
 
 def test_images_are_standardised_if_asked_for():
     seen = dict.fromkeys(("pixels", "pixels_side"), (40, 40, 3))
+    with pytest.raises(ValueError, match="no images"):
+        small(standardize_images=True)
     plain, asked = (small(image_sizes=seen, channels=2, standardize_images=one) for one in (False, True))
     assert list(plain.standardized_images) == [] and list(asked.standardized_images) == list(seen)
     asked.set_image_statistics(
