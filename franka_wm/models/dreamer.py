@@ -37,8 +37,8 @@ class Dreamer(ActorCritic):
         now (with `burn_in=0` it is empty), not from states kept in the replay. The divergences of its first step are
         left out.
       * `encode`, `observe` and `next` take the likeliest codes: what acts and plans is deterministic. Training draws.
-      * Vectors are standardised before symlog, see `set_observation_statistics`; the default is the identity. So are
-        images with `standardize_images`.
+      * Vectors are standardised before symlog, see `set_observation_statistics`; the default is the identity. With
+        `standardize_images` images are standardised, too.
       * AdamW with clipped gradient norms (of model, actor and critic apart) instead of LaProp with adaptive clipping.
       * The encoder of vectors ends with a plain linear layer, one of its `encoder_layers`.
       * Images go through TD-MPC2's convolutions, and come back through sub-pixel convolutions.
