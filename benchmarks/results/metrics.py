@@ -84,7 +84,7 @@ def number(value: float) -> str:
 
 def verdicts(row: Row, records: Sequence[Record]) -> list[tuple[str, str, bool]]:
     """For each thing wanted: what, what was reached, and whether that is enough."""
-    found = []
+    found = goals_met(row, records[0]["rows"]) if row.goals else []
     for name, wanted in row.wanted.items():
         policy = row.acting(records[0]["policies"])
         if name == "minutes":

@@ -15,7 +15,6 @@ from benchmarks.results.metrics import (
     WITHIN,
     Metric,
     columns,
-    goals_met,
     mean,
     number,
     verdicts,
@@ -127,7 +126,7 @@ def part(row: Row, records: Sequence[Record], judged: tuple[str, list[str]], pla
     if row.script is not None:
         shown = [f"![{row.title}](results/{row.picture})", ""] if row.plot else []
         lines += [*shown, table(list(records[0]["rows"][0]), _cells(records[0]["rows"])), ""]
-        if judgement := goals_met(row, records[0]["rows"]):
+        if judgement := verdicts(row, records):
             lines += [_judged(judgement), ""]
         return "\n".join(lines)
     if judgement := verdicts(row, records):
@@ -297,6 +296,7 @@ def readme_tables(rows: Mapping[str, Row], place: Path = PLACE) -> str:
     """README's part: the arm, other environments, speed; rows of several seeds that belong together."""
     arm, manipulation, others = [], [], []
     speed: dict[tuple[str, ...], list[list[str]]] = {}
+    slow: list[str] = []
     episodes: set[int] = set()
     aged = alike = chosen = False
     for row in rows.values():
@@ -313,6 +313,7 @@ def readme_tables(rows: Mapping[str, Row], place: Path = PLACE) -> str:
             speed.setdefault(tuple(titles), []).extend(
                 [who, *line] for line in _cells(records[0]["rows"], row.readme)
             )
+            slow += _missed(row, records)
             continue
         policy = row.acting(records[0]["policies"])
         of = f" of {len(row.seeds)}" if unmeasured(row, records) else ""
@@ -376,6 +377,8 @@ def readme_tables(rows: Mapping[str, Row], place: Path = PLACE) -> str:
         )
         parts += [f"Environment steps per second. {text}:", ""]
         parts += [line for titles, cells in speed.items() for line in (table(titles, cells), "")]
+    if slow:
+        parts += [f"Wanted and missed: {'; '.join(slow)}.", ""]
     if aged:
         parts += ["¹ Measured before changes of the code; docs/results.md names them.", ""]
     if chosen:

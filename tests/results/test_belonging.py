@@ -116,6 +116,25 @@ def test_what_runs_beside_a_benchmark_is_recorded(tmp_path: Path, monkeypatch: p
     assert records.read(SPEED, tmp_path / "other")[0]["machine"]["jobs"] == 2
 
 
+def test_what_a_benchmark_misses_is_told_everywhere(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    row = replace(SPEED, goals=[{"batch": 32, "speed": "≥ 1000"}, {"batch": 32, "wait": "≤ 9"}])
+    lines = [{"batch": 32, "speed": 999.0, "wait": 8.0}]
+
+    def call(command: list[str], environment: Any, log: Path) -> None:
+        Path(command[-1]).write_text(json.dumps({"machine": MACHINE, "rows": lines}))
+
+    monkeypatch.setattr(running, "_call", call)
+    running.run([(row, [])], running.Machine(threads=1), out=tmp_path / "out", place=tmp_path)
+    assert "Wanted and missed: batch 32: speed ≥ 1,000: 999." in render.readme_tables(
+        {"speed": row}, tmp_path
+    )
+    assert "| batch 32: speed ≥ 1,000 | 999 | **no** |" in render.page({"speed": row}, tmp_path)
+    told = overview({"speed": row}, tmp_path)
+    assert "missed: batch 32: speed ≥ 1,000, is 999" in told and "wait" not in told
+    without = render.readme_tables({"speed": replace(row, goals=row.goals[1:])}, tmp_path)
+    assert "missed:" not in without
+
+
 # -- which seeds ------------------------------------------------------------------------------------------
 
 
