@@ -27,9 +27,12 @@ ROWS = {
     "goal_image": "lewm-gpu",
     "two_stages": "action-world-model-gpu",
     "control_suite": "reacher-hard-gpu",
+    "control_suite_dreamer": "dreamer-walker-gpu",
     "demonstrations": "pick-demos-gpu",
 }
-"""Experiment → the row of the results that measured it."""
+"""Experiment → the row of the results that measured it, or will."""
+TASKS = {"control_suite_dreamer": ("env.name=walker", "env.task=walk")}
+"""What is typed beside an experiment's name in its row's command."""
 OF_MEASURING = ("evaluation.episodes", "evaluation.during", "trainer.checkpoint_replay", "device")
 
 
@@ -66,7 +69,7 @@ def test_every_planner_and_first_stage_at_every_scale(scale: str) -> None:
 @pytest.mark.parametrize(
     ("name", "measured_by", "words"),
     [
-        *((name, ROWS[name], ()) for name in options("experiment")),
+        *((name, ROWS[name], TASKS.get(name, ())) for name in options("experiment")),
         ("demonstrations", "drawer-demos-gpu", ("env=drawer", "replay.demos=datasets/drawer")),
         ("demonstrations", "push-demos-cpu", ("env=push", "replay.demos=datasets/push")),
     ],
