@@ -31,7 +31,8 @@ def page(root) -> dict[str, set[str]]:
     text = (root / "docs/models.md").read_text(encoding="utf-8")
     text = text.split("| flag | method |")[1].split("\n\n")[0]
     rows = re.findall(r"^\| `(\w+)` \| [^|]* \| ([^|]*) \|", text, re.MULTILINE)
-    return {flag: {NAMES[name.split(" (")[0].strip()] for name in who.split(",")} for flag, who in rows}
+    notes = re.compile(r"\([^)]*\)")  # what stands in brackets is no family's name
+    return {flag: {NAMES[name.strip()] for name in notes.sub("", who).split(",")} for flag, who in rows}
 
 
 @pytest.mark.parametrize("flag", [*ABILITIES, "discrete", "cross_episode", "moved_windows"])
