@@ -88,8 +88,10 @@ def play_episodes(
 
     Returns:
         Batch size (N,), or (episodes,), all float32, of each world's first episode up to its true last observation.
-        ``return`` and ``length`` of any environment. Of several tasks at once also ``success``, ``success_once``, and
-        ``task_success`` by task, NaN in the worlds of others. Of the arm also:
+        ``return`` and ``length`` of any environment. Of the arm, in one task or several, ``cut_short``, 0 or 1: the
+        simulator ended it, since the world was no longer finite or lost contacts; what it shows is not known. Of
+        several tasks at once also ``success``, ``success_once``, and ``task_success`` by task, NaN in the worlds of
+        others. Of the arm also:
 
         * ``success`` at the end and ``success_once`` at any step, as the task judges, 0 or 1;
         * ``final_distance`` and ``closest_distance``, tool to goal [m], where the task is to be near the goal;
@@ -118,7 +120,8 @@ def play_episodes(
             decided = policy(tensordict) if count == n else _decide_for_some(policy, tensordict, count)
             tensordict, following = env.step_and_maybe_reset(decided)
             after = tensordict.get("next")
-            total += running * after.get("reward").squeeze(-1)
+            # Not a product: what a world does after its first episode, not finite perhaps, does not count.
+            total += torch.where(running, after.get("reward").squeeze(-1), 0.0)
             length += running
             if motion is not None:
                 motion.see(running, after)
@@ -148,8 +151,8 @@ class _Tasks:
     """How each task judges its own worlds' first episodes, where worlds have several tasks."""
 
     def __init__(self, env: MultiTaskEnv):
-        self.names, self.one_hot = list(env.envs), env.one_hot.bool()
-        self.success, self.once = torch.zeros(2, env.num_envs, dtype=torch.bool, device=env.device)
+        self.envs, self.one_hot = env.envs, env.one_hot.bool()
+        self.success, self.once, self.cut = torch.zeros(3, env.num_envs, dtype=torch.bool, device=env.device)
 
     def start(self) -> None: ...
 
@@ -158,13 +161,26 @@ class _Tasks:
         succeeds = after.get("success").squeeze(-1)
         self.success = torch.where(running, succeeds, self.success)
         self.once |= running & succeeds
+        for k, env in enumerate(self.envs.values()):
+            self.cut[k :: len(self.envs)] |= running[k :: len(self.envs)] & _cut_short(env)
 
     def summary(self, length: Tensor) -> dict[str, Any]:
         own = {
             name: torch.where(self.one_hot[:, k], self.success.float(), torch.nan)
-            for k, name in enumerate(self.names)
+            for k, name in enumerate(self.envs)
         }
-        return {"success": self.success.float(), "success_once": self.once.float(), "task_success": own}
+        return {
+            "success": self.success.float(),
+            "success_once": self.once.float(),
+            "cut_short": self.cut.float(),
+            "task_success": own,
+        }
+
+
+def _cut_short(arm: FrankaEnv) -> Tensor:
+    """(N,) bool: worlds whose last step was not finite, or lost contacts."""
+    arrays = arm.simulation.tensors
+    return arrays.broken | (arrays.overflow != 0)
 
 
 class _Motion:
@@ -175,7 +191,7 @@ class _Motion:
         self.arm, self.task = arm, arm.simulation.task
         self.distance, self.path, self.change, self.jerk = torch.zeros(4, n, device=device)
         self.closest = torch.full((n,), torch.inf, device=device)
-        self.success, self.once = torch.zeros(2, n, dtype=torch.bool, device=device)
+        self.success, self.once, self.cut = torch.zeros(3, n, dtype=torch.bool, device=device)
         self.measures: dict[str, Tensor] = {}
 
     def start(self) -> None:
@@ -192,6 +208,7 @@ class _Motion:
         succeeds = after.get("success").squeeze(-1)
         self.success = torch.where(running, succeeds, self.success)
         self.once |= running & succeeds
+        self.cut |= running & _cut_short(self.arm)
         found: object = self.task.measures(sim)
         if not isinstance(found, Mapping):
             raise UserError(
@@ -207,13 +224,13 @@ class _Motion:
                 )
             self.measures[name] = torch.where(running, value.float(), self.measures.get(name, 0.0))
         self._tools = [*self._tools[-3:], sim.tensors.next_true_state[:, 14:17].clone()]
-        self.path += running * (self._tools[-1] - self._tools[-2]).norm(dim=-1)
+        self.path += torch.where(running, (self._tools[-1] - self._tools[-2]).norm(dim=-1), 0.0)
         if len(self._tools) == 4:
             a, b, c, d = self._tools
-            self.jerk += running * (d - 3 * c + 3 * b - a).square().sum(-1)
+            self.jerk += torch.where(running, (d - 3 * c + 3 * b - a).square().sum(-1), 0.0)
         action = sim.tensors.action.clone()
         if self._action is not None:
-            self.change += running * (action - self._action).square().mean(-1)
+            self.change += torch.where(running, (action - self._action).square().mean(-1), 0.0)
         self._action = action
 
     def summary(self, length: Tensor) -> dict[str, Any]:
@@ -223,6 +240,7 @@ class _Motion:
             **(near if self.task.goal_distance else {}),
             "success": self.success.float(),
             "success_once": self.once.float(),
+            "cut_short": self.cut.float(),
             **({"measures": self.measures} if self.measures else {}),
             "path_length": self.path,
             "action_change": self.change / changes,
@@ -242,7 +260,7 @@ def summarize(episodes: TensorDictBase, *, thresholds: Sequence[float] = THRESHO
         where there are distances and thresholds, else one rate each, as the task judges; ``task_success`` by task;
         ``return``; ``measures`` of the task's own, by name, over the episodes where they are not NaN;
         ``path_length``, ``action_change``, ``jerk``, ``length``,
-        each with its interval; and ``episodes``, the count.
+        each with its interval; ``episodes``, the count; and, where there are any, how many were ``cut_short``.
 
     Raises:
         UserError: A return is not finite, or a measure infinite.
@@ -279,6 +297,7 @@ def summarize(episodes: TensorDictBase, *, thresholds: Sequence[float] = THRESHO
         **({"measures": own} if own else {}),
         **means("path_length", "action_change", "jerk", "length"),
         "episodes": count,
+        **({"cut_short": cut} if (cut := int(present.get("cut_short", torch.zeros(1)).sum())) else {}),
     }
 
 

@@ -159,13 +159,26 @@ def test_a_line_about_a_policy() -> None:
     assert describe("ik", {"return": {"mean": 1.234}}) == "  ik: return 1.23"
 
 
-def test_what_the_trainer_logs(env: FrankaEnv, settled) -> None:
+def test_what_the_trainer_logs(env: FrankaEnv, settled, capsys) -> None:
     settings = settled("evaluation.during=[policy,noop]", "evaluation.during_episodes=2").evaluation
     noop = {"noop": NoopPolicy(), "random": SmoothRandomPolicy(generator=torch.Generator())}
     told = during_training(settings, env, noop)()
     assert told == numbers_to_log(env, {"noop": NoopPolicy()}, episodes=2) and told
     assert during_training(settings, None, noop)() == {}
+    capsys.readouterr()
     assert during_training(settings, env, {"random": noop["random"]})() == {}
+    assert capsys.readouterr().out == (
+        "evaluation.during=[policy,noop]: no such policy acts here, of those there: random; nothing is evaluated while "
+        "training\n"
+    )
+    at_steps = settled("evaluation.during=[policy,noop]", "evaluation.at_steps=[9]").evaluation
+    assert during_training(at_steps, env, noop)(), "one of them is enough"
+    with pytest.raises(
+        UserError, match=r"those there: random; name one of them, or leave evaluation.at_steps empty"
+    ):
+        during_training(at_steps, env, {"random": noop["random"]})
+    assert during_training(settled("evaluation.during=[]").evaluation, env, noop)() == {}
+    assert capsys.readouterr().out == ""
 
 
 def test_the_first_process_writes_what_was_found(

@@ -1,0 +1,61 @@
+"""Episodes that the simulator ends are told; what a world does after its own episode does not spoil it."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from tensordict import TensorDictBase
+
+from franka_wm.envs import FrankaEnv
+from franka_wm.evaluation.closed_loop import play_episodes
+from franka_wm.evaluation.protocol import evaluate_policies
+from franka_wm.policies.scripted import NoopPolicy
+
+LENGTH = 4
+
+
+class Breaks(NoopPolicy):
+    """Before the second step, a joint of world 1 moves at a speed that is no number."""
+
+    def __init__(self, env: FrankaEnv):
+        super().__init__(env.action_dim)
+        self.env, self.asked = env, 0
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        if self.asked == 1:
+            self.env.simulation.tensors.joint_qd.view(self.env.num_envs, -1)[1] = torch.nan
+        self.asked += 1
+        return super().forward(tensordict)
+
+
+@pytest.fixture(scope="module")
+def env(small_env) -> FrankaEnv:
+    return small_env(3, episode_length=LENGTH)
+
+
+def test_broken_worlds_are_counted_and_said(env: FrankaEnv, capsys) -> None:
+    found = evaluate_policies(env, {"it": Breaks(env)})
+    rows, summary = found.episodes["it"], found.policies["it"]
+    assert rows["cut_short"].tolist() == [0.0, 1.0, 0.0] and rows["length"].tolist() == [LENGTH, 2, LENGTH]
+    assert summary["cut_short"] == 1 and summary["episodes"] == 3
+    assert "warning: it: the simulator cut 1 of 3 episodes short" in capsys.readouterr().out
+    whole = evaluate_policies(env, {"noop": NoopPolicy()})
+    assert "cut_short" not in whole.policies["noop"] and capsys.readouterr().out == ""
+
+
+def test_what_comes_after_an_episode_does_not_spoil_it(env: FrankaEnv, monkeypatch) -> None:
+    """World 1 plays on after step 2; a reward, or a pose, that is no number there is of no episode that counts."""
+    expected, step, steps = play_episodes(env, Breaks(env), seed=2), env.step_and_maybe_reset, 0
+
+    def odd(tensordict: TensorDictBase) -> tuple[TensorDictBase, TensorDictBase]:
+        nonlocal steps
+        after, following = step(tensordict)
+        steps += 1
+        if steps > 2:
+            after["next", "reward"][1] = env.simulation.tensors.next_true_state[1, 14:17] = torch.nan
+            env.simulation.tensors.action[1] = torch.nan
+        return after, following
+
+    monkeypatch.setattr(env, "step_and_maybe_reset", odd)
+    found = play_episodes(env, Breaks(env), seed=2)
+    assert steps == LENGTH and (found == expected).all()
