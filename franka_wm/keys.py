@@ -1,4 +1,7 @@
-"""Keys of what steps hold, where several rooms read them and some of these may import nothing heavy."""
+"""Keys that several rooms read, of which some may import nothing heavy."""
 
 LOST = "overflow"
-"""The flag of a step in which contacts were lost, where there is a scene."""
+"""Of a step: contacts were lost in it, where there is a scene."""
+
+DERIVED = "derived"
+"""Of a checkpoint's configuration: what of ``model`` the model had found itself, since nothing was asked for."""

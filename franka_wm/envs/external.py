@@ -170,12 +170,12 @@ class ExternalEnv(TransformedEnv):
         return spec.shape[-1] if spec.dtype.is_floating_point else int(spec.n)  # type: ignore[attr-defined]
 
     def statistics(self, *, clear: bool = True) -> dict[str, float]:
-        """Means over the episodes that ended since the last call: ``return``, ``length``; and ``episodes``."""
+        """``episodes`` that ended since the last call; if any, means over them, too: ``return``, ``length``."""
         total, length, count = self._totals.tolist()
         if clear:
             self._totals.zero_()
-        count_or_one = max(count, 1.0)
-        return {"return": total / count_or_one, "length": length / count_or_one, "episodes": count}
+        means = {"return": total / count, "length": length / count} if count else {}
+        return {"episodes": count, **means}
 
 
 class _ToDevice(DeviceCastTransform):

@@ -27,6 +27,7 @@ from typing import Any
 
 from franka_wm.errors import UserError
 from franka_wm.evaluation.results import OF_RUN, OTHERWISE, Result, last_row, results
+from franka_wm.keys import DERIVED
 from franka_wm.untrusted import UntrustedFolder, check_image, check_video, values_of
 
 SAME_BUT = ("seed", "device", "resume")
@@ -192,8 +193,14 @@ def but_for_the_seed(config: Mapping[str, object]) -> str:
 
 
 def without_the_seed(config: Mapping[str, object], seed: object) -> dict[str, object]:
-    """Without what repetitions differ in: what is in `SAME_BUT`, and a dataset's seed that follows `seed`."""
-    kept = {name: value for name, value in config.items() if name not in SAME_BUT}
+    """Without what repetitions differ in: what is in `SAME_BUT`, and a dataset's seed that follows `seed`.
+
+    Of a run that went on from a checkpoint what its model had found itself is as it was asked for, not at all.
+    """
+    kept = {name: value for name, value in config.items() if name not in (*SAME_BUT, DERIVED)}
+    model, derived = kept.get("model"), config.get(DERIVED)
+    if isinstance(model, Mapping) and isinstance(derived, Sequence):
+        kept["model"] = {name: None if name in derived else value for name, value in model.items()}
     dataset = kept.get("dataset")
     if isinstance(dataset, Mapping) and dataset.get("seed") == seed:
         kept["dataset"] = {name: value for name, value in dataset.items() if name != "seed"}

@@ -21,6 +21,7 @@ from torchrl.record.loggers import Logger
 
 from franka_wm.console import say
 from franka_wm.errors import UserError
+from franka_wm.files import atomic_write
 from franka_wm.options import leaves
 
 FILES = ("csv", "tensorboard")
@@ -62,12 +63,16 @@ def check_loggers(names: Iterable[str], **options: Mapping[str, object]) -> None
             )
 
 
-def make_loggers(names: Sequence[str], folder: str | Path, **options: Mapping[str, object]) -> list[Logger]:
+def make_loggers(
+    names: Sequence[str], folder: str | Path, *, updates: int | None = None, **options: Mapping[str, object]
+) -> list[Logger]:
     """Open loggers.
 
     Args:
         names: of `NAMES`, in any order; none for no logging.
         folder: of the run. Files go there, also what an offline service keeps; its name is the run's.
+        updates: of the checkpoint that a run goes on from: what files hold of later ones is taken out, since the run
+            makes those anew.
         options: by logger, as ``conf/logger/NAME.yaml`` lists them.
 
     Returns:
@@ -80,7 +85,11 @@ def make_loggers(names: Sequence[str], folder: str | Path, **options: Mapping[st
     loggers = []
     for name in names:
         try:
+            if name == "csv" and updates is not None:
+                _forget_later_lines(Path(folder) / name, updates)
             loggers.append(_open(name, Path(folder), dict(options.get(name, {}))))
+            if name == "tensorboard" and updates is not None:
+                _forget_later_events(loggers[-1], updates)
         except Exception as error:  # a service fails in ways of its own
             close_loggers(loggers)
             hint = "; logger.wandb.offline=true works without it" if name == "wandb" else ""
@@ -191,6 +200,23 @@ def kind(logger: Logger) -> str:
     """Which of `NAMES` a TorchRL logger is."""
     name = type(logger).__name__.removesuffix("Logger").lower()
     return name if name in NAMES else "other"
+
+
+def _forget_later_lines(folder: Path, updates: int) -> None:
+    """Of every quantity the lines beyond so many updates, and one that was cut off in writing."""
+    for file in sorted(folder.rglob("*.csv")):
+        lines = file.read_text(encoding="utf-8").splitlines(keepends=True)
+        kept = [line for line in lines if line.endswith("\n") and float(line.split(",")[0]) <= updates]
+        if len(kept) < len(lines):
+            with atomic_write(file) as path:
+                path.write_text("".join(kept), encoding="utf-8")
+
+
+def _forget_later_events(logger: Any, updates: int) -> None:
+    """Tells TensorBoard, which only adds to its files, that what follows so many updates is written anew."""
+    events = import_module("tensorboard.compat.proto.event_pb2")
+    start = events.SessionLog(status=events.SessionLog.START)
+    logger.experiment._get_file_writer().add_event(events.Event(session_log=start), updates + 1)
 
 
 def _open(name: str, folder: Path, options: dict[str, Any]) -> Any:

@@ -6,7 +6,7 @@ import gc
 import importlib
 import logging
 import sys
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -32,6 +32,7 @@ from franka_wm.envs import Environment
 from franka_wm.envs.multitask_config import MultiTaskConfig
 from franka_wm.errors import UserError, trying
 from franka_wm.interrupt import INTERRUPTED
+from franka_wm.keys import DERIVED
 from franka_wm.seeding import derive_seed, seeded
 from franka_wm.training import build
 from franka_wm.training.check import check
@@ -253,6 +254,10 @@ def start(cfg: DictConfig) -> Run:
         checkpoint, cfg = resumed(cfg, [f"device={cfg.device}"] if again else typed)
         _require_same(checkpoint)
     make_absolute(cfg)
+    wanted = cfg.trainer.updates
+    if checkpoint is not None and isinstance(wanted, int) and "whole_run" not in checkpoint.config:
+        # What is written is what the weights have had.
+        cfg.trainer.updates = max(wanted, int(checkpoint.counters.get("updates", 0)))
     settings = RunSettings.of(cfg, saved=checkpoint is not None)
     if checkpoint is not None and settings.is_arm and settings.is_discrete:
         require_same_actions(checkpoint, settings.env.arm)
@@ -283,13 +288,12 @@ def start(cfg: DictConfig) -> Run:
         say(f"warning: not the goal's image alone tells where the goal is, but also {' and '.join(told)}")
     if checkpoint is not None:
         done = int(checkpoint.counters.get("updates", 0))
-        wanted = settings.trainer.updates
         all_made = (
-            done >= wanted and "whole_run" not in checkpoint.config
-        )  # of a first stage: the second comes
+            done >= settings.trainer.updates and "whole_run" not in checkpoint.config
+        )  # else the second stage comes
         nothing = f"; trainer.updates={wanted} are made: only the run's end is done again, a larger number trains on"
         say(f"going on from update {done} of {checkpoint.folder}{nothing if all_made else ''}")
-    run = Run(settings, folder, checkpoint, open_loggers(settings, folder))
+    run = Run(settings, folder, checkpoint, open_loggers(settings, folder, checkpoint))
     if _begun is not None:
         _begun = (folder, _files(folder), run.loggers)
     return run
@@ -370,20 +374,29 @@ def resumed(cfg: DictConfig, overrides: list[str]) -> tuple[Checkpoint, DictConf
             )
         same = name in ("scale", "size", "seed") and str(cfg[name]) == str(saved.get(name))
         if "." not in name and not same and name not in ("device", "gpus"):
-            raise UserError(
-                f"{override}: a run that resumes keeps its {name}; leave it out, or change single values ({name}.key=…)"
-            )
+            group = isinstance(saved.get(name), Mapping)
+            single = f", or change single values ({name}.key=…)" if group else ""
+            raise UserError(f"{override}: a run that resumes keeps its {name}; leave it out{single}")
         # Of device=spread the GPU that was chosen, which the configuration has.
         value = cfg.device if name == "device" else parser.parse_override(override).value()
         OmegaConf.update(changes, name, value)
     merged = OmegaConf.merge(OmegaConf.create(saved), changes)
     assert isinstance(merged, DictConfig)
     merged.resume = str(cfg.resume)
+    if (derived := saved.get(DERIVED)) is not None:
+        if not isinstance(derived, list) or not all(isinstance(name, str) for name in derived):
+            raise UserError(
+                f"{checkpoint.folder}: {DERIVED}={derived!r} in its configuration is no list of names"
+            )
+        merged[DERIVED] = [name for name in derived if name not in changes.get("model", {})]
     return checkpoint, merged
 
 
-def open_loggers(settings: RunSettings, folder: Path) -> list[Logger]:
-    """The loggers that ``logger`` names; each is told the configuration."""
-    loggers = make_loggers(settings.logger.names, folder, **settings.logger.options)
+def open_loggers(settings: RunSettings, folder: Path, checkpoint: Checkpoint | None) -> list[Logger]:
+    """The loggers that ``logger`` names; each is told the configuration, and where the run goes on."""
+    updates = None
+    if checkpoint is not None:  # a first stage logs nothing
+        updates = 0 if "whole_run" in checkpoint.config else int(checkpoint.counters.get("updates", 0))
+    loggers = make_loggers(settings.logger.names, folder, updates=updates, **settings.logger.options)
     log_config(loggers, settings.values)
     return loggers

@@ -24,11 +24,13 @@ from franka_wm.envs import Environment
 from franka_wm.envs.transformed import arm_of
 from franka_wm.errors import UserError
 from franka_wm.interrupt import interruptible
+from franka_wm.keys import DERIVED
 from franka_wm.models import WorldModel
 from franka_wm.policies.exploration import ActingPolicy
 from franka_wm.seeding import derive_seed, seeded
 from franka_wm.training.broken import beyond_bounds, clipped, finite, odd_rewards, why
 from franka_wm.training.build import explore
+from franka_wm.training.episode_statistics import described, of_all
 from franka_wm.training.history import columns_of
 from franka_wm.training.learner import Learner
 from franka_wm.training.loggers import log_numbers
@@ -163,6 +165,8 @@ class Trainer:
                         progress.begin(updates + 1, self.env_steps)
                     if self._asks_at_once:
                         self.require_finite()
+                    if processes.count() == 1 and stop():  # several end a batch's updates together
+                        break
                 self.seconds = time.perf_counter() - started
                 now = time.perf_counter()
                 last = self.learner.updates >= total
@@ -179,9 +183,13 @@ class Trainer:
                 )
                 if due:
                     self.log(progress)
+                if saves:  # before an evaluation, which may take long
+                    self.save(last=False)
+                    saved = time.perf_counter()
                 if reached and stopping and not last:
                     say(f"  evaluation.at_steps: left out at {self.env_steps} steps, the run stops")
                 if evaluates and not stopping:
+                    now = time.perf_counter()
                     self.require_finite()
                     with self.aside("evaluation"):
                         numbers = self.evaluate()
@@ -190,10 +198,8 @@ class Trainer:
                     spent = time.perf_counter() - now
                     self._evaluated += spent
                     started += spent  # seconds count training, not evaluation
+                    progress.leave_out(spent)
                     [stopping] = processes.agree([stop()], [])
-                if saves:
-                    self.save(last=False)
-                    saved = time.perf_counter()
             if ahead and not stopping:
                 say(f"  evaluation.at_steps={ahead}: not evaluated, the run ends at {self.env_steps} steps")
             self.save()
@@ -290,16 +296,8 @@ class Trainer:
         self.require_finite()
         if self.env is not None:
             self.replay.sampler.check()
-            episodes = _of_all(processes.objects(self.env.statistics()))
-            row = {f"train/{name}": value for name, value in episodes.items()}
-            if episodes["episodes"]:
-                text = f"return {episodes['return']:.2f}"
-                if "success" in episodes:
-                    text += f"   success {100 * episodes['success']:.0f} %"
-            if episodes.get("nonfinite"):
-                text += f"   {episodes['nonfinite']:.0f} worlds broke and were reset"
-            if episodes.get("overflow"):
-                text += f"   {episodes['overflow']:.0f} times too little room for contacts (env.max_contacts)"
+            episodes = of_all(processes.objects(self.env.statistics()))
+            row, text = {f"train/{name}": value for name, value in episodes.items()}, described(episodes)
         metrics = self.learner.metrics()
         if not text and "loss" in metrics:
             text = f"loss {metrics['loss']:.4g}"
@@ -313,7 +311,8 @@ class Trainer:
             row["device_memory_mb"] = torch.cuda.memory_reserved(self.learner.device) / 1e6
         row |= progress.line(self.learner.updates, self.env_steps, text)
         bounds = None if self._said_bounds else self.spaces.reward_bounds
-        beyond = beyond_bounds(self.model, self._batch, bounds)
+        found = processes.objects(beyond_bounds(self.model, self._batch, bounds))  # of any process's rewards
+        beyond = next(filter(None, found), "")
         self._said_bounds |= bool(beyond)
         for line in filter(None, (warning, clipped(metrics), beyond)):
             say(f"  warning: {line}")
@@ -382,9 +381,10 @@ class Trainer:
 
     def _config(self) -> Mapping[str, Any]:
         """The configuration, so that the checkpoint alone rebuilds the model, without what it was started from."""
-        own = self.model.rebuild_overrides()
-        values = self.settings.values
-        return {**values, "model": {**values["model"], **own}}
+        own, values = self.model.rebuild_overrides(), self.settings.values
+        derived = {*values.get(DERIVED, ()), *(name for name in own if values["model"].get(name) is None)}
+        found = {DERIVED: sorted(derived)} if derived else {}
+        return {**values, "model": {**values["model"], **own}, **found}
 
     def require_finite(self, *, weights: bool = False) -> None:
         """Ends a run that cannot recover; waits for the device.
@@ -430,19 +430,3 @@ class Trainer:
         if full and cursor:
             return torch.cat([data[:, cursor:], data[:, :cursor]], 1)  # pyright: ignore[reportReturnType]
         return data
-
-
-def _of_all(found: Sequence[Mapping[str, float]]) -> dict[str, float]:
-    """Statistics of all processes' episodes: counts are summed, the others are means over (a task's) episodes."""
-    if len(found) == 1:
-        return dict(found[0])
-    out = {}
-    for name in dict.fromkeys(name for one in found for name in one):
-        of, _, task = name.partition("/")
-        episodes = f"episodes/{task}" if task else "episodes"
-        having = [(one[name], one[episodes]) for one in found if name in one]
-        if of in ("episodes", "nonfinite", "overflow"):
-            out[name] = sum(value for value, _ in having)
-        else:
-            out[name] = sum(value * n for value, n in having) / max(1.0, sum(n for _, n in having))
-    return out

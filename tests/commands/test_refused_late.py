@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import logging
+import os
 import runpy
+import signal
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -104,6 +106,22 @@ def test_what_is_stopped_says_what_there_is(saved: str | None, refused: Refused,
     on = f"go on from what was saved: franka-wm train resume={tmp_path}/run 'plugins=[mine]'"
     lost = f"there is no checkpoint to go on from yet; what was written is in {tmp_path}/run"
     assert f"stopped; {lost if saved is None else on}\n" in said
+
+
+def test_a_scheduler_that_ends_a_run_in_its_evaluation_is_told_the_same(
+    refused: Refused, tmp_path: Path
+) -> None:
+    """SIGTERM, when training has saved and handles no signals any more."""
+
+    def begin(folder: Path) -> None:
+        Run.keep(None)  # type: ignore[arg-type]
+        (folder / "checkpoints" / "latest").mkdir(parents=True)
+        os.kill(os.getpid(), signal.SIGTERM)
+
+    before = signal.getsignal(signal.SIGTERM)
+    said = refused("hydra.run.dir=run", error=UserError("went on"), status=130, first=begin)
+    assert f"stopped; go on from what was saved: franka-wm train resume={tmp_path}/run\n" in said
+    assert signal.getsignal(signal.SIGTERM) is before
 
 
 def test_a_file_of_the_users_stays(refused: Refused, tmp_path: Path) -> None:

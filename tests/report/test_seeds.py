@@ -134,6 +134,15 @@ def test_the_seed_of_recorded_data_follows_the_runs(tmp_path):
     assert alike[0] == alike[1] and len({alike[0], *chosen, other}) == 4
 
 
+def test_a_run_that_went_on_is_the_repetition_it_was(tmp_path):
+    """Its configuration names what its model had found itself before; only what was asked for tells runs apart."""
+    began = but_for_the_seed({"seed": 0, "model": {"name": "tdmpc2", "value_low": None, "lr": 1}})
+    found = {"seed": 1, "model": {"name": "tdmpc2", "value_low": -3.2, "lr": 1}, "resume": "there"}
+    assert but_for_the_seed({**found, "derived": ["value_low"]}) == began
+    assert but_for_the_seed({**found, "derived": []}) != began
+    assert but_for_the_seed({**found, "derived": 3}) != began, "of a damaged file"
+
+
 def test_a_run_given_twice_is_refused(tmp_path, capsys):
     """By any name, and by itself beside its sweep."""
     (tmp_path / "multirun.yaml").touch()

@@ -8,10 +8,16 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+import torch
 from hydra.core.global_hydra import GlobalHydra
 
+from franka_wm.envs import FrankaEnv
 from franka_wm.report import end_of_run, page
+from franka_wm.training import build
 from franka_wm.training.checkpoint import Checkpoint, latest_checkpoint, load_checkpoint
+from franka_wm.training.learner import Learner
+from franka_wm.training.settings import RunSettings
+from franka_wm.training.trainer import Trainer
 
 TINY = [
     "scale=smoke",
@@ -27,6 +33,11 @@ TINY = [
 ]
 
 Train = Callable[..., Checkpoint]
+
+N, CAPACITY = 4, 50
+"""Worlds of the trainer that `make` builds, and steps of each in its replay."""
+
+Make = Callable[..., Trainer]
 
 
 @pytest.fixture(scope="session")
@@ -63,3 +74,49 @@ def train(root: Path, tmp_path: Path, monkeypatch) -> Train:
         return load_checkpoint(latest_checkpoint(folder))
 
     return train
+
+
+# -- a trainer in this process ---------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def cfg(settled) -> RunSettings:
+    return settled(
+        "scale=smoke",
+        "device=cpu",
+        "env.substeps=1",
+        "env.episode_length=7",
+        f"collector.num_envs={N}",
+        f"replay.capacity={CAPACITY * N}",
+        "trainer.updates=20",
+        "logger=none",
+        "evaluation.every=1000",
+    )
+
+
+@pytest.fixture(scope="module")
+def env(cfg: RunSettings) -> FrankaEnv:
+    return build.make_env(cfg)
+
+
+@pytest.fixture
+def make(cfg: RunSettings, env: FrankaEnv, tmp_path: Path) -> Make:
+    def make(folder: str = "run", evaluate=dict, model=(), cfg=cfg, env=env, **changes) -> Trainer:
+        mine = cfg.changed(trainer=changes, model=dict(model))
+        torch.manual_seed(0)
+        env.set_seed(0)
+        built = build.make_model(mine, env)
+        return Trainer(
+            env=env,
+            learner=Learner(built),
+            replay=build.make_replay_buffer(mine, env.device),
+            policies=build.make_policies(built, build.make_planner(mine, env.action_dim), env),
+            actor="policy",
+            settings=mine,
+            spaces=build.Spaces.of_env(env),
+            folder=tmp_path / folder,
+            loggers=[],
+            evaluate=evaluate,
+        )
+
+    return make

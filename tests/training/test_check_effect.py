@@ -34,14 +34,26 @@ def test_what_would_do_nothing_is_refused(words: tuple[str, ...], said: str, set
     assert "\n" not in str(refused.value)
 
 
-def test_worlds_of_the_planner_are_said_where_the_policy_does_not_act(settled, capsys) -> None:
-    """Files of tuned values set them, so that they are no error."""
-    words = ("device=cpu", "scale=smoke", "collector.planner_worlds=2")
-    check(settled(*words, "collector.noise=0.3"))
-    assert "planner_worlds" not in capsys.readouterr().out
+def test_how_the_policy_explores_is_said_where_it_does_not_act(settled, capsys) -> None:
+    """Files of tuned values set it, so that it is no error."""
+    words = ("device=cpu", "scale=smoke", "collector.planner_worlds=2", "collector.noise=0.3")
+    check(settled(*words))
+    assert "collector" not in capsys.readouterr().out
     for actor in ("random", "planner"):
-        check(settled(*words, f"collector.policy={actor}", "collector.noise=0.3"))
-        assert "collector.planner_worlds=2: is for collector.policy=policy" in capsys.readouterr().out
+        check(settled(*words, f"collector.policy={actor}"))
+        said = capsys.readouterr().out
+        assert "collector.planner_worlds=2: is for collector.policy=policy" in said
+        assert "collector.noise=0.3: is for collector.policy=policy and does nothing here" in said
+        assert f"the worlds act by {actor}\n" in said
+        check(settled(*words[:2], f"collector.policy={actor}", "collector.noise=0"))
+        assert "collector" not in capsys.readouterr().out
+
+
+def test_images_to_be_standardised_are_said_where_nothing_is(settled, capsys) -> None:
+    words = ("device=cpu", "scale=smoke", "env=reach_pixels", "model=tdmpc2_pixels")
+    for standardize, said in (("true", 0), ("false", 1)):
+        check(settled(*words, "model.standardize_images=true", f"trainer.standardize={standardize}"))
+        assert capsys.readouterr().out.count("does nothing with trainer.standardize=false") == said
 
 
 @pytest.mark.parametrize(

@@ -137,6 +137,28 @@ def test_files_hold_the_numbers_and_the_video(tmp_path: Path) -> None:
     assert count_frames_of_gif(picture.encoded_image_string) == 6
 
 
+def test_files_of_a_run_that_goes_on_forget_what_it_makes_anew(tmp_path: Path) -> None:
+    """From update 20 of a run that logged until 30 and died: one curve, not two in one another."""
+    from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+    first = make_loggers(["csv", "tensorboard"], tmp_path)
+    for step in (10, 20, 30):
+        log_numbers(first, {"loss": float(step), "eval/planner/success": 0.25}, step=step)
+    close_loggers(first)
+    with (tmp_path / "csv/scalars/loss.csv").open("a") as file:
+        file.write("4")  # cut off in writing: not update 4
+    again = make_loggers(["csv", "tensorboard"], tmp_path, updates=20)
+    log_numbers(again, {"loss": 0.5}, step=25)
+    close_loggers(again)
+
+    assert (tmp_path / "csv/scalars/loss.csv").read_text() == "10,10.0\n20,20.0\n25,0.5\n"
+    assert (tmp_path / "csv/scalars/eval/planner/success.csv").read_text() == "10,0.25\n20,0.25\n"
+    events = EventAccumulator(str(tmp_path / "tensorboard"))
+    events.Reload()
+    assert [(e.step, e.value) for e in events.Scalars("loss")] == [(10, 10.0), (20, 20.0), (25, 0.5)]
+    assert [e.step for e in events.Scalars("eval/planner/success")] == [10, 20]
+
+
 def count_frames_of_gif(data: bytes) -> int:
     import io
 

@@ -7,6 +7,7 @@ import sys
 from dataclasses import replace
 from importlib.resources import files
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -19,7 +20,7 @@ from franka_wm.errors import FrankaError, UserError
 from franka_wm.training import build
 from franka_wm.training.checkpoint import load_checkpoint, save_checkpoint
 from franka_wm.training.place import left_by, make_absolute, occupied
-from franka_wm.training.run import Run, import_plugins, resumed
+from franka_wm.training.run import Run, import_plugins, open_loggers, resumed
 from franka_wm.training.settings import RunSettings
 from franka_wm.training.spaces import Spaces
 from small_checkpoint import save
@@ -106,18 +107,43 @@ def test_plugins_that_cannot_be_imported_are_one_line(names, said: str, tmp_path
     assert "\n" not in str(caught.value)
 
 
-@pytest.mark.parametrize("word", ["scale=gpu", "size=gpu", "seed=7", "planner=icem"])
-def test_a_resumed_run_keeps_what_it_was(word: str, tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("word", "instead"),
+    [
+        ("scale=gpu", ""),
+        ("size=gpu", ""),
+        ("seed=7", ""),
+        ("planner=icem", r", or change single values \(planner.key=…\)"),
+    ],
+)
+def test_a_resumed_run_keeps_what_it_was(word: str, instead: str, tmp_path: Path) -> None:
     """The weights are of the first seed and scale, whatever the folder of the second would say."""
     words = ("scale=smoke", "device=cpu", "env=reach_fixed", "seed=0")
     began = OmegaConf.create(OmegaConf.to_container(compose(*words), resolve=True))
     save_checkpoint(tmp_path, model=torch.nn.Linear(1, 1), config=began, counters={})
     cfg = compose(f"resume={tmp_path}", word)
-    with pytest.raises(FrankaError, match=f"{word}: a run that resumes keeps its {word.partition('=')[0]}"):
+    kept = f"{word}: a run that resumes keeps its {word.partition('=')[0]}; leave it out{instead}$"
+    with pytest.raises(FrankaError, match=kept):
         resumed(cfg, [f"resume={tmp_path}", word])
     same = [f"resume={tmp_path}", "scale=smoke", "seed=0", "trainer.updates=50"]
     _, merged = resumed(compose(*same), same)
     assert merged.trainer.updates == 50 and merged.seed == 0
+
+
+def test_what_a_model_had_found_itself_is_told_from_what_was_asked_for(tmp_path: Path) -> None:
+    began = OmegaConf.create(OmegaConf.to_container(compose("scale=smoke", "device=cpu"), resolve=True))
+    began.model.value_low, began.model.value_high, began.derived = -3.2, 3.2, ["value_high", "value_low"]
+    save_checkpoint(tmp_path, model=torch.nn.Linear(1, 1), config=began, counters={})
+    for words, derived in (
+        ([], ["value_high", "value_low"]),
+        (["model.value_low=-9"], ["value_high"]),
+    ):
+        words = [f"resume={tmp_path}", *words]
+        assert resumed(compose(*words), words)[1].derived == derived
+    began.derived = {"value_high": 1}
+    save_checkpoint(tmp_path, model=torch.nn.Linear(1, 1), config=began, counters={})
+    with pytest.raises(UserError, match="is no list of names"):
+        resumed(compose(words[0]), words[:1])
 
 
 @pytest.mark.parametrize(
@@ -241,3 +267,19 @@ def test_a_run_does_not_write_into_a_dataset(tmp_path: Path) -> None:
     (tmp_path / "meta").mkdir()
     (tmp_path / "meta" / "info.json").touch()
     assert "a dataset is there; choose another folder" in (occupied(tmp_path, None) or "")
+
+
+@pytest.mark.parametrize(("first_stage", "updates"), [(None, None), (False, 30), (True, 0)])
+def test_loggers_are_told_from_where_a_run_goes_on(
+    first_stage: bool | None, updates: int | None, settled, tmp_path: Path, monkeypatch
+) -> None:
+    """A first stage logs nothing, so that all there is comes after it."""
+    told: list[object] = []
+    monkeypatch.setattr(
+        "franka_wm.training.run.make_loggers", lambda *given, **named: told.append(named.get("updates")) or []
+    )
+    config = {"whole_run": {}} if first_stage else {}
+    checkpoint: Any = None
+    if first_stage is not None:
+        checkpoint = SimpleNamespace(config=config, counters={"updates": 30.0})
+    assert open_loggers(settled("scale=smoke"), tmp_path, checkpoint) == [] and told == [updates]
