@@ -206,10 +206,6 @@ class Progress:
         self._started = self._last = time.perf_counter()
         self._first = self._previous = (updates, env_steps)
 
-    def leave_out(self, seconds: float) -> None:
-        """What just took so long is neither update nor step: it counts for the time left, not for the rates."""
-        self._last += seconds
-
     def due(self) -> bool:
         """Whether it is time for a line."""
         return time.perf_counter() - self._last >= self.every

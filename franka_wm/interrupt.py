@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import signal
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -17,28 +16,6 @@ INTERRUPTED = 130
 def _tell(signum: int) -> None:
     again = "; press Ctrl-C again to stop at once" if signum == signal.SIGINT else ""
     say(f"\nasked to stop: finishing this step and saving{again}")
-
-
-@contextmanager
-def ended_by_sigterm() -> Iterator[None]:
-    """SIGTERM ends this process as Ctrl-C does, so that it says what was saved; forks end without a word, as ever."""
-    own = os.getpid()
-
-    def end(signum: int, frame: Any) -> None:
-        if os.getpid() == own:
-            raise KeyboardInterrupt
-        signal.signal(signum, signal.SIG_DFL)
-        os.kill(os.getpid(), signum)
-
-    try:
-        before = signal.signal(signal.SIGTERM, end)
-    except ValueError:  # not in the main thread
-        yield
-        return
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGTERM, before)
 
 
 @contextmanager

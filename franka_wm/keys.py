@@ -1,7 +1,4 @@
-"""Keys that several rooms read, of which some may import nothing heavy."""
+"""Keys of what steps hold, where several rooms read them and some of these may import nothing heavy."""
 
 LOST = "overflow"
-"""Of a step: contacts were lost in it, where there is a scene."""
-
-DERIVED = "derived"
-"""Of a checkpoint's configuration: what of ``model`` the model had found itself, since nothing was asked for."""
+"""The flag of a step in which contacts were lost, where there is a scene."""

@@ -74,12 +74,6 @@ def test_rates_and_time_left_count_from_the_last_beginning(monkeypatch: pytest.M
     assert progress.due()
     assert progress.line(21, 240) == {"updates_per_s": 2.0, "env_steps_per_s": 20.0}
     assert "left 0:40" in capsys.readouterr().out  # 80 more, at 2 a second
-    now = 230.0  # of which 15 s went into an evaluation
-    progress.leave_out(15.0)
-    assert not progress.due(), "a line after 5 s of updates would tell of one batch alone"
-    now = 235.0
-    assert progress.due() and progress.line(41, 440) == {"updates_per_s": 2.0, "env_steps_per_s": 20.0}
-    assert "left 0:52" in capsys.readouterr().out  # 60 more; the next evaluations come, too
 
 
 def test_a_long_wait_says_what_part_of_it_runs(capsys) -> None:

@@ -41,9 +41,9 @@ def whole(least: int = 0, most: int | None = None) -> click.IntRange:
     return click.IntRange(least, most)
 
 
-def real(least: float, most: float | None = None, *, above: bool = False) -> click.FloatRange:
-    """A finite number from ``least``, or above it, to ``most``."""
-    return _Real(min=least, min_open=above, max=most)
+def real(above: float, most: float | None = None) -> click.FloatRange:
+    """A finite number above ``above``, at most ``most``."""
+    return _Real(min=above, min_open=True, max=most)
 
 
 def wanted(kind: click.ParamType) -> str:
@@ -55,7 +55,7 @@ def wanted(kind: click.ParamType) -> str:
         return f"a whole number of at least {kind.min}{most}"
     if isinstance(kind, click.FloatRange):
         most = "" if kind.max is None else f", at most {kind.max:g}"
-        return f"a finite number {'above' if kind.min_open else 'of at least'} {kind.min:g}{most}"
+        return f"a finite number above {kind.min:g}{most}"
     return "true or false"
 
 

@@ -27,7 +27,7 @@ from franka_wm.commands.overrides import compose, given, unknown_flags, values
 from franka_wm.commands.sweep import Sweep, jobs, names, spread
 from franka_wm.console import program, quoted, resuming, say, terminal_log
 from franka_wm.errors import REFUSALS, FrankaError, machine_refused
-from franka_wm.interrupt import INTERRUPTED, ended_by_sigterm
+from franka_wm.interrupt import INTERRUPTED
 
 ELSEWHERE = ("submitit_slurm", "ray")
 """Launchers that take jobs to other machines: this one does not know their devices."""
@@ -240,7 +240,7 @@ def one_line_errors(main: Callable[[DictConfig], object]) -> Callable[[DictConfi
             spread(cfg, int(told.job.num) if told.mode == RunMode.MULTIRUN else 0)
             if several.goes_on(cfg):
                 several.go_on(cfg, Path(told.runtime.output_dir))
-            with one_line_refusals(), ended_by_sigterm() if several.is_alone() else nullcontext():
+            with one_line_refusals():
                 return main(cfg)
         except FrankaError as error:
             _discard()

@@ -36,11 +36,6 @@ def started_by_torchrun() -> bool:
     return "TORCHELASTIC_RUN_ID" in os.environ and int(os.environ.get("WORLD_SIZE", "1")) > 1
 
 
-def is_alone() -> bool:
-    """Whether nothing of ours, nor torchrun, started this process: it ends others, and says so."""
-    return JOB not in os.environ and not started_by_torchrun()
-
-
 def wanted(overrides: list[str]) -> tuple[int, str]:
     """How many processes a checked command line asks for, and on which device; a run that resumes keeps its own."""
     from franka_wm.training.run import resumed

@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 @word("policy", "who acts first: planner, policy, ik, expert, random, noop", metavar="NAME")
 @word("port", "of http://127.0.0.1; 0 takes a free one", whole(0, 65535), 8080)
 @word("out", "where recordings go: videos and LeRobot datasets", default=".")
-@word("seconds", "ends after so long; without it, Ctrl-C ends it", real(0, above=True), metavar="S")
+@word("seconds", "ends after so long; without it, Ctrl-C ends it", real(above=0), metavar="S")
 @word("seed", "of the world", whole(), 0)
 @word("device", "auto, cpu, cuda, cuda:K", default="auto")
 @word("rerun", "no page: writes one episode for the Rerun viewer", metavar="FILE.rrd")

@@ -27,7 +27,6 @@ from typing import Any
 
 from franka_wm.errors import UserError
 from franka_wm.evaluation.results import OF_RUN, OTHERWISE, Result, last_row, results
-from franka_wm.keys import DERIVED
 from franka_wm.untrusted import UntrustedFolder, check_image, check_video, values_of
 
 SAME_BUT = ("seed", "device", "resume")
@@ -197,8 +196,8 @@ def without_the_seed(config: Mapping[str, object], seed: object) -> dict[str, ob
 
     Of a run that went on from a checkpoint what its model had found itself is as it was asked for, not at all.
     """
-    kept = {name: value for name, value in config.items() if name not in (*SAME_BUT, DERIVED)}
-    model, derived = kept.get("model"), config.get(DERIVED)
+    kept = {name: value for name, value in config.items() if name not in (*SAME_BUT, "derived")}
+    model, derived = kept.get("model"), config.get("derived")
     if isinstance(model, Mapping) and isinstance(derived, Sequence):
         kept["model"] = {name: None if name in derived else value for name, value in model.items()}
     dataset = kept.get("dataset")

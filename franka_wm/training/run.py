@@ -32,7 +32,6 @@ from franka_wm.envs import Environment
 from franka_wm.envs.multitask_config import MultiTaskConfig
 from franka_wm.errors import UserError, trying
 from franka_wm.interrupt import INTERRUPTED
-from franka_wm.keys import DERIVED
 from franka_wm.seeding import derive_seed, seeded
 from franka_wm.training import build
 from franka_wm.training.check import check
@@ -43,6 +42,7 @@ from franka_wm.training.loggers import close_loggers, log_config, log_video, mak
 from franka_wm.training.place import lock_run_dir, make_absolute, occupied
 from franka_wm.training.settings import RunSettings
 from franka_wm.training.spaces import Spaces
+from franka_wm.training.trainer import DERIVED
 from franka_wm.training.tree import damaged
 from franka_wm.versions import FINISHED, write_finished, write_versions
 

@@ -175,11 +175,8 @@ def reason_to_leave_out(size: int, folder: Path, *, last: bool, wanted: bool | N
             f"checkpoint without the experience ({size / 1e9:.1f} GB): a run that goes on from it gathers anew; "
             f"trainer.checkpoint_replay=true keeps more than {KEPT / 1e9:.0f} GB"
         )
-    if wanted is None and not last and size > BETWEEN:
-        return (
-            f"checkpoint without the experience ({size / 1e9:.1f} GB), which is written at the end; "
-            "trainer.checkpoint_replay=true writes it each time"
-        )
+    if not last and size > BETWEEN:
+        return f"checkpoint without the experience ({size / 1e9:.1f} GB), which is written at the end"
     there = next(path for path in (folder.resolve(), *folder.resolve().parents) if path.exists())
     free = shutil.disk_usage(there).free
     if size > free - SPARE:

@@ -24,7 +24,6 @@ from franka_wm.envs import Environment
 from franka_wm.envs.transformed import arm_of
 from franka_wm.errors import UserError
 from franka_wm.interrupt import interruptible
-from franka_wm.keys import DERIVED
 from franka_wm.models import WorldModel
 from franka_wm.policies.exploration import ActingPolicy
 from franka_wm.seeding import derive_seed, seeded
@@ -40,8 +39,19 @@ from franka_wm.training.shards import save_together
 from franka_wm.training.spaces import Spaces
 from franka_wm.training.storage_budget import fill, filled_bytes, reason_to_leave_out
 
+DERIVED = "derived"
+"""Of a checkpoint's configuration: what of ``model`` the model had found itself, since nothing was asked for."""
+
 EVALUATION_SHARE, EVALUATION_SECONDS = 0.1, 5.0
 """Share of training's time, and seconds, after which evaluations are left out unless ``evaluation.every`` is given."""
+
+
+class UpdateProgress(Progress):
+    """Rates of updates alone: an evaluation counts for the time left, not for them."""
+
+    def leave_out(self, seconds: float) -> None:
+        """What just took so long was neither an update nor a step."""
+        self._last += seconds
 
 
 class Trainer:
@@ -133,7 +143,7 @@ class Trainer:
         total = trainer.updates
         started = time.perf_counter() - self.seconds
         updates = self.learner.updates
-        progress = Progress(total, done=updates, env_steps=self.env_steps, every=trainer.log_every)
+        progress = UpdateProgress(total, done=updates, env_steps=self.env_steps, every=trainer.log_every)
         saved = time.perf_counter()
         every = self.settings.evaluation_period
         ahead = sorted(steps for steps in self.settings.evaluation.at_steps if steps > self.env_steps)
@@ -356,7 +366,9 @@ class Trainer:
         if self.env is not None and wanted is not False and len(self.replay) and needed:
             size = filled_bytes(self.replay) * processes.count()
             # Disks of several hosts may have other room: the first process decides.
-            why = processes.objects(reason_to_leave_out(size, self.folder, last=last, wanted=wanted))[0]
+            # What is asked for is in every checkpoint: one without would take the place of what a run went on from.
+            whole = last or wanted is True
+            why = processes.objects(reason_to_leave_out(size, self.folder, last=whole, wanted=wanted))[0]
             replay = self.experience() if why is None else None
             if why is not None and (last or not self._said):
                 say(f"  {why}")

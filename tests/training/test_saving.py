@@ -36,6 +36,9 @@ def test_large_experience_is_written_at_the_end_alone(make: Make, monkeypatch, c
     trainer.fit()
     assert written == [40]
     assert capsys.readouterr().out.count("written at the end") == 1
+    asked_for = make("asked for", updates=40, checkpoint_every=1e-9, checkpoint_replay=True)
+    asked_for.fit()
+    assert "written at the end" not in capsys.readouterr().out, "it is in each of them"
     assert load_checkpoint(latest_checkpoint(trainer.folder)).replay("cpu") is not None
 
 

@@ -37,13 +37,7 @@ def test_size_of_what_is_filled() -> None:
         (3e9, 100e9, False, None, "written at the end"),
         (3e9, 100e9, True, None, None),
         (9e9, 100e9, True, None, "checkpoint_replay=true keeps more than 8 GB"),
-        (
-            9e9,
-            100e9,
-            False,
-            True,
-            None,
-        ),  # what was asked for is in every checkpoint: none takes its place without
+        (9e9, 100e9, False, True, "written at the end"),
         (9e9, 100e9, True, True, None),
         (3e9, 3.1e9, True, True, "WITHOUT"),
         (1e9, 1.1e9, False, None, "WITHOUT"),

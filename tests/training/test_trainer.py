@@ -20,7 +20,7 @@ from franka_wm.training.learner import Learner
 from franka_wm.training.resume import restore
 from franka_wm.training.run import Run
 from franka_wm.training.settings import RunSettings
-from franka_wm.training.trainer import Trainer
+from franka_wm.training.trainer import Trainer, UpdateProgress
 from tests.training.conftest import CAPACITY, Make, N
 
 
@@ -63,6 +63,18 @@ def test_rates_and_time_left_are_without_the_first_update(make: Make, monkeypatc
     trainer = make(updates=10, log_every=0.1)
     trainer.fit()
     assert trainer.rows[0]["updates"] == 10 and trainer.rows[0]["updates_per_s"] > 3.0
+
+
+def test_an_evaluation_counts_for_the_time_left_and_not_for_rates(monkeypatch, capsys) -> None:
+    now = 0.0
+    monkeypatch.setattr("franka_wm.console.time", SimpleNamespace(perf_counter=lambda: now))
+    progress = UpdateProgress(100, every=10.0)
+    now = 20.0  # of which 15 s went into an evaluation
+    progress.leave_out(15.0)
+    assert not progress.due(), "a line after 5 s of updates would tell of one batch alone"
+    now = 25.0
+    assert progress.due() and progress.line(20, 200) == {"updates_per_s": 2.0, "env_steps_per_s": 20.0}
+    assert "left 1:40" in capsys.readouterr().out  # 80 more; the next evaluations come, too
 
 
 @pytest.mark.parametrize("low", [None, -0.01])
@@ -270,7 +282,7 @@ def test_evaluations_that_take_long_are_left_out_unless_asked_for(make: Make, ca
         return {"eval/policy/success": 0.5}
 
     left_out: list[float] = []
-    monkeypatch.setattr(Progress, "leave_out", lambda self, seconds: left_out.append(seconds))
+    monkeypatch.setattr(UpdateProgress, "leave_out", lambda self, seconds: left_out.append(seconds))
     cases = ((None, 1.0, 0.1, 1), (10, 1.0, 0.1, 3), (None, 9.0, 0.1, 3), (None, 1.0, 99.0, 3))
     for every, seconds, share, count in cases:
         monkeypatch.setattr("franka_wm.training.trainer.EVALUATION_SECONDS", seconds)

@@ -242,7 +242,7 @@ def test_ctrl_c_leaves_a_dataset(tmp_path, load) -> None:
         (["out=x", "env.observations=[depth]"], "depth has no place"),
         (
             ["out=x", "policy=expert", "noise=1e300"],
-            "noise=1e300: must be a finite number of at least 0, at most 2",
+            "noise=1e300: must be a finite number above 0, at most 2",
         ),
         (["out=x", "policy=expert"], "policy=expert: task=reach has none; env=lift has one"),
         (["out=x", "policy=ik", "env=lift"], "policy=ik: brings the tool to the goal and knows no gripper"),
