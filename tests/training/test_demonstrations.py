@@ -24,7 +24,8 @@ from franka_wm.errors import UserError
 from franka_wm.evaluation.closed_loop import begin
 from franka_wm.evaluation.protocol import held_out_seeds
 from franka_wm.training import build
-from franka_wm.training.check_dataset import _check_same_views, check
+from franka_wm.training.check import check
+from franka_wm.training.check_dataset import _check_same_views
 from franka_wm.training.demos import check_demonstrations, open_demonstrations
 from franka_wm.training.history import read_rows
 from franka_wm.training.learner import Learner
