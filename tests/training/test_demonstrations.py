@@ -324,9 +324,8 @@ def test_a_model_that_sees_acts_where_it_sees_the_same(
         _check_same_views(run.changed(model={"observations": ["state"]}), [("dataset.root=there", source)])
     if "image_size" in there:  # as dataset.image_size makes it
         return _check_same_views(run, [("dataset.root=there", source)])
-    with pytest.raises(
-        UserError, match=rf"recorded with .*env\.{next(iter(there))}.*images show something else"
-    ):
+    other = rf"recorded with .*env\.{next(iter(there))}.*images show something else"
+    with pytest.raises(UserError, match=other):
         _check_same_views(run, [("dataset.root=there", source)])
     chosen = settled(*words, "dataset.features={pixels: observation.images.front}")
     if "cameras" in there:
