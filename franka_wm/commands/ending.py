@@ -24,6 +24,7 @@ def ended_by_sigterm() -> Iterator[None]:
 
     def end(signum: int, frame: Any) -> None:
         if os.getpid() == own:
+            signal.signal(signum, signal.SIG_IGN)  # a scheduler and a parent may both send one
             raise KeyboardInterrupt
         signal.signal(signum, signal.SIG_DFL)
         os.kill(os.getpid(), signum)

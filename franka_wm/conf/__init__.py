@@ -62,7 +62,7 @@ def refuse_unknown(names: Iterable[Any]) -> None:
         UserError: One line that names the nearest.
     """
     for name in names:
-        if name not in (*KNOWN, "derived"):  # which a checkpoint's has
+        if name not in KNOWN:
             raise UserError(unknown(str(name), KNOWN))
 
 

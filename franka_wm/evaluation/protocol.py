@@ -139,8 +139,8 @@ def evaluate_policies(
         summary = evaluation.policies[name] = summarize(rows, thresholds=thresholds(env))
         if cut := summary.get("cut_short"):
             console.say(
-                f"  warning: {name}: the simulator cut {cut} of {episodes} episodes short, as failures with what they "
-                "had until then: not finite any more, or too little room for contacts (env.max_contacts)"
+                f"  warning: {name}: the simulator cut {cut} of {episodes} episodes short, which count as they stood "
+                "then: not finite any more, or too little room for contacts (env.max_contacts)"
             )
         if timing:
             with seeded(seeds[0], policy):
@@ -247,16 +247,11 @@ def during_training(
     """A function for the trainer: plays the policies of ``evaluation.during`` and returns numbers to log.
 
     None where there are none, as without an environment. Of several processes all call it; they divide the episodes.
-
-    Raises:
-        UserError: ``evaluation.at_steps`` asks for evaluations, and there is none of the policies.
     """
     chosen = {name: policies[name] for name in settings.during if name in policies}
     if env is not None and settings.during and not chosen:
         there = ", ".join(policies) or "none"
         nothing = f"evaluation.during=[{','.join(settings.during)}]: no such policy acts here, of those there: {there}"
-        if settings.at_steps:
-            raise UserError(f"{nothing}; name one of them, or leave evaluation.at_steps empty")
         console.say(f"{nothing}; nothing is evaluated while training")
     if env is None or not chosen:
         return dict

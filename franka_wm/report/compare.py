@@ -26,7 +26,7 @@ from franka_wm.report.document import (
     table,
 )
 from franka_wm.report.horizon import horizon_figure
-from franka_wm.report.run import RunFiles, but_for_the_seed, malformed
+from franka_wm.report.run import RunFiles, as_asked, but_for_the_seed, malformed
 from franka_wm.report.sections import logged_name
 from franka_wm.report.spectra import spectrum_figure
 from franka_wm.report.table import Table, evaluation_tables, is_interval
@@ -47,7 +47,7 @@ def compare_page(runs: Sequence[RunFiles]) -> str:
         )
     with malformed(*(run.folder for run in runs)):
         named = dict(zip(unique_names(runs), runs, strict=True))
-        different = differences({name: run.config for name, run in named.items()})
+        different = differences({name: as_asked(run.config) for name, run in named.items()})
         groups = repetitions(named)
         parts = [
             Section("tasks", "Tasks and families", _tasks(groups)),
@@ -96,6 +96,8 @@ def differences(configs: Mapping[str, Mapping[str, object]]) -> dict[str, dict[s
     out = {}
     for entry in entries:
         having = {name: values[entry] for name, values in flat.items() if entry in values}
+        if all(value is None for value in having.values()):  # null is not given
+            continue
         # As text: 1 and True and 1.0 are not the same in a configuration.
         if len(having) < len(flat) or len({json.dumps(v, default=str) for v in having.values()}) > 1:
             out[entry] = having

@@ -188,18 +188,23 @@ def read_config(folder: str | Path) -> dict[str, object]:
 def but_for_the_seed(config: Mapping[str, object]) -> str:
     """The same for repetitions, and for nothing else; empty for an empty configuration."""
     kept = without_the_seed(config, config.get("seed"))
+    if isinstance(model := kept.get("model"), Mapping):  # null is not given
+        kept["model"] = {name: value for name, value in model.items() if value is not None}
     return json.dumps(kept, sort_keys=True, default=str) if kept else ""
 
 
-def without_the_seed(config: Mapping[str, object], seed: object) -> dict[str, object]:
-    """Without what repetitions differ in: what is in `SAME_BUT`, and a dataset's seed that follows `seed`.
-
-    Of a run that went on from a checkpoint what its model had found itself is as it was asked for, not at all.
-    """
-    kept = {name: value for name, value in config.items() if name not in (*SAME_BUT, "derived")}
+def as_asked(config: Mapping[str, object]) -> dict[str, object]:
+    """What a resumed run's model had found itself counts as not given, as in the run that it went on from."""
+    kept = {name: value for name, value in config.items() if name != "derived"}
     model, derived = kept.get("model"), config.get("derived")
-    if isinstance(model, Mapping) and isinstance(derived, Sequence):
+    if isinstance(model, Mapping) and isinstance(derived, list):
         kept["model"] = {name: None if name in derived else value for name, value in model.items()}
+    return kept
+
+
+def without_the_seed(config: Mapping[str, object], seed: object) -> dict[str, object]:
+    """As asked, without what repetitions differ in: what is in `SAME_BUT`, and a dataset's seed that follows `seed`."""
+    kept = {name: value for name, value in as_asked(config).items() if name not in SAME_BUT}
     dataset = kept.get("dataset")
     if isinstance(dataset, Mapping) and dataset.get("seed") == seed:
         kept["dataset"] = {name: value for name, value in dataset.items() if name != "seed"}

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import importlib.util
 import os
+import re
 import tempfile
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -203,10 +204,11 @@ def kind(logger: Logger) -> str:
 
 
 def _forget_later_lines(folder: Path, updates: int) -> None:
-    """Of every quantity the lines beyond so many updates, and one that was cut off in writing."""
+    """Of every quantity the lines beyond so many updates, and what is no line, as one that was cut off in writing."""
     for file in sorted(folder.rglob("*.csv")):
-        lines = file.read_text(encoding="utf-8").splitlines(keepends=True)
-        kept = [line for line in lines if line.endswith("\n") and float(line.split(",")[0]) <= updates]
+        lines = file.read_bytes().decode(errors="replace").splitlines(keepends=True)
+        found = [re.match(r"(\d+),.*\n$", line) for line in lines]
+        kept = [one[0] for one in found if one is not None and int(one[1]) <= updates]
         if len(kept) < len(lines):
             with atomic_write(file) as path:
                 path.write_text("".join(kept), encoding="utf-8")

@@ -254,10 +254,6 @@ def start(cfg: DictConfig) -> Run:
         checkpoint, cfg = resumed(cfg, [f"device={cfg.device}"] if again else typed)
         _require_same(checkpoint)
     make_absolute(cfg)
-    wanted = cfg.trainer.updates
-    if checkpoint is not None and isinstance(wanted, int) and "whole_run" not in checkpoint.config:
-        # What is written is what the weights have had.
-        cfg.trainer.updates = max(wanted, int(checkpoint.counters.get("updates", 0)))
     settings = RunSettings.of(cfg, saved=checkpoint is not None)
     if checkpoint is not None and settings.is_arm and settings.is_discrete:
         require_same_actions(checkpoint, settings.env.arm)
@@ -291,7 +287,9 @@ def start(cfg: DictConfig) -> Run:
         all_made = (
             done >= settings.trainer.updates and "whole_run" not in checkpoint.config
         )  # else the second stage comes
-        nothing = f"; trainer.updates={wanted} are made: only the run's end is done again, a larger number trains on"
+        nothing = (
+            f"; trainer.updates={done} are made: only the run's end is done again, a larger number trains on"
+        )
         say(f"going on from update {done} of {checkpoint.folder}{nothing if all_made else ''}")
     run = Run(settings, folder, checkpoint, open_loggers(settings, folder, checkpoint))
     if _begun is not None:
@@ -383,6 +381,11 @@ def resumed(cfg: DictConfig, overrides: list[str]) -> tuple[Checkpoint, DictConf
     merged = OmegaConf.merge(OmegaConf.create(saved), changes)
     assert isinstance(merged, DictConfig)
     merged.resume = str(cfg.resume)
+    wanted = OmegaConf.select(merged, "trainer.updates")
+    if (
+        isinstance(wanted, int) and "whole_run" not in checkpoint.config
+    ):  # what is written is what the weights have had
+        merged.trainer.updates = max(wanted, int(checkpoint.counters.get("updates", 0)))
     if (derived := saved.get(DERIVED)) is not None:
         if not isinstance(derived, list) or not all(isinstance(name, str) for name in derived):
             raise UserError(

@@ -47,7 +47,7 @@ EVALUATION_SHARE, EVALUATION_SECONDS = 0.1, 5.0
 
 
 class UpdateProgress(Progress):
-    """Rates of updates alone: an evaluation counts for the time left, not for them."""
+    """Rates without evaluations, which count for the time left alone."""
 
     def leave_out(self, seconds: float) -> None:
         """What just took so long was neither an update nor a step."""
@@ -193,9 +193,6 @@ class Trainer:
                 )
                 if due:
                     self.log(progress)
-                if saves:  # before an evaluation, which may take long
-                    self.save(last=False)
-                    saved = time.perf_counter()
                 if reached and stopping and not last:
                     say(f"  evaluation.at_steps: left out at {self.env_steps} steps, the run stops")
                 if evaluates and not stopping:
@@ -210,6 +207,9 @@ class Trainer:
                     started += spent  # seconds count training, not evaluation
                     progress.leave_out(spent)
                     [stopping] = processes.agree([stop()], [])
+                if saves:
+                    self.save(last=False)
+                    saved = time.perf_counter()
             if ahead and not stopping:
                 say(f"  evaluation.at_steps={ahead}: not evaluated, the run ends at {self.env_steps} steps")
             self.save()
@@ -366,9 +366,7 @@ class Trainer:
         if self.env is not None and wanted is not False and len(self.replay) and needed:
             size = filled_bytes(self.replay) * processes.count()
             # Disks of several hosts may have other room: the first process decides.
-            # What is asked for is in every checkpoint: one without would take the place of what a run went on from.
-            whole = last or wanted is True
-            why = processes.objects(reason_to_leave_out(size, self.folder, last=whole, wanted=wanted))[0]
+            why = processes.objects(reason_to_leave_out(size, self.folder, last=last, wanted=wanted))[0]
             replay = self.experience() if why is None else None
             if why is not None and (last or not self._said):
                 say(f"  {why}")

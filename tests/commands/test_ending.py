@@ -32,7 +32,12 @@ def test_a_process_ends_as_by_ctrl_c_and_its_forks_as_ever(mode: SimpleNamespace
             finally:
                 os._exit(3)
         assert os.WTERMSIG(os.waitpid(fork, 0)[1]) == signal.SIGTERM
-        os.kill(os.getpid(), signal.SIGTERM)
+        try:
+            os.kill(os.getpid(), signal.SIGTERM)
+        finally:
+            os.kill(
+                os.getpid(), signal.SIGTERM
+            )  # one more, of its parent, does not end what is said and closed
     assert signal.getsignal(signal.SIGTERM) is before
 
 

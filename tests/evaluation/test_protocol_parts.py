@@ -171,12 +171,6 @@ def test_what_the_trainer_logs(env: FrankaEnv, settled, capsys) -> None:
         "evaluation.during=[policy,noop]: no such policy acts here, of those there: random; nothing is evaluated while "
         "training\n"
     )
-    at_steps = settled("evaluation.during=[policy,noop]", "evaluation.at_steps=[9]").evaluation
-    assert during_training(at_steps, env, noop)(), "one of them is enough"
-    with pytest.raises(
-        UserError, match=r"those there: random; name one of them, or leave evaluation.at_steps empty"
-    ):
-        during_training(at_steps, env, {"random": noop["random"]})
     assert during_training(settled("evaluation.during=[]").evaluation, env, noop)() == {}
     assert capsys.readouterr().out == ""
 

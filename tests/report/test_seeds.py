@@ -9,7 +9,8 @@ from franka_wm.commands.summary import summary
 from franka_wm.errors import UserError
 from franka_wm.evaluation.intervals import bootstrap_mean
 from franka_wm.evaluation.results import END, Result
-from franka_wm.report.run import RunFiles, but_for_the_seed
+from franka_wm.report.compare import differences
+from franka_wm.report.run import RunFiles, as_asked, but_for_the_seed
 from franka_wm.report.seeds import cells_told, read_evaluation, runs_of, seeds_table
 from light import answers
 
@@ -140,6 +141,15 @@ def test_a_run_that_went_on_is_the_repetition_it_was(tmp_path):
     found = {"seed": 1, "model": {"name": "tdmpc2", "value_low": -3.2, "lr": 1}, "resume": "there"}
     assert but_for_the_seed({**found, "derived": ["value_low"]}) == began
     assert but_for_the_seed({**found, "derived": []}) != began
+    encoder = {
+        **found,
+        "model": {**found["model"], "encoder_architecture": [1, 2]},
+    }  # no option has such a name
+    assert but_for_the_seed({**encoder, "derived": ["encoder_architecture", "value_low"]}) == began
+    first = {"seed": 0, "model": {"name": "tdmpc2", "value_low": None}}
+    again = {"seed": 0, "model": {"name": "tdmpc2", "value_low": -3.2, "encoder_architecture": [1]}}
+    derived = {"derived": ["encoder_architecture", "value_low"]}
+    assert differences({"a": as_asked(first), "b": as_asked(again | derived)}) == {}
     assert but_for_the_seed({**found, "derived": 3}) != began, "of a damaged file"
 
 

@@ -146,7 +146,7 @@ def test_files_of_a_run_that_goes_on_forget_what_it_makes_anew(tmp_path: Path) -
         log_numbers(first, {"loss": float(step), "eval/planner/success": 0.25}, step=step)
     close_loggers(first)
     with (tmp_path / "csv/scalars/loss.csv").open("a") as file:
-        file.write("4")  # cut off in writing: not update 4
+        file.write("\n\0\0\n4")  # cut off in writing: not update 4
     again = make_loggers(["csv", "tensorboard"], tmp_path, updates=20)
     log_numbers(again, {"loss": 0.5}, step=25)
     close_loggers(again)

@@ -128,6 +128,10 @@ def test_a_resumed_run_keeps_what_it_was(word: str, instead: str, tmp_path: Path
     same = [f"resume={tmp_path}", "scale=smoke", "seed=0", "trainer.updates=50"]
     _, merged = resumed(compose(*same), same)
     assert merged.trainer.updates == 50 and merged.seed == 0
+    save_checkpoint(tmp_path, model=torch.nn.Linear(1, 1), config=began, counters={"updates": 80.0})
+    assert resumed(compose(*same), same)[1].trainer.updates == 80, (
+        "what is written is what the weights have had"
+    )
 
 
 def test_what_a_model_had_found_itself_is_told_from_what_was_asked_for(tmp_path: Path) -> None:
@@ -192,7 +196,7 @@ def test_the_first_steps_are_learned_before_more_is_gathered(train, tmp_path: Pa
     for updates in (0, 11):  # the second in whole batches of updates
         words = (f"collector.seed_updates={updates}", "evaluation.during=[]", f"trainer.onednn={updates > 0}")
         saved = train(*words, folder=tmp_path / f"{updates}")
-        run = RunSettings.of(saved.config)
+        run = RunSettings.of(saved.config, saved=True)
         assert saved.counters["updates"] == run.trainer.updates == 30
         assert saved.counters["env_steps"] == run.collector.num_envs * run.planned_steps()
         gathered.append(saved.counters["env_steps"])

@@ -36,24 +36,7 @@ def test_large_experience_is_written_at_the_end_alone(make: Make, monkeypatch, c
     trainer.fit()
     assert written == [40]
     assert capsys.readouterr().out.count("written at the end") == 1
-    asked_for = make("asked for", updates=40, checkpoint_every=1e-9, checkpoint_replay=True)
-    asked_for.fit()
-    assert "written at the end" not in capsys.readouterr().out, "it is in each of them"
     assert load_checkpoint(latest_checkpoint(trainer.folder)).replay("cpu") is not None
-
-
-def test_an_evaluation_begins_with_everything_saved_that_is_due(make: Make) -> None:
-    """It may take minutes, and what kills a run does not wait for it."""
-    saved = []
-
-    def evaluate() -> dict[str, float]:
-        saved.append(load_checkpoint(latest_checkpoint(trainer.folder)).counters["updates"])
-        return {}
-
-    trainer = make(updates=30, checkpoint_every=1e-9, evaluate=evaluate)
-    trainer.settings = trainer.settings.changed(evaluation={"every": 10})
-    trainer.fit()
-    assert saved == [10, 20]
 
 
 def test_who_is_asked_to_stop_saves_before_anything_else(make: Make, capsys) -> None:
