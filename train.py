@@ -16,7 +16,7 @@ from franka_wm.commands.entry import one_line_errors, run_command
 
 @hydra.main(version_base="1.3", config_path="pkg://franka_wm.conf", config_name="config")
 @one_line_errors
-@ended_by_sigterm()
+@ended_by_sigterm
 def main(cfg: DictConfig) -> float | None:
     """One run: build, pretrain if asked to, fit, evaluate, report, export.
 

@@ -2,20 +2,33 @@
 
 from __future__ import annotations
 
+import functools
 import os
 import signal
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any
 
 from hydra.core.hydra_config import HydraConfig
 from hydra.types import RunMode
+from omegaconf import DictConfig
 
 from franka_wm.commands import several
 
 
+def ended_by_sigterm(main: Callable[[DictConfig], object]) -> Callable[[DictConfig], object]:
+    """A run in which SIGTERM does what Ctrl-C does; a plain function around it, which sweeps can send to processes."""
+
+    @functools.wraps(main)
+    def wrapped(cfg: DictConfig) -> object:
+        with as_by_ctrl_c():
+            return main(cfg)
+
+    return wrapped
+
+
 @contextmanager
-def ended_by_sigterm() -> Iterator[None]:
+def as_by_ctrl_c() -> Iterator[None]:
     """SIGTERM raises ``KeyboardInterrupt``, so that the run says what was saved and how to go on.
 
     Not in the jobs of a sweep, nor in one of several processes: what ends those says so. Forks end without a word.

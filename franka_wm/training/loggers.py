@@ -204,7 +204,7 @@ def kind(logger: Logger) -> str:
 
 
 def _forget_later_lines(folder: Path, updates: int) -> None:
-    """Of every quantity the lines beyond so many updates, and what is no line, as one that was cut off in writing."""
+    """Removes lines beyond so many updates of every quantity, and what is no line, as one that was cut off."""
     for file in sorted(folder.rglob("*.csv")):
         lines = file.read_bytes().decode(errors="replace").splitlines(keepends=True)
         found = [re.match(r"(\d+),.*\n$", line) for line in lines]

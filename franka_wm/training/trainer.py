@@ -40,7 +40,7 @@ from franka_wm.training.spaces import Spaces
 from franka_wm.training.storage_budget import fill, filled_bytes, reason_to_leave_out
 
 DERIVED = "derived"
-"""Of a checkpoint's configuration: what of ``model`` the model had found itself, since nothing was asked for."""
+"""What of ``model`` in a checkpoint's configuration the model had found itself, since nothing was asked for."""
 
 EVALUATION_SHARE, EVALUATION_SECONDS = 0.1, 5.0
 """Share of training's time, and seconds, after which evaluations are left out unless ``evaluation.every`` is given."""

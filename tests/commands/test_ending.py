@@ -10,7 +10,7 @@ import pytest
 from hydra.types import RunMode
 
 from franka_wm.commands import ending, several
-from franka_wm.commands.ending import ended_by_sigterm
+from franka_wm.commands.ending import as_by_ctrl_c
 
 
 @pytest.fixture
@@ -24,7 +24,7 @@ def mode(monkeypatch: pytest.MonkeyPatch) -> SimpleNamespace:
 def test_a_process_ends_as_by_ctrl_c_and_its_forks_as_ever(mode: SimpleNamespace) -> None:
     """A fork that is ended by its parent has nothing to say."""
     before = signal.getsignal(signal.SIGTERM)
-    with pytest.raises(KeyboardInterrupt), ended_by_sigterm():
+    with pytest.raises(KeyboardInterrupt), as_by_ctrl_c():
         fork = os.fork()
         if not fork:
             try:
@@ -48,5 +48,5 @@ def test_one_of_many_is_left_as_it_is(one_of: str, mode: SimpleNamespace, monkey
     else:
         monkeypatch.setenv(several.JOB, "there")
     before = signal.getsignal(signal.SIGTERM)
-    with ended_by_sigterm():
+    with as_by_ctrl_c():
         assert signal.getsignal(signal.SIGTERM) is before
