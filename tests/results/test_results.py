@@ -391,7 +391,7 @@ def test_train_accepts_every_declared_command(monkeypatch: pytest.MonkeyPatch) -
     from franka_wm.training.check import check
     from franka_wm.training.settings import RunSettings
 
-    monkeypatch.setattr("franka_wm.training.check._check_dataset", lambda run: None)  # `before` would make it
+    monkeypatch.setattr("franka_wm.training.check.check_dataset", lambda run: None)  # `before` would make it
     for row in load_rows().values():
         if row.script is not None:
             assert (source.ROOT / row.script).is_file()
