@@ -34,14 +34,15 @@ def test_recorded_windows_have_them(recorded: Path, settled) -> None:
 
 
 def test_a_batch_of_the_replay_and_demonstrations_has_them(recorded: Path, settled) -> None:
-    """With goals in hindsight, and as the model's loss takes them."""
+    """With goals in hindsight, of what the run keeps; and as the model's loss takes them."""
     run = settled(*WORDS, f"replay.demos={recorded}", "collector.num_envs=2")
     env = FrankaEnv(run.env.arm, num_envs=2, seed=0)
     spaces, hindsight = Spaces.of_env(env), build.make_hindsight(run)
     shown = open_demonstrations(run, spaces, hindsight)
     replay = build.make_replay_buffer(run, torch.device("cpu"), hindsight, shown)
-    keys = [*spaces.observation_sizes, "action", "is_init"]
-    after = [("next", key) for key in (*spaces.observation_sizes, "reward", "terminated")]
+    model = build.make_model(run, spaces, torch.device("cpu"))
+    keys = [*model.observation_keys, "action", "is_init"]
+    after = [("next", key) for key in (*model.observation_keys, "reward", "terminated")]
     root, steps = env.reset(seed=0), []
     for _ in range(30):
         step, root = env.step_and_maybe_reset(
@@ -52,11 +53,10 @@ def test_a_batch_of_the_replay_and_demonstrations_has_them(recorded: Path, settl
     batch = replay.sample()
     assert run.burn_in == 4 and batch.shape == (run.replay.batch_size, 4 + run.window)
     assert batch["demonstrated"][:, 0].any() and not batch["demonstrated"][:, 0].all()
-    goal = batch["goal"][:, 4:]
-    assert (goal == goal[:, :1]).all()
+    goal = batch["state"][..., 14:17] - batch["state"][..., 17:20]
+    assert torch.allclose(goal[:, 4:], goal[:, 4:5].expand_as(goal[:, 4:]), atol=1e-6)
     same = batch["is_init"].flatten(1)[:, 1:5].flip(1).cumsum(1).flip(1) == 0  # of the window's episode
-    assert torch.equal((batch["goal"][:, :4] == goal[:, :1]).all(-1) | ~same, torch.ones_like(same))
-    model = build.make_model(run, spaces, torch.device("cpu"))
+    assert (((goal[:, :4] - goal[:, 4:5]).abs() < 1e-6).all(-1) | ~same).all()
     assert model.loss(batch)["loss"].isfinite()
 
 
