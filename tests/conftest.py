@@ -7,6 +7,7 @@ import importlib.util
 import itertools
 import logging
 import os
+import random
 import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -64,6 +65,17 @@ def pytest_configure(config: pytest.Config) -> None:
         from absl import logging as absl_logging
 
         absl_logging.get_absl_handler().python_handler.stream = sys.__stderr__
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_runtest_setup() -> None:
+    """The same random numbers for a test whichever ran before it in its process, and for the fixtures that it makes."""
+    import numpy as np
+    import torch
+
+    random.seed(0)
+    np.random.seed(0)
+    torch.manual_seed(0)
 
 
 def pytest_runtest_teardown() -> None:
