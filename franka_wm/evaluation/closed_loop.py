@@ -89,7 +89,7 @@ def play_episodes(
     Returns:
         Batch size (N,), or (episodes,), all float32, of each world's first episode up to its true last observation.
         ``return`` and ``length`` of any environment. Of the arm, in one task or several, ``cut_short``, 0 or 1: the
-        simulator ended it, since the world was no longer finite or lost contacts; what it shows is not known. Of
+        simulator ended it, since the world was no longer finite or lost contacts; such an episode is no success. Of
         several tasks at once also ``success``, ``success_once``, and ``task_success`` by task, NaN in the worlds of
         others. Of the arm also:
 
@@ -171,7 +171,7 @@ class _Tasks:
         }
         return {
             "success": self.success.float(),
-            "success_once": self.once.float(),
+            "success_once": (self.once & ~self.cut).float(),
             "cut_short": self.cut.float(),
             "task_success": own,
         }
@@ -239,7 +239,7 @@ class _Motion:
         return {
             **(near if self.task.goal_distance else {}),
             "success": self.success.float(),
-            "success_once": self.once.float(),
+            "success_once": (self.once & ~self.cut).float(),
             "cut_short": self.cut.float(),
             **({"measures": self.measures} if self.measures else {}),
             "path_length": self.path,
@@ -259,14 +259,15 @@ def summarize(episodes: TensorDictBase, *, thresholds: Sequence[float] = THRESHO
         What there is: ``final_distance`` [m]; ``success`` at the end and ``success_once`` at any step, by threshold
         where there are distances and thresholds, else one rate each, as the task judges; ``task_success`` by task;
         ``return``; ``measures`` of the task's own, by name, over the episodes where they are not NaN;
-        ``path_length``, ``action_change``, ``jerk``, ``length``,
-        each with its interval; ``episodes``, the count; and, where there are any, how many were ``cut_short``.
+        ``path_length``, ``action_change``, ``jerk``, ``length``, each with its interval; ``episodes``, the count; and,
+        where there are any, how many were ``cut_short``, near the goal or not: none of these is a success.
 
     Raises:
         UserError: A return is not finite, or a measure infinite.
     """
     present = {str(name): episodes.get(name).cpu() for name in episodes.keys()}  # noqa: SIM118
     count = episodes.numel()
+    cut = present.get("cut_short", torch.zeros(count)).bool()
 
     def mean(name: str, values: Tensor, whose: str) -> dict[str, Any]:
         if odd := int((~values.isfinite()).sum()):
@@ -278,7 +279,7 @@ def summarize(episodes: TensorDictBase, *, thresholds: Sequence[float] = THRESHO
 
     def rates(name: str, distance: str) -> dict[str, Any]:
         if thresholds and distance in present:
-            within = {f"{t:g}": int((present[distance] < t).sum()) for t in thresholds}
+            within = {f"{t:g}": int(((present[distance] < t) & ~cut).sum()) for t in thresholds}
             return {name: {t: wilson(hits, count).as_dict() for t, hits in within.items()}}
         return {name: wilson(int(present[name].sum()), count).as_dict()} if name in present else {}
 
@@ -297,7 +298,7 @@ def summarize(episodes: TensorDictBase, *, thresholds: Sequence[float] = THRESHO
         **({"measures": own} if own else {}),
         **means("path_length", "action_change", "jerk", "length"),
         "episodes": count,
-        **({"cut_short": cut} if (cut := int(present.get("cut_short", torch.zeros(1)).sum())) else {}),
+        **({"cut_short": int(cut.sum())} if bool(cut.any()) else {}),
     }
 
 

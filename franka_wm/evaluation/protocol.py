@@ -139,8 +139,8 @@ def evaluate_policies(
         summary = evaluation.policies[name] = summarize(rows, thresholds=thresholds(env))
         if cut := summary.get("cut_short"):
             console.say(
-                f"  warning: {name}: the simulator cut {cut} of {episodes} episodes short, which count as they stood "
-                "then: not finite any more, or too little room for contacts (env.max_contacts)"
+                f"  warning: {name}: the simulator cut {cut} of {episodes} episodes short, none of which counts as a "
+                "success: not finite any more, or too little room for contacts (env.max_contacts)"
             )
         if timing:
             with seeded(seeds[0], policy):

@@ -166,13 +166,13 @@ def note(episodes: int) -> str:
     )
 
 
-def verdict(distance: Tensor, unshifted: Tensor, *, success_distance: float) -> str:
+def verdict(distance: Tensor, unshifted: Tensor, *, now: Tensor, before: Tensor) -> str:
     """What a shift does to a policy, in a word or two.
 
     Args:
         distance: (E,) final distances in the shifted world [m].
         unshifted: (E,) of the same episodes in the world of training [m].
-        success_distance: Below which an episode is a success [m].
+        now, before: (E,) bool, success of the same.
 
     Returns:
         ``never worked``: unshifted, less than :data:`WORKS_SHARE` of the episodes end within :data:`WORKS_AT`, so
@@ -182,12 +182,8 @@ def verdict(distance: Tensor, unshifted: Tensor, *, success_distance: float) -> 
         unshifted successes are left. ``holds``: none of these was seen.
     """
     grown = bootstrap_mean(distance - unshifted)
-    return verdict_of_success(
-        distance < success_distance,
-        unshifted < success_distance,
-        works=unshifted < WORKS_AT,
-        further=grown.low > 0 and grown.mean > LEAST_DISTANCE,
-    )
+    further = grown.low > 0 and grown.mean > LEAST_DISTANCE
+    return verdict_of_success(now, before, works=unshifted < WORKS_AT, further=further)
 
 
 def verdict_of_success(
@@ -221,7 +217,7 @@ def _compared(played: TensorDictBase, before: TensorDictBase, near: float | None
     if near is None:
         told = verdict_of_success(now, then)
     else:
-        told = verdict(value, unshifted, success_distance=near)
+        told = verdict(value, unshifted, now=now, before=then)
     same = played is before
     return {
         what: bootstrap_mean(value).as_dict(),

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import pytest
 import torch
-from tensordict import TensorDictBase
+from tensordict import TensorDict, TensorDictBase
 
-from franka_wm.envs import FrankaEnv
+from franka_wm.envs import FrankaEnv, MultiTaskEnv
+from franka_wm.envs.multitask_config import MultiTaskConfig
+from franka_wm.evaluation import robustness
 from franka_wm.evaluation.closed_loop import play_episodes
 from franka_wm.evaluation.protocol import evaluate_policies
 from franka_wm.policies.scripted import NoopPolicy
@@ -41,6 +43,35 @@ def test_broken_worlds_are_counted_and_said(env: FrankaEnv, capsys) -> None:
     assert "warning: it: the simulator cut 1 of 3 episodes short" in capsys.readouterr().out
     whole = evaluate_policies(env, {"noop": NoopPolicy()})
     assert "cut_short" not in whole.policies["noop"] and capsys.readouterr().out == ""
+
+
+@pytest.mark.parametrize("at_once", [False, True])
+def test_they_are_no_successes_wherever_they_stood(small_env, at_once: bool) -> None:
+    """Everywhere is near enough here; of several tasks at once, too."""
+    near = {"episode_length": LENGTH, "success_distance": 5.0}
+    env = arm = small_env(4, **near)
+    if at_once:
+        env = MultiTaskEnv(
+            MultiTaskConfig(tasks={"one": arm.config, "other": arm.config}), num_envs=4, device="cpu"
+        )
+        arm = env.envs["other"]
+    found = evaluate_policies(env, {"it": Breaks(arm)})
+    rows, summary = found.episodes["it"], found.policies["it"]
+    cut = 3 if at_once else 1  # world 1 of its task's two
+    kept = [float(k != cut) for k in range(4)]
+    assert rows["success"].tolist() == rows["success_once"].tolist() == kept
+    tasks = {"one": 1.0, "other": 0.5} if at_once else {}
+    assert {name: rate["mean"] for name, rate in summary.get("task_success", {}).items()} == tasks
+    for name in ("success", "success_once"):
+        assert (summary[name] if at_once else summary[name]["5"])["mean"] == 0.75
+
+
+def test_a_world_that_breaks_them_is_no_better_for_their_distance() -> None:
+    """All end at the goal in both worlds; in the shifted one they were cut short there."""
+    near = {"final_distance": torch.full((40,), 0.01)}
+    before = TensorDict({**near, "success": torch.ones(40)}, [40])
+    after = TensorDict({**near, "success": torch.zeros(40)}, [40])
+    assert robustness._compared(after, before, 0.05)["verdict"] == "breaks"
 
 
 def test_what_comes_after_an_episode_does_not_spoil_it(env: FrankaEnv, monkeypatch) -> None:

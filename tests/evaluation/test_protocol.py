@@ -242,7 +242,11 @@ def test_what_a_shift_does(agent) -> None:
 )
 def test_verdicts(unshifted: float, grown: float, says: str) -> None:
     before = torch.full((40,), unshifted)
-    assert verdict(before + grown, before, success_distance=0.05) == says
+    assert judged(before + grown, before) == says
+
+
+def judged(after: torch.Tensor, before: torch.Tensor) -> str:
+    return verdict(after, before, now=after < 0.05, before=before < 0.05)
 
 
 def test_a_few_lost_successes_are_worse_only_if_they_are_more_than_luck_and_2_percent() -> None:
@@ -250,15 +254,15 @@ def test_a_few_lost_successes_are_worse_only_if_they_are_more_than_luck_and_2_pe
     for lost, says in ((6, "holds"), (40, "worse"), (300, "breaks")):
         after = before.clone()
         after[:lost] = 0.0501
-        assert verdict(after, before, success_distance=0.05) == says
+        assert judged(after, before) == says
 
 
 def test_a_policy_that_works_in_a_tenth_of_the_episodes_works() -> None:
     before = torch.full((40,), 0.5)
     before[:4] = 0.01
-    assert verdict(before, before, success_distance=0.05) == "holds"
+    assert judged(before, before) == "holds"
     before[0] = 0.5
-    assert verdict(before, before, success_distance=0.05) == "never worked"
+    assert judged(before, before) == "never worked"
 
 
 def test_few_episodes_are_noted() -> None:
