@@ -15,7 +15,7 @@ from franka_wm.errors import UserError
 from franka_wm.evaluation import diagnose
 from franka_wm.evaluation.decoder import Imagined
 from franka_wm.evaluation.open_loop import NothingToPredictError
-from franka_wm.evaluation.protocol import Evaluation, describe, evaluate_agent, protocol
+from franka_wm.evaluation.protocol import Evaluation, describe, evaluate_agent, protocol, warn_of_cut
 from franka_wm.evaluation.results import COMMAND, FILE, OF_RUN, OTHERWISE, read_result, to_json
 from franka_wm.evaluation.robustness import check_shiftable, note, robustness
 from franka_wm.files import atomic_write, run_of
@@ -205,6 +205,9 @@ def _shift(agent: Agent, episodes: int, results: dict[str, Any], say: Say) -> No
     def told(case: str, found: Mapping[str, Any]) -> None:
         parts = (f"{describe(p, r).strip()} {r['verdict']}" for p, r in found.items())
         say(f"  {case}: {'   '.join(parts)}")
+        for name, result in found.items():
+            if cut := result.get("cut_short"):
+                say(warn_of_cut(name, cut, episodes))
 
     results["robustness"] = robustness(agent, episodes=episodes, report=told)
     results["protocol"]["robustness episodes"] = episodes

@@ -25,8 +25,9 @@ MOST_NAMED = 3
 def summary(folders: tuple[str, ...]) -> None:
     """Show runs of several seeds in one table.
 
-    Runs that differ in more than their seed get a table for each configuration. Of a sweep, runs that have not been
-    evaluated yet, or failed, are named and left out.
+    Runs that differ in more than their seed get a table for each configuration. Of several runs of one seed, as a run
+    and what went on from it, that of later weights counts, and the others are named. Of a sweep, runs that have not
+    been evaluated yet, or failed, are named and left out.
     """
     from franka_wm.report.run import but_for_the_seed, malformed, read_config, without_the_seed
     from franka_wm.report.seeds import evaluated, read_evaluation
@@ -49,10 +50,24 @@ def summary(folders: tuple[str, ...]) -> None:
                 alike = "\n".join([but_for_the_seed(config), *acted])
                 groups.setdefault(alike, {})[run] = found
                 configs.setdefault(alike, leaves(without_the_seed(config, config.get("seed"))))
-    for alike, group in groups.items():
-        with malformed(*group):
+    for alike, every in groups.items():
+        with malformed(*every):
+            group = _one_of_each_seed(every)
             text = table(group, apart=_own(configs, alike) if len(groups) > 1 else None)
         print(text)
+
+
+def _one_of_each_seed(group: Mapping[Path, Result]) -> dict[Path, Result]:
+    """Of runs with the same seed that of later weights, then that of more episodes; the others are named."""
+    from franka_wm.report.run import read_config
+
+    best: dict[object, Path] = {}
+    for run in sorted(group, key=lambda run: (group[run].updates or 0, group[run].episodes), reverse=True):
+        seed = read_config(run).get("seed", group[run].protocol.get("seed"))
+        kept = best.setdefault(run if seed is None else seed, run)
+        if kept != run:
+            print(f"left out: {run}, of seed {seed} as {kept}, which counts")
+    return {run: one for run, one in group.items() if run in best.values()}
 
 
 def _own(configs: Mapping[str, Mapping[str, object]], one: str) -> str:

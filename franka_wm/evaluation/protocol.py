@@ -138,16 +138,21 @@ def evaluate_policies(
         evaluation.episodes[name] = rows
         summary = evaluation.policies[name] = summarize(rows, thresholds=thresholds(env))
         if cut := summary.get("cut_short"):
-            console.say(
-                f"  warning: {name}: the simulator cut {cut} of {episodes} episodes short, none of which counts as a "
-                "success: not finite any more, or too little room for contacts (env.max_contacts)"
-            )
+            console.say(warn_of_cut(name, cut, episodes))
         if timing:
             with seeded(seeds[0], policy):
                 evaluation.seconds[name] = float(decision_times(env, policy, seed=seeds[0]).median())
         if report is not None:
             report(name, evaluation.policies[name])
     return evaluation
+
+
+def warn_of_cut(name: str, cut: int, episodes: int) -> str:
+    """A line about a policy of whose episodes the simulator cut some short."""
+    return (
+        f"  warning: {name}: the simulator cut {cut} of {episodes} episodes short, none of which counts as a success: "
+        "not finite any more, or too little room for contacts (env.max_contacts)"
+    )
 
 
 def _play(env: Environment, policy: TensorDictModuleBase, seed: int, episodes: int) -> list[TensorDict]:

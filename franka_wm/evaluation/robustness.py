@@ -94,8 +94,9 @@ def robustness(
     Returns:
         Shift → policy → ``final_distance`` [m] and ``success`` at the end, as the task judges, with 95 % intervals
         (bootstrap, Wilson); ``change`` of the final distance [m], paired by episode, with its bootstrap interval
-        (``None`` for :data:`UNSHIFTED`); ``verdict``, of :func:`verdict` (empty for :data:`UNSHIFTED`). Of tasks whose
-        success is no distance: ``return`` and ``return_change`` instead of the distances.
+        (``None`` for :data:`UNSHIFTED`); ``verdict``, of :func:`verdict` (empty for :data:`UNSHIFTED`); where there
+        are any, how many episodes the simulator ``cut_short``, which are no successes. Of tasks whose success is no
+        distance: ``return`` and ``return_change`` instead of the distances.
 
     Raises:
         UserError: Not the arm, fewer than 2 episodes, or no such policy.
@@ -148,12 +149,15 @@ def check_shiftable(agent: Agent) -> None:
     """Whether the agent's worlds can be shifted.
 
     Raises:
-        UserError: Not the arm.
+        UserError: Not the arm, or a solver that cannot randomise.
     """
-    if arm_of(agent.env) is None:
+    arm = arm_of(agent.env)
+    if arm is None:
         raise UserError(
             "robustness=true: only the arm can be shifted, in one task; this run's environment is another"
         )
+    if arm.config.solver == "featherstone":
+        raise UserError("robustness=true: shifts need env.solver=mujoco; this run has featherstone")
 
 
 def note(episodes: int) -> str:
@@ -166,13 +170,12 @@ def note(episodes: int) -> str:
     )
 
 
-def verdict(distance: Tensor, unshifted: Tensor, *, now: Tensor, before: Tensor) -> str:
+def verdict(played: TensorDictBase, before: TensorDictBase) -> str:
     """What a shift does to a policy, in a word or two.
 
     Args:
-        distance: (E,) final distances in the shifted world [m].
-        unshifted: (E,) of the same episodes in the world of training [m].
-        now, before: (E,) bool, success of the same.
+        played: (E,) episodes in the shifted world, as `play_episodes` gives them, with ``final_distance`` [m].
+        before: The same episodes in the world of training.
 
     Returns:
         ``never worked``: unshifted, less than :data:`WORKS_SHARE` of the episodes end within :data:`WORKS_AT`, so
@@ -181,9 +184,19 @@ def verdict(distance: Tensor, unshifted: Tensor, *, now: Tensor, before: Tensor)
         interval of that change, paired by episode, leaves out 0. ``breaks``: worse, and less than half of the
         unshifted successes are left. ``holds``: none of these was seen.
     """
-    grown = bootstrap_mean(distance - unshifted)
-    further = grown.low > 0 and grown.mean > LEAST_DISTANCE
-    return verdict_of_success(now, before, works=unshifted < WORKS_AT, further=further)
+    unshifted = before.get("final_distance")
+    grown = bootstrap_mean(played.get("final_distance") - unshifted)
+    return verdict_of_success(
+        played.get("success").bool(),
+        before.get("success").bool(),
+        works=(unshifted < WORKS_AT) & ~_cut(before),
+        further=grown.low > 0 and grown.mean > LEAST_DISTANCE,
+    )
+
+
+def _cut(played: TensorDictBase) -> Tensor:
+    """(E,) bool: the simulator cut it short."""
+    return played.get("cut_short").bool()
 
 
 def verdict_of_success(
@@ -214,14 +227,12 @@ def _compared(played: TensorDictBase, before: TensorDictBase, near: float | None
     what, change = ("return", "return_change") if near is None else ("final_distance", "change")
     value, unshifted = played.get(what), before.get(what)
     now, then = played.get("success").bool(), before.get("success").bool()
-    if near is None:
-        told = verdict_of_success(now, then)
-    else:
-        told = verdict(value, unshifted, now=now, before=then)
-    same = played is before
+    told = verdict_of_success(now, then) if near is None else verdict(played, before)
+    same, cut = played is before, int(_cut(played).sum())
     return {
         what: bootstrap_mean(value).as_dict(),
         "success": wilson(int(now.sum()), now.numel()).as_dict(),
         change: None if same else bootstrap_mean(value - unshifted).as_dict(),
         "verdict": "" if same else told,
+        **({"cut_short": cut} if cut else {}),
     }

@@ -105,15 +105,15 @@ def differences(configs: Mapping[str, Mapping[str, object]]) -> dict[str, dict[s
 
 
 def repetitions(runs: Mapping[str, RunFiles]) -> dict[str, dict[str, RunFiles]]:
-    """Runs grouped by configuration, whatever their seed; a group is called by its run, or by the first of them."""
+    """Runs grouped by configuration, each of another seed; a group is called by its run, or by the first of them."""
     groups: dict[str, dict[str, RunFiles]] = {}
     for name, run in runs.items():
         # Runs without a configuration are known to be the same as nothing.
         alike = but_for_the_seed(run.config) or name
         if run.elsewhere:  # of a run that may be here, too, or that was evaluated twice: not another run
             alike += " elsewhere"
-            if any(one.seed == run.seed for one in groups.get(alike, {}).values()):
-                alike += name
+        if run.seed is not None and any(one.seed == run.seed for one in groups.get(alike, {}).values()):
+            alike += name
         groups.setdefault(alike, {})[name] = run
     return {next(iter(group)): group for group in groups.values()}
 

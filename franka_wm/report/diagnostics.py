@@ -91,7 +91,8 @@ def robustness_table(
     for shift, policies in results.items():
         for policy, r in policies.items():
             cells = ["" if r[name] is None else interval(r[name], scale) for name in change]
-            rows.append([shift, policy_name(policy), *cells, interval(r["success"], 100, 0), r["verdict"]])
+            ended = f"{r['verdict']} ({r['cut_short']} cut short)" if r.get("cut_short") else r["verdict"]
+            rows.append([shift, policy_name(policy), *cells, interval(r["success"], 100, 0), ended.strip()])
     return Table(["shift", "policy", *what, success, "verdict"], rows)
 
 

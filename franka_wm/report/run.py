@@ -130,9 +130,7 @@ def read_run(folder: str | Path) -> RunFiles:
 def _read_run(run: Path) -> RunFiles:
     files = UntrustedFolder(run)
     config, typed, preset = _chosen(files)
-    told = files.json(OF_RUN) if config is None else None
-    if told is not None and not {"config", "overrides", "preset", "typed"} <= told.keys():
-        told = None  # of somebody else
+    told = _told_of_run(files) if config is None else None
     if told is not None:
         config, typed, preset = told["config"], list(map(str, told["overrides"])), str(told["preset"])
     found = results(run)
@@ -176,13 +174,21 @@ def read_chosen(folder: str | Path) -> dict[str, Any]:
     return {"config": config or {}, "overrides": typed, "preset": preset}
 
 
+def _told_of_run(files: UntrustedFolder) -> dict[str, Any] | None:
+    """Of which run ``franka-wm evaluate`` wrote the results that lie here."""
+    told = files.json(OF_RUN)
+    return told if told is not None and {"config", "overrides", "preset", "typed"} <= told.keys() else None
+
+
 def read_config(folder: str | Path) -> dict[str, object]:
-    """The configuration of a run; empty if it has none.
+    """The configuration of a run, or of the one that results here are of; empty if there is none.
 
     Raises:
         UserError: It cannot be read.
     """
-    return _config(UntrustedFolder(Path(folder))) or {}
+    files = UntrustedFolder(Path(folder))
+    config = _config(files)
+    return config if config is not None else (_told_of_run(files) or {}).get("config") or {}
 
 
 def but_for_the_seed(config: Mapping[str, object]) -> str:

@@ -2,16 +2,21 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import pytest
 import torch
 from tensordict import TensorDict, TensorDictBase
 
+from franka_wm.commands import evaluate_checkpoint
 from franka_wm.envs import FrankaEnv, MultiTaskEnv
 from franka_wm.envs.multitask_config import MultiTaskConfig
+from franka_wm.errors import UserError
 from franka_wm.evaluation import robustness
 from franka_wm.evaluation.closed_loop import play_episodes
 from franka_wm.evaluation.protocol import evaluate_policies
 from franka_wm.policies.scripted import NoopPolicy
+from franka_wm.report.diagnostics import robustness_table
 
 LENGTH = 4
 
@@ -66,12 +71,33 @@ def test_they_are_no_successes_wherever_they_stood(small_env, at_once: bool) -> 
         assert (summary[name] if at_once else summary[name]["5"])["mean"] == 0.75
 
 
-def test_a_world_that_breaks_them_is_no_better_for_their_distance() -> None:
-    """All end at the goal in both worlds; in the shifted one they were cut short there."""
+def test_shifted_worlds_that_break_are_counted() -> None:
+    """All end at the goal in both worlds; where they were cut short there they are no successes, and nothing works."""
     near = {"final_distance": torch.full((40,), 0.01)}
-    before = TensorDict({**near, "success": torch.ones(40)}, [40])
-    after = TensorDict({**near, "success": torch.zeros(40)}, [40])
-    assert robustness._compared(after, before, 0.05)["verdict"] == "breaks"
+    whole = TensorDict({**near, "success": torch.ones(40), "cut_short": torch.zeros(40)}, [40])
+    cut = TensorDict({**near, "success": torch.zeros(40), "cut_short": torch.ones(40)}, [40])
+    found = robustness._compared(cut, whole, 0.05)
+    assert found["verdict"] == "breaks" and found["cut_short"] == 40
+    assert robustness._compared(cut, cut.clone(), 0.05)["verdict"] == "never worked"
+    whole = robustness._compared(whole, whole.clone(), 0.05)
+    assert whole["verdict"] == "holds" and "cut_short" not in whole
+    rows = robustness_table({"mass": {"ik": found}, "gains": {"ik": whole}}, success_distance=0.05).rows
+    assert [row[-1] for row in rows] == ["breaks (40 cut short)", "holds"]
+
+
+def test_they_are_said_of_shifted_worlds(monkeypatch, capsys) -> None:
+    found = {"ik": {"verdict": "breaks", "cut_short": 3, "final_distance": {"mean": 0.1}}}
+    monkeypatch.setattr(
+        evaluate_checkpoint, "robustness", lambda agent, episodes, report: report("mass", found)
+    )
+    evaluate_checkpoint._shift(None, 40, {"protocol": {}}, print)  # type: ignore[arg-type]
+    assert "warning: ik: the simulator cut 3 of 40 episodes short" in capsys.readouterr().out
+
+
+def test_a_solver_that_cannot_randomise_is_refused_before_anything_is_played(small_env) -> None:
+    agent = SimpleNamespace(env=small_env(2, solver="featherstone"))
+    with pytest.raises(UserError, match=r"shifts need env\.solver=mujoco"):
+        robustness.check_shiftable(agent)  # type: ignore[arg-type]
 
 
 def test_what_comes_after_an_episode_does_not_spoil_it(env: FrankaEnv, monkeypatch) -> None:

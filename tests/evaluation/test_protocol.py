@@ -8,6 +8,7 @@ from types import SimpleNamespace
 
 import pytest
 import torch
+from tensordict import TensorDict
 
 from franka_wm.errors import UserError
 from franka_wm.evaluation import diagnose
@@ -246,7 +247,13 @@ def test_verdicts(unshifted: float, grown: float, says: str) -> None:
 
 
 def judged(after: torch.Tensor, before: torch.Tensor) -> str:
-    return verdict(after, before, now=after < 0.05, before=before < 0.05)
+    played, then = (
+        TensorDict(
+            {"final_distance": x, "success": (x < 0.05).float(), "cut_short": torch.zeros(len(x))}, [len(x)]
+        )
+        for x in (after, before)
+    )
+    return verdict(played, then)
 
 
 def test_a_few_lost_successes_are_worse_only_if_they_are_more_than_luck_and_2_percent() -> None:

@@ -33,6 +33,7 @@ def made(monkeypatch: pytest.MonkeyPatch) -> list[dict[str, Any]]:
             {
                 "final_distance": torch.full((4,), cm / 100),
                 "success": torch.ones(4, dtype=torch.bool),
+                "cut_short": torch.zeros(4),
             },
             batch_size=[4],
         )

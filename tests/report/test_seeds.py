@@ -9,8 +9,8 @@ from franka_wm.commands.summary import summary
 from franka_wm.errors import UserError
 from franka_wm.evaluation.intervals import bootstrap_mean
 from franka_wm.evaluation.results import END, Result
-from franka_wm.report.compare import differences
-from franka_wm.report.run import RunFiles, as_asked, but_for_the_seed
+from franka_wm.report.compare import differences, repetitions
+from franka_wm.report.run import RunFiles, as_asked, but_for_the_seed, read_run
 from franka_wm.report.seeds import cells_told, read_evaluation, runs_of, seeds_table
 from light import answers
 
@@ -163,6 +163,42 @@ def test_a_run_given_twice_is_refused(tmp_path, capsys):
     for words in (["0-reach", "0-reach/"], ["1-reach", "link"], [".", "1-reach"]):
         assert main(["summary", *(f"{tmp_path}/{word}" for word in words)]) == 1
         assert "is given twice; each run counts once" in capsys.readouterr().err
+
+
+def test_of_one_seed_the_later_weights_count(tmp_path, capsys):
+    """A run and what went on from it are no two seeds, nor are results of a run that lie elsewhere."""
+    for name, seed, updates in (("a", 1, 300), ("b", 2, 300), ("a2", 1, 600), ("out", 1, 300)):
+        run = tmp_path / name
+        run.mkdir()
+        config = {"seed": seed, "model": {"name": "tdmpc2"}}
+        if name == "out":
+            told = {"config": config, "overrides": [], "preset": "", "typed": []}
+            (run / "run.json").write_text(json.dumps(told))
+        else:
+            (run / "config.yaml").write_text(json.dumps(config))
+        found = {"protocol": {"by": END, "updates": updates}, "policies": evaluation(0.01 * len(name), 1.0)}
+        (run / "evaluation.json").write_text(json.dumps(found))
+    assert main(["summary", *(str(tmp_path / name) for name in ("a", "b", "a2", "out"))]) == 0
+    out = capsys.readouterr().out
+    assert "2 runs of 64 episodes" in out and "1.50 (1.00 – 2.00)" in out
+    for left in ("a", "out"):
+        assert f"left out: {tmp_path / left}, of seed 1 as {tmp_path / 'a2'}, which counts" in out
+    groups = repetitions({name: read_run(tmp_path / name) for name in ("a", "b", "a2")})
+    assert [list(group) for group in groups.values()] == [["a", "b"], ["a2"]]
+
+
+def test_results_elsewhere_are_of_the_configuration_of_their_runs(tmp_path, capsys):
+    for k, size in enumerate((32, 512, 512)):
+        run = tmp_path / str(k)
+        run.mkdir()
+        config = {"seed": k, "model": {"name": "tdmpc2", "latent_dim": size}}
+        (run / "run.json").write_text(
+            json.dumps({"config": config, "overrides": [], "preset": "", "typed": []})
+        )
+        (run / "evaluation.json").write_text(written(0.01, 1.0))
+    assert main(["summary", *(str(tmp_path / str(k)) for k in range(3))]) == 0
+    out = capsys.readouterr().out
+    assert "1 run (0: model.latent_dim=32)" in out and "2 runs (1, 2: model.latent_dim=512)" in out
 
 
 def test_runs_of_other_updates_or_versions_are_told(tmp_path, capsys):
