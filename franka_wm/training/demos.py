@@ -90,7 +90,13 @@ def _recorded(
         action_dim=action_dim,
     )
     there, given = {**recorded.observation_sizes, **recorded.image_sizes}, f"replay.demos={roots}"
-    for key, size in wanted.items():
+    arm = run.env.arm if starts else None
+    begins = (
+        {}
+        if arm is None
+        else dict(zip(READS, (arm.state_dim, arm.target_dim, arm.object_dim, 3), strict=True))
+    )
+    for key, size in {**wanted, **begins}.items():
         if there[key] != size:
             raise UserError(
                 f"{given}: {key} has size {there[key]} there, {size} in this environment; record it with its options"
@@ -195,7 +201,14 @@ def check_demonstrations(run: RunSettings) -> None:
 def _check_recorded(run: RunSettings, roots: Any, arm: FrankaConfig | None, whose: str) -> None:
     """The same of datasets of one task, that of `arm`; `whose` it is, for what is refused."""
     from franka_wm.data.lerobot.opening import read_datasets
-    from franka_wm.data.lerobot.provenance import MEANING, VIEWS, other_option, other_scene, recorded_sessions
+    from franka_wm.data.lerobot.provenance import (
+        MEANING,
+        VIEWS,
+        other_option,
+        other_scene,
+        recorded_sessions,
+    )
+    from franka_wm.data.lerobot.provenance import told as told_of
 
     share = run.replay.demo_resets
     if arm is not None and share:
@@ -238,6 +251,8 @@ def _check_recorded(run: RunSettings, roots: Any, arm: FrankaConfig | None, whos
             raise UserError(
                 f"replay.demos={source.root}: recorded with another env.scene, whose objects are other ones"
             )
+        for line in (*told_of(sessions, env), *(told_of(sessions, env, looks=True) if looks else ())):
+            say(f"replay.demos={source.root}: {line}")
 
 
 @contextmanager

@@ -13,6 +13,7 @@ from franka_wm import processes
 from franka_wm.console import say
 from franka_wm.data.image_storage import CHANNELS, OVERFLOW
 from franka_wm.errors import UserError
+from franka_wm.options import leaves
 from franka_wm.seeding import derive_seed
 from franka_wm.training.checkpoint import Checkpoint
 from franka_wm.training.history import read_rows
@@ -53,6 +54,7 @@ def restore(trainer: Trainer, checkpoint: Checkpoint) -> None:
         fits = env is None or there == here
         experience = own_experience(checkpoint, env.device) if env is not None and fits else None
         if experience is not None:
+            _tell_other_environment(trainer, checkpoint)
             fill(
                 trainer.replay,
                 _fitting(trainer, experience),
@@ -80,6 +82,26 @@ def restore(trainer: Trainer, checkpoint: Checkpoint) -> None:
                 "numbers start anew; this run will not be the same"
             )
             torch.manual_seed(derive_seed("process", settings.seed, processes.rank(), learner.updates))
+
+
+def _tell_other_environment(trainer: Trainer, checkpoint: Checkpoint) -> None:
+    """Says what the environment was while the checkpoint's experience was gathered, where it is another now.
+
+    Raises:
+        UserError: The run exports: a dataset is of one environment.
+    """
+    before, now = ({"env": one["env"]} for one in (checkpoint.config, trainer.settings.values))
+    now = leaves(now)
+    changed = [f"{name}={value}" for name, value in leaves(before).items() if now.get(name, value) != value]
+    if not changed:
+        return
+    gathered = f"the checkpoint's experience was gathered with {', '.join(changed)}"
+    if trainer.settings.export.kind != "none":
+        raise UserError(
+            f"export={trainer.settings.export.kind}: {gathered}, and a dataset is of one environment; "
+            "leave env as it was"
+        )
+    say(f"  {gathered}; it is learned from beside what is gathered now")
 
 
 def _fitting(trainer: Trainer, experience: TensorDictBase) -> TensorDictBase:

@@ -210,8 +210,21 @@ def test_worlds_that_start_new_episodes(why: str, make: Make, checkpoint, env, m
         monkeypatch.setattr(resume, "restorable", lambda env: None)
         why = "the simulators of other libraries cannot be put back"
     restore(make(), checkpoint)
-    assert said(capsys) == [f"worlds: {why}; they start new episodes, and this run will not be the same"]
+    told = [f"worlds: {why}; they start new episodes, and this run will not be the same"]
+    if why == "of another configuration":
+        gathered = "the checkpoint's experience was gathered with env.success_distance=0.2"
+        told.insert(0, f"{gathered}; it is learned from beside what is gathered now")
+    assert said(capsys) == told
     assert (env.get_state()["episode"] == -1).all()
+
+
+def test_a_dataset_is_of_one_environment(make: Make, checkpoint) -> None:
+    """Episodes from before would be said to be of the environment that is now, and be cut by its length."""
+    checkpoint.config["env"]["episode_length"] = 5
+    trainer = make()
+    trainer.settings = trainer.settings.changed(export={"kind": "lerobot"})
+    with pytest.raises(UserError, match=r"gathered with env\.episode_length=5, and a dataset is of one"):
+        restore(trainer, checkpoint)
 
 
 def test_policies_that_drew_on_another_kind_of_device(make: Make, checkpoint, monkeypatch, capsys) -> None:

@@ -9,7 +9,7 @@ from typing import Any
 
 _START = r"(?:^|(?<=[\s='\"\[({,:;`|<>@+]))"
 _ROOT = r"(?:file://)?(?:~\w*[\\/]|[A-Za-z]:\\|/(?!/))"
-_QUOTED = re.compile(rf"(['\"])({_ROOT}[^'\"\n]*)\1")
+_QUOTED = re.compile(rf"(['\"])([\w./+-]+=)?({_ROOT}[^'\"\n]*)\1")
 _PLAIN = re.compile(rf"{_START}{_ROOT}[^\s'\"=,;:\[\](){{}}|<>`]+")
 
 
@@ -27,12 +27,13 @@ def last(path: str) -> str:
 def shortened(text: str) -> str:
     """``text`` with every absolute path in it replaced by the path's last component.
 
-    A path with spaces is found whole if it is quoted or if the spaces are in this user's home.
+    A path with spaces is found whole if it is quoted, alone or as ``'name=/a path'``, or if the spaces are in this
+    user's home.
     """
     home = str(Path.home())
     if len(home) > 1 and " " in home:
         text = text.replace(home + "/", "~/")
-    text = _QUOTED.sub(lambda found: found[1] + last(found[2]) + found[1], text)
+    text = _QUOTED.sub(lambda found: f"{found[1]}{found[2] or ''}{last(found[3])}{found[1]}", text)
     return _PLAIN.sub(lambda found: last(found[0]), text)
 
 

@@ -320,6 +320,7 @@ def test_a_number_that_is_not_finite_is_not_published(copy, capsys) -> None:
             "https://hub/a/b hf:user/name outputs/run 3 cm/s",
         ),
         (r"out=C:\Users\me\set", "out=set"),
+        ("collect 'out=/mnt/a client/data' x", "collect 'out=data' x"),
     ],
 )
 def test_absolute_paths_become_their_last_component(text, becomes) -> None:
