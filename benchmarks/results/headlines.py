@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from pathlib import Path
 
 from benchmarks.results.confirm import confirmed
-from benchmarks.results.metrics import SUCCESS, WITHIN, columns, mean
+from benchmarks.results.metrics import SUCCESS, WITHIN, columns, mean, percent
 from benchmarks.results.records import PLACE, read
 from benchmarks.results.render import table
 from benchmarks.results.rows import Row
@@ -36,7 +36,7 @@ def headlines(rows: Mapping[str, Row], place: Path = PLACE) -> str:
         took = duration(mean([seconds(record) for record in timing]))
         aged = kind == "stale" and confirmed(row, records, place) is None
         title = row.title + " ".join([*"¹" * aged, *"²" * row.chosen])
-        found.append([title, cores(row, records), took, f"{worst:.0f} % {what}, {len(records)} seeds"])
+        found.append([title, cores(row, records), took, f"{percent(worst)} % {what}, {len(records)} seeds"])
     if not found:
         return ""
     titles = " ".join(title for title, *_ in found)

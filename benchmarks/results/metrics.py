@@ -25,8 +25,18 @@ class Metric:
         return self.factor * self.find(record["policies"][policy])[bound]
 
     def show(self, *values: float) -> str:
-        first, *others = (f"{value:.{self.digits}f}" for value in values)
+        first, *others = (
+            percent(value) if self.factor == 100 and not self.digits else f"{value:.{self.digits}f}"
+            for value in values
+        )
         return f"{first} ({' – '.join(others)})" if others else first
+
+
+def percent(rate: float) -> str:
+    """A rate [%] without decimals, unless it would be taken for all or none."""
+    if 99.5 <= rate < 100:
+        return f"{min(rate, 99.9):.1f}"
+    return f"{max(rate, 0.1):.1f}" if 0 < rate <= 0.5 else f"{rate:.0f}"
 
 
 def _within(distance: str) -> Callable[[Mapping[str, Any]], Mapping[str, float]]:

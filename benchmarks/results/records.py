@@ -18,7 +18,7 @@ import yaml
 
 from benchmarks.results.rows import Row
 from franka_wm.errors import UserError
-from franka_wm.evaluation.results import read_result, to_json
+from franka_wm.evaluation.results import END, read_result, to_json
 from franka_wm.files import atomic_write
 from franka_wm.policies.names import RENAMED
 from franka_wm.report.run import SAME_BUT, read_config
@@ -43,8 +43,8 @@ def record_run(row: Row, folder: Path, *, jobs: int, commit: str | None = None) 
         commit: Of the code, where the run could not tell.
 
     Raises:
-        UserError: It did not finish, was resumed, is not a run of this row and one of its seeds, or ran on another
-            kind of machine.
+        UserError: It did not finish, was resumed or evaluated again in its place, is not a run of this row and one of
+            its seeds, or ran on another kind of machine.
     """
     versions, finished, found = (
         read_json(folder / f"{name}.json") for name in ("versions", "finished", "evaluation")
@@ -59,6 +59,8 @@ def record_run(row: Row, folder: Path, *, jobs: int, commit: str | None = None) 
     check_arguments(row, typed, folder)
     check_machine(row, versions, folder)
     result = read_result(folder / "evaluation.json")
+    if (by := result.protocol.get("by")) != END:
+        raise UserError(f"{folder}: evaluation.json is by {by}; results need what the run's own end found")
     kept = {name: value for name, value in config.items() if name not in SAME_BUT}
     return {
         "row": row.name,

@@ -17,6 +17,7 @@ from benchmarks.results.metrics import (
     columns,
     mean,
     number,
+    percent,
     verdicts,
 )
 from benchmarks.results.records import BESIDE, PLACE, read
@@ -341,7 +342,7 @@ def readme_tables(rows: Mapping[str, Row], place: Path = PLACE) -> str:
         distance = mean([DISTANCE.of(record, policy) for record in records])
         worst = min(WITHIN["5"].of(record, policy) for record in records)
         nothing = mean([DISTANCE.of(record, "noop") for record in records])
-        found = [*took, f"{distance:.1f} cm", f"{worst:.0f} %", f"{nothing:.0f} cm"]
+        found = [*took, f"{distance:.1f} cm", f"{percent(worst)} %", f"{nothing:.0f} cm"]
         arm.append([who, row.model, f"{where}, {runs}", *found, missed])
     parts = []
     if arm:

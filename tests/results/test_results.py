@@ -18,6 +18,7 @@ from benchmarks.results.rows import Row, Section, load_rows
 from benchmarks.results.state import composed, state
 from franka_wm import source
 from franka_wm.errors import UserError
+from franka_wm.evaluation.results import COMMAND, END
 from result_rows import ROW
 
 TYPED = ["scale=smoke", "device=cpu", "env=reach_fixed"]
@@ -62,7 +63,7 @@ def make_run(tmp_path: Path) -> Callable[..., Path]:
             yaml.safe_dump(now | {"seed": seed, "device": "cpu"} | (config or {}))
         )
         policies = {"planner": policy(distance, within), "noop": policy(0.25, 0.0)}
-        found = {"protocol": protocol or {}, "policies": policies}
+        found = {"protocol": {"by": END, **(protocol or {})}, "policies": policies}
         (run / "evaluation.json").write_text(json.dumps(found))
         counters = {"env_steps": 200, "updates": 30, "seconds": 30.0 + seed - 100}
         (run / "checkpoints" / "latest" / "counters.json").write_text(json.dumps(counters))
@@ -96,7 +97,7 @@ def test_a_record_holds_what_the_run_wrote(make_run) -> None:
     run = make_run(100, 0.01, protocol={"episodes": 128})
     record = records.record_run(ROW, run, jobs=3)
     assert record["policies"] == json.loads((run / "evaluation.json").read_text())["policies"]
-    assert record["protocol"] == {"episodes": 128}
+    assert record["protocol"] == {"by": END, "episodes": 128}
     assert record["command"] == "python train.py scale=smoke device=cpu env=reach_fixed seed=100"
     assert (record["seed"], record["commit"], record["date"]) == (100, "0123456789abcdef", "2026-01-02")
     machine = {"processor": "a processor", "cores": 2, "threads": 2, "gpu": None, "jobs": 3}
@@ -130,6 +131,7 @@ def test_both_stages_count(make_run, tmp_path) -> None:
             "on NVIDIA H200, and reach is measured with at most 2 threads",
         ),
         ({"versions": {"threads": 4}}, "with 4 threads"),
+        ({"protocol": {"by": COMMAND}}, "is by franka-wm evaluate; results need"),
     ],
 )
 def test_another_run_is_refused(make_run, given, says) -> None:

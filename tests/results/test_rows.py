@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from benchmarks.results.metrics import goals_met, verdicts
+from benchmarks.results.metrics import SUCCESS, goals_met, percent, verdicts
 from benchmarks.results.rows import Row, Section, load_rows
 from franka_wm import conf
 from franka_wm.errors import UserError
@@ -137,3 +137,20 @@ def test_a_list_that_nobody_reads_to_its_end_ends_quietly(root: Path, tmp_path: 
         command = [sys.executable, "-m", "benchmarks.results", "list", f"--results={tmp_path}"]
         done = subprocess.run(command, cwd=root, stdout=stream, stderr=subprocess.PIPE, text=True)
     assert done.returncode == 1 and done.stderr == ""
+
+
+@pytest.mark.parametrize(
+    ("rate", "shown"),
+    [
+        (0, "0"),
+        (0.02, "0.1"),
+        (0.5, "0.5"),
+        (50, "50"),
+        (99.4, "99"),
+        (99.61, "99.6"),
+        (99.99, "99.9"),
+        (100, "100"),
+    ],
+)
+def test_a_rate_that_is_not_all_or_none_does_not_look_so(rate: float, shown: str) -> None:
+    assert percent(rate) == shown and SUCCESS.show(rate, rate).startswith(f"{shown} ({shown}")
