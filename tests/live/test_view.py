@@ -299,7 +299,7 @@ def recording() -> None:
 def test_what_ctrl_c_loses_is_said(tmp_path) -> None:
     fork = Fork(recording, cwd=tmp_path, log=tmp_path / "log")
     until = time.monotonic() + 120
-    while "Ctrl-C ends it" not in fork.said() and time.monotonic() < until:
+    while "Ctrl-C ends it" not in fork.said()[0] and time.monotonic() < until:
         time.sleep(0.05)
     os.kill(fork.pid, signal.SIGINT)
     assert "a recording was not saved" in fork.wait(30).stdout
