@@ -58,7 +58,7 @@ def summary(folders: tuple[str, ...]) -> None:
 
 
 def _one_of_each_seed(group: Mapping[Path, Result]) -> dict[Path, Result]:
-    """Of runs with the same seed that of later weights, then that of more episodes; the others are named."""
+    """The run of later weights, then of more episodes, of those with the same seed; the others are named."""
     from franka_wm.report.run import read_config
 
     best: dict[object, Path] = {}

@@ -136,8 +136,8 @@ def evaluate_policies(
                 )
         rows = cast(TensorDict, torch.cat(played))
         evaluation.episodes[name] = rows
-        summary = evaluation.policies[name] = summarize(rows, thresholds=thresholds(env))
-        if cut := summary.get("cut_short"):
+        evaluation.policies[name] = summarize(rows, thresholds=thresholds(env))
+        if cut := evaluation.policies[name].get("cut_short"):
             console.say(warn_of_cut(name, cut, episodes))
         if timing:
             with seeded(seeds[0], policy):

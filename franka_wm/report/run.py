@@ -175,7 +175,7 @@ def read_chosen(folder: str | Path) -> dict[str, Any]:
 
 
 def _told_of_run(files: UntrustedFolder) -> dict[str, Any] | None:
-    """Of which run ``franka-wm evaluate`` wrote the results that lie here."""
+    """The run of which ``franka-wm evaluate`` wrote the results that lie here."""
     told = files.json(OF_RUN)
     return told if told is not None and {"config", "overrides", "preset", "typed"} <= told.keys() else None
 

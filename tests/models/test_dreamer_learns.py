@@ -7,7 +7,7 @@ from tensordict import TensorDict
 from franka_wm.models import make
 
 SIZES = dict(
-    deter_dim=64, hidden_dim=64, codes=8, classes=8, blocks=2, encoder_layers=2, bins=101, imagination=8
+    deter_dim=64, hidden_dim=64, codes=8, classes=8, blocks=2, encoder_layers=2, bins=101, imagination=5
 )
 
 
@@ -39,8 +39,8 @@ def test_it_remembers_what_is_not_seen_and_learns_to_act(actor_gradient):
         actor_gradient=actor_gradient,
         **SIZES,
     )
-    optimiser = torch.optim.AdamW(model.parameter_groups(2e-3), weight_decay=0.0)
-    for _ in range(600):
+    optimiser = torch.optim.AdamW(model.parameter_groups(4e-3), weight_decay=0.0)
+    for _ in range(400):
         losses = model.loss(hidden_velocity(16, 10))
         optimiser.zero_grad()
         losses["loss"].backward()
