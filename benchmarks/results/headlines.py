@@ -6,12 +6,13 @@ from collections.abc import Mapping
 from pathlib import Path
 
 from benchmarks.results.confirm import confirmed
-from benchmarks.results.metrics import SUCCESS, WITHIN, columns, mean, percent
+from benchmarks.results.metrics import SUCCESS, WITHIN, columns, mean
 from benchmarks.results.records import PLACE, read
 from benchmarks.results.render import table
 from benchmarks.results.rows import Row
 from benchmarks.results.state import state, unmeasured
 from benchmarks.results.times import cores, duration, seconds, timed
+from franka_wm.evaluation.intervals import percent
 
 BEGIN, END = "<!-- headlines: written by `make results` -->", "<!-- end of headlines -->"
 

@@ -10,6 +10,7 @@ from benchmarks.results.rows import Row, is_bound
 from benchmarks.results.state import Record
 from benchmarks.results.times import company, duration, seconds, timed
 from franka_wm.errors import UserError
+from franka_wm.evaluation.intervals import percent
 
 
 @dataclass(frozen=True)
@@ -30,13 +31,6 @@ class Metric:
             for value in values
         )
         return f"{first} ({' – '.join(others)})" if others else first
-
-
-def percent(rate: float) -> str:
-    """A rate [%] without decimals, unless it would be taken for all or none."""
-    if 99.5 <= rate < 100:
-        return f"{min(rate, 99.9):.1f}"
-    return f"{max(rate, 0.1):.1f}" if 0 < rate <= 0.5 else f"{rate:.0f}"
 
 
 def _within(distance: str) -> Callable[[Mapping[str, Any]], Mapping[str, float]]:

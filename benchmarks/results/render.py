@@ -17,7 +17,6 @@ from benchmarks.results.metrics import (
     columns,
     mean,
     number,
-    percent,
     verdicts,
 )
 from benchmarks.results.records import BESIDE, PLACE, read
@@ -25,6 +24,7 @@ from benchmarks.results.rows import Row
 from benchmarks.results.state import Record, apart, numbers, state, unmeasured
 from benchmarks.results.times import company, cores, duration, grouped, machine, seconds, timed
 from franka_wm.errors import UserError
+from franka_wm.evaluation.intervals import percent
 
 BEGIN, END = "<!-- results: written by `make results` -->", "<!-- end of results -->"
 LEGEND = (

@@ -25,9 +25,9 @@ MOST_NAMED = 3
 def summary(folders: tuple[str, ...]) -> None:
     """Show runs of several seeds in one table.
 
-    Runs that differ in more than their seed get a table for each configuration. Of several runs of one seed, as a run
-    and what went on from it, that of later weights counts, and the others are named. Of a sweep, runs that have not
-    been evaluated yet, or failed, are named and left out.
+    Runs that differ in more than their seed get a table for each configuration. Of several of one seed, as where a run
+    was repeated or evaluated elsewhere, that of later weights counts, and the others are named. Of a sweep, runs that
+    have not been evaluated yet, or failed, are named and left out.
     """
     from franka_wm.report.run import but_for_the_seed, malformed, read_config, without_the_seed
     from franka_wm.report.seeds import evaluated, read_evaluation

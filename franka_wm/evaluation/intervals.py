@@ -168,3 +168,15 @@ def _samples(*values: Values) -> list[NDArray[np.float64]]:
 def _check_confidence(confidence: float) -> None:
     if not 0 < confidence < 1:
         raise UserError(f"confidence is {confidence}; it must lie between 0 and 1, 0.95 is usual.")
+
+
+def scaled(value: float, scale: float, digits: int) -> str:
+    """``scale * value`` with so many decimals; a rate [%] without any, unless it would be taken for all or none."""
+    return percent(scale * value) if (scale, digits) == (100, 0) else f"{scale * value:z.{digits}f}"
+
+
+def percent(rate: float) -> str:
+    """A rate [%] without decimals, unless it would be taken for all or none."""
+    if 99.5 <= rate < 100 - 1e-9:
+        return f"{min(rate, 99.9):.1f}"
+    return f"{max(rate, 0.1):.1f}" if 1e-9 < rate <= 0.5 else f"{rate:z.0f}"

@@ -23,6 +23,7 @@ from franka_wm.evaluation.closed_loop import (
     success_distance,
     summarize,
 )
+from franka_wm.evaluation.intervals import percent
 from franka_wm.evaluation.results import END, FILE, point, to_json
 from franka_wm.files import atomic_write
 from franka_wm.options import is_whole
@@ -240,7 +241,7 @@ def numbers_to_log(
 def describe(name: str, summary: Mapping[str, Any]) -> str:
     """One line about a policy as its numbers come."""
     success = summary.get("success") or {}
-    own = f"success {100 * success['mean']:.0f} %, " if "mean" in success else ""
+    own = f"success {percent(100 * success['mean'])} %, " if "mean" in success else ""
     if "final_distance" in summary:
         return f"  {name}: {own}final distance {100 * summary['final_distance']['mean']:.2f} cm"
     return f"  {name}: {own}return {summary['return']['mean']:.2f}"

@@ -95,8 +95,8 @@ def robustness(
         Shift → policy → ``final_distance`` [m] and ``success`` at the end, as the task judges, with 95 % intervals
         (bootstrap, Wilson); ``change`` of the final distance [m], paired by episode, with its bootstrap interval
         (``None`` for :data:`UNSHIFTED`); ``verdict``, of :func:`verdict` (empty for :data:`UNSHIFTED`); where there
-        are any, how many episodes the simulator ``cut_short``, which are no successes. Of tasks whose success is no
-        distance: ``return`` and ``return_change`` instead of the distances.
+        are any, how many episodes the simulator ``cut_short`` in either world, which are no successes. Of tasks whose
+        success is no distance: ``return`` and ``return_change`` instead of the distances.
 
     Raises:
         UserError: Not the arm, fewer than 2 episodes, or no such policy.
@@ -228,7 +228,7 @@ def _compared(played: TensorDictBase, before: TensorDictBase, near: float | None
     value, unshifted = played.get(what), before.get(what)
     now, then = played.get("success").bool(), before.get("success").bool()
     told = verdict_of_success(now, then) if near is None else verdict(played, before)
-    same, cut = played is before, int(_cut(played).sum())
+    same, cut = played is before, int((_cut(played) | _cut(before)).sum())
     return {
         what: bootstrap_mean(value).as_dict(),
         "success": wilson(int(now.sum()), now.numel()).as_dict(),

@@ -112,8 +112,9 @@ def repetitions(runs: Mapping[str, RunFiles]) -> dict[str, dict[str, RunFiles]]:
         alike = but_for_the_seed(run.config) or name
         if run.elsewhere:  # of a run that may be here, too, or that was evaluated twice: not another run
             alike += " elsewhere"
-        if run.seed is not None and any(one.seed == run.seed for one in groups.get(alike, {}).values()):
-            alike += name
+        # The second run of a seed is in a second group: what was repeated, or measured twice, is no other seed.
+        while run.seed is not None and any(one.seed == run.seed for one in groups.get(alike, {}).values()):
+            alike += " again"
         groups.setdefault(alike, {})[name] = run
     return {next(iter(group)): group for group in groups.values()}
 

@@ -6,6 +6,7 @@ import math
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
+from franka_wm.evaluation.intervals import scaled
 from franka_wm.evaluation.protocol import INTERVALS, Evaluation
 from franka_wm.report.style import centimetres, policy_legend, policy_name
 from franka_wm.report.table import Table, evaluation_tables, markdown
@@ -43,7 +44,7 @@ def evaluation_markdown(found: Evaluation) -> str:
 
 def interval(value: Mapping[str, float], scale: float = 1.0, digits: int = 2) -> str:
     """`mean (low – high)`."""
-    mean, low, high = (f"{scale * value[name]:z.{digits}f}" for name in ("mean", "low", "high"))
+    mean, low, high = (scaled(value[name], scale, digits) for name in ("mean", "low", "high"))
     return f"{mean} ({low} – {high})"
 
 

@@ -6,6 +6,7 @@ from typing import Any
 
 from markupsafe import Markup
 
+from franka_wm.evaluation.intervals import percent
 from franka_wm.evaluation.results import SHOWN, Result
 from franka_wm.report import style
 from franka_wm.report.bars import bars_figure
@@ -121,8 +122,8 @@ def _outcome(values: Mapping[str, Any], who: str) -> list[tuple[str, str, str]]:
         out.append(
             (
                 f"success at {style.centimetres(widest)}" if widest else "success",
-                f"{100 * rate['mean']:.0f} %",
-                f"{100 * rate['low']:.0f} – {100 * rate['high']:.0f}, {values.get('episodes', '?')} episodes",
+                f"{percent(100 * rate['mean'])} %",
+                f"{percent(100 * rate['low'])} – {percent(100 * rate['high'])}, {values.get('episodes', '?')} episodes",
             )
         )
     return out

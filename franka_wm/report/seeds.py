@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Any
 
 from franka_wm.errors import UserError
-from franka_wm.evaluation.intervals import bootstrap_mean
+from franka_wm.evaluation.intervals import bootstrap_mean, scaled
 from franka_wm.evaluation.results import Result, results
 from franka_wm.report.style import centimetres
 from franka_wm.untrusted import UntrustedFolder
@@ -78,11 +78,13 @@ def seeds_table(evaluations: Sequence[Mapping[str, Any]]) -> str:
     for policy in policies:
         cells, ranges = [], []
         for _, path, scale, digits in columns:
-            values = [scale * _mean(e[policy], path) for e in evaluations]
-            mean, low, high = bootstrap_mean(values)
-            ranges.append(f"{min(values):.{digits}f} – {max(values):.{digits}f}")
-            spread = f"{low:.{digits}f} – {high:.{digits}f}" if len(values) >= ENOUGH else ranges[-1]
-            cells.append(f"{mean:.{digits}f}" + f" ({spread})" * (len(values) > 1))
+            values = [_mean(e[policy], path) for e in evaluations]
+            mean, low, high, least, most = (
+                scaled(x, scale, digits) for x in (*bootstrap_mean(values), min(values), max(values))
+            )
+            ranges.append(f"{least} – {most}")
+            spread = f"{low} – {high}" if len(values) >= ENOUGH else ranges[-1]
+            cells.append(mean + f" ({spread})" * (len(values) > 1))
         lines.append(f"| {policy} | " + " | ".join(cells) + " |")
         if len(evaluations) >= ENOUGH:
             lines.append("| | " + " | ".join(ranges) + " |")

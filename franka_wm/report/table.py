@@ -8,6 +8,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
+from franka_wm.evaluation.intervals import scaled
 from franka_wm.report.style import centimetres, policy_name
 
 if TYPE_CHECKING:
@@ -202,7 +203,7 @@ def _text(path: tuple[str, ...], value: Any, digits: int) -> str:
         return "–"
     if known is not None:
         _, scale, places = known
-        mean, *ends = (f"{scale * number:z.{places}f}" for number in numbers)
+        mean, *ends = (scaled(number, scale, places) for number in numbers)
     else:
         # What is left of rounding, such as -3.6e-16, is 0.
         rounded = [0 if abs(number) < 1e-12 else number for number in numbers]

@@ -12,12 +12,22 @@ from torch import Tensor
 from franka_wm import processes
 from franka_wm.console import say
 from franka_wm.data.image_storage import CHANNELS, OVERFLOW
+from franka_wm.data.lerobot.provenance import (
+    DYNAMICS,
+    LOOKS,
+    MEANING,
+    VIEWS,
+    as_typed,
+    other_options,
+    other_scene,
+)
 from franka_wm.errors import UserError
 from franka_wm.options import leaves
 from franka_wm.seeding import derive_seed
 from franka_wm.training.checkpoint import Checkpoint
 from franka_wm.training.history import read_rows
 from franka_wm.training.moment import draw_anew, go_on_drawing, put_back, restorable, same_worlds
+from franka_wm.training.settings import RunSettings
 from franka_wm.training.shards import own_experience, own_moment
 from franka_wm.training.storage_budget import fill
 from franka_wm.training.trainer import Trainer
@@ -90,18 +100,30 @@ def _tell_other_environment(trainer: Trainer, checkpoint: Checkpoint) -> None:
     Raises:
         UserError: The run exports: a dataset is of one environment.
     """
-    before, now = ({"env": one["env"]} for one in (checkpoint.config, trainer.settings.values))
-    now = leaves(now)
-    changed = [f"{name}={value}" for name, value in leaves(before).items() if now.get(name, value) != value]
+    changed = _changed(checkpoint.config["env"], trainer.settings)
     if not changed:
         return
     gathered = f"the checkpoint's experience was gathered with {', '.join(changed)}"
     if trainer.settings.export.kind != "none":
         raise UserError(
             f"export={trainer.settings.export.kind}: {gathered}, and a dataset is of one environment; "
-            "leave env as it was"
+            "leave env as it was, or add export.kind=none"
         )
-    say(f"  {gathered}; it is learned from beside what is gathered now")
+    say(f"  {gathered}; it stays in the replay beside what is gathered now")
+
+
+def _changed(before: Mapping[str, Any], settings: RunSettings) -> list[str]:
+    """What of the environment gives transitions another meaning than they had with ``before``, as one types it."""
+    if not settings.is_arm:
+        there, here = (leaves(one, "env") for one in (before, settings.values["env"]))
+        names = sorted(name for name in {*there, *here} if there.get(name) != here.get(name))
+        return [f"{name}={as_typed(there.get(name))}" for name in names]
+    arm = settings.env.arm
+    env = {**vars(arm), "urdf_path": settings.env.urdf_path}
+    names = (*MEANING, *DYNAMICS, *((*VIEWS, *LOOKS) if arm.images else ()), "episode_length")
+    session = {"config": {"env": before}}
+    changed = [f"env.{name}={value}" for name, value in other_options([session], env, names).items()]
+    return changed + ["another env.scene"] * other_scene([session], env, images=bool(arm.images), moves=True)
 
 
 def _fitting(trainer: Trainer, experience: TensorDictBase) -> TensorDictBase:

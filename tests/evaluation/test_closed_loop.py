@@ -112,20 +112,20 @@ def test_of_several_tasks_each_judges_the_first_episode_of_its_worlds() -> None:
     tensors = {name: SimpleNamespace(broken=broken[name], overflow=overflow[name]) for name in broken}
     envs = {name: SimpleNamespace(simulation=SimpleNamespace(tensors=own)) for name, own in tensors.items()}
     env = SimpleNamespace(envs=envs, one_hot=torch.eye(2)[[0, 1, 0]], num_envs=3, device=torch.device("cpu"))
-    broken["a"][1], overflow["a"][0] = True, 1  # the last and the first world's
+    overflow["a"][1] = 1  # the last world's
     judged = _Tasks(env)
     for running, success in (([1, 1, 1], [0, 1, 1]), ([1, 1, 1], [1, 0, 0]), ([1, 0, 0], [1, 1, 1])):
         after = TensorDict({"success": torch.tensor(success, dtype=torch.bool).unsqueeze(-1)}, [3])
         judged.see(torch.tensor(running, dtype=torch.bool), after)
         overflow["b"][0] = success == [1, 0, 0]  # in the third step: a later episode of its world
     found = judged.summary(torch.ones(3))
-    assert found["success"].tolist() == [1.0, 0.0, 0.0] and found["success_once"].tolist() == [0.0, 1.0, 0.0]
-    assert found["cut_short"].tolist() == [1.0, 0.0, 1.0]
+    assert found["success"].tolist() == [1.0, 0.0, 0.0] and found["success_once"].tolist() == [1.0, 1.0, 0.0]
+    assert found["cut_short"].tolist() == [0.0, 0.0, 1.0]
     rows = TensorDict({**found, "return": torch.zeros(3)}, [3])
     assert rows["task_success", "a"][[0, 2]].tolist() == [1.0, 0.0] and rows["task_success", "a"][1].isnan()
     summary = summarize(rows)
     rates = {name: interval["mean"] for name, interval in summary["task_success"].items()}
-    assert rates == {"a": 0.5, "b": 0.0} and summary["success_once"]["mean"] == pytest.approx(1 / 3)
+    assert rates == {"a": 0.5, "b": 0.0} and summary["success_once"]["mean"] == pytest.approx(2 / 3)
 
 
 def test_video_is_called_before_every_step(env: FrankaEnv) -> None:

@@ -79,6 +79,7 @@ def test_shifted_worlds_that_break_are_counted() -> None:
     found = robustness._compared(cut, whole, 0.05)
     assert found["verdict"] == "breaks" and found["cut_short"] == 40
     assert robustness._compared(cut, cut.clone(), 0.05)["verdict"] == "never worked"
+    assert robustness._compared(whole, cut, 0.05)["cut_short"] == 40
     whole = robustness._compared(whole, whole.clone(), 0.05)
     assert whole["verdict"] == "holds" and "cut_short" not in whole
     rows = robustness_table({"mass": {"ik": found}, "gains": {"ik": whole}}, success_distance=0.05).rows

@@ -49,6 +49,11 @@ def test_three_runs_have_an_interval_of_their_mean():
     assert seeds_table([evaluation(0.01, 1.0), evaluation(0.03, 0.5)]).count("\n") == 2
 
 
+def test_one_failure_in_many_episodes_shows():
+    table = seeds_table([evaluation(0.01, rate) for rate in (1.0, 1.0, 127 / 128)])
+    assert "| 99.7 (99 – 100) |" in table and "| 99 – 100 |" in table
+
+
 def test_a_table_does_not_wait_for_torch(tmp_path):
     for k in range(3):
         (tmp_path / str(k)).mkdir()
@@ -167,7 +172,13 @@ def test_a_run_given_twice_is_refused(tmp_path, capsys):
 
 def test_of_one_seed_the_later_weights_count(tmp_path, capsys):
     """A run and what went on from it are no two seeds, nor are results of a run that lie elsewhere."""
-    for name, seed, updates in (("a", 1, 300), ("b", 2, 300), ("a2", 1, 600), ("out", 1, 300)):
+    for name, seed, updates in (
+        ("a", 1, 300),
+        ("b", 2, 300),
+        ("a2", 1, 600),
+        ("b2", 2, 600),
+        ("out", 1, 300),
+    ):
         run = tmp_path / name
         run.mkdir()
         config = {"seed": seed, "model": {"name": "tdmpc2"}}
@@ -178,13 +189,13 @@ def test_of_one_seed_the_later_weights_count(tmp_path, capsys):
             (run / "config.yaml").write_text(json.dumps(config))
         found = {"protocol": {"by": END, "updates": updates}, "policies": evaluation(0.01 * len(name), 1.0)}
         (run / "evaluation.json").write_text(json.dumps(found))
-    assert main(["summary", *(str(tmp_path / name) for name in ("a", "b", "a2", "out"))]) == 0
+    assert main(["summary", *(str(tmp_path / name) for name in ("a", "b", "b2", "a2", "out"))]) == 0
     out = capsys.readouterr().out
-    assert "2 runs of 64 episodes" in out and "1.50 (1.00 – 2.00)" in out
+    assert "2 runs of 64 episodes" in out and "2.00 (2.00 – 2.00)" in out
     for left in ("a", "out"):
         assert f"left out: {tmp_path / left}, of seed 1 as {tmp_path / 'a2'}, which counts" in out
-    groups = repetitions({name: read_run(tmp_path / name) for name in ("a", "b", "a2")})
-    assert [list(group) for group in groups.values()] == [["a", "b"], ["a2"]]
+    groups = repetitions({name: read_run(tmp_path / name) for name in ("a", "b", "a2", "b2")})
+    assert [list(group) for group in groups.values()] == [["a", "b"], ["a2", "b2"]]
 
 
 def test_results_elsewhere_are_of_the_configuration_of_their_runs(tmp_path, capsys):

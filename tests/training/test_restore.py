@@ -213,7 +213,7 @@ def test_worlds_that_start_new_episodes(why: str, make: Make, checkpoint, env, m
     told = [f"worlds: {why}; they start new episodes, and this run will not be the same"]
     if why == "of another configuration":
         gathered = "the checkpoint's experience was gathered with env.success_distance=0.2"
-        told.insert(0, f"{gathered}; it is learned from beside what is gathered now")
+        told.insert(0, f"{gathered}; it stays in the replay beside what is gathered now")
     assert said(capsys) == told
     assert (env.get_state()["episode"] == -1).all()
 
@@ -225,6 +225,29 @@ def test_a_dataset_is_of_one_environment(make: Make, checkpoint) -> None:
     trainer.settings = trainer.settings.changed(export={"kind": "lerobot"})
     with pytest.raises(UserError, match=r"gathered with env\.episode_length=5, and a dataset is of one"):
         restore(trainer, checkpoint)
+
+
+CUBE = {"objects": [{"name": "cube", "shape": "box", "size": [0.05, 0.05, 0.05], "mass": 0.1}]}
+
+
+@pytest.mark.parametrize(
+    ("words", "before", "changed"),
+    [
+        (("env=reach",), {"max_contacts": 9, "target_ke": 4500.0}, ["env.target_ke=4500.0"]),
+        (("env=reach",), {"camera_distance": 1.0}, []),  # it has no images
+        (("env=lift",), {"scene": CUBE}, ["another env.scene"]),
+        (("env=push",), {"task_options": {"reach": 0.1}}, ["env.task_options={reach: 0.1}"]),
+        (("env=gym", "env.name=Pendulum-v1"), {"frame_skip": 3}, ["env.frame_skip=3"]),
+    ],
+)
+def test_what_gives_transitions_another_meaning(
+    words: tuple[str, ...], before: dict, changed: list[str], settled
+) -> None:
+    """Also where one of both is null; not what changes none of them, such as the room for contacts."""
+    settings = settled("scale=smoke", *words)
+    own = settings.values["env"]
+    assert resume._changed(own, settings) == []
+    assert resume._changed({**own, **before}, settings) == changed
 
 
 def test_policies_that_drew_on_another_kind_of_device(make: Make, checkpoint, monkeypatch, capsys) -> None:

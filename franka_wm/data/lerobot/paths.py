@@ -9,7 +9,7 @@ from typing import Any
 
 _START = r"(?:^|(?<=[\s='\"\[({,:;`|<>@+]))"
 _ROOT = r"(?:file://)?(?:~\w*[\\/]|[A-Za-z]:\\|/(?!/))"
-_QUOTED = re.compile(rf"(['\"])([\w./+-]+=)?({_ROOT}[^'\"\n]*)\1")
+_QUOTED = re.compile(rf"(['\"])((?:[\w./+-]+=)?)(\[?)({_ROOT}[^'\"\n]*)\1")
 _PLAIN = re.compile(rf"{_START}{_ROOT}[^\s'\"=,;:\[\](){{}}|<>`]+")
 
 
@@ -27,14 +27,20 @@ def last(path: str) -> str:
 def shortened(text: str) -> str:
     """``text`` with every absolute path in it replaced by the path's last component.
 
-    A path with spaces is found whole if it is quoted, alone or as ``'name=/a path'``, or if the spaces are in this
-    user's home.
+    A path with spaces is found whole if it is quoted, alone, as ``'name=/a path'`` or in a list that begins with one,
+    or if the spaces are in this user's home.
     """
     home = str(Path.home())
     if len(home) > 1 and " " in home:
         text = text.replace(home + "/", "~/")
-    text = _QUOTED.sub(lambda found: f"{found[1]}{found[2] or ''}{last(found[3])}{found[1]}", text)
+    text = _QUOTED.sub(_quoted, text)
     return _PLAIN.sub(lambda found: last(found[0]), text)
+
+
+def _quoted(found: re.Match[str]) -> str:
+    quote, name, bracket, path = found.groups()
+    parts = path.split(",") if bracket else [path]  # the last one of a list ends in its bracket
+    return quote + name + bracket + ",".join(last(one) if is_local(one) else one for one in parts) + quote
 
 
 def without_paths(value: Any, *, clear: bool = False) -> Any:

@@ -321,6 +321,8 @@ def test_a_number_that_is_not_finite_is_not_published(copy, capsys) -> None:
         ),
         (r"out=C:\Users\me\set", "out=set"),
         ("collect 'out=/mnt/a client/data' x", "collect 'out=data' x"),
+        ("'replay.demos=[/a client/d1,sets/d2,/c/d3]'", "'replay.demos=[d1,sets/d2,d3]'"),
+        ("'hydra.searchpath=[file:///a b/c]'", "'hydra.searchpath=[c]'"),
     ],
 )
 def test_absolute_paths_become_their_last_component(text, becomes) -> None:
