@@ -30,7 +30,14 @@ def test_gradients_flow_as_without(calls):
 @runs_kernels
 def test_a_plan_is_the_same(monkeypatch, calls):
     """CUDA plans by the kernels; here the device is said to be one."""
-    sizes = {"action_dim": 3, "horizon": 2, "num_samples": 24, "num_policy_samples": 4, "num_elites": 6}
+    sizes = {
+        "action_dim": 3,
+        "horizon": 2,
+        "iterations": 2,
+        "num_samples": 24,
+        "num_policy_samples": 4,
+        "num_elites": 6,
+    }
     whole = model()
     observation = TensorDict({"state": torch.randn(2, 5), "is_init": torch.ones(2, 1, dtype=torch.bool)}, [2])
 
