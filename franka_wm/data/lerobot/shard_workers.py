@@ -20,6 +20,7 @@ from franka_wm.data.lerobot.merge import merge
 from franka_wm.data.lerobot.schema import Schema
 from franka_wm.data.lerobot.shard import write_shard
 from franka_wm.errors import UserError
+from franka_wm.files import sync
 
 LOCK = "lock.workers"
 """Held by the writing processes together, in the folder of a dataset that is being written."""
@@ -61,6 +62,10 @@ def wait_for_orphans(path: Path) -> None:
                 time.sleep(0.05)
     finally:
         os.close(descriptor)
+
+
+class WritingFailedError(UserError):
+    """A shard, or the dataset of all of them, could not be written."""
 
 
 class WorkerEnded(Exception):
@@ -145,9 +150,7 @@ class InProcess:
 
 def _raise(problem: str | None) -> None:
     if problem is not None:
-        raise UserError(
-            f"writing failed: {problem}; what is finished is kept: collect goes on with resume=true"
-        )
+        raise WritingFailedError(f"writing failed: {problem}")
 
 
 def _do(kind: str, *job: Any) -> str | None:
@@ -181,4 +184,6 @@ def work() -> None:
 def _write_shard(folder: Path, schema: Schema, episodes: list[Episode]) -> None:
     partial = folder.with_name(folder.name + PARTIAL)
     write_shard(partial, schema, episodes)
+    for path in (*partial.rglob("*"), partial):  # on the disk before it counts as whole
+        sync(path)
     os.rename(partial, folder)

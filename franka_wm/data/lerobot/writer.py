@@ -38,6 +38,7 @@ from franka_wm.data.lerobot.shard_workers import (
     InProcess,
     Worker,
     WorkerEnded,
+    WritingFailedError,
     lock_folder,
     wait_for_orphans,
 )
@@ -75,6 +76,8 @@ def check_out(out: str | Path, *, resume: bool = False, resumable: bool = True) 
     if _shards(working) and not resume and (resumable or not _made_again(working)):
         more = "go on with resume=true, or " if resumable else ""
         raise UserError(f"{working} holds an unfinished dataset; {more}remove {working}")
+    if _shards(working) and resumable and _made_again(working):
+        raise UserError(f"{working} is what an export left, which is not gone on with; remove {working}")
     why = unwritable(working)
     if why is not None:
         raise UserError(f"out={out}: {why}; choose another folder")
@@ -271,8 +274,11 @@ class DatasetWriter:
     @contextmanager
     def _rescuing(self) -> Iterator[None]:
         """Inside, the end of a writing process costs the shard that it was at: what is in memory is written here."""
+        more = ": collect goes on with resume=true" if self._resumable else ""
         try:
             yield
+        except WritingFailedError as error:
+            raise UserError(str(error) + (more and f"; what is finished is kept{more}")) from error
         except WorkerEnded as error:
             for worker in self._workers:
                 worker.stop()  # with its shard written, unless that takes half a minute
@@ -283,7 +289,6 @@ class DatasetWriter:
                     self._dispatch()
             except UserError as other:
                 also = f"; what was in memory is lost: {other}"
-            more = ": collect goes on with resume=true" if self._resumable else ""
             raise UserError(
                 f"{error}{also}; {episodes_there(self.out)} episodes are on disk{more}"
             ) from error

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import signal
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -88,3 +89,32 @@ def test_what_cannot_be_written_here_either_is_told_with_it(
             UserError, match=r"ended.*memory is lost: writing failed: no room.*0 episodes are on disk$"
         ):
             writer.add(episodes[1:])
+
+
+@pytest.mark.parametrize("resumable", [True, False])
+def test_what_failed_is_gone_on_with_only_where_it_can_be(
+    resumable: bool, tmp_path, make_schema, make_episode, monkeypatch
+) -> None:
+    monkeypatch.setattr("franka_wm.data.lerobot.shard_workers._do", lambda *_: "no room on the disk")
+    options: Any = {"provenance": {}, "workers": 0, "resumable": resumable}
+    with DatasetWriter(tmp_path / "set", schema := make_schema(), **options) as writer:
+        writer.add([make_episode(schema, 0)])
+        with pytest.raises(UserError) as failed:
+            writer.flush()
+    more = "; what is finished is kept: collect goes on with resume=true" if resumable else ""
+    assert str(failed.value) == f"writing failed: no room on the disk{more}"
+
+
+def test_a_shard_is_on_the_disk_before_it_counts(tmp_path, make_schema, make_episode, monkeypatch) -> None:
+    synced, real = {}, os.rename
+    monkeypatch.setattr("franka_wm.data.lerobot.shard_workers.sync", lambda path: synced.setdefault(path))
+
+    def rename(old: Path, new: Path) -> None:
+        assert {*old.rglob("*"), old} == synced.keys() and old.suffix == ".partial"
+        real(old, new)
+
+    with DatasetWriter(tmp_path / "set", schema := make_schema(), provenance={}, workers=0) as writer:
+        writer.add([make_episode(schema, 0)])
+        monkeypatch.setattr(os, "rename", rename)
+        writer.flush()
+    assert synced

@@ -254,8 +254,12 @@ def test_an_export_that_was_killed_is_made_again(tmp_path, make_schema, make_epi
             with pytest.raises(UserError, match="unfinished"):
                 write(out, schema, episodes, resumable=False)
             shutil.rmtree(writer.working)
-    with pytest.raises(UserError, match="unfinished"):
-        write(out, schema, episodes)
+    for resume, what in (
+        (False, "holds an unfinished dataset"),
+        (True, "is what an export left, which is not gone on"),
+    ):
+        with pytest.raises(UserError, match=what):
+            write(out, schema, episodes, resume=resume)
     compare(load(write(out, schema, episodes, resumable=False)), schema, episodes)
     assert [p.name for p in tmp_path.iterdir()] == ["set"]
 
