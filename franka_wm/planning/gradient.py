@@ -21,7 +21,8 @@ class GradientPlanner(ContinuousPlanner):
     Adam (Kingma & Ba, arXiv:1412.6980) on whole action sequences, by backpropagation through the model's
     `next` and the objective, as in Universal Planning Networks (Srinivas et al., arXiv:1804.00645). The first
     start is the warm start; the others are scattered around it, since the gradient only leads to the nearest
-    optimum. Steps are Adam's, so neither the unit of the reward nor that of the latents matters.
+    optimum. Steps are Adam's, so neither the unit of the reward nor that of the latents matters (while gradients are
+    well above its 1e-8, and their squares below the largest float32).
 
     Of all plans of all starts and iterations the best one counts, the starts included, so the result is never
     worse than what it began with (`tanh` first moves starts at a bound in by 1 % of half the range). A
