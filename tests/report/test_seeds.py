@@ -171,7 +171,7 @@ def test_a_run_given_twice_is_refused(tmp_path, capsys):
 
 
 def test_of_one_seed_the_later_weights_count(tmp_path, capsys):
-    """A run and what went on from it are no two seeds, nor are results of a run that lie elsewhere."""
+    """A run that was repeated for longer is no second seed, nor are results of a run that lie elsewhere."""
     for name, seed, updates in (
         ("a", 1, 300),
         ("b", 2, 300),

@@ -50,8 +50,8 @@ def test_a_batch_of_the_replay_and_demonstrations_has_them(recorded: Path, settl
         )
         steps.append(step.select(*keys, *after).clone())
     replay.extend(torch.stack(steps, 1))
-    batch = replay.sample()
-    assert run.burn_in == 4 and batch.shape == (run.replay.batch_size, 4 + run.window)
+    batch = torch.cat([replay.sample() for _ in range(20)])
+    assert run.burn_in == 4 and batch.shape == (20 * run.replay.batch_size, 4 + run.window)
     assert batch["demonstrated"][:, 0].any() and not batch["demonstrated"][:, 0].all()
     goal = batch["state"][..., 14:17] - batch["state"][..., 17:20]
     assert torch.allclose(goal[:, 4:], goal[:, 4:5].expand_as(goal[:, 4:]), atol=1e-6)
