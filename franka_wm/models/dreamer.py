@@ -7,18 +7,19 @@ from typing import Any, ClassVar, Literal
 
 import torch
 from tensordict import TensorDict, TensorDictBase
-from torch import Tensor, nn
+from torch import Tensor
 from torch.nn import functional as F
 
 from franka_wm.errors import UserError
 from franka_wm.models.actor_critic import ActorCritic
+from franka_wm.models.dreamer_images import PixelEncoder
 from franka_wm.models.ema import frozen_copy
-from franka_wm.models.images import ImageSize, check_image_sizes, check_images
+from franka_wm.models.images import ImageSize, check_image_sizes
 from franka_wm.models.layers import TwoHotSymlog, symlog
 from franka_wm.models.normalizer import ObservationNormalizer
 from franka_wm.models.returns import RunningScale, discount_per_step, value_range
 from franka_wm.models.rssm import RSSM, divergence, network
-from franka_wm.models.vision import ConvDecoder, ConvEncoder
+from franka_wm.models.vision import ConvDecoder
 from franka_wm.models.windows import check_windows, window_of
 from franka_wm.options import COEFFICIENT, DEPTH, FRACTION, POSITIVE, Bounds, with_defaults
 from franka_wm.streams import side_stream
@@ -41,13 +42,13 @@ class Dreamer(ActorCritic):
         `standardize_images` images are standardised, too.
       * AdamW with clipped gradient norms (of model, actor and critic apart) instead of LaProp with adaptive clipping.
       * The encoder of vectors ends with a plain linear layer, one of its `encoder_layers`.
-      * Images go through TD-MPC2's convolutions, and come back through sub-pixel convolutions.
+      * Convolutions read and give four pixels of an image as one of an image half as large, see `PixelEncoder`.
       * The two-hot code is TD-MPC2's: bins are equidistant in symlog space, and its expectation is taken there.
 
     Args:
         observation_sizes: observation key -> size of its last dimension; encoded in this order. May be empty
             where there are images.
-        image_sizes: image key -> (height, width, channels), uint8.
+        image_sizes: image key -> (height, width, channels), uint8; height and width are the same of all.
         action_dim: size of an action; each component lies in [-1, 1].
         episode_length: steps of an episode, from which the discount follows if it is not given:
             clamp((T/5 - 1) / (T/5), 0.95, 0.995).
@@ -58,9 +59,8 @@ class Dreamer(ActorCritic):
         blocks: of the recurrent matrix.
         unimix: share of the uniform distribution in those of codes.
         encoder_layers: layers of the encoder, and hidden ones of the decoder, of vectors.
-        channels: of each convolution over images.
-        standardize_images: images of the convolutions, by a mean image and one deviation of each camera, see
-            `set_image_statistics`.
+        channels: of the convolutions that read and draw images, see `PixelEncoder` and `ConvDecoder`.
+        standardize_images: by a mean image and one deviation, see `set_image_statistics`.
         bins, value_low, value_high: two-hot code of rewards and values; the range is in symlog space. None:
             derived from `reward_bounds` and the discount, see `value_range`.
         reward_bounds: the least and the largest reward of a step; None: unknown.
@@ -82,7 +82,7 @@ class Dreamer(ActorCritic):
         tau, scale_tau: how far the slow critic and the scale of returns move at each update.
 
     Raises:
-        ValueError: a size or coefficient that cannot work, or nothing to read.
+        ValueError: a size or coefficient that cannot work, images of several sizes, or nothing to read.
     """
 
     moved_windows = True
@@ -90,13 +90,9 @@ class Dreamer(ActorCritic):
         **dict.fromkeys(("action_dim", "deter_dim", "hidden_dim", "codes", "blocks"), POSITIVE),
         **dict.fromkeys(("channels", "imagination"), POSITIVE),
         **dict.fromkeys(("classes", "bins"), Bounds(least=2, most=10**6)),
-        **dict.fromkeys(
-            ("free_nats", "dynamics_coef", "representation_coef", "decoder_coef", "reward_coef"), COEFFICIENT
-        ),
-        **dict.fromkeys(
-            ("vector_coef", "termination_coef", "replay_value_coef", "entropy_coef"), COEFFICIENT
-        ),
-        "actor_critic_lr_scale": COEFFICIENT,
+        **dict.fromkeys(("free_nats", "dynamics_coef", "representation_coef", "decoder_coef"), COEFFICIENT),
+        **dict.fromkeys(("vector_coef", "reward_coef", "termination_coef"), COEFFICIENT),
+        **dict.fromkeys(("replay_value_coef", "entropy_coef", "actor_critic_lr_scale"), COEFFICIENT),
         "burn_in": Bounds(least=0, most=1000),
         **dict.fromkeys(("discount", "unimix"), Bounds(least=0, below=1)),
         **dict.fromkeys(("tau", "scale_tau"), Bounds(above=0, most=1)),
@@ -167,14 +163,12 @@ class Dreamer(ActorCritic):
         self.actor_critic_lr_scale = actor_critic_lr_scale
 
         deep, size = (hidden_dim,) * encoder_layers, self.vectors.size
-        convolutions = {
-            key: ConvEncoder(shape, channels=channels, standardize=standardize_images)
-            for key, shape in self.image_sizes.items()
-        }
-        self.image_encoders = nn.ModuleDict(convolutions)
+        self.image_encoder = self.image_decoder = None
+        if seen := self.image_sizes:
+            self.image_encoder = PixelEncoder(seen, channels=channels, standardize=standardize_images)
         self.standardized_images = list(self.image_sizes) if standardize_images else ()
         self.vector_encoder = network(size, deep[1:], hidden_dim) if size else None
-        embed_dim = sum(one.features for one in convolutions.values()) + (hidden_dim if size else 0)
+        embed_dim = (self.image_encoder.features if self.image_encoder else 0) + (hidden_dim if size else 0)
         self.rssm = RSSM(
             embed_dim=embed_dim,
             action_dim=action_dim,
@@ -188,10 +182,8 @@ class Dreamer(ActorCritic):
         self.latent_dim = width = self.rssm.size
         decodes = decoder_coef > 0.0
         self.vector_decoder = network(width, deep, size) if size and decodes else None
-        decoders = {
-            key: ConvDecoder(width, shape, channels=channels) for key, shape in self.image_sizes.items()
-        }
-        self.image_decoders = nn.ModuleDict(decoders if decodes else {})
+        if self.image_encoder is not None and decodes:
+            self.image_decoder = ConvDecoder(width, self.image_encoder.image_size, channels=channels)
         self.reward_head = network(width, (hidden_dim,), bins, scale=0.0)
         self.termination_head = network(width, (hidden_dim,), 1) if terminates else None
         self.actor = network(width, (hidden_dim,) * 3, 2 * action_dim, scale=0.01)
@@ -256,6 +248,7 @@ class Dreamer(ActorCritic):
     parts_of_loss = (
         "_embed",
         "_step",
+        "_steps",
         "_imagined_step",
         "_model_loss",
         "_actor_critic_loss",
@@ -263,6 +256,8 @@ class Dreamer(ActorCritic):
     )
     """Compiled one by one: all steps in one program would take minutes to compile."""
     repeated = ("rssm", "actor")
+    unrolled = 8
+    """Steps of a window in one program, which sums their gradients itself."""
 
     def loss(self, batch: TensorDictBase) -> TensorDict:
         """Losses of a batch of windows; call `backward` once on the entry `loss`.
@@ -335,17 +330,15 @@ class Dreamer(ActorCritic):
         self.vectors.set_statistics(mean, std)
 
     def set_image_statistics(self, moments: Mapping[str, Sequence[Tensor]]) -> None:
-        """Standardise images of the convolutions from now on, as `ConvEncoder.set_statistics` does.
+        """Standardise images of the convolutions from now on, as `PixelEncoder.set_statistics` does.
 
         An addition to the paper, of models with `standardize_images`; saved with the weights, never trained.
 
         Args:
             moments: mean and deviation (height, width, c) of each of `standardized_images`, of images in [0, 1].
         """
-        for key, encoder in self.image_encoders.items():
-            assert isinstance(encoder, ConvEncoder)
-            mean, std = moments[key]
-            encoder.set_statistics(mean, std)
+        assert self.image_encoder is not None
+        self.image_encoder.set_statistics(moments)
 
     def rebuild_overrides(self) -> dict[str, Any]:
         """The range of rewards and values, wherever it came from."""
@@ -355,7 +348,9 @@ class Dreamer(ActorCritic):
 
     def _embed(self, observation: TensorDictBase) -> Tensor:
         """What the posterior reads (..., hidden_dim) of observations (...)."""
-        parts = [one(check_images(observation.get(key))) for key, one in self.image_encoders.items()]
+        parts = []
+        if self.image_encoder is not None:
+            parts.append(self.image_encoder(self.image_encoder.images(observation)))
         if self.vector_encoder is not None:
             parts.append(self.vector_encoder(symlog(self.vectors(observation))))
         return self.rssm.of_observation(torch.cat(parts, dim=-1))
@@ -392,12 +387,23 @@ class Dreamer(ActorCritic):
         h (B, deter_dim) is the first step's.
         """
         states, posteriors = [], []
+        for some, actions in zip(
+            embedded[:-1].split(self.unrolled), action.split(self.unrolled), strict=True
+        ):
+            z, posterior, h = self._steps(h, some, actions)
+            states.append(z)
+            posteriors.append(posterior)
+        z, posterior = self._see(h, embedded[-1], sample=True)
+        return torch.cat((*states, z.unsqueeze(0))), torch.cat((*posteriors, posterior.unsqueeze(0)))
+
+    def _steps(self, h: Tensor, embedded: Tensor, action: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """`_step` after `_step` with features (K, B, E), actions (K, B, A): z and posteriors (K, B, ...), last h."""
+        states, posteriors = [], []
         for t in range(action.shape[0]):
             z, posterior, h = self._step(h, embedded[t], action[t])
             states.append(z)
             posteriors.append(posterior)
-        z, posterior = self._see(h, embedded[-1], sample=True)
-        return torch.stack((*states, z)), torch.stack((*posteriors, posterior))
+        return torch.stack(states), torch.stack(posteriors), h
 
     def _model_loss(
         self, z: Tensor, posterior: Tensor, window: TensorDictBase, reward: Tensor, terminated: Tensor
@@ -438,7 +444,7 @@ class Dreamer(ActorCritic):
         if self.vector_decoder is not None:
             error = self.vector_decoder(z) - symlog(self.vectors(window))
             total = total + self.vector_coef * error.square().sum(-1).mean()
-        for key, decoder in self.image_decoders.items():
-            error = decoder(z) - window.get(key).to(z.dtype) / 255.0
+        if self.image_encoder is not None and self.image_decoder is not None:
+            error = self.image_decoder(z) - self.image_encoder.images(window).to(z.dtype) / 255.0
             total = total + error.square().sum((-3, -2, -1)).mean()
         return total
