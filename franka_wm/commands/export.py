@@ -33,6 +33,7 @@ def export(source: str, out: str, format: str, workers: int) -> None:
     check_out(out, resumable=False)
     from franka_wm.data.lerobot.export import arm_config, export_replay, tell
     from franka_wm.training.checkpoint import latest_checkpoint, load_checkpoint
+    from franka_wm.training.history import gathered_with
     from franka_wm.training.load import require_same_actions
 
     checkpoint = load_checkpoint(latest_checkpoint(source))
@@ -42,6 +43,11 @@ def export(source: str, out: str, format: str, workers: int) -> None:
     if data is None:
         raise UserError(
             f"export: {checkpoint.folder} was saved without its replay; train with trainer.checkpoint_replay=true"
+        )
+    if others := gathered_with(checkpoint):
+        raise UserError(
+            f"export: {checkpoint.folder}: some of its experience was gathered with {', '.join(others)}, and a dataset "
+            "is of one environment; export a run that did not go on in another"
         )
     if not data.get("action").is_floating_point():
         require_same_actions(checkpoint, config)

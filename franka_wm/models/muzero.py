@@ -17,6 +17,7 @@ from franka_wm.models.returns import discount_per_step, n_step_returns, value_ra
 from franka_wm.models.simplicial import SimplicialWorldModel
 from franka_wm.models.windows import check_windows
 from franka_wm.options import COEFFICIENT, DEPTH, FRACTION, POSITIVE, Bounds, with_defaults
+from franka_wm.seeding import of_worlds
 
 
 class MuZero(SimplicialWorldModel):
@@ -190,8 +191,8 @@ class MuZero(SimplicialWorldModel):
         logits = self.policy_head(self.prediction_body(z))
         if not deterministic:
             # The largest of logits + Gumbel noise is a draw from their softmax.
-            draw = torch.empty_like(logits).exponential_().clamp_min(torch.finfo(logits.dtype).tiny)
-            logits = logits - draw.log()
+            draw = of_worlds(lambda shape: logits.new_empty(shape).exponential_(), logits.shape)
+            logits = logits - draw.clamp_min(torch.finfo(logits.dtype).tiny).log()
         return logits.argmax(-1)
 
     def prediction(self, z: Tensor) -> tuple[Tensor, Tensor]:

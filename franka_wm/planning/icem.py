@@ -75,7 +75,7 @@ class ICEM(CEM):
             reused elites come on top.
         num_policy_samples: how many of them are rolled out with `prior`, if `plan` gets one. They are
             candidates of the first iteration; the good ones stay as elites.
-        noise_beta: exponent of the noise's spectrum, 0 (white) to about 4.
+        noise_beta: exponent of the noise's spectrum, 0 (white) to about 4; at most 10.
         reuse: share of the elites that is kept.
         decay: factor by which the population shrinks, at least 1.
     """
@@ -92,7 +92,7 @@ class ICEM(CEM):
 
     ranges: ClassVar[Mapping[str, Bounds]] = {
         **CEM.ranges,
-        "noise_beta": Bounds(least=0),
+        "noise_beta": Bounds(least=0, most=10),  # far beyond, no noise is left, or no number
         "reuse": FRACTION,
         "decay": Bounds(least=1),
     }

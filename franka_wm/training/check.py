@@ -177,16 +177,25 @@ def _check_objective(run: RunSettings) -> None:
         raise UserError(
             f"model.reward_head=true: no objective reads it, since {model} has no value; leave it at false"
         )
-    if run.objective_name == "goal_image":
-        return
-    options = [(option, "is of objective=goal_image") for option in ("metric", "summed", "steps_weight")]
-    if run.is_discrete or run.objective_name is None:
-        why = f"{model} plans without an objective"
-        options += [(f"{name}_penalty", why) for name in ("action", "smoothness", "policy")]
-    for option, why in options:
+    if run.is_discrete and run.objective.name != "auto":
+        raise UserError(
+            f"objective={run.objective.name}: {model} plans without an objective; leave it at auto"
+        )
+    for option, why in idle_objective_options(run).items():
         given, default = getattr(run.objective, option), getattr(ObjectiveSettings(), option)
         if given != default:
             raise UserError(f"objective.{option}={given}: {why}; leave it at {default}")
+
+
+def idle_objective_options(run: RunSettings) -> dict[str, str]:
+    """Options of ``objective`` that do nothing in this run, and why."""
+    if run.objective_name == "goal_image":
+        return {}
+    idle: dict[str, str] = dict.fromkeys(("metric", "summed", "steps_weight"), "is of objective=goal_image")
+    if run.is_discrete or run.objective_name is None:
+        penalties = ("action_penalty", "smoothness_penalty", "policy_penalty")
+        idle |= dict.fromkeys(penalties, f"model={run.model.name} plans without an objective")
+    return idle
 
 
 def _check_demonstrations(run: RunSettings) -> None:

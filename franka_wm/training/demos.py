@@ -90,13 +90,11 @@ def _recorded(
         action_dim=action_dim,
     )
     there, given = {**recorded.observation_sizes, **recorded.image_sizes}, f"replay.demos={roots}"
-    arm = run.env.arm if starts else None
-    begins = (
-        {}
-        if arm is None
-        else dict(zip(READS, (arm.state_dim, arm.target_dim, arm.object_dim, 3), strict=True))
-    )
-    for key, size in {**wanted, **begins}.items():
+    sizes = dict(wanted)
+    if starts:
+        arm = run.env.arm
+        sizes |= zip(READS, (arm.state_dim, arm.target_dim, arm.object_dim, 3), strict=True)
+    for key, size in sizes.items():
         if there[key] != size:
             raise UserError(
                 f"{given}: {key} has size {there[key]} there, {size} in this environment; record it with its options"

@@ -20,7 +20,7 @@ from franka_wm.envs import Environment, FrankaConfig
 from franka_wm.errors import UserError
 from franka_wm.options import did_you_mean, preset_of_ones_own
 from franka_wm.training import build
-from franka_wm.training.check import sketch
+from franka_wm.training.check import idle_objective_options, sketch
 from franka_wm.training.checkpoint import Checkpoint, latest_checkpoint, load_checkpoint
 from franka_wm.training.settings import RunSettings
 from franka_wm.training.spaces import Spaces
@@ -146,6 +146,10 @@ def _planning_otherwise(settings: RunSettings, planning: Mapping[str, Mapping[st
                 raise UserError(
                     f"{group}.{key}: no such option of this run's {group}; there are {', '.join(there)}{near}"
                 )
+    idle = idle_objective_options(settings)
+    for key in planning.get("objective", {}):
+        if key in idle:
+            raise UserError(f"objective.{key}: {idle[key]}; leave it out")
     return settings.changed(**planning)
 
 

@@ -25,7 +25,7 @@ from franka_wm.errors import UserError
 from franka_wm.options import leaves
 from franka_wm.seeding import derive_seed
 from franka_wm.training.checkpoint import Checkpoint
-from franka_wm.training.history import read_rows
+from franka_wm.training.history import gathered_with, read_rows
 from franka_wm.training.moment import draw_anew, go_on_drawing, put_back, restorable, same_worlds
 from franka_wm.training.settings import RunSettings
 from franka_wm.training.shards import own_experience, own_moment
@@ -101,9 +101,10 @@ def _tell_other_environment(trainer: Trainer, checkpoint: Checkpoint) -> None:
         UserError: The run exports: a dataset is of one environment.
     """
     changed = _changed(checkpoint.config["env"], trainer.settings)
-    if not changed:
+    trainer.gathered_with = list(dict.fromkeys([*gathered_with(checkpoint), *changed]))
+    if not trainer.gathered_with:
         return
-    gathered = f"the checkpoint's experience was gathered with {', '.join(changed)}"
+    gathered = f"the checkpoint's experience was gathered with {', '.join(trainer.gathered_with)}"
     if trainer.settings.export.kind != "none":
         raise UserError(
             f"export={trainer.settings.export.kind}: {gathered}, and a dataset is of one environment; "

@@ -30,7 +30,7 @@ from franka_wm.seeding import derive_seed, seeded
 from franka_wm.training.broken import beyond_bounds, clipped, finite, odd_rewards, why
 from franka_wm.training.build import explore
 from franka_wm.training.episode_statistics import described, of_all
-from franka_wm.training.history import columns_of
+from franka_wm.training.history import GATHERED_WITH, columns_of
 from franka_wm.training.learner import Learner
 from franka_wm.training.loggers import log_numbers
 from franka_wm.training.moment import draws, worlds_now
@@ -104,6 +104,7 @@ class Trainer:
         self.env_steps = 0
         self.seconds = 0.0
         self.rows: list[dict[str, float]] = []
+        self.gathered_with: list[str] = []  # of other environments, before runs that went on from another
         self.interrupted = False
         self.validation = validation
         self.diagnose = diagnose
@@ -379,7 +380,11 @@ class Trainer:
             config=self._config(),
             counters=self.counters,
             replay=replay,
-            extra={"rows": columns_of(self.rows), "spaces": self.spaces.as_dict()},
+            extra={
+                "rows": columns_of(self.rows),
+                "spaces": self.spaces.as_dict(),
+                GATHERED_WITH: self.gathered_with,
+            },
             moment=self.moment(),
         )
         return latest

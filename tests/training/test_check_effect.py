@@ -24,6 +24,10 @@ LEWM = ("env=reach_goal_image", "model=lewm")
             (*MUZERO, "objective.name=reward_value", "objective.action_penalty=1"),
             "plans without an objective",
         ),
+        (
+            (*MUZERO, "objective=reward_value"),
+            "objective=reward_value: model=muzero plans without .* at auto",
+        ),
         ((*MUZERO, "objective.summed=false"), "objective.summed=False: is of objective=goal_image"),
         ((*LEWM, "model.reward_head=true"), "model.reward_head=true: no objective reads it"),
     ],

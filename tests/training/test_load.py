@@ -255,3 +255,10 @@ def test_another_planner_is_what_the_runs_scale_has(scale: str, horizon: int, se
 def test_options_of_a_planner_that_are_given_otherwise_end_in_one_line(planning: Any, settled) -> None:
     with pytest.raises(UserError, match=r'must be options of planner or objective, such as \{"planner"'):
         _planning_otherwise(settled("scale=smoke", "device=cpu"), planning)
+
+
+def test_an_option_that_the_runs_objective_does_not_read_is_refused(settled) -> None:
+    run = settled("scale=smoke", "device=cpu")
+    with pytest.raises(UserError, match=r"objective\.metric: is of objective=goal_image; leave it out"):
+        _planning_otherwise(run, {"objective": {"metric": "cosine"}})
+    assert _planning_otherwise(run, {"objective": {"action_penalty": 0.1}}).objective.action_penalty == 0.1

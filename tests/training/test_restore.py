@@ -14,6 +14,7 @@ import torch
 from tensordict import TensorDict
 
 from franka_wm import processes
+from franka_wm.commands.main import main
 from franka_wm.envs import FrankaEnv, MultiTaskEnv
 from franka_wm.errors import UserError
 from franka_wm.seeding import derive_seed
@@ -225,6 +226,27 @@ def test_a_dataset_is_of_one_environment(make: Make, checkpoint) -> None:
     trainer.settings = trainer.settings.changed(export={"kind": "lerobot"})
     with pytest.raises(UserError, match=r"gathered with env\.episode_length=5, and a dataset is of one"):
         restore(trainer, checkpoint)
+
+
+def test_that_experience_is_of_another_environment_too_is_remembered(
+    make: Make, checkpoint, tmp_path, capsys
+) -> None:
+    """Resumed once more, in the same environment now, and published by `franka-wm export`."""
+    checkpoint.config["env"]["success_distance"] = 0.2
+    mixed = make()
+    restore(mixed, checkpoint)
+    mixed.folder = tmp_path
+    again = load_checkpoint(mixed.save())
+    third = make()
+    capsys.readouterr()
+    restore(third, again)
+    assert "gathered with env.success_distance=0.2; it stays in the replay" in capsys.readouterr().out
+    third.settings = third.settings.changed(export={"kind": "lerobot"})
+    with pytest.raises(UserError, match=r"gathered with env\.success_distance=0\.2, and a dataset is of one"):
+        restore(third, again)
+    assert main(["export", f"source={tmp_path}", f"out={tmp_path / 'set'}"]) == 1
+    assert "was gathered with env.success_distance=0.2, and a dataset is of one" in capsys.readouterr().err
+    assert not (tmp_path / "set").exists()
 
 
 CUBE = {"objects": [{"name": "cube", "shape": "box", "size": [0.05, 0.05, 0.05], "mass": 0.1}]}
