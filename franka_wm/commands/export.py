@@ -33,8 +33,8 @@ def export(source: str, out: str, format: str, workers: int) -> None:
     check_out(out, resumable=False)
     from franka_wm.data.lerobot.export import arm_config, export_replay, tell
     from franka_wm.training.checkpoint import latest_checkpoint, load_checkpoint
-    from franka_wm.training.history import gathered_with
     from franka_wm.training.load import require_same_actions
+    from franka_wm.training.resume import gathered_with
 
     checkpoint = load_checkpoint(latest_checkpoint(source))
     resolved = checkpoint.config
@@ -46,8 +46,8 @@ def export(source: str, out: str, format: str, workers: int) -> None:
         )
     if others := gathered_with(checkpoint):
         raise UserError(
-            f"export: {checkpoint.folder}: some of its experience was gathered with {', '.join(others)}, and a dataset "
-            "is of one environment; export a run that did not go on in another"
+            f"export: {checkpoint.folder}: its run went on from experience gathered with {', '.join(others)}, and a "
+            "dataset is of one environment; export a run that stayed in one"
         )
     if not data.get("action").is_floating_point():
         require_same_actions(checkpoint, config)

@@ -254,7 +254,7 @@ class Dreamer(ActorCritic):
         "_actor_critic_loss",
         "_replay_value_loss",
     )
-    """Compiled one by one: all steps in one program would take minutes to compile."""
+    """Compiled one by one: all steps of a long window in one program would take minutes to compile."""
     repeated = ("rssm", "actor")
     unrolled = 8
     """Steps of a window in one program, which sums their gradients itself."""

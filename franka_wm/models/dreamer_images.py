@@ -20,8 +20,8 @@ class PixelEncoder(nn.Module):
     """Features of the images of all cameras: four times, a 3 × 3 convolution of an image half as large.
 
     The counterpart of `ConvDecoder`: what four pixels hold is laid out as one pixel with four times as many channels
-    (arXiv:1609.05158), so each convolution sees 6 × 6 pixels in steps of 2, where DreamerV3's sees 5 × 5. Normalised
-    pixel by pixel, SiLU. 64 × 64 pixels become 4 × 4.
+    (arXiv:1609.05158), so each convolution sees 6 × 6 pixels in steps of 2. DreamerV3's sees 5 × 5 in steps of 1, and
+    of four results the largest goes on. Normalised pixel by pixel, SiLU. 64 × 64 pixels become 4 × 4.
 
     (..., height, width, C) uint8 -> (..., features); C: the channels of all cameras side by side, as DreamerV3's.
 

@@ -1,7 +1,4 @@
-"""What a checkpoint knows of its run: logged rows, and the environments that its experience is of.
-
-Rows are kept as columns of numbers, since a run of days has hundreds of thousands.
-"""
+"""Logged rows in a checkpoint: as columns of numbers, since a run of days has hundreds of thousands of rows."""
 
 from __future__ import annotations
 
@@ -12,9 +9,6 @@ from torch import Tensor
 
 from franka_wm.training.checkpoint import Checkpoint
 from franka_wm.training.tree import damaged
-
-GATHERED_WITH = "gathered_with"
-"""Under this name a checkpoint keeps what was other in environments that its experience is also of."""
 
 
 def columns_of(rows: Sequence[Mapping[str, float]]) -> dict[str, dict[str, Tensor]]:
@@ -52,13 +46,3 @@ def read_rows(checkpoint: Checkpoint) -> list[dict[str, float]]:
             for number, value in zip(column["row"].tolist(), column["value"].tolist(), strict=True):
                 rows[number][name] = value
         return rows
-
-
-def gathered_with(checkpoint: Checkpoint) -> list[str]:
-    """What was other, as one types it, in environments of which some of the experience is: the run went on in another.
-
-    Raises:
-        UserError: Something else stands in its place.
-    """
-    with damaged(checkpoint.folder, "extra.json"):
-        return [str(one) for one in (checkpoint.extra() or {}).get(GATHERED_WITH) or []]

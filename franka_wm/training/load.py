@@ -226,7 +226,12 @@ def _model(checkpoint: Checkpoint, settings: RunSettings, device: torch.device) 
     with damaged(checkpoint.folder, "extra.json"):
         shapes = sketch(settings, spaces)
         if shapes is not None:  # before anything of the sizes that config.yaml names is allocated
-            checkpoint.check_model(shapes)
+            try:
+                checkpoint.check_model(shapes)
+            except UserError as error:
+                raise UserError(
+                    f"{error} That was done here: so it is of an earlier version, whose models were others; train anew"
+                ) from error
         model = build.make_model(settings, spaces, device)
     checkpoint.load_model(model)
     return model.eval()

@@ -25,12 +25,12 @@ from franka_wm.errors import UserError
 from franka_wm.options import leaves
 from franka_wm.seeding import derive_seed
 from franka_wm.training.checkpoint import Checkpoint
-from franka_wm.training.history import gathered_with, read_rows
+from franka_wm.training.history import read_rows
 from franka_wm.training.moment import draw_anew, go_on_drawing, put_back, restorable, same_worlds
 from franka_wm.training.settings import RunSettings
 from franka_wm.training.shards import own_experience, own_moment
 from franka_wm.training.storage_budget import fill
-from franka_wm.training.trainer import Trainer
+from franka_wm.training.trainer import GATHERED_WITH, Trainer
 from franka_wm.training.tree import damaged
 
 OTHER_DEVICE = (
@@ -106,11 +106,21 @@ def _tell_other_environment(trainer: Trainer, checkpoint: Checkpoint) -> None:
         return
     gathered = f"the checkpoint's experience was gathered with {', '.join(trainer.gathered_with)}"
     if trainer.settings.export.kind != "none":
+        leave = "leave env as it was, or add export.kind=none" if changed else "add export.kind=none"
         raise UserError(
-            f"export={trainer.settings.export.kind}: {gathered}, and a dataset is of one environment; "
-            "leave env as it was, or add export.kind=none"
+            f"export={trainer.settings.export.kind}: {gathered}, and a dataset is of one environment; {leave}"
         )
     say(f"  {gathered}; it stays in the replay beside what is gathered now")
+
+
+def gathered_with(checkpoint: Checkpoint) -> list[str]:
+    """What was other, as one types it, in environments in which experience was gathered that the run went on from.
+
+    Raises:
+        UserError: Something else stands in its place.
+    """
+    with damaged(checkpoint.folder, "extra.json"):
+        return [str(one) for one in (checkpoint.extra() or {}).get(GATHERED_WITH) or []]
 
 
 def _changed(before: Mapping[str, Any], settings: RunSettings) -> list[str]:

@@ -30,7 +30,7 @@ from franka_wm.seeding import derive_seed, seeded
 from franka_wm.training.broken import beyond_bounds, clipped, finite, odd_rewards, why
 from franka_wm.training.build import explore
 from franka_wm.training.episode_statistics import described, of_all
-from franka_wm.training.history import GATHERED_WITH, columns_of
+from franka_wm.training.history import columns_of
 from franka_wm.training.learner import Learner
 from franka_wm.training.loggers import log_numbers
 from franka_wm.training.moment import draws, worlds_now
@@ -38,6 +38,9 @@ from franka_wm.training.settings import RunSettings
 from franka_wm.training.shards import save_together
 from franka_wm.training.spaces import Spaces
 from franka_wm.training.storage_budget import fill, filled_bytes, reason_to_leave_out
+
+GATHERED_WITH = "gathered_with"
+"""Under this name a checkpoint keeps what was other in environments that its run went on from."""
 
 DERIVED = "derived"
 """What of ``model`` in a checkpoint's configuration the model had found itself, since nothing was asked for."""
@@ -104,7 +107,7 @@ class Trainer:
         self.env_steps = 0
         self.seconds = 0.0
         self.rows: list[dict[str, float]] = []
-        self.gathered_with: list[str] = []  # of other environments, before runs that went on from another
+        self.gathered_with: list[str] = []  # see GATHERED_WITH
         self.interrupted = False
         self.validation = validation
         self.diagnose = diagnose

@@ -98,6 +98,14 @@ def test_windows_are_filtered_as_observe_does_step_by_step(monkeypatch):
     assert posterior.shape == (5, 5, 3, 4)
 
 
+def test_eight_steps_of_a_window_are_one_program(monkeypatch):
+    model, given = small(), []
+    steps = model._steps
+    monkeypatch.setattr(model, "_steps", lambda h, *others: given.append(len(others[0])) or steps(h, *others))
+    model.loss(windows(batch=2, horizon=10))
+    assert given == [8, 2] and "_steps" in model.parts_of_loss
+
+
 def test_reward_is_that_of_the_state_an_action_leads_to_and_ends_need_a_head():
     model = randomise(small())
     z, action = torch.randn(7, model.latent_dim), torch.rand(7, 2)

@@ -39,7 +39,7 @@ def test_a_captured_update_is_the_eager_one(actor_gradient, compile):
     for capture in (False, True):
         learner = Learner(small(actor_gradient), lr=1e-4, capture=capture, compile=compile and capture)
         torch.manual_seed(0)
-        batches = [windows(batch=16, horizon=6).cuda() for _ in range(8)]
+        batches = [windows(batch=16, horizon=10).cuda() for _ in range(8)]
         for k, batch in enumerate(batches):
             torch.manual_seed(k)
             learner.update(batch)

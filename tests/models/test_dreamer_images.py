@@ -11,7 +11,7 @@ from franka_wm.models.layers import symlog
 from franka_wm.models.windows import window_of
 from small_tdmpc2 import windows
 
-SIZE = (40, 48, 3)
+SIZE = (40, 44, 3)
 CAMERAS = dict.fromkeys(("pixels", "pixels_side"), SIZE)
 
 
@@ -41,7 +41,7 @@ def test_an_image_is_halved_four_times():
     assert encoder.features == 64 * 4 * 4  # the last of 32, 48, 64, 64
     assert encoder(pictures(2, 5, size=(64, 64, 3))).shape == (2, 5, 1024)
     assert [one.out_channels for one in encoder.convolutions] == [32, 48, 64, 64]
-    assert one_camera(SIZE)(pictures(3)).shape == (3, 4 * 3 * 3)  # 40 × 48: filled up to 48 × 48
+    assert one_camera(SIZE)(pictures(3)).shape == (3, 4 * 3 * 3)  # 40 × 44: filled up to 48 × 48
 
 
 def test_four_pixels_of_an_image_are_channels_of_the_smaller_one():
@@ -60,8 +60,8 @@ def test_a_side_is_filled_up_behind_its_last_pixel():
     full.load_state_dict(encoder.state_dict(), strict=False)
     full.set_statistics({"pixels": (torch.zeros(48, 48, 3), torch.ones(48, 48, 3))})
     shown = torch.zeros(1, 48, 48, 3, dtype=torch.uint8)
-    shown[:, :40] = images
-    full.mean[:40] = 0.5  # added rows stay at zero
+    shown[:, :40, :44] = images
+    full.mean[:40, :44] = 0.5  # what is added stays at zero
     torch.testing.assert_close(encoder(images), full(shown))
 
 
@@ -69,7 +69,7 @@ def test_the_channels_of_all_cameras_lie_side_by_side():
     model = small()
     seen = TensorDict({"state": torch.zeros(2, 3), **{key: pictures(2) for key in CAMERAS}}, [2])
     both = model.image_encoder.images(seen)
-    assert both.shape == (2, 40, 48, 6)
+    assert both.shape == (2, 40, 44, 6)
     assert torch.equal(both[..., :3], seen["pixels"]) and torch.equal(both[..., 3:], seen["pixels_side"])
     assert model.image_encoder.convolutions[0].in_channels == 24
     other = seen.clone().update({"pixels_side": pictures(2)})
@@ -120,7 +120,7 @@ def test_images_are_standardised_if_asked_for():
 
 
 def test_moments_of_one_frame_are_those_of_each_in_a_stack():
-    model = small(image_sizes={"pixels": (40, 48, 9)}, standardize_images=True)
+    model = small(image_sizes={"pixels": (40, 44, 9)}, standardize_images=True)
     mean, std = torch.rand(SIZE), torch.rand(SIZE)
     model.set_image_statistics({"pixels": (mean, std)})
     assert torch.equal(model.image_encoder.mean, torch.cat((mean,) * 3, -1))

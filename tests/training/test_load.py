@@ -20,7 +20,7 @@ from franka_wm.errors import UserError
 from franka_wm.training import build
 from franka_wm.training.check import check
 from franka_wm.training.learner import Learner
-from franka_wm.training.load import _planning_otherwise, load_agent, preset_of
+from franka_wm.training.load import _planning_otherwise, load_agent, load_model, preset_of
 from franka_wm.training.place import _LOCKS, lock_run_dir
 from franka_wm.training.run import Run
 from franka_wm.training.settings import RunSettings
@@ -262,3 +262,12 @@ def test_an_option_that_the_runs_objective_does_not_read_is_refused(settled) -> 
     with pytest.raises(UserError, match=r"objective\.metric: is of objective=goal_image; leave it out"):
         _planning_otherwise(run, {"objective": {"metric": "cosine"}})
     assert _planning_otherwise(run, {"objective": {"action_penalty": 0.1}}).objective.action_penalty == 0.1
+
+
+def test_weights_of_an_earlier_version_are_said_to_be_that(monkeypatch) -> None:
+    monkeypatch.setattr("franka_wm.training.load.sketch", lambda *_: torch.nn.Linear(2, 2))
+    with pytest.raises(
+        UserError, match="of an earlier version, whose models were others; train anew"
+    ) as said:
+        load_model(AGENT)
+    assert "does not fit this Linear" in str(said.value) and "\n" not in str(said.value)

@@ -242,10 +242,12 @@ def test_that_experience_is_of_another_environment_too_is_remembered(
     restore(third, again)
     assert "gathered with env.success_distance=0.2; it stays in the replay" in capsys.readouterr().out
     third.settings = third.settings.changed(export={"kind": "lerobot"})
-    with pytest.raises(UserError, match=r"gathered with env\.success_distance=0\.2, and a dataset is of one"):
+    with pytest.raises(
+        UserError, match=r"=0\.2, and a dataset is of one environment; add export\.kind=none$"
+    ):
         restore(third, again)
     assert main(["export", f"source={tmp_path}", f"out={tmp_path / 'set'}"]) == 1
-    assert "was gathered with env.success_distance=0.2, and a dataset is of one" in capsys.readouterr().err
+    assert "gathered with env.success_distance=0.2, and a dataset is of one" in capsys.readouterr().err
     assert not (tmp_path / "set").exists()
 
 
