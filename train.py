@@ -7,11 +7,14 @@ python train.py --help                   everything that can be changed
 
 from __future__ import annotations
 
+import sys
+
 import hydra
 from omegaconf import DictConfig
 
 from franka_wm.commands.ending import ended_by_sigterm
 from franka_wm.commands.entry import one_line_errors, run_command
+from franka_wm.commands.resumed import with_options_of_its_run
 
 
 @hydra.main(version_base="1.3", config_path="pkg://franka_wm.conf", config_name="config")
@@ -89,7 +92,7 @@ def main(cfg: DictConfig) -> float | None:
 
 def command(arguments: list[str] | None = None) -> None:
     """This file as a program, and ``franka-wm train``: the package has a link to this file."""
-    run_command(main, arguments)
+    run_command(main, with_options_of_its_run(sys.argv[1:] if arguments is None else arguments))
 
 
 if __name__ == "__main__":

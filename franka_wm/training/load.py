@@ -133,23 +133,25 @@ def _planning_otherwise(settings: RunSettings, planning: Mapping[str, Mapping[st
         raise UserError(
             f"objective.{next(iter(planning['objective']))}: a tree search has no objective; leave it out"
         )
+    idle = {"objective": idle_objective_options(settings)}
     for group, changes in planning.items():
         if group not in ("planner", "objective") or not isinstance(changes, Mapping):
             raise UserError(
                 f"planning: {group}={changes!r}: must be options of planner or objective, such as "
                 '{"planner": {"num_samples": 64}}'
             )
-        there = [key for key in settings.values.get(group, {}) if key != "name"]
+        unread = idle.get(group, {})
+        there = [key for key in settings.values.get(group, {}) if key != "name" and key not in unread]
         for key in changes:
+            if key in unread:
+                raise UserError(
+                    f"objective.{key}: {unread[key]}, this run has objective={settings.objective_name}; leave it out"
+                )
             if key not in there:
                 near = did_you_mean(key, there)
                 raise UserError(
                     f"{group}.{key}: no such option of this run's {group}; there are {', '.join(there)}{near}"
                 )
-    idle = idle_objective_options(settings)
-    for key in planning.get("objective", {}):
-        if key in idle:
-            raise UserError(f"objective.{key}: {idle[key]}; leave it out")
     return settings.changed(**planning)
 
 

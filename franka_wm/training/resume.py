@@ -110,7 +110,7 @@ def _tell_other_environment(trainer: Trainer, checkpoint: Checkpoint) -> None:
         raise UserError(
             f"export={trainer.settings.export.kind}: {gathered}, and a dataset is of one environment; {leave}"
         )
-    say(f"  {gathered}; it stays in the replay beside what is gathered now")
+    say(f"  {gathered}; it stays in the replay beside what is gathered now, as earlier points in curves")
 
 
 def gathered_with(checkpoint: Checkpoint) -> list[str]:

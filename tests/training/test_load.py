@@ -259,7 +259,9 @@ def test_options_of_a_planner_that_are_given_otherwise_end_in_one_line(planning:
 
 def test_an_option_that_the_runs_objective_does_not_read_is_refused(settled) -> None:
     run = settled("scale=smoke", "device=cpu")
-    with pytest.raises(UserError, match=r"objective\.metric: is of objective=goal_image; leave it out"):
+    with pytest.raises(
+        UserError, match=r"metric: is of objective=goal_image, this run has objective=reward_value; "
+    ):
         _planning_otherwise(run, {"objective": {"metric": "cosine"}})
     assert _planning_otherwise(run, {"objective": {"action_penalty": 0.1}}).objective.action_penalty == 0.1
 

@@ -214,7 +214,9 @@ def test_worlds_that_start_new_episodes(why: str, make: Make, checkpoint, env, m
     told = [f"worlds: {why}; they start new episodes, and this run will not be the same"]
     if why == "of another configuration":
         gathered = "the checkpoint's experience was gathered with env.success_distance=0.2"
-        told.insert(0, f"{gathered}; it stays in the replay beside what is gathered now")
+        told.insert(
+            0, f"{gathered}; it stays in the replay beside what is gathered now, as earlier points in curves"
+        )
     assert said(capsys) == told
     assert (env.get_state()["episode"] == -1).all()
 
