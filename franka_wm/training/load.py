@@ -231,6 +231,8 @@ def _model(checkpoint: Checkpoint, settings: RunSettings, device: torch.device) 
             try:
                 checkpoint.check_model(shapes)
             except UserError as error:
+                if "does not fit this" not in str(error):  # damaged, or replaced meanwhile
+                    raise
                 raise UserError(
                     f"{error} That was done here: so it is of an earlier version, whose models were others; train anew"
                 ) from error

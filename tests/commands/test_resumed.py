@@ -91,6 +91,41 @@ def test_without_a_run_to_go_on_from_nothing_changes(tmp_path: Path) -> None:
         assert with_options_of_its_run(words) == words
 
 
+def test_a_sweep_over_runs_takes_what_each_has(run: str, tmp_path: Path, capsys) -> None:
+    folder = run.partition("=")[2]
+    plain: Any = OmegaConf.create(
+        OmegaConf.to_container(compose(["scale=smoke", "device=cpu"]), resolve=True)
+    )
+    save_checkpoint(tmp_path / "plain", model=torch.nn.Linear(1, 1), config=plain, counters={})
+    assert with_options_of_its_run([f"{run},{folder}", "model.burn_in=2,3"])[1] == "++model.burn_in=2,3"
+    with pytest.raises(SystemExit):
+        with_options_of_its_run([f"{run},{tmp_path}/plain", "model.burn_in=2"])
+    assert "model.burn_in: no such option" in capsys.readouterr().err
+
+
+def test_an_older_run_has_todays_options_of_its_planner(tmp_path: Path) -> None:
+    words = ["scale=smoke", "device=cpu", "model=muzero", "planner=gumbel", "env=reach_fixed"]
+    older: Any = OmegaConf.to_container(compose(words), resolve=True)
+    del older["planner"]["c_scale_acting"]
+    save_checkpoint(tmp_path, model=torch.nn.Linear(1, 1), config=OmegaConf.create(older), counters={})  # type: ignore[arg-type]
+    given = with_options_of_its_run([f"+resume={tmp_path}", "planner.c_scale_acting=2"])
+    assert given[1] == "++planner.c_scale_acting=2"
+    older["planner"]["name"] = "mine"  # of a plugin: what it has is known later
+    save_checkpoint(tmp_path, model=torch.nn.Linear(1, 1), config=OmegaConf.create(older), counters={})  # type: ignore[arg-type]
+    assert with_options_of_its_run(words := [f"resume={tmp_path}", "planner.width=2"]) == words
+
+
+@pytest.mark.parametrize("named", ["[", "/tmp/run(1)", "~/run", "x" * 300])
+def test_what_names_no_folder_is_said_where_it_is_read(named: str) -> None:
+    words = [f"resume={named}", "model.burn_in=3"]
+    assert with_options_of_its_run(words) == words
+
+
+def test_help_reads_no_run(tmp_path: Path) -> None:
+    words = ["--help", f"resume={tmp_path}", "model.burn_in=3"]
+    assert with_options_of_its_run(words) == words
+
+
 def test_train_reads_options_so(run: str, monkeypatch, capsys) -> None:
     from franka_wm.commands import train
 

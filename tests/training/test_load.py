@@ -273,3 +273,10 @@ def test_weights_of_an_earlier_version_are_said_to_be_that(monkeypatch) -> None:
     ) as said:
         load_model(AGENT)
     assert "does not fit this Linear" in str(said.value) and "\n" not in str(said.value)
+
+    def broken(*_: object) -> None:
+        raise UserError("weights: is damaged")
+
+    monkeypatch.setattr("franka_wm.training.checkpoint.Checkpoint.check_model", broken)
+    with pytest.raises(UserError, match="^weights: is damaged$"):
+        load_model(AGENT)
