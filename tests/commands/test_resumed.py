@@ -112,7 +112,8 @@ def test_an_older_run_has_todays_options_of_its_planner(tmp_path: Path) -> None:
     assert given[1] == "++planner.c_scale_acting=2"
     older["planner"]["name"] = "mine"  # of a plugin: what it has is known later
     save_checkpoint(tmp_path, model=torch.nn.Linear(1, 1), config=OmegaConf.create(older), counters={})  # type: ignore[arg-type]
-    assert with_options_of_its_run(words := [f"resume={tmp_path}", "planner.width=2"]) == words
+    words = [f"resume={tmp_path}", "planner.width=2"]
+    assert with_options_of_its_run(words) == words
 
 
 @pytest.mark.parametrize("named", ["[", "/tmp/run(1)", "~/run", "x" * 300])

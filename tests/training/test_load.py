@@ -278,5 +278,5 @@ def test_weights_of_an_earlier_version_are_said_to_be_that(monkeypatch) -> None:
         raise UserError("weights: is damaged")
 
     monkeypatch.setattr("franka_wm.training.checkpoint.Checkpoint.check_model", broken)
-    with pytest.raises(UserError, match="^weights: is damaged$"):
+    with pytest.raises(UserError, match=r"^weights: is damaged$"):
         load_model(AGENT)
