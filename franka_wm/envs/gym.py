@@ -15,17 +15,19 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from functools import cached_property
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
+import yaml
 from tensordict import TensorDictBase
 
 from franka_wm.envs.camera import whole_arm
 from franka_wm.envs.config import NUM_JOINTS, FrankaConfig
 from franka_wm.envs.franka import FrankaEnv
 from franka_wm.envs.specs import MARKS
-from franka_wm.envs.tasks import TASKS
+from franka_wm.envs.tasks import TASKS, task_class
 from franka_wm.errors import UserError
 
 try:
@@ -81,7 +83,7 @@ class FrankaVectorEnv(gymnasium.vector.VectorEnv):
         num_envs: Number of worlds, N.
         env: A ready environment to view instead; it must observe ``state``. Then give nothing else.
         device: Where it simulates; the GPU where there is one.
-        seed: Until the first ``reset(seed=…)``.
+        seed: Until the first ``reset(seed=…)``; ``None``: one that no other instance of this process has.
         render_mode: ``"rgb_array"`` for :meth:`render`, or ``None``.
         **config: Fields of :class:`~franka_wm.envs.FrankaConfig`.
 
@@ -94,8 +96,9 @@ class FrankaVectorEnv(gymnasium.vector.VectorEnv):
         "render_fps": 30,
         "autoreset_mode": AutoresetMode.SAME_STEP,
     }
-    task = "reach"
-    task_description = "move the gripper to the goal"
+    task: str
+    """What is to be done: the name of a task, and in `task_description` its words."""
+    task_description: str
 
     def __init__(
         self,
@@ -103,7 +106,7 @@ class FrankaVectorEnv(gymnasium.vector.VectorEnv):
         *,
         env: FrankaEnv | None = None,
         device: torch.device | str | None = None,
-        seed: int = 0,
+        seed: int | None = None,
         render_mode: str | None = None,
         **config: Any,
     ):
@@ -120,6 +123,7 @@ class FrankaVectorEnv(gymnasium.vector.VectorEnv):
                 f"observations={env.config.observations}: agent_pos is read from 'state'; add it to observations"
             )
         self.env = env
+        self.task, self.task_description = env.config.task, task_class(env.config.task).words
         self.num_envs = env.num_envs
         self.render_mode = render_mode
         self.metadata = {**type(self).metadata, "render_fps": round(env.config.fps)}
@@ -295,7 +299,7 @@ class FrankaGymEnv(gymnasium.Env):
 
     Args:
         device: Where it simulates; the GPU where there is one.
-        seed: Until the first ``reset(seed=…)``.
+        seed: Until the first ``reset(seed=…)``; ``None``: one that no other instance of this process has.
         render_mode: ``"rgb_array"`` for :meth:`render`, or ``None``.
         **config: Fields of :class:`~franka_wm.envs.FrankaConfig`.
 
@@ -309,7 +313,7 @@ class FrankaGymEnv(gymnasium.Env):
         self,
         *,
         device: torch.device | str | None = None,
-        seed: int = 0,
+        seed: int | None = None,
         render_mode: str | None = None,
         **config: Any,
     ):
@@ -359,11 +363,12 @@ class FrankaGymEnv(gymnasium.Env):
 
 
 def register() -> None:
-    """Tells Gymnasium about every task: ``franka_wm/Reach-v0``, ``franka_wm/Track-v0``, and those of your own.
+    """Tells Gymnasium about every task: ``franka_wm/Reach-v0``, ``franka_wm/Lift-v0``, and those of your own.
 
-    Importing this module does it; call it again after :func:`franka_wm.envs.tasks.register`. Names that are there
-    stay as they are. Options are every field of :class:`~franka_wm.envs.FrankaConfig`, ``device``, ``seed`` and
-    ``render_mode``. ``FrankaWM/Reach-v0`` is the former name of the vector environment.
+    A task with a gripper is that of ``env=TASK``: its length, rate, start and camera. Importing this module does it;
+    call it again after :func:`franka_wm.envs.tasks.register`. Names that are there stay as they are. Options are every
+    field of :class:`~franka_wm.envs.FrankaConfig`, ``device``, ``seed`` and ``render_mode``. ``FrankaWM/Reach-v0`` is
+    the former name of the vector environment.
     """
     names = {f"franka_wm/{_camel(task)}-v0": task for task in TASKS}
     for name, task in (names | {"FrankaWM/Reach-v0": "reach"}).items():
@@ -372,9 +377,21 @@ def register() -> None:
                 name,
                 entry_point=f"{__name__}:FrankaGymEnv" if name in names else None,
                 vector_entry_point=f"{__name__}:FrankaVectorEnv",
-                kwargs=REACH_V0 | {"task": task},
+                kwargs=REACH_V0 | _preset(task) | {"task": task},
                 disable_env_checker=True,
             )
+
+
+def _preset(task: str) -> dict[str, Any]:
+    """What ``conf/env/TASK.yaml`` and those that it begins with say beyond reach, but for what is observed."""
+    file = Path(__file__).parents[1] / "conf" / "env" / f"{task}.yaml"
+    if (
+        task in ("reach", "franka") or not file.is_file()
+    ):  # reach is REACH_V0; tasks of one's own have no file here
+        return {}
+    own: dict[str, Any] = yaml.safe_load(file.read_text(encoding="utf-8"))
+    first = next((one for one in own.pop("defaults", ()) if one != "_self_"), "reach")
+    return _preset(first) | {name: value for name, value in own.items() if name != "observations"}
 
 
 def _camel(task: str) -> str:

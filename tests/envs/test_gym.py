@@ -10,6 +10,7 @@ import torch
 from gymnasium.utils.env_checker import check_env
 from gymnasium.vector import AutoresetMode
 
+from franka_wm.conf import compose
 from franka_wm.envs import FrankaConfig, FrankaEnv, tasks
 from franka_wm.envs.gym import REACH_V0, FrankaGymEnv, FrankaVectorEnv, register
 from franka_wm.errors import UserError
@@ -175,7 +176,7 @@ def test_lerobot_reads_it() -> None:
     assert observation["observation.state"].shape == (2, 7)
     assert observation["observation.environment_state"].shape == (2, 3)
     assert view.call("_max_episode_steps")[0] == 50
-    assert view.call("task_description") == ("move the gripper to the goal",) * 2
+    assert view.call("task_description") == ("Move the tool to the goal position and hold it there.",) * 2
     frames = view.call("render")
     assert len(frames) == 2
     assert frames[0].shape == (256, 256, 3)
@@ -251,6 +252,31 @@ def test_every_task_has_a_name() -> None:
         assert gymnasium.spec("franka_wm/NamedByGym-v0").kwargs["task"] == "named_by_gym"
     finally:
         gymnasium.registry.pop("franka_wm/NamedByGym-v0")
+
+
+@pytest.mark.parametrize("task", ["reach", "lift", "push", "pick", "stack", "drawer", "peg"])
+def test_a_name_is_the_task_of_the_configuration(task: str) -> None:
+    """In its length, rate, start and camera; what is observed is Gymnasium's."""
+    given = gymnasium.spec(f"franka_wm/{task.capitalize()}-v0").kwargs
+    preset = compose(f"env={task}").env
+    for name in {*given, "fps", "pose_noise", "camera_distance"} - {"observations"}:
+        default = {"task": "reach"}.get(name, FrankaConfig.__dataclass_fields__[name].default)
+        assert given.get(name, default) == preset[name], name
+    assert given["observations"] == ("pixels", "state")
+
+
+def test_arms_without_a_seed_play_other_episodes() -> None:
+    options = {"observations": ("state",), "device": "cpu", "substeps": 2}
+    envs = [gymnasium.make("franka_wm/Reach-v0", **options) for _ in range(2)]
+    goals = [env.reset()[0]["environment_state"] for env in envs]
+    assert not np.array_equal(*goals)
+    again = [env.reset(seed=3)[0]["environment_state"] for env in envs]
+    assert np.array_equal(*again)
+
+
+def test_what_is_to_be_done_is_told() -> None:
+    view = FrankaVectorEnv(1, task="lift", observations=("state",), device="cpu", substeps=2)
+    assert (view.task, view.task_description) == ("lift", "Lift the cube.")
 
 
 def test_without_gymnasium_the_extra_is_named(monkeypatch) -> None:
