@@ -97,7 +97,7 @@ class FrankaVectorEnv(gymnasium.vector.VectorEnv):
         "autoreset_mode": AutoresetMode.SAME_STEP,
     }
     task: str
-    """What is to be done: the name of a task, and in `task_description` its words."""
+    """The name of the task, as LeRobot asks for it; ``task_description`` has its words."""
     task_description: str
 
     def __init__(
@@ -385,9 +385,8 @@ def register() -> None:
 def _preset(task: str) -> dict[str, Any]:
     """What ``conf/env/TASK.yaml`` and those that it begins with say beyond reach, but for what is observed."""
     file = Path(__file__).parents[1] / "conf" / "env" / f"{task}.yaml"
-    if (
-        task in ("reach", "franka") or not file.is_file()
-    ):  # reach is REACH_V0; tasks of one's own have no file here
+    # Reach is REACH_V0 already; tasks of one's own have no file here.
+    if task in ("reach", "franka") or not file.is_file():
         return {}
     own: dict[str, Any] = yaml.safe_load(file.read_text(encoding="utf-8"))
     first = next((one for one in own.pop("defaults", ()) if one != "_self_"), "reach")
