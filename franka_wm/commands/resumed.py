@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 import sys
 from collections.abc import Mapping, Sequence
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -49,14 +50,20 @@ def with_options_of_its_run(arguments: Sequence[str]) -> list[str]:
         sys.exit(INTERRUPTED)
 
 
+@cache
+def _defaults() -> DictConfig:
+    """What Hydra composes of no option of a run's own."""
+    return compose(["scale=smoke"])
+
+
 def _typed(argument: str, saved: Mapping[str, Any]) -> str:
     """`argument`, with ++ before an option that the run has and Hydra's defaults do not: so Hydra takes it."""
     found = _OPTION.match(argument)
     group = None if found is None else saved.get(found[1])
     if found is None or not isinstance(group, Mapping) or found[1] not in conf.KNOWN:
         return argument
-    default, parts = compose(["scale=smoke"]), found[0].split(".")
-    given = argument if _has(default, parts) else f"++{argument}"
+    parts = found[0].split(".")
+    given = argument if _has(_defaults(), parts) else f"++{argument}"
     if _has(saved, parts):
         return given
     if found[1] not in ("model", "planner"):  # of which a default may be another one: elsewhere Hydra knows

@@ -110,10 +110,9 @@ class RayEnv(EnvBase):
             ask = [one if one[0].any() or not self._now else None for one in ask]
         found = self._ask("reset", ask)
         # Worlds of actors that were not asked stand where they stood; a reset has no reward.
-        kept = next(one for one in found if one is not None).keys()
-        self._now = [
-            {key: self._now[k][key] for key in kept} if one is None else one for k, one in enumerate(found)
-        ]
+        now = [self._now[k] if one is None else one for k, one in enumerate(found)]
+        kept = [key for key in now[0] if key not in self.reward_keys and all(key in one for one in now)]
+        self._now = [{key: one[key] for key in kept} for one in now]
         return self._joined()
 
     def _joined(self) -> TensorDict:

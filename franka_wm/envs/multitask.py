@@ -241,7 +241,7 @@ class MultiTaskEnv(EnvBase):
         """Puts all worlds where :meth:`get_state` found them.
 
         Raises:
-            UserError: It is no state, or one of other tasks or numbers of worlds.
+            UserError: It is no state, or one of other tasks or numbers of worlds; nothing is changed then.
         """
         check_state(state)
         for name in state.keys():  # noqa: SIM118  (a TensorDict iterates over its worlds)
@@ -258,9 +258,11 @@ class MultiTaskEnv(EnvBase):
             raise UserError(
                 f"set_state: {wrong[0]} has another number of worlds; take it from get_state() of this one"
             )
+        entries = {name: dict(state.get(name).items()) for name in self.envs}
         for name, env in self.envs.items():
-            entries = dict(state.get(name).items())
-            env.set_state(TensorDict(entries, batch_size=env.batch_size, device=env.device))
+            env.simulation.check_state(entries[name])
+        for name, env in self.envs.items():
+            env.set_state(TensorDict(entries[name], batch_size=env.batch_size, device=env.device))
 
 
 def _require_first_task(first_world: int, tasks: int) -> None:

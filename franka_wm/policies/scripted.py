@@ -4,16 +4,22 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
+from torch.nn.functional import pad
 
 from franka_wm.envs.config import FrankaConfig
+from franka_wm.envs.constants import NUM_JOINTS
 from franka_wm.envs.kinematics import Kinematics
+from franka_wm.envs.multitask import MultiTaskEnv
 from franka_wm.errors import UserError
 from franka_wm.seeding import of_worlds, restore_generator
+
+if TYPE_CHECKING:
+    from franka_wm.envs.franka import FrankaEnv
 
 
 class ScriptedPolicy(TensorDictModuleBase):
@@ -50,19 +56,41 @@ class DrawingPolicy(ScriptedPolicy):
 
 
 class NoopPolicy(ScriptedPolicy):
-    """Does nothing: action 0. What every agent must beat."""
+    """Does nothing: action 0, which leaves the servo's targets where they are. What every agent must beat.
+
+    Args:
+        action_dim: Size of the environment's actions.
+        env: The arm's. Where actions are poses (``action_mode="joint_position"``), of which 0 is the middle of the
+            joints' limits, the action is the servo's present targets; the fingers' is 0 as elsewhere.
+    """
 
     in_keys = ["is_init"]
 
-    def __init__(self, action_dim: int = 7):
+    def __init__(self, action_dim: int = 7, *, env: FrankaEnv | MultiTaskEnv | None = None):
         super().__init__()
         self.action_dim = action_dim
+        self._env = env
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         is_init = tensordict.get("is_init")
+        if self._env is not None:
+            return tensordict.set(
+                "action", _staying(self._env)[: len(is_init)]
+            )  # an evaluation may play some
         return tensordict.set(
             "action", is_init.new_zeros(*is_init.shape[:-1], self.action_dim, dtype=torch.float32)
         )
+
+
+def _staying(env: FrankaEnv | MultiTaskEnv) -> torch.Tensor:
+    """The actions (N, A) that leave the servo's targets where they are."""
+    if isinstance(env, MultiTaskEnv):
+        return env.join({name: _staying(one) for name, one in env.envs.items()})
+    if env.config.action_mode != "joint_position":
+        return torch.zeros(env.num_envs, env.action_dim, device=env.device)
+    k, targets = env.kinematics, env.joint_targets()[:, :NUM_JOINTS]
+    pose = 2 * (targets - k.lower) / (k.upper - k.lower) - 1
+    return pad(pose, (0, env.action_dim - NUM_JOINTS))
 
 
 class SmoothRandomPolicy(DrawingPolicy):

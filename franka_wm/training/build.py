@@ -267,7 +267,7 @@ def make_scripted_policies(
         return {"random": RandomDiscretePolicy(env.action_dim, generator=generator)}
     size = env.action_dim if arm is None else arm.config.action_dim
     scripted: dict[str, TensorDictModuleBase] = {
-        "noop": NoopPolicy(size),
+        "noop": NoopPolicy(size, env=env if isinstance(env, MultiTaskEnv) else arm),
         "random": SmoothRandomPolicy(size, smoothness=smoothness, generator=generator),
     }
     if isinstance(env, MultiTaskEnv):

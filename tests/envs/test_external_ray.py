@@ -121,6 +121,10 @@ def test_only_actors_with_a_world_to_reset_are_asked(fake: InProcess) -> None:
     assert torch.equal(
         again["state"] == carry["state"], torch.tensor([1, 1, 0, 1])[:, None].expand(4, 4) == 1
     )
+    fake.asked.clear()
+    now = env.step(env.rand_action(carry))["next"]
+    none = env.reset(now.clone().set("_reset", torch.zeros(4, 1, dtype=torch.bool)))
+    assert fake.asked == ["step", "step"] and torch.equal(none["state"], now["state"])
     env.close()
     assert fake.ended == 2
 

@@ -1,6 +1,7 @@
 """Several tasks at once: every world is as it would be alone, and each task is judged by itself."""
 
 import json
+from dataclasses import replace
 from typing import Any
 
 import pytest
@@ -203,6 +204,29 @@ def test_worlds_go_on_from_a_state(env) -> None:
         env.set_state(state.exclude("push"))
     with pytest.raises(UserError, match="push has another number of worlds"):
         env.set_state(state.clone().set("push", state["push"][:1]))
+    now = env.get_state()
+    with pytest.raises(
+        UserError, match="joint_q must be"
+    ):  # of the second task: the first has not moved either
+        env.set_state(state.clone().set("push", state["push"].exclude("joint_q")))
+    assert not torch.equal(now["reach", "joint_q"], state["reach", "joint_q"])
+    assert torch.equal(env.get_state()["reach", "joint_q"], now["reach", "joint_q"])
+
+
+def test_doing_nothing_keeps_poses_where_they_are(config) -> None:
+    """Of the task whose actions are poses; the other's action is 0."""
+    tasks = {
+        "reach": config.tasks["reach"],
+        "push": replace(config.tasks["push"], action_mode="joint_position"),
+    }
+    env = MultiTaskEnv(MultiTaskConfig(tasks=tasks), num_envs=5, seed=0)
+    noop, now = build.make_scripted_policies(env)["noop"], env.reset()
+    assert noop(now[:3].clone())["action"].shape == (3, 8)
+    targets = env.envs["push"].joint_targets()
+    action = noop(now)["action"]
+    assert (action[0::2] == 0).all() and (action[1::2, :7] != 0).any()
+    env.step(now)
+    torch.testing.assert_close(env.envs["push"].joint_targets()[:, :7], targets[:, :7], atol=1e-5, rtol=0)
 
 
 def test_each_task_has_its_expert(env) -> None:

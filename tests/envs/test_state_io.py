@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import contextmanager
 from typing import Any
 
 import pytest
@@ -80,6 +81,24 @@ def test_what_is_observed_after_set_state(env: FrankaEnv, random_actions) -> Non
     for key in env._observed:
         assert torch.equal(back[key], root[key]), key
     assert not back["done"].any() and not back["is_init"].any()
+
+
+def test_what_follows_from_a_state_waits_for_it(env: FrankaEnv, random_actions, monkeypatch) -> None:
+    """On a GPU the drawn values are handed to MuJoCo on the stream that wrote them."""
+    sim, inside = env.simulation, []
+
+    @contextmanager
+    def on_stream():
+        inside.append(True)
+        yield
+        inside.pop()
+
+    halfway(env, random_actions)
+    found = []
+    monkeypatch.setattr(sim.recorder, "on_stream_of_torch", on_stream)
+    monkeypatch.setattr(sim.randomizer, "apply", lambda: found.append(bool(inside)))
+    env.set_state(env.get_state())
+    assert found == [True]
 
 
 def test_get_state_is_a_copy(env: FrankaEnv, random_actions) -> None:

@@ -31,6 +31,20 @@ def test_noop() -> None:
     assert action.shape == (4, 7) and action.dtype == torch.float32 and not action.any()
 
 
+@pytest.mark.parametrize("env_name", ["reach", "lift"])
+def test_noop_leaves_poses_as_they_are(settled, env_name: str) -> None:
+    """Of poses 0 is the middle of the limits: there the arm would swing away."""
+    env: Any = build.make_env(
+        settled(f"env={env_name}", "device=cpu", "env.action_mode=joint_position"), num_envs=2
+    )
+    noop, observation = build.make_scripted_policies(env)["noop"], env.reset(seed=0)
+    before, targets = env.joint_positions(), env.joint_targets()[:, :7]
+    for _ in range(10):
+        observation = env.step(noop(observation))["next"]
+    torch.testing.assert_close(env.joint_targets()[:, :7], targets, atol=1e-5, rtol=0)
+    assert (env.joint_positions() - before).abs().max() < 0.01
+
+
 def test_smooth_random_is_smooth_bounded_and_starts_anew() -> None:
     policy = SmoothRandomPolicy(smoothness=0.8, generator=torch.Generator().manual_seed(0))
     actions = torch.stack([policy(first(300))["action"] for _ in range(30)], 1)

@@ -181,6 +181,10 @@ class Simulation:
         """A copy of everything that the worlds' futures depend on, by name, each (N, …)."""
         return worlds.read(self)
 
+    def check_state(self, state: Mapping[str, torch.Tensor]) -> None:
+        """Raises UserError where :meth:`set_state` would; nothing is changed."""
+        worlds.check(self, state)
+
     def set_state(self, state: Mapping[str, torch.Tensor]) -> None:
         """Puts all worlds where :meth:`get_state` found them; its arrays have N rows.
 

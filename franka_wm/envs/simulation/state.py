@@ -61,11 +61,11 @@ def read(sim: Simulation) -> dict[str, torch.Tensor]:
     return state
 
 
-def write(sim: Simulation, state: Mapping[str, torch.Tensor]) -> None:
-    """Puts :func:`read`'s values back; the present observation is not refreshed.
+def check(sim: Simulation, state: Mapping[str, torch.Tensor]) -> dict[str, torch.Tensor]:
+    """A state that :func:`write` can put back.
 
     Raises:
-        UserError: An array is missing or has another shape; nothing is changed then.
+        UserError: An array is missing or has another shape.
     """
     there = memory(sim)
     state = {"ended": torch.zeros_like(there["ended"])} | dict(state)  # states of version 0.1.0 have none
@@ -77,7 +77,18 @@ def write(sim: Simulation, state: Mapping[str, torch.Tensor]) -> None:
                 f"set_state: {name} must be {tuple(tensor.shape)} {tensor.dtype}, is {found}; "
                 "take it from get_state() of an environment with the same config, with one row for each world"
             )
-    for name, tensor in there.items():
+    return state
+
+
+def write(sim: Simulation, state: Mapping[str, torch.Tensor]) -> None:
+    """Puts :func:`read`'s values back; the present observation is not refreshed.
+
+    Raises:
+        UserError: An array is missing or has another shape; nothing is changed then.
+    """
+    state = check(sim, state)
+    for name, tensor in memory(sim).items():
         tensor.copy_(state[name])
     sim.tensors.seed[:1] = state["seed"][:1]
-    sim.randomizer.apply()
+    with sim.recorder.on_stream_of_torch():  # what was written above is there
+        sim.randomizer.apply()
