@@ -34,7 +34,8 @@ def next_targets(config: FrankaConfig, kinematics: Kinematics, targets: Tensor, 
         gram = jacobian @ jacobian.mT + DAMPING * torch.eye(3, device=targets.device)
         pull = torch.linalg.solve(gram, config.ee_scale * action.unsqueeze(-1))
         step = (jacobian.mT @ pull).squeeze(-1)
-        targets = targets + step.clamp(-config.action_scale, config.action_scale)
+        most = step.abs().amax(-1, keepdim=True).clamp_min(1e-9)
+        targets = targets + step * (config.action_scale / most).clamp_max(1.0)
     else:
         targets = targets + config.action_scale * action
     return torch.clamp(targets, lower, upper)

@@ -8,7 +8,7 @@ from importlib.resources import files
 import numpy as np
 import pytest
 import torch
-from tensordict import TensorDictBase
+from tensordict import TensorDict, TensorDictBase
 
 from franka_wm.envs import FrankaEnv
 
@@ -82,6 +82,19 @@ def test_ee_delta_moves_the_tool_along_the_axes(tool: FrankaEnv) -> None:
     commanded = 5 * 0.3 * tool.config.ee_scale
     assert ((along - commanded).abs() < 0.010).all(), along
     assert (sideways < 0.010).all(), sideways
+
+
+def test_ee_delta_keeps_its_direction_where_joints_may_not_follow(small_env) -> None:
+    """A twentieth of the wish, at 5 mrad of a joint: cut off joint by joint, the tool would go elsewhere."""
+    env = small_env(6, action_mode="ee_delta", action_scale=0.005, ee_scale=0.05, substeps=4, pose_noise=0.3)
+    env.reset(seed=0)
+    wish, k = torch.cat([torch.eye(3), -torch.eye(3)]), env.kinematics
+    before = env.joint_targets()
+    env.step(TensorDict({"action": wish}, [6]))
+    after = env.joint_targets()
+    torch.testing.assert_close((after - before).abs().amax(-1), torch.full((6,), 0.005), atol=1e-5, rtol=0)
+    moved = k.forward(after) - k.forward(before)
+    assert ((moved * wish).sum(-1) / moved.norm(dim=-1) > 0.995).all()
 
 
 def test_ee_delta_stands_still_without_action(tool: FrankaEnv) -> None:

@@ -89,7 +89,10 @@ def apply_tool_action(
     target: wp.array2d[float],
     control: wp.array2d[float],
 ):
-    """Tool displacements to joint targets: one damped least-squares step (Wampler 1986) at the targets."""
+    """Tool displacements to joint targets: one damped least-squares step (Wampler 1986) at the targets.
+
+    Where a joint would move by more than ``largest``, all move by the same share less: the tool keeps its direction.
+    """
     world = wp.tid()
     frame = wp.transform_identity(dtype=float)
     for j in range(JOINTS):
@@ -109,10 +112,15 @@ def apply_tool_action(
         wp.clamp(action[world, 2], -1.0, 1.0),
     )
     pull = wp.inverse(gram) * (wish * scale)
+    most = float(0.0)
+    for j in range(JOINTS):
+        column = wp.cross(directions[world, j], tool - origins[world, j])
+        most = wp.max(most, wp.abs(wp.dot(column, pull)))
+    pull *= wp.min(1.0, largest / wp.max(most, 1.0e-9))
     finite = wp.isfinite(action[world, 0]) and wp.isfinite(action[world, 1]) and wp.isfinite(action[world, 2])
     for j in range(JOINTS):
         column = wp.cross(directions[world, j], tool - origins[world, j])
-        value = target[world, j] + wp.clamp(wp.dot(column, pull), -largest, largest)
+        value = target[world, j] + wp.dot(column, pull)
         slack = lead[j] + largest
         value = wp.clamp(value, joint_q[world, j] - slack, joint_q[world, j] + slack)
         value = wp.clamp(value, lower[j], upper[j])
