@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import torch
@@ -69,14 +70,13 @@ class NoopPolicy(ScriptedPolicy):
     def __init__(self, action_dim: int = 7, *, env: FrankaEnv | MultiTaskEnv | None = None):
         super().__init__()
         self.action_dim = action_dim
-        self._env = env
+        # Not the environment itself, which would be a part of the policy, with a state to save.
+        self._staying = None if env is None else partial(_staying, env)
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         is_init = tensordict.get("is_init")
-        if self._env is not None:
-            return tensordict.set(
-                "action", _staying(self._env)[: len(is_init)]
-            )  # an evaluation may play some
+        if self._staying is not None:
+            return tensordict.set("action", self._staying()[: len(is_init)])  # an evaluation may play some
         return tensordict.set(
             "action", is_init.new_zeros(*is_init.shape[:-1], self.action_dim, dtype=torch.float32)
         )
