@@ -16,15 +16,15 @@ from forks import spare
 from rooms.campaign import short_run
 
 NUMBER = {
-    "config": 60,
-    "urdf": 60,
-    "scene": 60,
-    "mechanism": 60,
-    "dataset": 40,
-    "checkpoint": 40,
-    "run_folder": 20,
+    "config": 40,
+    "urdf": 40,
+    "scene": 40,
+    "mechanism": 40,
+    "dataset": 25,
+    "checkpoint": 25,
+    "run_folder": 12,
 }
-"""Cases of the short run: two minutes in all on two cores."""
+"""Cases of the short run: a bit more than a minute in all on two cores."""
 
 SLOW = [pytest.param(name, marks=pytest.mark.slow) for name in ("dataset", "checkpoint", "run_folder")]
 ROOMS = ["config", "urdf", "scene", "mechanism", *SLOW]

@@ -278,12 +278,12 @@ def test_evaluation_while_training(make: Make, cfg: RunSettings) -> None:
 
 def test_evaluations_that_take_long_are_left_out_unless_asked_for(make: Make, capsys, monkeypatch) -> None:
     def slowly() -> dict[str, float]:
-        time.sleep(2.0)
+        time.sleep(1.0)
         return {"eval/policy/success": 0.5}
 
     left_out: list[float] = []
     monkeypatch.setattr(UpdateProgress, "leave_out", lambda self, seconds: left_out.append(seconds))
-    cases = ((None, 1.0, 0.1, 1), (10, 1.0, 0.1, 3), (None, 9.0, 0.1, 3), (None, 1.0, 99.0, 3))
+    cases = ((None, 0.5, 0.1, 1), (10, 0.5, 0.1, 3), (None, 4.5, 0.1, 3), (None, 0.5, 99.0, 3))
     for every, seconds, share, count in cases:
         monkeypatch.setattr("franka_wm.training.trainer.EVALUATION_SECONDS", seconds)
         monkeypatch.setattr("franka_wm.training.trainer.EVALUATION_SHARE", share)
@@ -292,7 +292,7 @@ def test_evaluations_that_take_long_are_left_out_unless_asked_for(make: Make, ca
         trainer.fit()
         assert sum("eval/policy/success" in row for row in trainer.rows) == count
         assert capsys.readouterr().out.count("some are left out") == (count == 1)
-        assert sum(left_out) >= 2.0 * count, "rates are of updates alone"
+        assert sum(left_out) >= 1.0 * count, "rates are of updates alone"
         left_out.clear()
 
 
