@@ -310,7 +310,7 @@ def _simple(
 
     generator = torch.Generator(device=env.device).manual_seed(derive_seed("policies", seed, "collection"))
     makers: dict[str, Callable[[], Any]] = {
-        "noop": lambda: NoopPolicy(env.action_dim, env=env),
+        "noop": lambda: NoopPolicy.of(env),
         "ik": lambda: IKPolicy(env.kinematics, config),
         "random": lambda: SmoothRandomPolicy(
             env.action_dim,

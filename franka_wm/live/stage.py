@@ -133,7 +133,9 @@ def untrained(options: Options, changes: Mapping[str, Any]) -> Stage:
             policies = {"expert": ExpertPolicy(task, env.kinematics, config)}
     elif "joint_target" in config.observations:
         policies = {"planner": kinematic_planner(env), "ik": IKPolicy(env.kinematics, config)}
-    policies |= {"random": SmoothRandomPolicy(env.action_dim), "noop": NoopPolicy(env.action_dim, env=env)}
+    policies |= {"random": SmoothRandomPolicy(env.action_dim)}
+    if {*(noop := NoopPolicy.of(env)).in_keys} <= {"is_init", *config.observations}:
+        policies |= {"noop": noop}
     title = "planning with exact geometry" if "planner" in policies else config.task_class.words
     return Stage(env, policies, title, EPISODE)
 

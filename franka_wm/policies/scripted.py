@@ -4,18 +4,15 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
-from torch.nn.functional import pad
 
 from franka_wm.envs.config import FrankaConfig
 from franka_wm.envs.constants import NUM_JOINTS
 from franka_wm.envs.kinematics import Kinematics
-from franka_wm.envs.multitask import MultiTaskEnv
 from franka_wm.errors import UserError
 from franka_wm.seeding import of_worlds, restore_generator
 
@@ -61,36 +58,28 @@ class NoopPolicy(ScriptedPolicy):
 
     Args:
         action_dim: Size of the environment's actions.
-        env: The arm's. Where actions are poses (``action_mode="joint_position"``), of which 0 is the middle of the
-            joints' limits, the action is the servo's present targets; the fingers' is 0 as elsewhere.
+        kinematics: The arm's, where actions are poses (``action_mode="joint_position"``), of which 0 is the middle of
+            the joints' limits: the action is the servo's present targets, which must be observed; the fingers' is 0.
     """
 
-    in_keys = ["is_init"]
-
-    def __init__(self, action_dim: int = 7, *, env: FrankaEnv | MultiTaskEnv | None = None):
+    def __init__(self, action_dim: int = 7, *, kinematics: Kinematics | None = None):
         super().__init__()
-        self.action_dim = action_dim
-        # Not the environment itself, which would be a part of the policy, with a state to save.
-        self._staying = None if env is None else partial(_staying, env)
+        self.action_dim, self.kinematics = action_dim, kinematics
+        self.in_keys = ["is_init"] if kinematics is None else ["is_init", "joint_target"]
+
+    @classmethod
+    def of(cls, env: FrankaEnv) -> NoopPolicy:
+        """As the environment's actions need it."""
+        posed = env.config.action_mode == "joint_position"
+        return cls(env.config.action_dim, kinematics=env.kinematics if posed else None)
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        is_init = tensordict.get("is_init")
-        if self._staying is not None:
-            return tensordict.set("action", self._staying()[: len(is_init)])  # an evaluation may play some
-        return tensordict.set(
-            "action", is_init.new_zeros(*is_init.shape[:-1], self.action_dim, dtype=torch.float32)
-        )
-
-
-def _staying(env: FrankaEnv | MultiTaskEnv) -> torch.Tensor:
-    """The actions (N, A) that leave the servo's targets where they are."""
-    if isinstance(env, MultiTaskEnv):
-        return env.join({name: _staying(one) for name, one in env.envs.items()})
-    if env.config.action_mode != "joint_position":
-        return torch.zeros(env.num_envs, env.action_dim, device=env.device)
-    k, targets = env.kinematics, env.joint_targets()[:, :NUM_JOINTS]
-    pose = 2 * (targets - k.lower) / (k.upper - k.lower) - 1
-    return pad(pose, (0, env.action_dim - NUM_JOINTS))
+        is_init, k = tensordict.get("is_init"), self.kinematics
+        action = is_init.new_zeros(*is_init.shape[:-1], self.action_dim, dtype=torch.float32)
+        if k is not None:
+            target = _joint_target(tensordict, "noop")[..., :NUM_JOINTS]
+            action[..., :NUM_JOINTS] = 2 * (target - k.lower) / (k.upper - k.lower) - 1
+        return tensordict.set("action", action)
 
 
 class SmoothRandomPolicy(DrawingPolicy):
@@ -173,7 +162,7 @@ class IKPolicy(ScriptedPolicy):
             )
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        target = _joint_target(tensordict)
+        target = _joint_target(tensordict, "ik")
         goal, c, k = tensordict.get("goal"), self.config, self.kinematics
         if c.action_mode == "ee_delta":
             action = (goal - k.forward(target)) / c.ee_scale
@@ -184,10 +173,10 @@ class IKPolicy(ScriptedPolicy):
         return tensordict.set("action", action.clamp(-1.0, 1.0))
 
 
-def _joint_target(tensordict: TensorDictBase) -> torch.Tensor:
+def _joint_target(tensordict: TensorDictBase, policy: str) -> torch.Tensor:
     target = tensordict.get("joint_target", None)
     if target is None:
-        raise UserError("policy=ik reads joint_target; add it to the environment's observations")
+        raise UserError(f"policy={policy} reads joint_target; add it to the environment's observations")
     return target
 
 
@@ -213,7 +202,7 @@ class DiscreteIKPolicy(ScriptedPolicy):
         self.table = table
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        target, goal = _joint_target(tensordict), tensordict.get("goal")
+        target, goal = _joint_target(tensordict, "ik"), tensordict.get("goal")
         if self.config.action_mode == "ee_delta":
             target = self.kinematics.forward(target)  # tool positions stand for targets: actions shift them
         once = self._moved(target)  # (N, M, 7 or 3)

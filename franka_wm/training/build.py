@@ -258,7 +258,8 @@ def make_scripted_policies(
 ) -> dict[str, TensorDictModuleBase]:
     """Policies that need no model: ``noop``, ``random`` and, for the arm, ``ik``; with a gripper ``expert``.
 
-    Of several tasks at once ``expert`` is each task's own, or ``ik``.
+    Of several tasks at once ``expert`` is each task's own, or ``ik``. Where actions are poses, there is a ``noop``
+    if they are continuous and of one task alone.
     """
     generator = torch.Generator(device=env.device).manual_seed(seed)
     discrete = not env.action_spec.dtype.is_floating_point
@@ -267,9 +268,12 @@ def make_scripted_policies(
         return {"random": RandomDiscretePolicy(env.action_dim, generator=generator)}
     size = env.action_dim if arm is None else arm.config.action_dim
     scripted: dict[str, TensorDictModuleBase] = {
-        "noop": NoopPolicy(size, env=env if isinstance(env, MultiTaskEnv) else arm),
+        "noop": NoopPolicy(size) if arm is None else NoopPolicy.of(arm),
         "random": SmoothRandomPolicy(size, smoothness=smoothness, generator=generator),
     }
+    arms = env.envs.values() if isinstance(env, MultiTaskEnv) else [arm] * discrete
+    if any(one is not None and one.config.action_mode == "joint_position" for one in arms):
+        del scripted["noop"]
     if isinstance(env, MultiTaskEnv):
         own = {name: make_scripted_policies(one) for name, one in env.envs.items()}
         able = {

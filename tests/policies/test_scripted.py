@@ -43,6 +43,8 @@ def test_noop_leaves_poses_as_they_are(settled, env_name: str) -> None:
         observation = env.step(noop(observation))["next"]
     torch.testing.assert_close(env.joint_targets()[:, :7], targets, atol=1e-5, rtol=0)
     assert (env.joint_positions() - before).abs().max() < 0.01
+    with pytest.raises(UserError, match="policy=noop reads joint_target"):
+        noop(first(2))
 
 
 def test_smooth_random_is_smooth_bounded_and_starts_anew() -> None:
@@ -127,6 +129,7 @@ def test_ik_with_moves_to_poses_takes_the_best(moving) -> None:
     poses = k.lower + (env.transform.table + 1) / 2 * (k.upper - k.lower)
     distances = (k.forward(poses) - observation["goal"].unsqueeze(1)).norm(dim=-1)
     assert torch.equal(move, distances.argmin(1))
+    assert "noop" not in build.make_scripted_policies(env)  # each is some pose
 
 
 def test_doing_nothing_with_discrete_actions_leaves_the_fingers_open() -> None:
