@@ -40,7 +40,7 @@ class FrankaConfig:
 
     Attributes:
         image_size: Side of the square ``pixels`` observation [px].
-        action_scale: Change of the joint targets per unit of action [rad].
+        action_scale: Change of the joint targets per unit of action [rad]; for ``"ee_delta"`` a joint's largest.
         fps: Control rate [Hz].
         substeps: Physics steps per control step.
         joint_armature: Rotor inertia added to every joint [kg·m²].
@@ -68,7 +68,7 @@ class FrankaConfig:
         action_mode: ``"joint_delta"`` (change of the joint targets, × ``action_scale``), ``"joint_position"``
             (the targets themselves, −1 and 1 at the joint limits) or ``"ee_delta"`` (tool displacement in the
             world, × ``ee_scale``, through differential inverse kinematics).
-        ee_scale: Tool displacement per unit of action, for ``"ee_delta"`` [m].
+        ee_scale: Tool displacement per unit of action, for ``"ee_delta"`` [m], as far as ``action_scale`` allows.
         task: What is asked of the arm; ``docs/tasks.md`` lists the tasks. It also says which scene, gripper and home
             pose there are, where the config does not.
         task_options: Options that the task brings itself, ``option_defaults`` of its class, by name. Those left out

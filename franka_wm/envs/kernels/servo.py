@@ -91,7 +91,8 @@ def apply_tool_action(
 ):
     """Tool displacements to joint targets: one damped least-squares step (Wampler 1986) at the targets.
 
-    Where a joint would move by more than ``largest``, all move by the same share less: the tool keeps its direction.
+    Where a joint would move by more than ``largest``, all move by the same share less: the tool keeps its direction, until
+    a joint meets its limit or runs ahead of what it can follow.
     """
     world = wp.tid()
     frame = wp.transform_identity(dtype=float)
