@@ -205,9 +205,8 @@ def test_worlds_go_on_from_a_state(env) -> None:
     with pytest.raises(UserError, match="push has another number of worlds"):
         env.set_state(state.clone().set("push", state["push"][:1]))
     now = env.get_state()
-    with pytest.raises(
-        UserError, match="joint_q must be"
-    ):  # of the second task: the first has not moved either
+    # Of the second task: the first has not moved either.
+    with pytest.raises(UserError, match="joint_q must be"):
         env.set_state(state.clone().set("push", state["push"].exclude("joint_q")))
     assert not torch.equal(now["reach", "joint_q"], state["reach", "joint_q"])
     assert torch.equal(env.get_state()["reach", "joint_q"], now["reach", "joint_q"])

@@ -398,3 +398,12 @@ def test_a_task_whose_expert_cannot_act_is_shown_without_it() -> None:
     assert list(stage.policies) == ["random", "noop"] and stage.env.action_dim == 4
     with pytest.raises(UserError, match="policy=expert: drives joints"):
         build(options_of(["env.action_mode=ee_delta"], None, policy="expert", **changes))  # type: ignore[arg-type]
+
+
+def test_who_cannot_see_where_it_stands_cannot_stay_there() -> None:
+    """Of poses none is nothing: the no-op reads the servo's targets."""
+    words = ["env.action_mode=joint_position", "env.observations=[state]"]
+    posed = options_of(words, None, device="cpu")
+    assert set(build(posed).policies) == {"random"}
+    stage = build(options_of([*words[:1], "env.observations=[state,joint_target]"], None, device="cpu"))
+    assert "noop" in stage.policies
