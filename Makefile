@@ -55,7 +55,7 @@ PYTEST = PYTHONDONTWRITEBYTECODE= OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 2
 test: $(DEV) ## run the quick tests; pytest options in ARGS="..."
 	@$(PYTEST) -m "not slow" $(ARGS)
 
-test-slow: $(DEV) ## run the slow tests, which continuous integration runs as well
+test-slow: $(DEV) ## run the slow tests; continuous integration runs a few of them
 	@$(PYTEST) -m slow $(ARGS)
 
 # Numbers come from the files in docs/results/, which runs wrote: benchmarks/results/rows.yaml declares them.
