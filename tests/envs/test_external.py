@@ -171,6 +171,7 @@ def test_episodes_end_and_begin_on_the_gpu_as_on_the_cpu(workers: int) -> None:
     torch.testing.assert_close(*rollouts)
 
 
+@pytest.mark.slow
 def test_processes_of_their_own_play_the_same_and_end(monkeypatch: pytest.MonkeyPatch) -> None:
     """Episodes are drawn and end as in one process after the other, at different times in different worlds."""
     import multiprocessing

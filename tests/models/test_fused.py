@@ -22,6 +22,7 @@ pytest.importorskip("triton")  # comes with torch on Linux
 pytestmark = pytest.mark.usefixtures("seeded")
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(INTERPRETED, reason="is what began this process")
 def test_all_of_them_with_triton_s_interpreter():
     files = [str(Path(__file__).with_name(name)) for name in ("test_fused.py", "test_fused_use.py")]

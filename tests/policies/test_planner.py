@@ -169,6 +169,7 @@ def test_mistakes_are_named():
         acting(observation().rename_key_("state", "goal"))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("compile", [False, True])
 def test_a_policy_may_be_given_another_objective(compile: bool):
     """A plain function, or one that reads the present observation, which the policy then asks for."""

@@ -208,6 +208,7 @@ def test_after_a_kill(train, one_thread: None, made: Counter[str], tiny: list[st
     assert differing(weights(resumed), whole) == []
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("worlds", [2, 5])
 def test_another_number_of_worlds_gathers_anew(train, worlds: int, tmp_path: Path, capsys) -> None:
     first = train("evaluation.during=[]", "trainer.updates=10", folder=tmp_path / "first")
@@ -256,6 +257,7 @@ def interrupt(monkeypatch, number: int, stage: type) -> None:
     monkeypatch.setattr(Learner, "update", signalled)
 
 
+@pytest.mark.slow
 def test_recorded_data_go_on_where_they_were(train, made: Counter[str], monkeypatch, tmp_path: Path) -> None:
     """The second half draws other batches than the first."""
     from franka_wm.models.tdmpc2 import TDMPC2
@@ -292,6 +294,7 @@ def test_recorded_data_go_on_where_they_were(train, made: Counter[str], monkeypa
     assert torch.equal(states[0]["windows"], states[1]["windows"])
 
 
+@pytest.mark.slow
 def test_demonstrations_and_hindsight_go_on_where_they_were(
     train, made: Counter[str], monkeypatch, tmp_path: Path
 ) -> None:
@@ -323,6 +326,7 @@ def kept() -> dict[str, Checkpoint]:
     return {}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("stage", ["first", "second"])
 def test_any_stage_goes_on(
     stage: str, train, kept, made: Counter[str], monkeypatch, tmp_path: Path, capsys

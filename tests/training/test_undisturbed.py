@@ -40,6 +40,7 @@ def kept() -> dict[str, dict[str, torch.Tensor]]:
     return {}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("actor", "name"),
     [("policy", name) for name in OTHERWISE] + [(actor, "more, oftener") for actor in ("random", "planner")],

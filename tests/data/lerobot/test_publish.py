@@ -42,6 +42,7 @@ def one_line(result, *says: str) -> None:
     assert all(text in error[0] for text in says), error
 
 
+@pytest.mark.slow
 def test_a_dataset_goes_with_our_card_and_tag(hub, publish, dataset) -> None:
     done = publish(f"root={dataset}", "repo_id=user/arm", "license=cc-by-4.0")
     assert done.returncode == 0, done.stderr
