@@ -9,6 +9,7 @@ import torch
 from tensordict import TensorDictBase
 
 from franka_wm.data.image_storage import BOUNDARY, OVERFLOW
+from franka_wm.keys import CONTEXT
 
 Relabel = Callable[[TensorDictBase, torch.Tensor], TensorDictBase]
 """(windows (B, H), goals (B, 3) [m]) -> the entries that another goal changes, of the same shapes."""
@@ -17,7 +18,8 @@ Relabel = Callable[[TensorDictBase, torch.Tensor], TensorDictBase]
 class Hindsight:
     """Relabels a share of each batch of windows with goals reached later (HER, arXiv:1707.01495, strategy `future`).
 
-    The reward is a known function of state and goal, so relabeled windows are exact, not approximate. The new goal is
+    The reward is a known function of state and goal, so relabeled windows are exact, not approximate. Where a policy's
+    memory is kept (`context`), they begin as an episode does, without it. The new goal is
     where the tool, or the object that the goal is for, was after a step drawn uniformly from those between the window's
     end and the episode's.
 
@@ -65,6 +67,8 @@ class Hindsight:
         for key in relabeled.keys(True, True):
             new, old = relabeled.get(key), batch.get(key)
             batch.set(key, torch.where(mask.view(-1, *[1] * (old.dim() - 1)), new, old))
+        if batch.get(CONTEXT, None) is not None:  # what was remembered there tells of the goal that was
+            batch.get(BOUNDARY)[:, 0] |= mask.unsqueeze(-1)
         return batch
 
 

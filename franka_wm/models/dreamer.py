@@ -11,6 +11,7 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from franka_wm.errors import UserError
+from franka_wm.keys import CONTEXT
 from franka_wm.models.actor_critic import ActorCritic
 from franka_wm.models.dreamer_images import PixelEncoder
 from franka_wm.models.ema import frozen_copy
@@ -34,9 +35,8 @@ class Dreamer(ActorCritic):
     recorded rewards. The model has memory: `observe` carries z along. The defaults are the published 12 M size.
 
     Deliberate differences from the paper (docs/models/dreamer.md):
-      * A window lies within one episode. Its memory comes from the `burn_in` steps before it, as the model sees them
-        now (with `burn_in=0` it is empty), not from states kept in the replay. The divergences of its first step are
-        left out.
+      * A window lies within one episode. Its memory begins empty (as published, with what the replay kept, by
+        `stored_state`) and goes through the `burn_in` steps before it. Its first step's divergences are left out.
       * `encode`, `observe` and `next` take the likeliest codes: what acts and plans is deterministic. Training draws.
       * Vectors are standardised before symlog, see `set_observation_statistics`; the default is the identity. With
         `standardize_images` images are standardised, too.
@@ -64,7 +64,7 @@ class Dreamer(ActorCritic):
         bins, value_low, value_high: two-hot code of rewards and values; the range is in symlog space. None:
             derived from `reward_bounds` and the discount, see `value_range`.
         reward_bounds: the least and the largest reward of a step; None: unknown.
-        terminates: whether episodes may terminate; otherwise there is no head for it.
+        terminates: whether episodes may terminate; else there is no head for it.
         free_nats: divergences below this are not reduced further.
         dynamics_coef, representation_coef: weights of the prior's and the posterior's divergence.
         decoder_coef: weight of reconstruction; at 0 there is no decoder, and rewards, ends and values shape z.
@@ -76,6 +76,7 @@ class Dreamer(ActorCritic):
         entropy_coef: weight, against scaled advantages, of the actor's entropy [nat].
         std_min, std_max: bounds of the actor's standard deviation.
         burn_in: steps in front of each window that `loss` takes, see there.
+        stored_state: windows begin with the memory that the acting policy had, which the replay keeps.
         actor_gradient: "reinforce", that of advantages, as published; "dynamics", that of the returns themselves,
             back through rewards, critic and imagined steps (DreamerV1, arXiv:1912.01603).
         actor_critic_lr_scale: learning rate of actor and critic relative to the model's.
@@ -137,6 +138,7 @@ class Dreamer(ActorCritic):
         std_min: float = 0.1,
         std_max: float = 1.0,
         burn_in: int = 0,
+        stored_state: bool = False,
         actor_gradient: Literal["reinforce", "dynamics"] = "reinforce",
         actor_critic_lr_scale: float = 1.0,
         tau: float = 0.02,
@@ -150,14 +152,14 @@ class Dreamer(ActorCritic):
             raise ValueError("give observation_sizes or image_sizes: there is nothing to read")
         if standardize_images and not self.image_sizes:
             raise ValueError(
-                "standardize_images=True, and it reads no images: set observations=[pixels], or leave it out"
+                "standardize_images=True: it reads no images; let it read pixels, or leave it out"
             )
         self.discount = discount_per_step(discount, episode_length, default=0.997)
         self.action_dim, self.terminates, self.free_nats = action_dim, terminates, free_nats
         self.dynamics_coef, self.representation_coef = dynamics_coef, representation_coef
         self.decoder_coef, self.vector_coef, self.reward_coef = decoder_coef, vector_coef, reward_coef
         self.termination_coef, self.replay_value_coef = termination_coef, replay_value_coef
-        self.burn_in = burn_in
+        self.burn_in, self.replay_keys = burn_in, (CONTEXT,) if stored_state else ()
         self.imagination, self.return_lambda, self.entropy_coef = imagination, return_lambda, entropy_coef
         self.std_min, self.std_max, self.actor_gradient = std_min, std_max, actor_gradient
         self.actor_critic_lr_scale = actor_critic_lr_scale
@@ -268,7 +270,7 @@ class Dreamer(ActorCritic):
             batch: batch size [B, burn_in + H]: H contiguous transitions, all of one episode, with the observation keys,
                 `action` (…, A), and in `next` the observation keys, `reward` (…, 1) and `terminated` (…, 1) bool. In
                 front of them `burn_in` steps, of any episode, from which the memory begins; with them, `is_init`
-                (…, 1) bool of all.
+                (…, 1) bool of all. With `stored_state` also that, and `context` (…, latent_dim), z as it was at play.
 
         Returns:
             batch size []: `loss` to differentiate, and detached: `loss_dynamics` and `loss_representation` [nat, not
@@ -278,7 +280,7 @@ class Dreamer(ActorCritic):
             `terminates` also `loss_termination`.
 
         Raises:
-            ValueError: the batch size is not [B, burn_in + H], or `is_init` is missing that `burn_in` needs.
+            ValueError: the batch size is not [B, burn_in + H], or an entry is missing that the memory begins with.
         """
         count = check_windows(batch)[1]
         if self.burn_in and (count <= self.burn_in or batch.get("is_init", None) is None):
@@ -286,7 +288,9 @@ class Dreamer(ActorCritic):
                 f"burn_in={self.burn_in}: windows have so many steps in front and `is_init`, see make_replay and "
                 f"open_dataset; these have {count} steps in all"
             )
-        earlier, batch = batch.split([self.burn_in, count - self.burn_in], dim=1)
+        if self.replay_keys and (batch.get(CONTEXT, None) is None or batch.get("is_init", None) is None):
+            raise ValueError(f"stored_state=True: the batch must have `{CONTEXT}` and `is_init`, see there")
+        whole, batch = batch, batch[:, self.burn_in :]
         # Time leads from here on: (H, B, ...).
         action, reward, terminated = (
             batch.get(key).transpose(0, 1) for key in ("action", ("next", "reward"), ("next", "terminated"))
@@ -297,7 +301,7 @@ class Dreamer(ActorCritic):
         # Weights that `lowered` casts for this update alone are read there, too.
         with side_stream(*observed, *self.rssm.of_observation.parameters()) as seen:
             embedded = self._embed(window)
-        h = self._remember(earlier, batch[:, 0], embedded[0])
+        h = self._remember(whole, embedded[0])
         seen.join(embedded)
         z, posterior = self._filter(h, embedded, action)  # (H+1, B, ...)
         read = (z, posterior, *observed, reward, terminated, *self.rssm.prior_head.parameters())
@@ -330,13 +334,7 @@ class Dreamer(ActorCritic):
         self.vectors.set_statistics(mean, std)
 
     def set_image_statistics(self, moments: Mapping[str, Sequence[Tensor]]) -> None:
-        """Standardise images of the convolutions from now on, as `PixelEncoder.set_statistics` does.
-
-        An addition to the paper, of models with `standardize_images`; saved with the weights, never trained.
-
-        Args:
-            moments: mean and deviation (height, width, c) of each of `standardized_images`, of images in [0, 1].
-        """
+        """Standardise images from now on, of models with `standardize_images`, see `PixelEncoder.set_statistics`."""
         assert self.image_encoder is not None
         self.image_encoder.set_statistics(moments)
 
@@ -365,21 +363,25 @@ class Dreamer(ActorCritic):
         z, posterior = self._see(h, embedded, sample=True)
         return z, posterior, self.rssm.recur(z, action)
 
-    def _remember(self, earlier: TensorDictBase, first: TensorDictBase, embedded: Tensor) -> Tensor:
-        """h (B, deter_dim) of a window's `first` step (B,), whose features are (B, E), after `earlier` steps (B, K).
+    def _remember(self, batch: TensorDictBase, embedded: Tensor) -> Tensor:
+        """h (B, deter_dim) of a window's first step, whose features are (B, E), after the steps before it.
 
-        No gradient reaches them: the burn-in of R2D2 (Kapturowski et al., 2019).
+        No gradient reaches these: stored state and burn-in of R2D2 (Kapturowski et al., 2019).
         """
         h = begin = self.rssm.begin(embedded)
-        if not self.burn_in:
+        if self.replay_keys:
+            h = batch.get(CONTEXT)[:, 0, : self.rssm.deter_dim].to(begin.dtype)
+        elif not self.burn_in:
             return begin
-        with torch.no_grad():
-            # Time leads, as in a window.
-            features = self._embed(earlier.select(*self.observation_keys).transpose(0, 1))
-            is_init, action = (earlier.get(key).transpose(0, 1) for key in ("is_init", "action"))
-            for t in range(self.burn_in):
-                _, _, h = self._step(torch.where(is_init[t], begin, h), features[t], action[t])
-        return torch.where(first.get("is_init"), begin, h)
+        # Time leads, as in a window.
+        is_init, action = (batch.get(key).transpose(0, 1) for key in ("is_init", "action"))
+        if self.burn_in:
+            with torch.no_grad():
+                earlier = batch[:, : self.burn_in].select(*self.observation_keys)
+                features = self._embed(earlier.transpose(0, 1))
+                for t in range(self.burn_in):
+                    _, _, h = self._step(torch.where(is_init[t], begin, h), features[t], action[t])
+        return torch.where(is_init[self.burn_in], begin, h)
 
     def _filter(self, h: Tensor, embedded: Tensor, action: Tensor) -> tuple[Tensor, Tensor]:
         """States (H+1, B, Z) and posteriors (H+1, B, codes, classes) of features (H+1, B, E), actions (H, B, A).

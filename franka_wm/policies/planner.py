@@ -15,6 +15,7 @@ from tensordict.nn import InteractionType, TensorDictModuleBase
 from tensordict.nn.probabilistic import interaction_type
 from torch import Tensor, nn
 
+from franka_wm import keys
 from franka_wm.models import fused
 from franka_wm.models.base import WorldModel
 from franka_wm.options import PRECISIONS
@@ -34,7 +35,7 @@ from franka_wm.seeding import share_of_worlds
 RECOMPILES = 64
 """For so many shapes a function is compiled: its rounds' numbers of candidates times the numbers of environments."""
 
-CONTEXT = ("context", "context_action")
+CONTEXT = (keys.CONTEXT, "context_action")
 """Entries in which a model's memory travels: the last latent, and the action taken in it."""
 
 Encode = Callable[[TensorDictBase], Tensor]
@@ -47,7 +48,7 @@ def latent_of(tensordict: TensorDictBase, encode: Encode, observe: Observe | Non
     Raises:
         ValueError: memory without `is_init`, which tells where it ends.
     """
-    before = None if observe is None else tensordict.get("context", None)
+    before = None if observe is None else tensordict.get(keys.CONTEXT, None)
     if observe is None or before is None:
         return encode(tensordict)
     is_init = tensordict.get("is_init", None)
@@ -342,7 +343,7 @@ class PlannerPolicy(TensorDictModuleBase):
             )
         decision = result.select("action", "plan")
         if self.observe is not None:
-            decision.set("context", z).set("context_action", result.get("action"))
+            decision.set(keys.CONTEXT, z).set("context_action", result.get("action"))
         return decision
 
     @property
@@ -438,5 +439,5 @@ class ModelPolicy(TensorDictModuleBase):
         z = latent_of(tensordict, self.encode, self.observe)
         goal = () if self.goals is None else (self.goals.goal(tensordict),)
         action = self.policy(z, *goal, deterministic=not explore)
-        memory = {} if self.observe is None else {"context": z, "context_action": action}
+        memory = {} if self.observe is None else {keys.CONTEXT: z, "context_action": action}
         return TensorDict({"action": action, **memory}, batch_size=tensordict.batch_size)

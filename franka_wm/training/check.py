@@ -68,6 +68,7 @@ def check(run: RunSettings) -> None:
                 )
     if run.model.options.get("standardize_images") and not run.trainer.standardize:
         say("model.standardize_images=true: does nothing with trainer.standardize=false")
+    _check_stored_state(run)
     _check_hindsight(run)
     _check_future(run)
     _check_objective(run)
@@ -145,6 +146,16 @@ def _check_windows(run: RunSettings) -> None:
         raise UserError(
             f"collector.seed_updates={c.seed_updates}: must be at most trainer.updates={run.trainer.updates}"
         )
+
+
+def _check_stored_state(run: RunSettings) -> None:
+    if run.model.options.get("stored_state"):
+        without = {"recorded data": run.is_offline, "demonstrations": run.replay.demos is not None}
+        without |= {"random steps (collector.policy)": not run.is_offline and run.actor == "random"}
+        if found := [what for what, used in without.items() if used]:
+            raise UserError(
+                f"model.stored_state=true: {found[0]} have no memory to keep; use stored_state=false"
+            )
 
 
 def _check_hindsight(run: RunSettings) -> None:

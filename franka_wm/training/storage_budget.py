@@ -14,6 +14,7 @@ from franka_wm.data.memory import free_memory
 from franka_wm.data.replay import WindowReplay
 from franka_wm.device import resolve_device
 from franka_wm.errors import UserError
+from franka_wm.keys import CONTEXT
 from franka_wm.models import WorldModel
 from franka_wm.training.settings import RunSettings
 from franka_wm.training.spaces import Spaces
@@ -67,6 +68,7 @@ def check_memory(run: RunSettings, model: WorldModel, spaces: Spaces) -> None:
     seen = _bytes(spaces)
     kept = model if run.export.kind == "none" else spaces  # a dataset is for other models, too
     step = _bytes(kept, stack=run.env.frame_stack)
+    step += 4 * getattr(model, "latent_dim", 0) if CONTEXT in model.replay_keys else 0
     planned = math.prod(run.planner.options.get(name, 1) for name in ("num_samples", "horizon"))
     steps = c.num_envs * run.planned_steps() if device.type != "cuda" else r.capacity
     if device.type == "cpu":

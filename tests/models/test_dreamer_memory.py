@@ -37,8 +37,7 @@ def batch() -> TensorDict:
 
 
 def first_memory(model: Dreamer, data: TensorDict) -> torch.Tensor:
-    first = data[:, EARLIER]
-    return model._remember(data[:, :EARLIER], first, model._embed(first))
+    return model._remember(data, model._embed(data[:, EARLIER]))
 
 
 def test_a_windows_memory_is_that_of_acting(monkeypatch) -> None:
@@ -136,3 +135,53 @@ def test_weights_that_are_cast_for_an_update_are_told_to_the_streams_that_read_t
     model.loss(batch())
     for layer, inputs in zip((model.rssm.of_observation, model.rssm.prior_head), told, strict=True):
         assert {id(one) for one in layer.parameters()} <= inputs
+
+
+def stored() -> tuple[Dreamer, TensorDict]:
+    """A model whose windows begin with what was remembered, and windows whose second one begins an episode."""
+    model, data = small().eval(), batch()
+    model.replay_keys = ("context",)
+    data["context"] = torch.randn(B, EARLIER + H, model.latent_dim)
+    data["is_init"][1, 0] = True
+    return model, data
+
+
+def test_a_window_begins_with_the_stored_memory() -> None:
+    """But where an episode begins, as it does then."""
+    model, data = stored()
+    model.burn_in = 0
+    found = model._remember(data, model._embed(data[:, 0]))
+    begin = model.rssm.begin(torch.zeros(1, 1))
+    expected = data["context"][:, 0, :16].clone()
+    expected[1] = begin[0]
+    torch.testing.assert_close(found, expected)
+
+
+def test_the_steps_before_a_window_go_on_from_the_stored_memory(monkeypatch) -> None:
+    model, data = stored()
+    see = model._see
+    monkeypatch.setattr(model, "_see", lambda h, embedded, sample: see(h, embedded, sample=False))
+    z = torch.cat((data["context"][:, 0, :16], torch.zeros(B, 12)), -1)
+    h = torch.where(data["is_init"][:, 0], model.rssm.begin(z), z[:, :16])
+    z = model._see(h, model._embed(data[:, 0]), sample=False)[0]
+    for t in range(1, EARLIER + 1):
+        z = model.observe(data[:, t], z, data["action"][:, t - 1], data["is_init"][:, t])
+    torch.testing.assert_close(first_memory(model, data), z[:, :16])
+
+
+@pytest.mark.parametrize("key", ["context", "is_init"])
+def test_windows_without_what_was_stored_are_refused(key: str) -> None:
+    model = Dreamer(observation_sizes={"state": 3, "joint_target": 2}, action_dim=2, stored_state=True)
+    assert model.replay_keys == ("context",)
+    with pytest.raises(ValueError, match="stored_state=True: the batch must have `context` and `is_init`"):
+        model.loss(stored()[1].exclude(key))
+
+
+def test_a_log_tells_of_latents_with_the_stored_memory() -> None:
+    model, data = stored()
+    model.burn_in = 0
+    data["is_init"][:, 1:] = False  # all within an episode
+    with torch.no_grad():
+        z = torch.where(data["is_init"][:, 0], model.encode(data[:, 0]), data["context"][:, 0])
+        expected = float(model.value(z).mean())
+    assert training_diagnostics(model, data)["value/mean"] == pytest.approx(expected, abs=1e-5)
