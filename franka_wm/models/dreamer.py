@@ -285,8 +285,7 @@ class Dreamer(ActorCritic):
         count = check_windows(batch)[1]
         if self.burn_in and (count <= self.burn_in or batch.get("is_init", None) is None):
             raise ValueError(
-                f"burn_in={self.burn_in}: windows have so many steps in front and `is_init`, see make_replay and "
-                f"open_dataset; these have {count} steps in all"
+                f"burn_in={self.burn_in}: windows have so many steps in front, and `is_init`; these have {count} steps in all"
             )
         if self.replay_keys and (batch.get(CONTEXT, None) is None or batch.get("is_init", None) is None):
             raise ValueError(f"stored_state=True: the batch must have `{CONTEXT}` and `is_init`, see there")
@@ -373,7 +372,6 @@ class Dreamer(ActorCritic):
             h = batch.get(CONTEXT)[:, 0, : self.rssm.deter_dim].to(begin.dtype)
         elif not self.burn_in:
             return begin
-        # Time leads, as in a window.
         is_init, action = (batch.get(key).transpose(0, 1) for key in ("is_init", "action"))
         if self.burn_in:
             with torch.no_grad():
