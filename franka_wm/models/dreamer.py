@@ -285,7 +285,7 @@ class Dreamer(ActorCritic):
         count = check_windows(batch)[1]
         if self.burn_in and (count <= self.burn_in or batch.get("is_init", None) is None):
             raise ValueError(
-                f"burn_in={self.burn_in}: windows have so many steps in front, and `is_init`; these have {count} steps in all"
+                f"burn_in={self.burn_in}: windows have so many steps in front (and `is_init`), not {count} in all"
             )
         if self.replay_keys and (batch.get(CONTEXT, None) is None or batch.get("is_init", None) is None):
             raise ValueError(f"stored_state=True: the batch must have `{CONTEXT}` and `is_init`, see there")
