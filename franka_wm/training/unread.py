@@ -1,8 +1,9 @@
-"""Images that nothing reads, or one stage alone, and goals that the model cannot see: each said in one line."""
+"""Images that nothing reads, randomization that none shows, goals that the model cannot see: each said in one line."""
 
 from __future__ import annotations
 
 from franka_wm.console import say
+from franka_wm.envs.config import FrankaConfig
 from franka_wm.envs.tasks import make_task
 from franka_wm.planning.objectives import goal_images
 from franka_wm.training.settings import RunSettings
@@ -21,6 +22,8 @@ def say_unread(run: RunSettings, spaces: Spaces) -> None:
         say(f"not read by the model: {', '.join(unread)} (model.observations)")
     if run.pretrain.kind != "none":
         _say_unseen(run, spaces)
+    if run.is_arm:
+        _say_unshown(run.env.arm, spaces)
 
 
 def say_unseen_goal(run: RunSettings) -> None:
@@ -36,6 +39,19 @@ def say_unseen_goal(run: RunSettings) -> None:
             "warning: each episode has another goal, and the model reads nothing that shows it: add state or goal to "
             "model.observations, or set env.show_goal=true"
         )
+
+
+def _say_unshown(config: FrankaConfig, spaces: Spaces) -> None:
+    """Says which randomization no image shows."""
+    cameras = {*config.cameras} & {"front", "side"} if spaces.image_sizes else set()
+    shown = {"color": spaces.image_sizes, "brightness": spaces.image_sizes}
+    shown |= {"camera_position": cameras, "camera_target": cameras}  # the wrist's moves with the hand
+    drawn = config.randomization
+    for name, by in shown.items():
+        if (value := getattr(drawn, name)) and not by:
+            say(
+                f"env.randomization.{name}={value:g}: does nothing, no image shows it (env.cameras, env.observations)"
+            )
 
 
 def _say_unseen(run: RunSettings, spaces: Spaces) -> None:

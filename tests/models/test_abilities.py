@@ -55,7 +55,9 @@ def test_the_page_tells_of_every_ability_and_of_nothing_else(page):
     built = {name for name in NAMES.values() if "burn_in" in signature(models.family(name)).parameters}
     assert built == page["burn_in"]
     asking = {name for name in NAMES.values() if models.family(name).replay_keys}
-    by_option = {name for name in NAMES.values() if "stored_state" in signature(models.family(name)).parameters}
+    by_option = {
+        name for name in NAMES.values() if "stored_state" in signature(models.family(name)).parameters
+    }
     assert asking | by_option == page["replay_keys"]
 
 

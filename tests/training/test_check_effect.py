@@ -79,6 +79,28 @@ def test_images_that_nothing_reads_are_said(
     assert lines == ([] if unread is None else [f"not read by the model: {unread} (model.observations)"])
 
 
+@pytest.mark.parametrize(
+    ("words", "drawn", "said"),
+    [
+        (("env=reach",), "{color: 0.5, camera_target: 0.1, mass: 0.1}", ["color=0.5", "camera_target=0.1"]),
+        (("env=reach_pixels",), "{color: 0.5, brightness: 0.5, camera_position: 0.1}", []),
+        (
+            ("env=push_pixels", "env.cameras=[wrist]"),
+            "{color: 0.5, camera_position: 0.1}",
+            ["camera_position=0.1"],
+        ),
+        (("env=push_pixels", "env.cameras=[side]"), "{camera_position: 0.1}", []),
+        (("env=reach_pixels",), "{}", []),
+    ],
+)
+def test_randomization_that_no_image_shows_is_said(
+    words: tuple[str, ...], drawn: str, said: list[str], settled, capsys
+) -> None:
+    check(settled("device=cpu", "scale=smoke", *words, f"env.randomization={drawn}"))
+    lines = [line for line in capsys.readouterr().out.splitlines() if "no image shows it" in line]
+    assert [line.split(": does nothing")[0] for line in lines] == [f"env.randomization.{one}" for one in said]
+
+
 def test_images_that_only_the_second_stage_reads_are_said(settled, capsys) -> None:
     words = ("env=reach_goal_image", "env.cameras=[front,side]", "model=action_world_model", "planner=cem")
     words = (*words, "model.observations=[pixels,pixels_side]", "pretrain=jepa", "scale=smoke", "device=cpu")
