@@ -28,6 +28,8 @@ ROWS = {
     "two_stages": "action-world-model-gpu",
     "control_suite": "reacher-hard-gpu",
     "control_suite_dreamer": "dreamer-walker-gpu",
+    "push": "push-gpu",
+    "lift": "lift-gpu",
     "demonstrations": "pick-demos-gpu",
 }
 """Experiment → the row of the results that measured it, or will."""
