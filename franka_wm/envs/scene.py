@@ -176,6 +176,22 @@ class Scene:
                 out.append((*one.at[:2], *sides, *turn, 0.0 if box else one.radius))
         return out
 
+    @property
+    def solids(self) -> list[tuple[float, ...]]:
+        """Boxes around obstacles (x, y, z, half sides, cosine and sine of the angle) [m], where no goal is drawn: not
+        of meshes and sockets, which may be mostly empty."""
+        return [
+            (
+                *one.at,
+                *(0.5 * w for w in one.widths),
+                one.half_height,
+                math.cos(one.angle),
+                math.sin(one.angle),
+            )
+            for one in self.obstacles
+            if one.shape not in ("mesh", "socket")
+        ]
+
     def outline(self) -> list[tuple[float, float, float]]:
         """Corners of what a task may be about [m]: the table as far as the arm reaches, objects where they may start,
         drawers and doors where they may stand, open, and obstacles as far as the arm reaches."""

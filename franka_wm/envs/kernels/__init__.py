@@ -10,6 +10,6 @@ Python numbers given to a captured launch are frozen into the graph, so whatever
 counters) lives in device arrays.
 """
 
-from franka_wm.envs.kernels.functions import JOINTS, STATE, chain_forward, episode_rng
+from franka_wm.envs.kernels.functions import JOINTS, STATE, away_from_solids, chain_forward, episode_rng
 
-__all__ = ["JOINTS", "STATE", "chain_forward", "episode_rng"]
+__all__ = ["JOINTS", "STATE", "away_from_solids", "chain_forward", "episode_rng"]

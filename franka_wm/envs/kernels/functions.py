@@ -51,6 +51,18 @@ def away_from_box(
 
 
 @wp.func
+def away_from_solids(at: wp.vec3f, raised: float, solids: wp.array2d[float]) -> float:
+    """From a point to the nearest box of :attr:`Scene.solids` [m], of a table that is so much higher."""
+    least = float(wp.inf)
+    for s in range(solids.shape[0]):  # x, y, z, half sides, cosine and sine of the angle
+        middle = wp.vec2f(solids[s, 0], solids[s, 1])
+        flat = away_from_box(at[0], at[1], middle, solids[s, 3], solids[s, 4], solids[s, 6], solids[s, 7])
+        up = wp.max(wp.abs(at[2] - raised - solids[s, 2]) - solids[s, 5], 0.0)
+        least = wp.min(least, wp.length(wp.vec2f(flat, up)))
+    return least
+
+
+@wp.func
 def away_from(x: float, y: float, base: wp.transformf, footprints: wp.array2d[float], body: int) -> float:
     """Distance of a point to what an articulated body takes of the table [m]; rows: middle x, y, half sides."""
     turn = wp.transform_get_rotation(base)

@@ -74,6 +74,7 @@ class Arrays[T]:
         grip: (N,) the fingers' set point [m].
         sizes: (N, K) factor of each object's size in this episode.
         raised: (N,) how much higher the table is in this episode than the scene says [m].
+        solids: (S, 8) boxes around obstacles, see ``Scene.solids``.
         body_q: (N, B) transforms, (N, B, 7) in torch: Newton's frames of the moving links.
         origins, directions: (N, 7) vectors, (N, 7, 3) in torch: scratch memory of the differential inverse kinematics.
     """
@@ -134,6 +135,7 @@ class Arrays[T]:
     grip: T
     sizes: T
     raised: T
+    solids: T
     body_q: T
     origins: T
     directions: T
@@ -173,7 +175,7 @@ def allocate(
     shows_goal = config.has_gripper and "goal_pixels" in config.images
     noisy = bool(config.randomization.observation_noise)
     framing = torch.tensor(list(look_at(*camera_framing(config))), device=device)
-    reset_mask = flags(n + 1)
+    reset_mask, scene = flags(n + 1), config.resolved_scene
     tensors = Arrays(
         action=zeros(n, actions),
         applied=zeros(n, actions),
@@ -234,6 +236,7 @@ def allocate(
         grip=zeros(n),
         sizes=torch.ones(n, config.num_objects, device=device),
         raised=zeros(n),
+        solids=torch.tensor(scene.solids if scene else [], device=device).reshape(-1, 8),
         body_q=newtons(state.body_q, 7),
         origins=zeros(n, NUM_JOINTS, 3),
         directions=zeros(n, NUM_JOINTS, 3),

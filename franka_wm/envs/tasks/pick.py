@@ -10,6 +10,7 @@ import torch
 import warp as wp
 from tensordict import TensorDictBase
 
+from franka_wm.envs.kernels import away_from_solids
 from franka_wm.envs.scene import Body, Scene
 from franka_wm.envs.tasks.experts import Aim, Sight, fetch, grasp_of
 from franka_wm.envs.tasks.manipulation import (
@@ -24,6 +25,7 @@ from franka_wm.envs.tasks.manipulation import (
     relabel_place,
     tool_of,
 )
+from franka_wm.envs.tasks.reach import CLEAR
 
 if TYPE_CHECKING:
     from franka_wm.envs.simulation import Simulation
@@ -34,6 +36,8 @@ REST = 0.2
 """The arm is at rest where no joint is faster [rad/s]."""
 MIDDLE, HALF, HIGHEST = 0.5, 0.10, 0.30
 """The goal's x in the middle of its range, half of the range of x and y, and its largest height over the cube's [m]."""
+ATTEMPTS = wp.constant(16)
+"""So many places are drawn, of which the first clear one is the goal."""
 
 
 @wp.kernel(enable_backward=False)
@@ -44,15 +48,28 @@ def goal_in_the_air(
     middle: float,
     half: float,
     highest: float,
+    raised: wp.array[float],
+    solids: wp.array2d[float],
+    clear: float,
     goal: wp.array2d[float],
 ):
+    """The first of some places that is clear of obstacles; where none is, the one where the cube stands."""
     world = wp.tid()
-    if mask[world]:
-        goal[world, 0] = middle + half * (2.0 * draws[world, 0] - 1.0)
-        goal[world, 1] = half * (2.0 * draws[world, 1] - 1.0)
-        goal[world, 2] = (
-            rest_q[world, 4] + highest * draws[world, 2]
-        )  # behind two fingers, x and y: the cube's z
+    if not mask[world]:
+        return
+    # behind two fingers: the cube's place
+    place = wp.vec3f(rest_q[world, 2], rest_q[world, 3], rest_q[world, 4])
+    found = bool(False)
+    for k in range(ATTEMPTS):
+        if not found:
+            x = middle + half * (2.0 * draws[world, 3 * k] - 1.0)
+            y = half * (2.0 * draws[world, 3 * k + 1] - 1.0)
+            z = rest_q[world, 4] + highest * draws[world, 3 * k + 2]
+            if away_from_solids(wp.vec3f(x, y, z), raised[world], solids) > clear:
+                found = True
+                place = wp.vec3f(x, y, z)
+    for i in range(3):
+        goal[world, i] = place[i]
 
 
 @wp.kernel(enable_backward=False)
@@ -105,7 +122,8 @@ class Pick(GripperTask):
     """Bring a cube to a point in the air and keep it there.
 
     **Scene**: a table and a cube of 4 cm and 50 g. **Randomization**: the cube stands within 10 cm in x and y of
-    (0.5, 0) m, turned by up to 45°; the goal lies within 10 cm of it in x and y and up to 30 cm over the resting cube.
+    (0.5, 0) m, turned by up to 45°; the goal lies within 10 cm of it in x and y and up to 30 cm over the resting cube,
+    5 cm or more from obstacles.
     **Success**: the cube's centre is at most 2.5 cm from the goal, and no joint of the arm is faster than 0.2 rad/s
     (ManiSkill3's PickCube: Tao et al. 2024; 50 steps at 20 Hz, joints within 0.02 rad of the same pose). **Reward**,
     dense, in [0, 1]: 1 where it succeeds; else 0.2 for the tool's nearness to the cube, 1 − tanh(5 · distance), 0.2 for
@@ -114,14 +132,14 @@ class Pick(GripperTask):
     """
 
     scene = Scene(objects=(Body(name="cube", at=(0.5, 0.0), spread=(0.10, 0.10), turn=math.pi / 4),))
-    num_draws = 3
+    num_draws = 3 * ATTEMPTS
     words = "Bring the cube to the goal."
     relabel_reads = ("state", "joint_target", "objects")
     achieved = ("objects", slice(0, 3))
 
     def reset(self, sim: "Simulation", mask: wp.array) -> None:
         w = sim.warp
-        inputs = [mask, w.draws, w.rest_q, MIDDLE, HALF, HIGHEST, w.task_goal]
+        inputs = [mask, w.draws, w.rest_q, MIDDLE, HALF, HIGHEST, w.raised, w.solids, CLEAR, w.task_goal]
         wp.launch(goal_in_the_air, sim.num_envs, inputs, device=sim.device)
 
     def pose_at_goal(self, sim: "Simulation", mask: wp.array) -> None:

@@ -9,7 +9,7 @@ import torch
 import warp as wp
 from tensordict import TensorDictBase
 
-from franka_wm.envs.kernels import JOINTS, chain_forward, episode_rng
+from franka_wm.envs.kernels import JOINTS, away_from_solids, chain_forward, episode_rng
 from franka_wm.envs.tasks.base import Task, with_goal
 from franka_wm.errors import UserError
 
@@ -17,6 +17,8 @@ if TYPE_CHECKING:
     from franka_wm.envs.config import FrankaConfig
     from franka_wm.envs.simulation import Simulation
 
+CLEAR = 0.05
+"""Drawn goals are farther from obstacles [m]: there the hand has no room."""
 REWARDS = {"dense": 0, "sparse": 1, "normalized": 2}
 
 
@@ -86,10 +88,12 @@ def reachable_goal(
     tool_frame: wp.array[wp.transformf],
     lowest: float,
     raised: wp.array[float],
+    solids: wp.array2d[float],
+    clear: float,
     goal_q: wp.array2d[float],
     goal: wp.array2d[float],
 ):
-    """The tool position of a random pose around home; poses in the ground or in the base are drawn again."""
+    """The tool position of a random pose around home; in the ground, the base or an obstacle it is drawn again."""
     world = wp.tid()
     if not mask[world]:
         return
@@ -100,11 +104,18 @@ def reachable_goal(
             for j in range(JOINTS):
                 goal_q[world, j] = wp.clamp(home[j] + wp.randf(rng, -noise, noise), lower[j], upper[j])
             tool = chain_forward(goal_q, world, parent_frames, child_frames, axes, tool_frame)
-            if tool[2] > lowest + raised[world] and wp.sqrt(tool[0] * tool[0] + tool[1] * tool[1]) > 0.25:
+            free = away_from_solids(tool, raised[world], solids) > clear
+            if (
+                free
+                and tool[2] > lowest + raised[world]
+                and wp.sqrt(tool[0] * tool[0] + tool[1] * tool[1]) > 0.25
+            ):
                 for i in range(3):
                     goal[world, i] = tool[i]
                 found = True
-    if not found:  # one in 10^12 episodes at the default noise: the home pose is a goal, too
+    if (
+        not found
+    ):  # one in 10^12 episodes at the default noise without obstacles: the home pose is a goal, too
         for j in range(JOINTS):
             goal_q[world, j] = home[j]
         tool = chain_forward(goal_q, world, parent_frames, child_frames, axes, tool_frame)
@@ -154,9 +165,9 @@ class Reach(Task):
     """Bring the tool to the goal and keep it there.
 
     **Goal**: ``config.goal``, or with ``goal_sampling="reachable"`` the tool position of a pose drawn
-    uniformly within ``goal_noise`` of home, at least 0.10 m above the ground, or the table where there is one, and
-    0.25 m from the base's axis, new in every world and episode. **Reward**: :func:`reach_reward`. **Success**: tool
-    within ``success_distance``.
+    uniformly within ``goal_noise`` of home, at least 0.10 m above the ground, or the table where there is one, 0.25 m
+    from the base's axis and 5 cm from obstacles, new in every world and episode. **Reward**: :func:`reach_reward`.
+    **Success**: tool within ``success_distance``.
     """
 
     words = "Move the tool to the goal position and hold it there."
@@ -203,6 +214,11 @@ class Reach(Task):
         """The config's; ``None`` where a subclass has another success."""
         return self.config.success_distance if self._judges else None
 
+    @property
+    def clear(self) -> float:
+        """How far a drawn goal is from obstacles, at least [m]."""
+        return CLEAR
+
     def reset(self, sim: "Simulation", mask: wp.array) -> None:
         self.choose(sim, mask, sim.warp.task_goal)
 
@@ -234,7 +250,8 @@ class Reach(Task):
             n,
             [
                 mask, w.seed, w.episode, c.home, self.config.goal_noise, c.lower, c.upper,
-                c.parent_frames, c.child_frames, c.axes, c.tool_frame, 0.10 + self.table_top, w.raised, w.goal_q, goal,
+                c.parent_frames, c.child_frames, c.axes, c.tool_frame, 0.10 + self.table_top, w.raised,
+                w.solids, self.clear, w.goal_q, goal,
             ],
             device=sim.device,
         )  # fmt: skip

@@ -58,6 +58,11 @@ class Track(Reach):
     own_options = (*Reach.own_options, "track_radius", "track_period")
     words = "Follow the moving goal with the tool."
 
+    @property
+    def clear(self) -> float:
+        """Of the centre: all of the circle is as far from obstacles as a goal that stands still."""
+        return super().clear + self.config.track_radius
+
     def reset(self, sim: "Simulation", mask: wp.array) -> None:
         self.choose(sim, mask, sim.warp.goal_center)
         self._move(sim, mask, everywhere=False, ahead=0)
