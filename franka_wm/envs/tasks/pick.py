@@ -30,14 +30,11 @@ from franka_wm.envs.tasks.reach import CLEAR
 if TYPE_CHECKING:
     from franka_wm.envs.simulation import Simulation
 
-NEAR = 0.025
-"""From the goal, at most [m]."""
-REST = 0.2
-"""The arm is at rest where no joint is faster [rad/s]."""
-MIDDLE, HALF, HIGHEST = 0.5, 0.10, 0.30
+NEAR, REST = 0.025, 0.2
+"""From the goal, at most [m]; the arm is at rest where no joint is faster [rad/s]."""
+MIDDLE, HALF, HIGHEST = wp.constant(0.5), wp.constant(0.10), wp.constant(0.30)
 """The goal's x in the middle of its range, half of the range of x and y, and its largest height over the cube's [m]."""
-ATTEMPTS = wp.constant(16)
-"""So many places are drawn, of which the first clear one is the goal."""
+ATTEMPTS = wp.constant(16)  # of so many places the first clear one is the goal
 
 
 @wp.kernel(enable_backward=False)
@@ -45,9 +42,6 @@ def goal_in_the_air(
     mask: wp.array[wp.bool],
     draws: wp.array2d[float],
     rest_q: wp.array2d[float],
-    middle: float,
-    half: float,
-    highest: float,
     raised: wp.array[float],
     solids: wp.array2d[float],
     clear: float,
@@ -55,21 +49,17 @@ def goal_in_the_air(
 ):
     """The first of some places that is clear of obstacles; where none is, the one where the cube stands."""
     world = wp.tid()
-    if not mask[world]:
-        return
-    # behind two fingers: the cube's place
-    place = wp.vec3f(rest_q[world, 2], rest_q[world, 3], rest_q[world, 4])
-    found = bool(False)
-    for k in range(ATTEMPTS):
-        if not found:
-            x = middle + half * (2.0 * draws[world, 3 * k] - 1.0)
-            y = half * (2.0 * draws[world, 3 * k + 1] - 1.0)
-            z = rest_q[world, 4] + highest * draws[world, 3 * k + 2]
-            if away_from_solids(wp.vec3f(x, y, z), raised[world], solids) > clear:
-                found = True
-                place = wp.vec3f(x, y, z)
-    for i in range(3):
-        goal[world, i] = place[i]
+    if mask[world]:
+        place = wp.vec3f(rest_q[world, 2], rest_q[world, 3], rest_q[world, 4])  # behind two fingers
+        for j in range(ATTEMPTS):
+            k = 3 * (ATTEMPTS - 1 - j)  # the first one last
+            x = MIDDLE + HALF * (2.0 * draws[world, k] - 1.0)
+            y = HALF * (2.0 * draws[world, k + 1] - 1.0)
+            at = wp.vec3f(x, y, rest_q[world, 4] + HIGHEST * draws[world, k + 2])
+            if away_from_solids(at, raised[world], solids) > clear:
+                place = at
+        for i in range(3):
+            goal[world, i] = place[i]
 
 
 @wp.kernel(enable_backward=False)
@@ -122,13 +112,12 @@ class Pick(GripperTask):
     """Bring a cube to a point in the air and keep it there.
 
     **Scene**: a table and a cube of 4 cm and 50 g. **Randomization**: the cube stands within 10 cm in x and y of
-    (0.5, 0) m, turned by up to 45°; the goal lies within 10 cm of it in x and y and up to 30 cm over the resting cube,
-    5 cm or more from obstacles.
-    **Success**: the cube's centre is at most 2.5 cm from the goal, and no joint of the arm is faster than 0.2 rad/s
-    (ManiSkill3's PickCube: Tao et al. 2024; 50 steps at 20 Hz, joints within 0.02 rad of the same pose). **Reward**,
-    dense, in [0, 1]: 1 where it succeeds; else 0.2 for the tool's nearness to the cube, 1 − tanh(5 · distance), 0.2 for
-    holding it, and while it is held 0.4 for its nearness to the goal, and there 0.2 for slow joints; sparse: 1 where it
-    succeeds. Both minus ``action_penalty`` · mean(action²).
+    (0.5, 0) m, turned by up to 45°; the goal lies within 10 cm of it in x and y, up to 30 cm over the resting cube and
+    5 cm from obstacles. **Success**: the cube's centre is at most 2.5 cm from the goal, and no joint of the arm faster
+    than 0.2 rad/s (ManiSkill3's PickCube: Tao et al. 2024; 50 steps at 20 Hz, joints within 0.02 rad of the same pose).
+    **Reward**, dense, in [0, 1]: 1 where it succeeds; else 0.2 for the tool's nearness to the cube, 1 − tanh(5 ·
+    distance), 0.2 for holding it, and while it is held 0.4 for its nearness to the goal, and there 0.2 for slow joints;
+    sparse: 1 where it succeeds. Both minus ``action_penalty`` · mean(action²).
     """
 
     scene = Scene(objects=(Body(name="cube", at=(0.5, 0.0), spread=(0.10, 0.10), turn=math.pi / 4),))
@@ -139,7 +128,7 @@ class Pick(GripperTask):
 
     def reset(self, sim: "Simulation", mask: wp.array) -> None:
         w = sim.warp
-        inputs = [mask, w.draws, w.rest_q, MIDDLE, HALF, HIGHEST, w.raised, w.solids, CLEAR, w.task_goal]
+        inputs = [mask, w.draws, w.rest_q, w.raised, w.solids, CLEAR, w.task_goal]
         wp.launch(goal_in_the_air, sim.num_envs, inputs, device=sim.device)
 
     def pose_at_goal(self, sim: "Simulation", mask: wp.array) -> None:
@@ -153,9 +142,8 @@ class Pick(GripperTask):
         return relabel_place(self, pick_reward, transitions, goal)
 
     def measures(self, sim: "Simulation") -> dict[str, torch.Tensor]:
-        return {
-            "cube to goal [m]": (sim.tensors.next_true_objects[:, :3] - sim.tensors.next_goal).norm(dim=-1)
-        }
+        missing = sim.tensors.next_true_objects[:, :3] - sim.tensors.next_goal
+        return {"cube to goal [m]": missing.norm(dim=-1)}
 
     def expert(self, sight: Sight) -> Aim:
         """Grasp the cube from above and bring it to the goal."""
