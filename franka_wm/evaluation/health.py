@@ -14,7 +14,6 @@ from franka_wm.evaluation.closed_loop import evaluating
 from franka_wm.evaluation.intervals import bootstrap_mean
 from franka_wm.evaluation.open_loop import correlation
 from franka_wm.evaluation.spectrum import collapse_warning, latent_statistics
-from franka_wm.keys import CONTEXT
 from franka_wm.policies import PlannerPolicy
 
 if TYPE_CHECKING:
@@ -50,10 +49,7 @@ def training_diagnostics(model: WorldModel, batch: TensorDictBase) -> dict[str, 
     batch, skipped = cast(TensorDictBase, batch[::apart]), model.burn_in
     devices = [device] if device.type == "cuda" else []
     with evaluating(model), torch.random.fork_rng(devices=devices):
-        z = model.encode(batch.select(*keys)[:, 0])
-        if (stored := batch.get(CONTEXT, None)) is not None:
-            z = torch.where(batch.get("is_init")[:, 0], z, stored[:, 0])
-        first = _walked(model, z, batch, 1, skipped + 1)
+        first = _walked(model, model.encode(batch.select(*keys)[:, 0]), batch, 1, skipped + 1)
         embedded = model.embed(first).float()
         if embedded.shape[0] < 2 or not bool(torch.isfinite(embedded).all()):
             return {}

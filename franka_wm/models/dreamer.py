@@ -76,7 +76,7 @@ class Dreamer(ActorCritic):
         entropy_coef: weight, against scaled advantages, of the actor's entropy [nat].
         std_min, std_max: bounds of the actor's standard deviation.
         burn_in: steps in front of each window that `loss` takes, see there.
-        stored_state: windows begin with the memory that the acting policy had, which the replay keeps.
+        stored_state: memory begins with what the acting policy had, which the replay keeps.
         actor_gradient: "reinforce", that of advantages, as published; "dynamics", that of the returns themselves,
             back through rewards, critic and imagined steps (DreamerV1, arXiv:1912.01603).
         actor_critic_lr_scale: learning rate of actor and critic relative to the model's.

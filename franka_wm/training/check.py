@@ -151,7 +151,8 @@ def _check_windows(run: RunSettings) -> None:
 def _check_stored_state(run: RunSettings) -> None:
     if run.model.options.get("stored_state"):
         without = {"recorded data": run.is_offline, "demonstrations": run.replay.demos is not None}
-        without |= {"random steps (collector.policy)": not run.is_offline and run.actor == "random"}
+        if not run.is_offline:
+            without |= {f"steps of collector.policy={run.actor}": run.actor not in ("policy", "planner")}
         if found := [what for what, used in without.items() if used]:
             raise UserError(
                 f"model.stored_state=true: {found[0]} have no memory to keep; use stored_state=false"

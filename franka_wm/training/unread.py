@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
+
 from franka_wm.console import say
 from franka_wm.envs.config import FrankaConfig
 from franka_wm.envs.tasks import make_task
@@ -43,8 +45,9 @@ def say_unseen_goal(run: RunSettings) -> None:
 
 def _say_unshown(config: FrankaConfig, spaces: Spaces) -> None:
     """Says which randomization no image shows."""
+    colored = [key for key in spaces.image_sizes if "pixels" in key]  # neither depth nor segmentation
     cameras = {*config.cameras} & {"front", "side"} if spaces.image_sizes else set()
-    shown = {"color": spaces.image_sizes, "brightness": spaces.image_sizes}
+    shown: dict[str, Collection[str]] = {"color": colored, "brightness": colored}
     shown |= {"camera_position": cameras, "camera_target": cameras}  # the wrist's moves with the hand
     drawn = config.randomization
     for name, by in shown.items():

@@ -173,13 +173,3 @@ def test_windows_without_what_was_stored_are_refused(key: str) -> None:
     assert model.replay_keys == ("context",)
     with pytest.raises(ValueError, match="stored_state=True: the batch must have `context` and `is_init`"):
         model.loss(stored()[1].exclude(key))
-
-
-def test_a_log_tells_of_latents_with_the_stored_memory() -> None:
-    model, data = stored()
-    model.burn_in = 0
-    data["is_init"][:, 1:] = False  # all within an episode
-    with torch.no_grad():
-        z = torch.where(data["is_init"][:, 0], model.encode(data[:, 0]), data["context"][:, 0])
-        expected = float(model.value(z).mean())
-    assert training_diagnostics(model, data)["value/mean"] == pytest.approx(expected, abs=1e-5)

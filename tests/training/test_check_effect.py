@@ -90,6 +90,7 @@ def test_images_that_nothing_reads_are_said(
             ["camera_position=0.1"],
         ),
         (("env=push_pixels", "env.cameras=[side]"), "{camera_position: 0.1}", []),
+        (("env=reach", "env.observations=[depth,state]"), "{color: 0.5, camera_target: 0.1}", ["color=0.5"]),
         (("env=reach_pixels",), "{}", []),
     ],
 )

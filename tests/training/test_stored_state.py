@@ -68,7 +68,10 @@ def test_memory_of_the_recorded_goal_is_forgotten_in_hindsight(share: float, set
 @pytest.mark.parametrize(
     ("words", "what"),
     [
-        (("collector.policy=random",), r"random steps \(collector.policy\)"),
+        *(
+            (((f"collector.policy={one}",), f"steps of collector.policy={one}"))
+            for one in ("random", "noop", "ik")
+        ),
         (("replay.demos=nowhere",), "demonstrations"),
         (("trainer=offline", "dataset=lerobot", "dataset.root=nowhere"), "recorded data"),
     ],

@@ -37,11 +37,9 @@ def lift_reward_and_success(
     cube = place_of(objects, world, 0)
     risen = wp.clamp(1.0 - (goal[world, 2] - cube[2]) / height, 0.0, 1.0)
     solved = cube[2] >= goal[world, 2]
-    value = 0.2 * nearness(wp.length(tool_of(state, world) - cube))
+    value = 0.25 * nearness(wp.length(tool_of(state, world) - cube))
     if holds(state, joint_target, cube, world):
-        value += 0.2 + 0.4 * risen
-    if solved:
-        value = 1.0
+        value += 0.25 + 0.5 * risen
     if sparse:
         value = wp.where(solved, 1.0, 0.0)
     reward[world, 0] = value - penalty * effort(action, world)
@@ -53,9 +51,9 @@ class Lift(GripperTask):
 
     **Scene**: a table and a cube of 4 cm and 50 g. **Randomization**: the cube stands within 10 cm in x and 15 cm in y
     of (0.5, 0) m, turned by up to 45°. **Goal**: 20 cm above where the cube stood. **Success**: the cube's centre is
-    that high (LiftCube of ManiSkill2: Gu et al. 2023). **Reward**, dense, in [0, 1]: 1 where it succeeds, else 0.2 for
-    the tool's nearness to the cube, 1 − tanh(5 · distance), 0.2 for holding it, 0.4 for how far it has risen while
-    held; sparse: 1 where it succeeds. Both minus ``action_penalty`` · mean(action²).
+    that high (LiftCube of ManiSkill2: Gu et al. 2023). **Reward**, dense, in [0, 1]: a quarter for the tool's nearness
+    to the cube, 1 − tanh(5 · distance), a quarter for holding it, half for how far it has risen while held; sparse: 1
+    where it succeeds. Both minus ``action_penalty`` · mean(action²).
     """
 
     scene = Scene(objects=(Body(name="cube", at=(0.5, 0.0), spread=(0.10, 0.15), turn=math.pi / 4),))

@@ -166,7 +166,8 @@ class Reach(Task):
 
     **Goal**: ``config.goal``, or with ``goal_sampling="reachable"`` the tool position of a pose drawn
     uniformly within ``goal_noise`` of home, at least 0.10 m above the ground, or the table where there is one, 0.25 m
-    from the base's axis and 5 cm from obstacles, new in every world and episode. **Reward**: :func:`reach_reward`.
+    from the base's axis and 5 cm from obstacles (``Scene.solids``), or, where 32 poses are not, at home; new in every
+    world and episode. **Reward**: :func:`reach_reward`.
     **Success**: tool within ``success_distance``.
     """
 
