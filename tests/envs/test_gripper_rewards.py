@@ -32,7 +32,7 @@ def played(composed, name: str) -> list:
 
 @pytest.mark.parametrize("name", ["push", "pick", "stack", "peg"])
 def test_to_succeed_pays_more_than_anything_else(name: str, composed) -> None:
-    """Else an agent may hover just below success, as well paid as above: lift's dense reward does not keep it from that."""
+    """Else an agent may hover just below success, as well paid as above: lift's reward does not prevent that."""
     steps = played(composed, name)
     value = torch.stack([step["value"] for step in steps])
     solved = torch.stack([step["success"].squeeze(-1) for step in steps])
