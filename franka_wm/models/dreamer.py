@@ -289,7 +289,7 @@ class Dreamer(ActorCritic):
             )
         if self.replay_keys and (batch.get(CONTEXT, None) is None or batch.get("is_init", None) is None):
             raise ValueError(f"stored_state=True: the batch must have `{CONTEXT}` and `is_init`, see there")
-        whole, batch = batch, batch[:, self.burn_in :]
+        whole, (_, batch) = batch, batch.split([self.burn_in, count - self.burn_in], dim=1)
         # Time leads from here on: (H, B, ...).
         action, reward, terminated = (
             batch.get(key).transpose(0, 1) for key in ("action", ("next", "reward"), ("next", "terminated"))
@@ -375,7 +375,7 @@ class Dreamer(ActorCritic):
         is_init, action = (batch.get(key).transpose(0, 1) for key in ("is_init", "action"))
         if self.burn_in:
             with torch.no_grad():
-                earlier = batch[:, : self.burn_in].select(*self.observation_keys)
+                earlier = batch.split(self.burn_in, dim=1)[0].select(*self.observation_keys)
                 features = self._embed(earlier.transpose(0, 1))
                 for t in range(self.burn_in):
                     _, _, h = self._step(torch.where(is_init[t], begin, h), features[t], action[t])
