@@ -60,7 +60,7 @@ class Track(Reach):
 
     @property
     def clear(self) -> float:
-        """Of the centre: all of the circle is as far from obstacles as a goal that stands still."""
+        """Distance of the centre: all of the circle is as far from obstacles as a goal that stands still [m]."""
         return super().clear + self.config.track_radius
 
     def reset(self, sim: "Simulation", mask: wp.array) -> None:
