@@ -18,10 +18,9 @@ Relabel = Callable[[TensorDictBase, torch.Tensor], TensorDictBase]
 class Hindsight:
     """Relabels a share of each batch of windows with goals reached later (HER, arXiv:1707.01495, strategy `future`).
 
-    The reward is a known function of state and goal, so relabeled windows are exact, not approximate. Where a policy's
-    memory is kept (`context`), they begin as an episode does, without it. The new goal is
+    The reward is a known function of state and goal, so relabeled windows are exact, not approximate. The new goal is
     where the tool, or the object that the goal is for, was after a step drawn uniformly from those between the window's
-    end and the episode's.
+    end and the episode's. Where a policy's memory is kept (`context`), these windows begin as episodes do, without it.
 
     Args:
         relabel: The task's, see `franka_wm.envs.tasks.Task.relabel`.
