@@ -95,7 +95,7 @@ def test_a_task_with_a_gripper_is_its_measured_row_but_for_time(env: str) -> Non
     measured = flat(compose("scale=gpu", *shlex.split(rows[f"{env}-gpu"]["arguments"])))
     named = flat(compose(f"env={env}", "scale=gpu"))
     of_time = {f"trainer.{name}" for name in ("updates", "updates_per_batch", "precision", "compile")}
-    assert {k for k in named if named[k] != measured[k]} - set(OF_MEASURING) == of_time
+    assert {k for k in named if named[k] != measured[k]} - set(OF_MEASURING) <= of_time
 
 
 @pytest.mark.parametrize(("name", "scale"), list(product(options("experiment"), SCALES)))

@@ -18,6 +18,8 @@ if TYPE_CHECKING:
 
 HEIGHT = 0.20
 """How far up [m]."""
+ABOVE = 0.03
+"""How far over the goal the cube is best held [m]: at the goal itself the least tremor would be failure."""
 
 
 @wp.kernel(enable_backward=False)
@@ -30,12 +32,14 @@ def lift_reward_and_success(
     sparse: bool,
     penalty: float,
     height: float,
+    above: float,
     reward: wp.array2d[float],
     success: wp.array2d[wp.bool],
 ):
     world = wp.tid()
     cube = place_of(objects, world, 0)
-    risen = wp.clamp(1.0 - (goal[world, 2] - cube[2]) / height, 0.0, 1.0)
+    missing = wp.abs(goal[world, 2] + above - cube[2])
+    risen = wp.max(1.0 - missing / (height + above), 0.0)
     solved = cube[2] >= goal[world, 2]
     value = 0.25 * nearness(wp.length(tool_of(state, world) - cube))
     if holds(state, joint_target, cube, world):
@@ -52,8 +56,9 @@ class Lift(GripperTask):
     **Scene**: a table and a cube of 4 cm and 50 g. **Randomization**: the cube stands within 10 cm in x and 15 cm in y
     of (0.5, 0) m, turned by up to 45°. **Goal**: 20 cm above where the cube stood. **Success**: the cube's centre is
     that high (LiftCube of ManiSkill2: Gu et al. 2023). **Reward**, dense, in [0, 1]: a quarter for the tool's nearness
-    to the cube, 1 − tanh(5 · distance), a quarter for holding it, half for how far it has risen while held; sparse: 1
-    where it succeeds. Both minus ``action_penalty`` · mean(action²).
+    to the cube, 1 − tanh(5 · distance), a quarter for holding it, half for how much of the way to 3 cm over the goal
+    it has risen while held, less again above that; sparse: 1 where it succeeds. Both minus ``action_penalty`` ·
+    mean(action²).
     """
 
     scene = Scene(objects=(Body(name="cube", at=(0.5, 0.0), spread=(0.10, 0.15), turn=math.pi / 4),))
@@ -67,11 +72,11 @@ class Lift(GripperTask):
         self.launch_goal_pose(sim, mask)
 
     def reward_and_success(self, sim: "Simulation") -> None:
-        self.launch_reward(sim, lift_reward_and_success, HEIGHT)
+        self.launch_reward(sim, lift_reward_and_success, HEIGHT, ABOVE)
 
     def measures(self, sim: "Simulation") -> dict[str, torch.Tensor]:
         return {"cube's height [m]": sim.tensors.next_true_objects[:, 2]}
 
     def expert(self, sight: Sight) -> Aim:
         """Grasp the cube from above and bring it a little higher than the goal."""
-        return fetch(sight, 0, moved(sight.goal, z=0.03), **grasp_of(self.objects[0]))[0]
+        return fetch(sight, 0, moved(sight.goal, z=ABOVE), **grasp_of(self.objects[0]))[0]
