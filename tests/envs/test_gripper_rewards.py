@@ -48,7 +48,7 @@ def test_lift_pays_for_nearness_grip_and_height(composed) -> None:
         risen = (1 - (step["goal"][:, 2] + 0.03 - cube[:, 2]).abs() / 0.23).clamp(min=0)
         held = held_in_torch(state, step["joint_target"], cube)
         near = near_in_torch((state[:, 14:17] - cube).norm(dim=-1))
-        expected = 0.25 * near + held * (0.25 + 0.5 * risen)
+        expected = 0.2 * near + held * (0.2 + 0.4 * risen + 0.2 * step["success"].squeeze(-1))
         torch.testing.assert_close(step["value"], expected, atol=1e-5, rtol=0)
         paid_for_height += int((held & (risen > 0.1) & (risen < 0.9)).sum())
     assert paid_for_height > WORLDS

@@ -41,9 +41,11 @@ def lift_reward_and_success(
     missing = wp.abs(goal[world, 2] + above - cube[2])
     risen = wp.max(1.0 - missing / (height + above), 0.0)
     solved = cube[2] >= goal[world, 2]
-    value = 0.25 * nearness(wp.length(tool_of(state, world) - cube))
+    value = 0.2 * nearness(wp.length(tool_of(state, world) - cube))
     if holds(state, joint_target, cube, world):
-        value += 0.25 + 0.5 * risen
+        value += 0.2 + 0.4 * risen
+        if solved:
+            value += 0.2
     if sparse:
         value = wp.where(solved, 1.0, 0.0)
     reward[world, 0] = value - penalty * effort(action, world)
@@ -55,10 +57,10 @@ class Lift(GripperTask):
 
     **Scene**: a table and a cube of 4 cm and 50 g. **Randomization**: the cube stands within 10 cm in x and 15 cm in y
     of (0.5, 0) m, turned by up to 45°. **Goal**: 20 cm above where the cube stood. **Success**: the cube's centre is
-    that high (LiftCube of ManiSkill2: Gu et al. 2023). **Reward**, dense, in [0, 1]: a quarter for the tool's nearness
-    to the cube, 1 − tanh(5 · distance), a quarter for holding it, half for how much of the way to 3 cm over the goal
-    it has risen while held, less again above that; sparse: 1 where it succeeds. Both minus ``action_penalty`` ·
-    mean(action²).
+    that high (LiftCube of ManiSkill2: Gu et al. 2023). **Reward**, dense, in [0, 1]: 0.2 for the tool's nearness to the
+    cube, 1 − tanh(5 · distance), 0.2 for holding it, and while it is held 0.4 for how much of the way to 3 cm over the
+    goal it has risen, less again above that, and 0.2 where it succeeds; sparse: 1 where it succeeds. Both minus
+    ``action_penalty`` · mean(action²).
     """
 
     scene = Scene(objects=(Body(name="cube", at=(0.5, 0.0), spread=(0.10, 0.15), turn=math.pi / 4),))
