@@ -157,8 +157,9 @@ def _fitting(trainer: Trainer, experience: TensorDictBase) -> TensorDictBase:
     for key in trainer.kept:
         if key not in experience.keys(True):
             name = key if isinstance(key, str) else ".".join(map(str, key))
+            options = "the model's options" if key in trainer.model.replay_keys else "the options of export"
             raise UserError(
-                f"the checkpoint's experience has no {name}, which this run keeps; leave export as it was then"
+                f"the checkpoint's experience has no {name}, which this run keeps; leave {options} as they were then"
             )
     experience = experience.select(*trainer.kept)
     for key in trainer.kept:

@@ -8,7 +8,7 @@ import torch
 from franka_wm.data.hindsight import Hindsight
 from franka_wm.envs import FrankaEnv
 from franka_wm.errors import UserError
-from franka_wm.training import build, storage_budget
+from franka_wm.training import build, resume, storage_budget
 from franka_wm.training.check import check
 from franka_wm.training.spaces import Spaces
 from tests.training.conftest import Make
@@ -95,3 +95,18 @@ def test_room_for_memory_is_asked_for(settled, monkeypatch) -> None:
             storage_budget.check_memory(run, model, spaces)
         said.append(float(str(refused.value).split("at least ")[1].split(" GB")[0]))
     assert said[1] - said[0] == pytest.approx(4e6 * 4 * model.latent_dim / 1e9, rel=0.1)
+
+
+def test_experience_without_memory_cannot_be_resumed_with_it(make: Make, settled) -> None:
+    cfg = settled(
+        *WORDS, "collector.num_envs=2", "collector.seed_steps=20", "replay.capacity=200", "logger=none"
+    )
+    trainer = make(cfg=cfg, env=FrankaEnv(cfg.env.arm, num_envs=2, seed=0))
+    trainer.seed()
+    resume._fitting(trainer, trainer.replay[:])
+    with pytest.raises(UserError, match=r"has no context, .*leave the model's options as they were then"):
+        resume._fitting(trainer, trainer.replay[:].exclude("context"))
+    with pytest.raises(
+        UserError, match=r"has no next.reward, .*leave the options of export as they were then"
+    ):
+        resume._fitting(trainer, trainer.replay[:].exclude(("next", "reward")))
