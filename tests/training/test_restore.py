@@ -369,6 +369,7 @@ def gathering(channels: int = 6, frame_stack: int = 2) -> Any:
     return SimpleNamespace(
         env=SimpleNamespace(fake_tensordict=lambda: steps(2, channels=channels)),
         settings=SimpleNamespace(env=SimpleNamespace(frame_stack=frame_stack)),
+        model=SimpleNamespace(replay_keys=("plan",)),
         kept=["plan", "state", "pixels", ("next", "reward")],
     )
 
